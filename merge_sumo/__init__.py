@@ -1,0 +1,1 @@
+"""merge-sumo: an interaction-aware testbed for merging controllers, hosted in SUMO."""

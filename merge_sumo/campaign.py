@@ -1,0 +1,138 @@
+"""The conductor: a sampler proposes, the world runs, the journal remembers."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.case import Pool
+from merge_sumo.drivers.pov import PovLibrary, available_levels
+from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.errors import UserError
+from merge_sumo.journal import Journal, Run, failures
+from merge_sumo.rollout import rollout
+from merge_sumo.samplers.registry import DEFAULT_SAMPLER, make_sampler
+from merge_sumo.scenario import LEVELS, V_VUT0_MAX_MPS, V_VUT0_MPS
+from merge_sumo.score import Outcome, measure
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.replay import write_scenario
+from merge_sumo.sumo.world import World
+from merge_sumo.trajectory import Trajectory
+
+DEFAULT_CASES: Final = 800
+DEFAULT_BATCH: Final = 40
+MAX_CORRIDORS: Final = 32
+EXPORTED_FAILURES: Final = 10
+SCENARIOS: Final = "scenarios"
+
+OnCase = Callable[[Outcome], None]
+"""Told of every case as it ends, in the order in which cases end."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CampaignSettings:
+    """Everything that decides what a campaign does; `UserError` for values that make none."""
+
+    vut: str
+    levels: tuple[int, ...]
+    sampler: str = DEFAULT_SAMPLER
+    cases: int = DEFAULT_CASES
+    batch: int = DEFAULT_BATCH
+    seed: int = 0
+    v_vut0_mps: float = V_VUT0_MPS
+
+    def __post_init__(self) -> None:
+        """Check the numbers, the names and the levels."""
+        vut_factory(self.vut)
+        make_sampler(self.sampler, self.pool, self.seed)
+        for name in ("cases", "batch"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name} is {getattr(self, name)}: it must be 1 or more")
+        if self.batch > self.cases:
+            raise UserError(
+                f"--batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
+                "cases than the campaign"
+            )
+        if self.seed < 0:
+            raise UserError(f"--seed is {self.seed}: it must be 0 or more")
+        if not 0.0 <= self.v_vut0_mps <= V_VUT0_MAX_MPS:
+            raise UserError(
+                f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {V_VUT0_MAX_MPS:g} m/s"
+            )
+
+    @property
+    def pool(self) -> Pool:
+        """The cases to choose from."""
+        return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps)
+
+
+def parse_levels(text: str) -> tuple[int, ...]:
+    """Return the levels that `--level` names: one, or all for which there is a policy."""
+    available = available_levels()
+    if text == "all":
+        return available
+    if text not in map(str, LEVELS):
+        raise UserError(f"there is no POV level {text!r}: choose 0, 1, 2 or all")
+    level = int(text)
+    if level not in available:
+        raise UserError(
+            f"there is no policy for a POV of level {level}: run `merge-sumo train` to make it"
+        )
+    return (level,)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that decide the outcome of a case."""
+    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def run_campaign(
+    settings: CampaignSettings, folder: Path, net: Net | None = None, on_case: OnCase | None = None
+) -> Run:
+    """Run a campaign into a new folder and return it as read back from there.
+
+    Same settings, same versions: same `outcomes.jsonl`. The worst failures are exported as
+    folders that sumo-gui opens. Raises `UserError` when the folder exists.
+    """
+    net = net or Net()
+    sampler = make_sampler(settings.sampler, settings.pool, settings.seed)
+    corridors = min(MAX_CORRIDORS, settings.batch)
+    with World(corridors, net) as world, closing(vut_factory(settings.vut)(corridors)) as vut:
+        pov = PovLibrary(corridors)
+        journal = Journal(folder, record_of(settings, net))
+        for batch, first in enumerate(range(0, settings.cases, settings.batch)):
+            cases = sampler.ask(min(settings.batch, settings.cases - first))
+            ran: list[tuple[Outcome, Trajectory]] = []
+            for place, trajectory in rollout(world, pov, vut, cases):
+                outcome = Outcome(first + place, batch, trajectory.case, measure(trajectory))
+                ran.append((outcome, trajectory))
+                if on_case is not None:
+                    on_case(outcome)
+            ran.sort(key=lambda pair: pair[0].index)
+            journal.append(ran)
+            sampler.tell(outcome for outcome, _ in ran)
+    run = Run(folder)
+    for outcome in failures(run.outcomes)[:EXPORTED_FAILURES]:
+        export_case(run, outcome.index, folder / SCENARIOS / case_name(outcome.index), net)
+    return run
+
+
+def record_of(settings: CampaignSettings, net: Net) -> dict[str, Any]:
+    """Return what `campaign.json` holds: everything that decides the outcomes."""
+    return {**asdict(settings), "versions": versions(), "net_sha256": net.sha256}
+
+
+def case_name(index: int) -> str:
+    """Return the name of a case's folder."""
+    return f"case-{index:05d}"
+
+
+def export_case(run: Run, index: int, folder: Path, net: Net | None = None) -> Path:
+    """Write a case of a run as a replay folder; return the path of its SUMO configuration."""
+    return write_scenario(folder, net or Net(), run.outcome(index), run.trajectory(index))

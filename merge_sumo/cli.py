@@ -1,0 +1,207 @@
+"""The command line: parse, call one function, print. Heavy modules are imported in the commands."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from merge_sumo.errors import UserError
+
+if TYPE_CHECKING:
+    from merge_sumo.journal import Run
+    from merge_sumo.summary import Summary
+
+app = typer.Typer(
+    help="""Find where a merging controller fails against drivers who react to it.
+
+    A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO while a primary other
+    vehicle (POV) on the mainline interacts with it. A sampler chooses the test cases; failures
+    are collisions at the merge point, and failure mode coverage (FMC) says how much of the
+    failing region was found.
+
+    Start with:  merge-sumo campaign --vut design2
+    """,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+NetOption = Annotated[
+    Path | None, typer.Option(help="SUMO net to use instead of the shipped US-23 ramp.")
+]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print the result as one JSON object on standard output.")
+]
+RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
+
+
+def say(text: str) -> None:
+    """Print a line for a person, on standard error: standard output is for results."""
+    typer.echo(text, err=True)
+
+
+@app.callback(invoke_without_command=True)
+def _version(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"merge-sumo {version_of('merge-sumo')}")
+        raise typer.Exit
+
+
+@app.command()
+def campaign(
+    vut: Annotated[str, typer.Option(help="Vehicle under test: level0, design1 or design2.")],
+    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2 or all.")] = "all",
+    sampler: Annotated[str, typer.Option(help="Who chooses the cases: gpr or uniform.")] = "gpr",
+    cases: Annotated[int, typer.Option(help="Number of test cases.")] = 800,
+    batch: Annotated[
+        int | None, typer.Option(help="Cases per batch.  [default: 40, or all if fewer]")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same outcomes.")] = 0,
+    v_vut0: Annotated[float, typer.Option(help="Initial speed of the VUT in m/s.")] = 18.0,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder to write.  [default: runs/VUT-DATE]")
+    ] = None,
+    net: NetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Test a VUT: run cases in SUMO, find failures, write a report and replayable scenarios.
+
+    Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
+    """
+    from merge_sumo import campaign as conductor
+    from merge_sumo.progress import CaseProgress
+    from merge_sumo.report import write_report
+    from merge_sumo.summary import summarise
+    from merge_sumo.sumo.net import Net
+
+    levels = conductor.parse_levels(level)
+    settings = conductor.CampaignSettings(
+        vut=vut,
+        levels=levels,
+        sampler=sampler,
+        cases=cases,
+        batch=min(conductor.DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
+        seed=seed,
+        v_vut0_mps=v_vut0,
+    )
+    if level == "all" and len(levels) < 3:
+        named = ", ".join(map(str, levels))
+        say(f"--level all: policies are there for level {named}; `merge-sumo train` makes others")
+    folder = out or Path("runs") / f"{vut}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    with CaseProgress(f"{vut} v level {'/'.join(map(str, levels))}", cases) as progress:
+        run = conductor.run_campaign(settings, folder, Net(net), progress.case_ended)
+    report_file = write_report(run)
+    summary = summarise(run.outcomes, levels)
+    if as_json:
+        result = {**asdict(summary), "run": str(folder), "report": str(report_file)}
+        typer.echo(json.dumps(result))
+    else:
+        _print_summary(run, summary, report_file)
+
+
+@app.command()
+def export(
+    run: RunArgument,
+    case: Annotated[list[int], typer.Argument(help="Indices of cases in outcomes.jsonl.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the case folders.  [default: RUN/scenarios]")
+    ] = None,
+    net: NetOption = None,
+) -> None:
+    """Write cases of a campaign as folders that sumo and sumo-gui replay with nothing else running.
+
+    Example:  merge-sumo export runs/design2 17 42
+    """
+    from merge_sumo.campaign import SCENARIOS, case_name, export_case
+    from merge_sumo.journal import Run
+    from merge_sumo.sumo.net import Net
+
+    loaded = Run(run)
+    target = out or run / SCENARIOS
+    for index in case:
+        loaded.outcome(index)
+    for index in case:
+        typer.echo(export_case(loaded, index, target / case_name(index), Net(net)))
+
+
+@app.command()
+def replay(
+    folder: Annotated[Path, typer.Argument(help="A scenario folder.")],
+    gui: Annotated[bool, typer.Option("--gui", help="Open it in sumo-gui.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Replay a scenario in SUMO and check every position and speed against its record.
+
+    Says "identical" (exit code 0) or "diverged at t = ..." (exit code 1).
+
+    Example:  merge-sumo replay scenarios/stalemate --gui
+    """
+    from merge_sumo.sumo import replay as replayer
+
+    if gui:
+        raise typer.Exit(replayer.open_gui(folder))
+    result = replayer.replay(folder)
+    identical = result.diverged_at_s is None
+    if as_json:
+        typer.echo(json.dumps({"identical": identical, **asdict(result)}))
+    elif identical:
+        typer.echo(f"identical: {result.rows} rows of x, y, position and speed")
+    else:
+        typer.echo(f"diverged at t = {result.diverged_at_s:.1f} s: {result.detail}")
+    raise typer.Exit(0 if identical else 1)
+
+
+@app.command()
+def report(run: RunArgument) -> None:
+    """Write the report of a campaign again and print its path.
+
+    Example:  merge-sumo report runs/design2
+    """
+    from merge_sumo.journal import Run
+    from merge_sumo.report import write_report
+
+    typer.echo(write_report(Run(run)))
+
+
+def _print_summary(run: Run, summary: Summary, report_file: Path) -> None:
+    from merge_sumo.campaign import SCENARIOS, case_name
+    from merge_sumo.journal import failures
+
+    typer.echo(f"{summary.failures} failures in {summary.cases} cases")
+    for level, found in summary.levels.items():
+        typer.echo(
+            f"  level {level}: {found.failures} failures in {found.cases} cases, "
+            f"FMC {found.fmc:.4f}, {found.regions} regions"
+        )
+    others = {end: n for end, n in summary.ends.items() if end not in ("MERGED", "COLLISION")}
+    if others:
+        typer.echo("  " + ", ".join(f"{n} {end}" for end, n in others.items()))
+    typer.echo(f"report: {report_file}")
+    worst = failures(run.outcomes)
+    if worst:
+        folder = run.folder / SCENARIOS / case_name(worst[0].index)
+        typer.echo(f"worst case: merge-sumo replay {folder} --gui")
+
+
+def main() -> None:
+    """Run the command line; a `UserError` becomes one sentence and exit code 2."""
+    try:
+        app()
+    except UserError as error:
+        say(f"merge-sumo: {error}")
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

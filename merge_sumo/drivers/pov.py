@@ -1,0 +1,38 @@
+"""The POV: one driver that plays, in each corridor, the level that the case asks for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from merge_sumo.case import Case, FloatArray
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.level0 import Level0Pov
+
+
+def available_levels() -> tuple[int, ...]:
+    """Return the levels for which a policy is there; level 0 needs none."""
+    return (0,)
+
+
+class PovLibrary(Driver):
+    """Plays a POV of level 0, 1 or 2, corridor by corridor."""
+
+    def __init__(self, corridors: int) -> None:
+        """Prepare the drivers of all available levels."""
+        super().__init__(corridors)
+        self._drivers: dict[int, Driver] = {0: Level0Pov(corridors)}
+        self._level = np.zeros(corridors, dtype=np.int64)
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Take the level of a case; KeyError when it has no policy."""
+        self._drivers[case.level].begin(corridor, case)
+        self._level[corridor] = case.level
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return each corridor's answer by the driver of its level."""
+        acceleration = np.zeros(self.corridors)
+        for level, driver in self._drivers.items():
+            mine = self._level == level
+            if mine.any():
+                acceleration = np.where(mine, driver.act(scene), acceleration)
+        return acceleration

@@ -1,0 +1,102 @@
+"""The three-stage rule-based VUT of Wang et al., section VII-A."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.case import Case, FloatArray
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.level0 import level0_acceleration, level0_time_to
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RuleBasedDesign:
+    """Parameters of a rule-based VUT; raises `UserError` for values that make no design.
+
+    Attributes:
+        x1_m: distance before M at which stage 2 begins.
+        x2_m: distance before M at which stage 3 begins.
+        gap_m: a predicted |dx| at M below this is "too close".
+        target_m: the |dx| at M that the PID of stage 3 aims at.
+        kp: proportional gain, m/s2 per m of gap error.
+        ki: integral gain, m/s2 per m s.
+        kd: derivative gain, m/s2 per m/s.
+        lag_s: time constant of a first-order actuator; 0 for none.
+    """
+
+    x1_m: float
+    x2_m: float
+    gap_m: float
+    target_m: float
+    kp: float
+    ki: float = 0.0
+    kd: float = 0.0
+    lag_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the order of the stages and the signs."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise UserError(f"{field.name} is {value}: it must be a number from 0 up")
+        if self.x2_m > self.x1_m:
+            raise UserError(f"x2_m is {self.x2_m}: stage 3 cannot begin before stage 2 (x1_m)")
+
+
+DESIGNS: Final = {
+    "design1": RuleBasedDesign(x1_m=80.0, x2_m=30.0, gap_m=15.0, target_m=15.0, kp=0.3, kd=0.1),
+    "design2": RuleBasedDesign(x1_m=160.0, x2_m=51.0, gap_m=22.0, target_m=22.0, kp=0.05, kd=0.1),
+}
+
+
+class RuleBasedVut(Driver):
+    """Follows the level-0 profile, coasts when it will be too close, regulates the gap at last.
+
+    All stages predict dx at M with the POV at constant speed and the VUT on the level-0 profile.
+    Before x1 the VUT follows that profile. From x1 to x2 it coasts while |dx| is predicted too
+    close. From x2 on it then sets its acceleration by a PID on the error of the predicted gap:
+    towards +target when the POV is predicted ahead, towards -target when it is predicted behind.
+    """
+
+    def __init__(self, corridors: int, design: RuleBasedDesign) -> None:
+        """Prepare a controller of this design for each corridor."""
+        super().__init__(corridors)
+        self.design = design
+        self._integral = np.zeros(corridors)
+        self._last_error = np.zeros(corridors)
+        self._regulated = np.zeros(corridors, dtype=bool)
+        self._actuator = np.zeros(corridors)
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Reset the PID and the actuator of a corridor."""
+        self._integral[corridor] = 0.0
+        self._regulated[corridor] = False
+        self._actuator[corridor] = 0.0
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the commanded acceleration, behind the actuator's lag if there is one."""
+        design = self.design
+        distance = np.maximum(-scene.x_vut_m, 0.0)
+        t_m = level0_time_to(distance, scene.v_vut_mps)
+        dx_at_m = scene.x_pov_m + scene.v_pov_mps * t_m
+        too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
+        regulate = too_close & (distance <= design.x2_m)
+        error = dx_at_m - np.where(dx_at_m >= 0.0, design.target_m, -design.target_m)
+        # The PID starts afresh whenever it takes over: no integral, no rate from before.
+        rate = np.where(self._regulated, (error - self._last_error) / DT_S, 0.0)
+        self._integral = np.where(regulate, self._integral + error * DT_S, 0.0)
+        self._last_error, self._regulated = error, regulate
+        pid = design.kp * error + design.ki * self._integral + design.kd * rate
+        profile = level0_acceleration(scene.v_vut_mps)
+        command = np.where(regulate, pid, np.where(too_close, 0.0, profile))
+        command = np.minimum(np.maximum(command, A_MIN_MPS2), A_MAX_MPS2)
+        if design.lag_s <= 0.0:
+            return command
+        self._actuator = self._actuator + (command - self._actuator) * min(DT_S / design.lag_s, 1.0)
+        return self._actuator

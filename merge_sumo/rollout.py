@@ -1,0 +1,155 @@
+"""From cases to trajectories: two drivers in the SUMO world."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.case import Case, FloatArray
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, X_VUT0_M
+from merge_sumo.sumo.world import POV, VUT, SimulationError, World
+from merge_sumo.trajectory import End, Trajectory
+
+RING_ROWS: Final = MAX_STEPS + 2
+"""Rows of the record: an episode is copied out before its first row is written over."""
+
+
+@dataclass(slots=True)
+class _Episode:
+    """What runs in a corridor."""
+
+    index: int
+    case: Case
+    first_row: int
+
+
+def rollout(
+    world: World, pov: Driver, vut: Driver, cases: Iterable[Case]
+) -> Iterator[tuple[int, Trajectory]]:
+    """Run cases in the world; yield (place in `cases`, trajectory) as the episodes end.
+
+    Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
+    episode does not depend on the number of corridors nor on its neighbours. What the VUT does
+    wrong ends its episode as VUT_ERROR. When SUMO fails, the episodes that were running end as
+    SIM_ERROR, SUMO is started again, and the others go on.
+    """
+    return _Rollout(world, pov, vut, cases).run()
+
+
+class _Rollout:
+    def __init__(self, world: World, pov: Driver, vut: Driver, cases: Iterable[Case]) -> None:
+        corridors = world.corridors
+        self.world, self.pov, self.vut = world, pov, vut
+        self.queue = enumerate(cases)
+        self.episodes: list[_Episode | None] = [None] * corridors
+        self.active = np.zeros(corridors, dtype=bool)
+        self.step = np.zeros(corridors, dtype=np.int64)
+        self.clipped = np.zeros(corridors, dtype=np.int64)
+        self.errors: dict[int, str] = {}
+        # One row per step of the world, shared by all corridors: x, v, a of POV and of VUT.
+        self.record = np.zeros((RING_ROWS, 3, 2, corridors))
+        self.row = 0
+
+    def run(self) -> Iterator[tuple[int, Trajectory]]:
+        world = self.world
+        self.refill_all()
+        while self.active.any():
+            acceleration = self.ask_drivers()
+            self.row += 1
+            try:
+                world.step(acceleration)
+            except SimulationError as error:
+                for corridor in np.flatnonzero(self.active).tolist():
+                    yield self.finish(corridor, End.SIM_ERROR, f"SUMO failed: {error}")
+                world.restart()
+                self.errors.clear()
+                self.refill_all()
+                continue
+            self.step += 1
+            arrived = world.x_m[VUT] >= 0.0
+            ended = (arrived | (self.step >= MAX_STEPS)) & self.active
+            ended[list(self.errors)] = True
+            if ended.any():
+                for corridor in np.flatnonzero(ended).tolist():
+                    if corridor in self.errors:
+                        yield self.finish(corridor, End.VUT_ERROR, self.errors.pop(corridor))
+                    else:
+                        yield self.finish(
+                            corridor, End.MERGED if arrived[corridor] else End.TIMEOUT
+                        )
+                    self.refill(corridor)
+                world.read()
+
+    def refill_all(self) -> None:
+        """Begin an episode in every corridor."""
+        for corridor in range(self.world.corridors):
+            self.refill(corridor)
+        self.world.read()
+
+    def refill(self, corridor: int) -> None:
+        """Begin the next episode in a corridor, or park it when there is none."""
+        index, case = next(self.queue, (-1, None))
+        self.active[corridor] = case is not None
+        self.step[corridor] = self.clipped[corridor] = 0
+        if case is None:
+            self.episodes[corridor] = None
+            self.world.park(corridor)
+            return
+        self.episodes[corridor] = _Episode(index, case, self.row)
+        self.world.place(corridor, case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps)
+        self.pov.begin(corridor, case)
+        try:
+            self.vut.begin(corridor, case)
+        except Exception as error:  # a black box may raise anything
+            self.errors[corridor] = f"reset raised {type(error).__name__}: {error}"
+
+    def ask_drivers(self) -> FloatArray:
+        """Return the accelerations of both vehicles, (2, K), within limits; write the record."""
+        x_m, v_mps = self.world.x_m, self.world.v_mps
+        scene = Scene(self.active, self.step, x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT])
+        answer = np.array((self.pov.act(scene), self.ask_vut(scene)))
+        acceleration = np.minimum(np.maximum(answer, A_MIN_MPS2), A_MAX_MPS2) * self.active
+        self.clipped += acceleration[VUT] != answer[VUT]
+        row = self.record[self.row % RING_ROWS]
+        # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
+        row[0], row[1], row[2] = x_m, v_mps, np.maximum(acceleration, v_mps / -DT_S)
+        return acceleration
+
+    def ask_vut(self, scene: Scene) -> FloatArray:
+        """Return the VUT's answer, with 0 where it was no answer; note what was wrong."""
+        corridors = self.world.corridors
+        raised: str | None = None
+        try:
+            answer = np.asarray(self.vut.act(scene), dtype=np.float64)
+            if answer.shape != (corridors,):
+                raise ValueError(f"answered shape {answer.shape} instead of ({corridors},)")
+        except Exception as error:  # a black box may raise anything
+            answer = np.full(corridors, np.nan)
+            raised = f"{type(error).__name__}: {error}"
+        finite = np.isfinite(answer)
+        if finite.all():
+            return answer
+        for corridor in np.flatnonzero(~finite & self.active).tolist():
+            reason = raised or self.vut.reason(corridor) or f"answered {answer[corridor]}"
+            self.errors.setdefault(corridor, reason)
+        return np.where(finite, answer, 0.0)
+
+    def finish(self, corridor: int, end: End, error: str | None = None) -> tuple[int, Trajectory]:
+        """Return the record of a corridor's episode; after an error without the last step."""
+        episode = self.episodes[corridor]
+        assert episode is not None, "only running episodes end"  # noqa: S101
+        rows = np.arange(episode.first_row, self.row + (error is None)) % RING_ROWS
+        motion = self.record[rows, :, :, corridor]
+        if error is None:
+            motion[-1, 0], motion[-1, 1] = (
+                self.world.x_m[:, corridor],
+                self.world.v_mps[:, corridor],
+            )
+        motion[-1, 2] = 0.0
+        columns = motion.transpose(0, 2, 1).reshape(len(rows), 6)
+        clipped = int(self.clipped[corridor])
+        return episode.index, Trajectory(episode.case, columns, end, error, clipped)

@@ -1,0 +1,105 @@
+"""The two verbs of a sampler, and the frame that all level-wise samplers share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.case import Case, FloatArray, Pool, dimensions, from_unit, to_unit
+from merge_sumo.samplers.allocation import even_shares
+from merge_sumo.score import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class LevelHistory:
+    """What is known of one POV level: N outcomes with a verdict, in the order of their index.
+
+    Attributes:
+        points: cases in the unit cube, (N, d).
+        score: P, (N,).
+        failed: P < lambda, (N,).
+        batch: batch of the campaign in which the case ran, (N,).
+    """
+
+    points: FloatArray
+    score: FloatArray
+    failed: NDArray[np.bool_]
+    batch: NDArray[np.int64]
+
+
+class Sampler(ABC):
+    """Proposes cases; knows nothing of SUMO and never runs anything.
+
+    `ask` is a pure function of the settings and of what was told: asking twice gives the same
+    cases, and the order of telling and telling twice do not matter. So a campaign is resumed by
+    telling its journal to a fresh sampler.
+    """
+
+    def __init__(self, pool: Pool, seed: int) -> None:
+        """Propose cases from `pool`; `seed` makes the proposals reproducible."""
+        self.pool = pool
+        self.seed = seed
+        self._outcomes: dict[int, Outcome] = {}
+
+    @abstractmethod
+    def ask(self, n: int) -> list[Case]:
+        """Return the next `n` cases."""
+
+    def tell(self, outcomes: Iterable[Outcome]) -> None:
+        """Take outcomes; those without a verdict (VUT_ERROR, SIM_ERROR) teach nothing."""
+        for outcome in outcomes:
+            self._outcomes[outcome.index] = outcome
+
+    def told(self, level: int | None = None) -> list[Outcome]:
+        """Return the outcomes with a verdict, of one level or of all, in order of their index."""
+        return [
+            outcome
+            for _, outcome in sorted(self._outcomes.items())
+            if outcome.measures.score is not None and level in (None, outcome.case.level)
+        ]
+
+    def history(self, level: int) -> LevelHistory:
+        """Return the outcomes with a verdict at one level as arrays."""
+        outcomes = self.told(level)
+        return LevelHistory(
+            points=to_unit((o.case for o in outcomes), level),
+            score=np.array([o.measures.score for o in outcomes], dtype=np.float64),
+            failed=np.array([o.failed for o in outcomes], dtype=bool),
+            batch=np.array([o.batch for o in outcomes], dtype=np.int64),
+        )
+
+    def rng(self, *key: int) -> np.random.Generator:
+        """Return the generator of this proposal: seed, cases told so far, and a key."""
+        return np.random.default_rng([self.seed, len(self.told()), *key])
+
+
+class LevelwiseSampler(Sampler):
+    """Shares a batch out over the levels, then proposes points in each level's unit cube."""
+
+    def ask(self, n: int) -> list[Case]:
+        """Return the next `n` cases, level by level."""
+        cases: list[Case] = []
+        for level, share in self.allocate(n).items():
+            if share:
+                points = self.propose(self.history(level), share, self.rng(level), level)
+                cases += from_unit(points, level, self.pool.v_vut0_mps)
+        return cases
+
+    def allocate(self, n: int) -> dict[int, int]:
+        """Return the number of cases for each level; they add up to `n`."""
+        return even_shares({level: len(self.told(level)) for level in self.pool.levels}, n)
+
+    @abstractmethod
+    def propose(
+        self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
+    ) -> FloatArray:
+        """Return `n` points, (n, d), of the level's unit cube."""
+
+
+def uniform_points(n: int, level: int, rng: np.random.Generator) -> FloatArray:
+    """Return `n` points, (n, d), drawn uniformly from the level's unit cube."""
+    return rng.random((n, len(dimensions(level))))

@@ -1,0 +1,110 @@
+"""Gaussian-process sampling as published: Wang et al., Algorithm 1."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, Final
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from merge_sumo.case import FloatArray
+from merge_sumo.samplers.allocation import last_failure_share, softmax_shares
+from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, uniform_points
+from merge_sumo.score import FAILURE_SCORE
+
+QUERIES: Final = 2000
+"""p, the uniform queries among which a batch is chosen."""
+EPSILON0: Final = 0.3
+ALPHA: Final = 0.95
+"""epsilon = EPSILON0 ALPHA^(i-1) is the share of exploring picks in batch i."""
+Z_EXPLOIT: Final = (2.0, 1.0)
+Z_EXPLORE: Final = (1.0, 2.0)
+"""Powers (z1, z2) and (z3, z4) of the predicted badness and of its variance."""
+XI: Final = 3.0
+"""Greediness of the shares of the levels."""
+NOISE: Final = 1e-4
+"""Variance of the observation noise, in units of lambda^2: P has a jump, which a smooth
+surrogate can only take as noise."""
+LENGTH_BOUNDS: Final = (0.05, 5.0)
+"""Bounds of the kernel's length scales in the unit cube. Below the FMC's radius a surrogate
+explains a jump by forgetting its neighbours."""
+
+
+class GprSampler(LevelwiseSampler):
+    """Zero-mean Gaussian process with a squared-exponential kernel on the score, epsilon-greedy.
+
+    The surrogate learns the badness -P / 500, because the powers of q = mu^z1 Var^z2 need
+    positive numbers: P itself is never positive. Within a batch the picks are made one after the
+    other, and the variance is conditioned on the earlier ones (it does not depend on their
+    results), so that a batch is spread out instead of piled up on one maximum.
+    """
+
+    def allocate(self, n: int) -> dict[int, int]:
+        """Return equal shares first, then shares by the softmax of the last failure shares."""
+        outcomes = self.told()
+        told = {level: sum(o.case.level == level for o in outcomes) for level in self.pool.levels}
+        shares = {level: last_failure_share(outcomes, level) for level in self.pool.levels}
+        return softmax_shares(shares, told, n, XI)
+
+    def propose(
+        self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
+    ) -> FloatArray:
+        """Return `n` points by lines 1 to 9 of Algorithm 1."""
+        if not len(history.points):
+            return uniform_points(n, level, rng)
+        queries = uniform_points(QUERIES, level, rng)
+        batches_before = len(np.unique(history.batch))
+        epsilon = EPSILON0 * ALPHA**batches_before
+        exploring = round(epsilon * n)
+        posterior = _Posterior(history, queries)
+        picks = [posterior.pick(*Z_EXPLOIT) for _ in range(n - exploring)]
+        picks += [posterior.pick(*Z_EXPLORE) for _ in range(exploring)]
+        return queries[picks]
+
+
+class _Posterior:
+    """The fitted surrogate at the queries, with a variance that knows the picks of the batch."""
+
+    def __init__(self, history: LevelHistory, queries: FloatArray) -> None:
+        self._queries = queries
+        process = _fit(history)
+        self._kernel = process.kernel_
+        cross = self._kernel(history.points, queries)
+        self._explained = solve_triangular(process.L_, cross, lower=True)
+        badness = np.maximum(cross.T @ process.alpha_, 0.0)
+        # A floor keeps every query reachable where the surrogate predicts no badness at all.
+        self._badness = badness + 1e-6
+        self._variance = self._kernel.diag(queries) - np.square(self._explained).sum(axis=0)
+        self._taken = np.zeros(len(queries), dtype=bool)
+
+    def pick(self, z_badness: float, z_variance: float) -> int:
+        """Take the query that maximises badness^z variance^z, and condition on it."""
+        variance = np.maximum(self._variance, 1e-12)
+        quality = z_badness * np.log(self._badness) + z_variance * np.log(variance)
+        quality[self._taken] = -np.inf
+        best = int(np.argmax(quality))
+        self._taken[best] = True
+        covariance = self._kernel(self._queries[[best]], self._queries)[0]
+        covariance -= self._explained[:, best] @ self._explained
+        step = covariance / np.sqrt(variance[best] + NOISE)
+        self._explained = np.vstack([self._explained, step])
+        self._variance = self._variance - np.square(step)
+        return best
+
+
+def _fit(history: LevelHistory) -> Any:
+    """Return the process with maximum-likelihood parameters; line 11 of Algorithm 1."""
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+    from threadpoolctl import threadpool_limits
+
+    dims = history.points.shape[1]
+    kernel = ConstantKernel(1.0, (1e-3, 1e3)) * RBF(np.full(dims, 0.3), LENGTH_BOUNDS)
+    process = GaussianProcessRegressor(kernel, alpha=NOISE)
+    # One thread: rounding must not depend on the number of cores, and small matrices gain nothing.
+    with threadpool_limits(1), warnings.catch_warnings():
+        # A length scale at its bound is expected where P hardly depends on a coordinate.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return process.fit(history.points, history.score / FAILURE_SCORE)

@@ -1,0 +1,21 @@
+"""The samplers by the name that a person writes after `--sampler`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from merge_sumo.case import Pool
+from merge_sumo.errors import UserError
+from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.gpr import GprSampler
+from merge_sumo.samplers.uniform import UniformSampler
+
+SAMPLERS: Final[dict[str, type[Sampler]]] = {"uniform": UniformSampler, "gpr": GprSampler}
+DEFAULT_SAMPLER: Final = "gpr"
+
+
+def make_sampler(name: str, pool: Pool, seed: int) -> Sampler:
+    """Return the sampler of that name; `UserError` for a name nobody knows."""
+    if name not in SAMPLERS:
+        raise UserError(f"there is no sampler {name!r}: choose one of {', '.join(SAMPLERS)}")
+    return SAMPLERS[name](pool, seed)

@@ -1,0 +1,18 @@
+"""Uniform sampling: the baseline, and the ground truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from merge_sumo.case import FloatArray
+from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, uniform_points
+
+
+class UniformSampler(LevelwiseSampler):
+    """Draws every case uniformly from the pool, an equal number at each level."""
+
+    def propose(
+        self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
+    ) -> FloatArray:
+        """Return `n` uniform points."""
+        return uniform_points(n, level, rng)

@@ -1,0 +1,254 @@
+"""The verdict on one episode: the score P and named safety measures (Wang et al., section V-A).
+
+P = MU_CRASH I_crash + MU_SAFETY P_safety + MU_TASK P_task is never positive, and P < -500 exactly
+when there was a collision. A surrogate must be able to learn it, so it falls smoothly over tens
+of metres towards a collision, jumps little there, and goes on falling with the overlap.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.case import Case, FloatArray
+from merge_sumo.scenario import (
+    A_MAX_MPS2,
+    A_MIN_MPS2,
+    DT_S,
+    DX_CRASH_M,
+    MAX_STEPS,
+    TTC_MIN_S,
+    V_HW_MAX_MPS,
+    V_HW_MIN_MPS,
+    V_MIN_MPS,
+)
+from merge_sumo.trajectory import End, Trajectory
+
+FAILURE_SCORE: Final = -500.0
+"""lambda: a case fails when its score is below."""
+
+# The bounds that make "P < -500" and "collision" the same: without a collision P_safety and
+# P_task are at least -1, so P >= -495; with one P_safety is at most -1, so P <= -560.
+MU_CRASH: Final = -110.0
+MU_SAFETY: Final = 450.0
+MU_TASK: Final = 45.0
+GAP_SCALE_M: Final = 15.0
+"""Length over which P_safety decays with the gap; tens of metres, so that a surrogate sees it."""
+TTC_SHARE: Final = 1.0 / 9.0
+"""Part of P_safety that a short time to collision can cost; the gap has the rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measures:
+    """Named measures of one episode, with the verdict first.
+
+    dx, dv, TTC, DRAC, the impact speed and the order of merging are taken at t1, the first step
+    with x_VUT >= 0, and are None when the VUT never arrived.
+
+    Attributes:
+        end: why the episode ended; COLLISION where the VUT arrived with |dx| < 6 m.
+        score: P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR).
+        dx_m: x_POV - x_VUT, front bumpers.
+        dv_mps: v_POV - v_VUT.
+        ttc_s: time to collision -dx/dv where dx dv < 0, else None (infinite).
+        pet_s: post-encroachment time: time between the two front bumpers at M (Allen et al.,
+            1978); where the POV has not arrived by t1, it is taken on at its speed at t1; None
+            when it stands.
+        t_end_s: time at which the episode ended.
+        drac_mps2: deceleration rate to avoid a crash that the follower needs at t1 (Cooper and
+            Ferguson, 1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None in a collision.
+        vut_max_brake_mps2: hardest braking of the VUT, positive.
+        pov_max_brake_mps2: hardest braking of the POV, positive.
+        impact_speed_mps: |dv| in a collision, else None.
+        merged_first: "VUT" or "POV".
+        last_avoidable_s: in a collision, the last time from which the VUT, at full acceleration
+            or full braking, would have avoided it against the recorded motion of the POV (taken
+            on at constant speed); None when there was no such time or no collision.
+        avoidable: in a collision, whether there was such a time; else None.
+        clipped_steps: steps in which the VUT asked for more than its limits of acceleration.
+        error: what the VUT or the simulation did wrong, else None.
+    """
+
+    end: End
+    score: float | None
+    dx_m: float | None
+    dv_mps: float | None
+    ttc_s: float | None
+    pet_s: float | None
+    t_end_s: float
+    drac_mps2: float | None
+    vut_max_brake_mps2: float
+    pov_max_brake_mps2: float
+    impact_speed_mps: float | None
+    merged_first: str | None
+    last_avoidable_s: float | None
+    avoidable: bool | None
+    clipped_steps: int
+    error: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A case that was run: its place in the campaign and its measures."""
+
+    index: int
+    batch: int
+    case: Case
+    measures: Measures
+
+    @property
+    def failed(self) -> bool:
+        """Whether this case is a failure of the VUT: P < lambda."""
+        return self.measures.score is not None and self.measures.score < FAILURE_SCORE
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
+        case = self.case
+        return {
+            "index": self.index,
+            "batch": self.batch,
+            "level": case.level,
+            "x_pov0_m": case.x_pov0_m,
+            "v_pov0_mps": case.v_pov0_mps,
+            "v_vut0_mps": case.v_vut0_mps,
+            "svo_rad": case.svo_rad,
+            **asdict(self.measures),
+        }
+
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> Outcome:
+        """Return the outcome of a record; KeyError, TypeError or ValueError where it is not one."""
+        values = dict(record)
+        index, batch = values.pop("index"), values.pop("batch")
+        if type(index) is not int or type(batch) is not int:
+            raise TypeError("index and batch must be whole numbers")
+        case = Case(**{name: values.pop(name) for name in Case.__dataclass_fields__})
+        values["end"] = End(values["end"])
+        return cls(index=index, batch=batch, case=case, measures=Measures(**values))
+
+
+def measure(trajectory: Trajectory) -> Measures:
+    """Return the verdict and the measures of an episode."""
+    motion = trajectory.motion
+    x_pov, v_pov, _, x_vut, v_vut, _ = motion[-1].tolist()
+    end = trajectory.end
+    arrived = end is End.MERGED
+    dx = dv = ttc = pet = drac = impact = first = avoidable = last_avoidable = None
+    if arrived:
+        dx, dv = x_pov - x_vut, v_pov - v_vut
+        ttc = time_to_collision(dx, dv)
+        pet = _post_encroachment_time(trajectory)
+        first = "VUT" if dx < 0 else "POV"
+        if abs(dx) < DX_CRASH_M:
+            end = End.COLLISION
+            impact = abs(dv)
+            last_avoidable = _last_avoidable_s(trajectory)
+            avoidable = last_avoidable is not None
+        else:
+            gap = abs(dx) - DX_CRASH_M
+            drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
+    lowest = motion.min(axis=0)
+    return Measures(
+        end=end,
+        score=None if trajectory.error is not None else _score(trajectory, end, dx, ttc),
+        dx_m=dx,
+        dv_mps=dv,
+        ttc_s=ttc,
+        pet_s=pet,
+        t_end_s=trajectory.t_end_s,
+        drac_mps2=drac,
+        vut_max_brake_mps2=max(0.0, -float(lowest[5])),
+        pov_max_brake_mps2=max(0.0, -float(lowest[2])),
+        impact_speed_mps=impact,
+        merged_first=first,
+        last_avoidable_s=last_avoidable,
+        avoidable=avoidable,
+        clipped_steps=trajectory.clipped_steps,
+        error=trajectory.error,
+    )
+
+
+def time_to_collision(dx_m: float, dv_mps: float) -> float | None:
+    """Return TTC = -dx/dv in seconds where the gap closes (dx dv < 0), else None (section VI-C)."""
+    return -dx_m / dv_mps if dx_m * dv_mps < 0 else None
+
+
+def _score(trajectory: Trajectory, end: End, dx: float | None, ttc: float | None) -> float:
+    p_safety = 0.0
+    if dx is not None:
+        overlap = DX_CRASH_M - abs(dx)
+        if end is End.COLLISION:
+            p_safety = -1.0 - overlap / DX_CRASH_M
+        else:
+            short_ttc = 0.0 if ttc is None else max(0.0, 1.0 - ttc / TTC_MIN_S)
+            near = math.exp(overlap / GAP_SCALE_M)
+            p_safety = -(1.0 - TTC_SHARE) * near - TTC_SHARE * short_ttc
+    crash = MU_CRASH if end is End.COLLISION else 0.0
+    return crash + MU_SAFETY * p_safety + MU_TASK * _task(trajectory, end)
+
+
+def _task(trajectory: Trajectory, end: End) -> float:
+    """Return P_task in [-1, 0]: a slow ramp, a final speed off the highway's, harshness, no end."""
+    v_vut = trajectory.v_vut_mps
+    v_end = float(v_vut[-1])
+    slow = float(np.maximum(V_MIN_MPS - v_vut, 0.0).mean()) / V_MIN_MPS
+    off_range = max(V_HW_MIN_MPS - v_end, v_end - V_HW_MAX_MPS, 0.0)
+    off_range = min(off_range / V_HW_MIN_MPS, 1.0)
+    harsh = float(np.square(trajectory.a_vut_mps2).mean()) / A_MIN_MPS2**2
+    return -(slow + off_range + harsh + (end is End.TIMEOUT)) / 4.0
+
+
+def _crossing_time_s(x: FloatArray, v: FloatArray) -> float | None:
+    """Return when a vehicle passed M; eq. (4) moves it at constant speed within a step."""
+    step = int(np.argmax(x >= 0.0))
+    if x[step] < 0.0:
+        return None
+    if step == 0:
+        return 0.0
+    return (step - 1) * DT_S + float(-x[step - 1] / v[step - 1])
+
+
+def _post_encroachment_time(trajectory: Trajectory) -> float | None:
+    t_vut = _crossing_time_s(trajectory.x_vut_m, trajectory.v_vut_mps)
+    t_pov = _crossing_time_s(trajectory.x_pov_m, trajectory.v_pov_mps)
+    if t_pov is None:
+        v_end = float(trajectory.v_pov_mps[-1])
+        if v_end <= 0.0:
+            return None
+        t_pov = trajectory.t_end_s - float(trajectory.x_pov_m[-1]) / v_end
+    assert t_vut is not None, "only called once the VUT has arrived"  # noqa: S101
+    return abs(t_pov - t_vut)
+
+
+def _last_avoidable_s(trajectory: Trajectory) -> float | None:
+    """Return the last time from which the VUT had a way out.
+
+    The POV never moves backwards, so of all ways to arrive at M the first and the last possible
+    decide: the VUT passes in front at full acceleration, or waits at full braking. Both are
+    rolled out from every step of the record at once.
+    """
+    x_pov = trajectory.x_pov_m
+    beyond = np.arange(1, MAX_STEPS + 1) * (trajectory.v_pov_mps[-1] * DT_S) + x_pov[-1]
+    x_pov_on = np.concatenate([x_pov, beyond])
+    starts = np.arange(len(x_pov) - 1)
+    way_out = np.zeros(len(starts), dtype=bool)
+    for acceleration in (A_MAX_MPS2, A_MIN_MPS2):
+        x, v = trajectory.x_vut_m[:-1].copy(), trajectory.v_vut_mps[:-1].copy()
+        driving = np.ones(len(starts), dtype=bool)
+        for ahead in range(1, MAX_STEPS + 1):
+            x = x + v * DT_S
+            v = np.maximum(v + acceleration * DT_S, 0.0)
+            arrived = driving & (x >= 0.0)
+            dx = x_pov_on[starts[arrived] + ahead] - x[arrived]
+            way_out[arrived] |= np.abs(dx) >= DX_CRASH_M
+            driving &= ~arrived
+            if not driving.any():
+                break
+            if acceleration < 0.0 and not v[driving].any():
+                # These stop short of M and can wait there, if the POV moves on.
+                way_out[driving] |= bool(trajectory.v_pov_mps[-1] > 0.0)
+                break
+    return float(starts[way_out][-1] * DT_S) if way_out.any() else None

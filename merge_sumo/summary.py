@@ -1,0 +1,61 @@
+"""A campaign in a few numbers."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from merge_sumo.case import to_unit
+from merge_sumo.fmc import fmc, regions
+from merge_sumo.score import Outcome
+from merge_sumo.trajectory import End
+
+
+@dataclass(frozen=True, slots=True)
+class LevelSummary:
+    """What was found at one POV level.
+
+    Attributes:
+        cases: cases that ran.
+        failures: cases with P < -500.
+        fmc: failure mode coverage, M(s, 0.05, -500), in the level's unit cube.
+        regions: groups of failures that are linked at a distance of 0.05.
+    """
+
+    cases: int
+    failures: int
+    fmc: float
+    regions: int
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What was found in all: totals, ends of episodes by name, and each level."""
+
+    cases: int
+    failures: int
+    ends: dict[str, int]
+    levels: dict[int, LevelSummary]
+
+
+def summarise(outcomes: Sequence[Outcome], levels: Sequence[int]) -> Summary:
+    """Return the summary of outcomes at the given levels."""
+    ends = Counter(outcome.measures.end for outcome in outcomes)
+    return Summary(
+        cases=len(outcomes),
+        failures=sum(outcome.failed for outcome in outcomes),
+        ends={end.value: ends[end] for end in End if ends[end]},
+        levels={level: _level(outcomes, level) for level in levels},
+    )
+
+
+def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
+    at_level = [outcome for outcome in outcomes if outcome.case.level == level]
+    points = to_unit((outcome.case for outcome in at_level if outcome.failed), level)
+    return LevelSummary(
+        cases=len(at_level),
+        failures=len(points),
+        fmc=fmc(points),
+        regions=int(regions(points).max(initial=-1)) + 1,
+    )

@@ -1,0 +1,1 @@
+"""SUMO as the host: the only part of the project that imports libsumo, sumo or sumolib."""

@@ -1,0 +1,48 @@
+"""The SUMO installation: its library and its programs, or a sentence that says what is missing."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.errors import UserError
+
+DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
+"""Shared libraries that SUMO's wheels load, even without a window."""
+
+
+def load_libsumo() -> Any:
+    """Import and return libsumo; `UserError` when the module or a system library is missing."""
+    try:
+        return importlib.import_module("libsumo")
+    except ModuleNotFoundError as error:
+        if error.name != "libsumo":
+            raise
+        raise UserError("libsumo is not installed: run `pip install libsumo==1.28.0`") from error
+    except ImportError as error:
+        raise UserError(
+            f"libsumo cannot be loaded ({error}): on Debian or Ubuntu run "
+            f"`apt-get install {DEBIAN_PACKAGES}`"
+        ) from error
+
+
+def sumo_program(name: str) -> str:
+    """Return the path of a SUMO program ("sumo", "sumo-gui"); `UserError` when it is missing.
+
+    The wheel puts a Python wrapper on the PATH; killing that leaves the program running, so the
+    program itself is started.
+    """
+    try:
+        home = Path(importlib.import_module("sumo").SUMO_HOME)
+    except (ImportError, AttributeError) as error:
+        raise UserError(
+            f"{name} is not installed: run `pip install eclipse-sumo==1.28.0`"
+        ) from error
+    program = home / "bin" / name
+    if not program.is_file():
+        raise UserError(
+            f"{name} is missing in {program.parent}: run `pip install --force-reinstall "
+            "eclipse-sumo==1.28.0`"
+        )
+    return str(program)

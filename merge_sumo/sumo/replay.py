@@ -1,0 +1,217 @@
+"""A recorded episode as a folder that sumo and sumo-gui replay with nothing else running."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from lxml import etree
+
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import DT_S
+from merge_sumo.score import Outcome
+from merge_sumo.sumo.binding import sumo_program
+from merge_sumo.sumo.net import Net
+from merge_sumo.trajectory import Trajectory
+
+CONFIG: Final = "replay.sumocfg"
+NET: Final = "us23.net.xml"
+TYPES: Final = "vehicles.add.xml"
+RECORD: Final = "episode.fcd.xml"
+VIEW: Final = "view.settings.xml"
+CASE: Final = "case.json"
+
+COMPARED: Final = ("x", "y", "pos", "speed")
+TOLERANCE: Final = 1e-6
+"""Metres and m/s; the record is written with nine digits."""
+
+COLOURS: Final = {"pov": "0.90,0.25,0.15", "vut": "0.10,0.35,0.90"}
+HOLD_STEPS: Final = 10
+"""Steps for which the last picture stays, so that a person sees how it ended."""
+
+
+def write_scenario(folder: Path, net: Net, outcome: Outcome, trajectory: Trajectory) -> Path:
+    """Write an episode as a replay folder and return the path of its configuration.
+
+    Raises `UserError` when the folder exists or cannot be written; nothing is overwritten.
+    """
+    try:
+        folder.mkdir(parents=True)
+        (folder / NET).write_bytes(net.text)
+        (folder / TYPES).write_bytes(_xml(_types(net, trajectory)))
+        (folder / RECORD).write_bytes(_xml(_fcd(net, trajectory)))
+        (folder / VIEW).write_bytes(_xml(_view()))
+        (folder / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
+        (folder / CONFIG).write_bytes(_xml(_config(trajectory)))
+    except FileExistsError as error:
+        raise UserError(f"{folder} exists: choose another folder or remove it first") from error
+    except OSError as error:
+        raise UserError(f"cannot write {folder}: {error.strerror}") from error
+    return folder / CONFIG
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What a headless replay showed: rows compared, and where the first differed, if one did."""
+
+    rows: int
+    diverged_at_s: float | None
+    detail: str
+
+
+def replay(folder: Path) -> Replay:
+    """Replay a folder in headless SUMO and compare every row of both vehicles with the record.
+
+    Positions (x, y, along the lane) and speeds must agree within 1e-6. Raises `UserError` when
+    the folder is no replay folder or SUMO cannot run it.
+    """
+    recorded = list(_rows(_existing(folder, RECORD)))
+    with tempfile.TemporaryDirectory(prefix="merge-sumo-") as scratch:
+        output = Path(scratch) / "replayed.fcd.xml"
+        command = [
+            *(sumo_program("sumo"), "-c", str(_existing(folder, CONFIG))),
+            *("--fcd-output", str(output), "--precision", "9", "--no-step-log", "true"),
+        ]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            reason = (done.stderr.strip() or "no message").splitlines()[0]
+            raise UserError(f"SUMO cannot replay {folder}: {reason}")
+        replayed = {(time, who): values for time, who, values in _rows(output)}
+    for time, who, values in recorded:
+        seen = replayed.get((time, who))
+        if seen is None:
+            return Replay(len(recorded), time, f"{who} is not there")
+        for name, was, now in zip(COMPARED, values, seen, strict=True):
+            if abs(now - was) > TOLERANCE:
+                return Replay(len(recorded), time, f"{name} of {who} is {now}, recorded {was}")
+    return Replay(len(recorded), None, "")
+
+
+def open_gui(folder: Path) -> int:
+    """Open a replay folder in sumo-gui, wait until it is closed, and return its exit code."""
+    if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UserError(
+            "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
+        )
+    config = _existing(folder, CONFIG)
+    return subprocess.run([sumo_program("sumo-gui"), "-c", str(config)], check=False).returncode
+
+
+def _existing(folder: Path, name: str) -> Path:
+    path = folder / name
+    if not path.is_file():
+        raise UserError(f"{folder} is not a replay folder: it has no {name}")
+    return path
+
+
+def _rows(path: Path) -> Iterator[tuple[float, str, tuple[float, ...]]]:
+    """Yield (time, vehicle, (x, y, pos, speed)) of an FCD file."""
+    try:
+        events = etree.iterparse(path, events=("end",), tag="timestep", resolve_entities=False)
+        for _, timestep in events:
+            time = round(float(timestep.get("time")), 3)
+            for vehicle in timestep.iterfind("vehicle"):
+                values = tuple(float(vehicle.get(name)) for name in COMPARED)
+                yield time, vehicle.get("id"), values
+            timestep.clear()
+    except (etree.XMLSyntaxError, TypeError, ValueError) as error:
+        raise UserError(f"{path} is not a readable FCD file: {error}") from error
+
+
+def _xml(root: etree._Element) -> bytes:
+    etree.indent(root, space="    ")
+    return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
+
+
+def _types(net: Net, trajectory: Trajectory) -> etree._Element:
+    root = etree.Element("additional")
+    first_speeds = {"pov": trajectory.v_pov_mps[0], "vut": trajectory.v_vut_mps[0]}
+    for name, colour in COLOURS.items():
+        etree.SubElement(
+            root,
+            "vType",
+            id=name,
+            color=colour,
+            guiShape="passenger/sedan",
+            length="5",
+            minGap="0",
+            # The replay inserts a vehicle at the highest speed it may drive, so make that the
+            # first speed of the record; all later speeds come from the record itself.
+            maxSpeed=f"{max(first_speeds[name], 1e-9):.9f}",
+            speedFactor="2",
+        )
+    return root
+
+
+def _fcd(net: Net, trajectory: Trajectory) -> etree._Element:
+    root = etree.Element("fcd-export")
+    motion = trajectory.motion.tolist()
+    motion += [motion[-1]] * HOLD_STEPS
+    for step, (x_pov, v_pov, _, x_vut, v_vut, _) in enumerate(motion):
+        timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
+        for who, x_m, v_mps in (("pov", x_pov, v_pov), ("vut", x_vut, v_vut)):
+            lane, position, x, y, angle = net.lane_point(x_m, on_ramp=who == "vut")
+            etree.SubElement(
+                timestep,
+                "vehicle",
+                id=who,
+                x=f"{x:.9f}",
+                y=f"{y:.9f}",
+                angle=f"{angle:.9f}",
+                type=who,
+                speed=f"{v_mps:.9f}",
+                pos=f"{position:.9f}",
+                lane=lane,
+            )
+    return root
+
+
+def _view() -> etree._Element:
+    root = etree.Element("viewsettings")
+    scheme = etree.SubElement(root, "scheme", name="merge")
+    etree.SubElement(
+        scheme,
+        "vehicles",
+        vehicleQuality="3",
+        vehicle_exaggeration="4",
+        vehicleName_show="1",
+        vehicleName_size="60",
+        vehicleName_color="0.1,0.1,0.1",
+    )
+    etree.SubElement(scheme, "background", backgroundColor="0.93,0.93,0.90", showGrid="0")
+    etree.SubElement(root, "viewport", zoom="440", x="-110", y="-20")
+    etree.SubElement(root, "delay", value="100")
+    return root
+
+
+def _config(trajectory: Trajectory) -> etree._Element:
+    end_s = (len(trajectory.motion) + HOLD_STEPS) * DT_S
+    sections = {
+        "input": {"net-file": NET, "additional-files": TYPES},
+        "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
+        "processing": {
+            "collision.action": "none",
+            "time-to-teleport": "-1",
+            "default.speeddev": "0",
+        },
+        "fcd_replay_device": {"device.fcd-replay.files": RECORD},
+        "report": {"no-warnings": "true", "xml-validation": "never"},
+        "gui_only": {
+            "gui-settings-file": VIEW,
+            "start": "true",
+            "delay": "100",
+            "window-size": "1280,800",
+        },
+    }
+    root = etree.Element("configuration")
+    for section, values in sections.items():
+        parent = etree.SubElement(root, section)
+        for name, value in values.items():
+            etree.SubElement(parent, name, value=value)
+    return root

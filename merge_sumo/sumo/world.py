@@ -1,0 +1,210 @@
+"""K corridors in one SUMO simulation, moved exactly by the paper's equations of motion.
+
+SUMO holds the state: positions and speeds are read back from it after every step. In its default
+(Euler) mode a vehicle advances by the speed it is given for a step, so eq. (4),
+
+    x(t+1) = x(t) + v(t) dt,    v(t+1) = v(t) + a(t) dt,
+
+is had by stepping at v(t) and then telling SUMO that the speed now is v(t+1).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+
+from merge_sumo.case import FloatArray
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import DT_S
+from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net
+
+POV: Final = 0
+VUT: Final = 1
+
+SPEED_MODE_COMMANDED: Final = 32
+"""All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
+PARKING_SPEED_MPS: Final = 0.0
+MAX_SPEED_MPS: Final = 200.0
+"""Above what a POV can reach by the timeout, so that SUMO never caps a commanded speed."""
+
+SUMO_OPTIONS: Final = (
+    *("--step-length", str(DT_S)),
+    *("--collision.action", "none"),
+    *("--insertion-checks", "none"),
+    *("--time-to-teleport", "-1"),
+    *("--default.speeddev", "0"),
+    *("--xml-validation", "never"),
+    *("--no-step-log", "true"),
+    *("--no-warnings", "true"),
+    *("--duration-log.disable", "true"),
+)
+
+
+class SimulationError(Exception):
+    """SUMO gave up; the world that raised it can only be restarted or closed."""
+
+
+class World:
+    """A libsumo simulation with `corridors` independent corridors.
+
+    State arrays have shape (2, corridors), row `POV` and row `VUT`:
+    `x_m`, lane coordinates with M = 0, and `v_mps`. They are read from SUMO.
+
+    libsumo holds one simulation per process, so one world may be open at a time.
+    """
+
+    _open = False
+
+    def __init__(self, corridors: int = 32, net: Net | None = None) -> None:
+        """Start SUMO; raises `UserError` when it cannot start, or when a world is open already."""
+        if World._open:
+            raise UserError("libsumo holds one simulation per process: close the other World first")
+        self.corridors = corridors
+        self.net = net or Net()
+        self._libsumo = load_libsumo()
+        self.x_m: FloatArray = np.empty((2, corridors))
+        self.v_mps: FloatArray = np.empty((2, corridors))
+        self._before_m = np.repeat(
+            [[self.net.main_in.length_m], [self.net.ramp.length_m]], corridors, axis=1
+        )
+        self._to_m = self._before_m.copy()
+        """What to subtract from a lane position: lane length before M, 0 behind it."""
+        self._position_m: FloatArray = np.zeros((2, corridors))
+        self._start()
+
+    def restart(self) -> None:
+        """Start SUMO afresh, with parked vehicles; what ran is gone."""
+        self.close()
+        self._start()
+
+    def _start(self) -> None:
+        libsumo = self._libsumo
+        with tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder:
+            net_file = Path(folder) / "corridors.net.xml"
+            net_file.write_bytes(self.net.replicate(self.corridors))
+            try:
+                libsumo.start(["sumo", "--net-file", str(net_file), *SUMO_OPTIONS])
+            except libsumo.TraCIException as error:
+                raise UserError(f"SUMO cannot load the net {self.net.path}: {error}") from error
+        vehicle = libsumo.vehicle
+        self._ids = [f"{who}.{k}" for who in ("pov", "vut") for k in range(self.corridors)]
+        try:
+            vtype = "DEFAULT_VEHTYPE"
+            libsumo.vehicletype.setMinGap(vtype, 0.0)
+            libsumo.vehicletype.setMaxSpeed(vtype, MAX_SPEED_MPS)
+            for index, name in enumerate(self._ids):
+                k = index % self.corridors
+                edge = RAMP if index >= self.corridors else MAIN_IN
+                libsumo.route.add(f"route.{name}", [f"{edge}.{k}", f"{MAIN_OUT}.{k}"])
+                vehicle.add(name, f"route.{name}", departLane="0", departPos="10", departSpeed="0")
+            libsumo.simulation.step()
+            for name in self._ids:
+                vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
+                vehicle.setLaneChangeMode(name, 0)
+                vehicle.setSpeed(name, PARKING_SPEED_MPS)
+        except libsumo.TraCIException as error:
+            libsumo.close()
+            raise UserError(f"SUMO cannot use the net {self.net.path}: {error}") from error
+        # Bound once: attribute look-ups cost as much as the calls themselves.
+        self._step_simulation = libsumo.simulation.step
+        self._move_to = vehicle.moveTo
+        self._set_speed, self._set_previous_speed = _raw(libsumo, "setSpeed", "setPreviousSpeed")
+        self._get_position, self._get_speed = _raw(libsumo, "getLanePosition", "getSpeed")
+        World._open = True
+        self.read()
+
+    def place(
+        self, corridor: int, x_pov_m: float, v_pov_mps: float, x_vut_m: float, v_vut_mps: float
+    ) -> None:
+        """Put both vehicles of a corridor where an episode starts, before M; then call `read`."""
+        for row, edge, x, v in (
+            (POV, MAIN_IN, x_pov_m, v_pov_mps),
+            (VUT, RAMP, x_vut_m, v_vut_mps),
+        ):
+            name = self._ids[row * self.corridors + corridor]
+            position = float(self._before_m[row, corridor]) + x
+            self._move_to(name, f"{edge}.{corridor}_0", position)
+            self._set_previous_speed(name, v, 0.0)
+            self._set_speed(name, v)
+            self._position_m[row, corridor] = position
+        self._to_m[:, corridor] = self._before_m[:, corridor]
+
+    def park(self, corridor: int) -> None:
+        """Stop both vehicles of a corridor that has no further episode."""
+        for name in self._ids[corridor :: self.corridors]:
+            self._set_previous_speed(name, PARKING_SPEED_MPS, 0.0)
+            self._set_speed(name, PARKING_SPEED_MPS)
+
+    def step(self, a_mps2: FloatArray) -> None:
+        """Advance all corridors by one step of eq. (4) and read the state.
+
+        `a_mps2` has shape (2, corridors). Speeds do not fall below 0. Raises `SimulationError`.
+        """
+        v_next = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
+        try:
+            self._step_simulation()
+            # A vehicle that keeps its speed needs no command: SUMO holds the last one.
+            changed = np.flatnonzero(v_next != self.v_mps)
+            ids, set_previous_speed, set_speed = (
+                self._ids,
+                self._set_previous_speed,
+                self._set_speed,
+            )
+            speeds, accelerations = v_next.ravel()[changed], a_mps2.ravel()[changed]
+            for index, v, a in zip(
+                changed.tolist(), speeds.tolist(), accelerations.tolist(), strict=True
+            ):
+                name = ids[index]
+                set_previous_speed(name, v, a)
+                set_speed(name, v)
+            self.read()
+        except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
+            raise SimulationError(str(error)) from error
+
+    def read(self) -> None:
+        """Read positions and speeds of all vehicles from SUMO into `x_m` and `v_mps`."""
+        count, shape = len(self._ids), self.x_m.shape
+        position = np.fromiter(map(self._get_position, self._ids), float, count).reshape(shape)
+        self.v_mps = np.fromiter(map(self._get_speed, self._ids), float, count).reshape(shape)
+        # Nothing drives backwards, so a lane position that falls means the lane behind M.
+        self._to_m[position < self._position_m] = 0.0
+        self._position_m = position
+        self.x_m = position - self._to_m
+
+    def acceleration_mps2(self) -> FloatArray:
+        """Return SUMO's own accelerations, (2, corridors)."""
+        get = self._libsumo.vehicle.getAcceleration
+        return np.array([get(name) for name in self._ids]).reshape(self.x_m.shape)
+
+    def close(self) -> None:
+        """End the simulation; the next world may start."""
+        if World._open:
+            World._open = False
+            self._libsumo.close()
+
+    def __enter__(self) -> Self:
+        """Return the world."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the world."""
+        self.close()
+
+
+def _raw(libsumo: Any, *names: str) -> list[Any]:
+    """Return vehicle functions without their Python wrappers, where the build exposes them.
+
+    The wrappers only pass their arguments on, and cost as much again as the call.
+    """
+    raw = getattr(libsumo, "_libsumo", None)
+    return [getattr(raw, f"vehicle_{name}", getattr(libsumo.vehicle, name)) for name in names]

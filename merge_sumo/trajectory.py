@@ -1,0 +1,74 @@
+"""What happened in one episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from merge_sumo.case import Case, FloatArray
+from merge_sumo.scenario import DT_S
+
+
+class End(StrEnum):
+    """Why an episode ended."""
+
+    MERGED = "MERGED"
+    COLLISION = "COLLISION"
+    TIMEOUT = "TIMEOUT"
+    VUT_ERROR = "VUT_ERROR"
+    SIM_ERROR = "SIM_ERROR"
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Positions, speeds and accelerations of both vehicles in one episode.
+
+    `motion` has shape (T + 1, 6): one row per step, from t = 0 to the end of the episode, with
+    the columns x_POV, v_POV, a_POV, x_VUT, v_VUT, a_VUT in m, m/s and m/s2. The acceleration in a
+    row acts from that row to the next; it is 0 in the last one.
+
+    `end` is MERGED whenever the VUT arrived at M: whether it collided there is the verdict of the
+    score. `error` says what the VUT or the simulation did wrong. `clipped_steps` counts the
+    answers of the VUT that were outside the limits of acceleration and were clipped.
+    """
+
+    case: Case
+    motion: FloatArray
+    end: End
+    error: str | None = None
+    clipped_steps: int = 0
+
+    @property
+    def x_pov_m(self) -> FloatArray:
+        """Positions of the POV, (T + 1,)."""
+        return self.motion[:, 0]
+
+    @property
+    def v_pov_mps(self) -> FloatArray:
+        """Speeds of the POV, (T + 1,)."""
+        return self.motion[:, 1]
+
+    @property
+    def a_pov_mps2(self) -> FloatArray:
+        """Accelerations of the POV, (T + 1,), the last one 0."""
+        return self.motion[:, 2]
+
+    @property
+    def x_vut_m(self) -> FloatArray:
+        """Positions of the VUT, (T + 1,)."""
+        return self.motion[:, 3]
+
+    @property
+    def v_vut_mps(self) -> FloatArray:
+        """Speeds of the VUT, (T + 1,)."""
+        return self.motion[:, 4]
+
+    @property
+    def a_vut_mps2(self) -> FloatArray:
+        """Accelerations of the VUT, (T + 1,), the last one 0."""
+        return self.motion[:, 5]
+
+    @property
+    def t_end_s(self) -> float:
+        """Time of the last row."""
+        return round((len(self.motion) - 1) * DT_S, 1)

@@ -1,0 +1,408 @@
+"""Failure mode coverage: closed forms, two independent references, and what must not matter."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from merge_sumo import fmc as fmc_module
+from merge_sumo.fmc import RADIUS, fmc, regions
+
+Points = NDArray[np.float64]
+
+BALL = {1: 2 * RADIUS, 2: math.pi * RADIUS**2, 3: 4 / 3 * math.pi * RADIUS**3}
+# What the docstring promises; 1e-12 per point is what snapping and rounding may cost.
+TOLERANCE = {1: 1e-10, 2: 1e-10, 3: 1e-4}
+DIMENSIONS = pytest.mark.parametrize("dimension", [1, 2, 3])
+
+
+def lens(distance: float, dimension: int) -> float:
+    """Volume common to two balls of the default radius."""
+    d, r = distance, RADIUS
+    if d >= 2 * r:
+        return 0.0
+    if dimension == 1:
+        return 2 * r - d
+    if dimension == 2:
+        return 2 * r**2 * math.acos(d / (2 * r)) - d / 2 * math.sqrt(4 * r**2 - d**2)
+    return math.pi * (4 * r + d) * (2 * r - d) ** 2 / 12
+
+
+def chain(count: int, distance: float, dimension: int) -> float:
+    """Volume of a row of balls: what a ball shares with all before it lies in the last of them."""
+    return count * BALL[dimension] - (count - 1) * lens(distance, dimension)
+
+
+def lattice(count: int, spacing: float, dimension: int) -> Points:
+    """Points on a square or cubic lattice."""
+    axis = np.arange(count) * spacing
+    return np.stack(np.meshgrid(*[axis] * dimension), axis=-1).reshape(-1, dimension)
+
+
+def covering_lattice_area(count: int, spacing: float) -> float:
+    """Union of discs on a square lattice so narrow (spacing <= sqrt(2) r) that it has no holes.
+
+    The square of the centres, and on each side the outer half of a row; the four halves have the
+    quarter of a disc at each corner in common.
+    """
+    assert spacing <= math.sqrt(2) * RADIUS * (1 + 1e-12)
+    return ((count - 1) * spacing) ** 2 + 2 * chain(count, spacing, 2) - BALL[2]
+
+
+def unit_vector(seed: int, dimension: int) -> Points:
+    vector = np.random.default_rng(seed).normal(size=dimension)
+    return vector / np.linalg.norm(vector)
+
+
+def monte_carlo(points: Points, seed: int, samples: int = 200_000) -> tuple[float, float]:
+    """The definition: share of a box within a radius of a point. Returns it and its std error."""
+    low, high = points.min(axis=0) - RADIUS, points.max(axis=0) + RADIUS
+    box = float(np.prod(high - low))
+    x = np.random.default_rng(seed).uniform(low, high, size=(samples, points.shape[1]))
+    share = float(np.mean(cKDTree(points).query(x)[0] <= RADIUS))
+    return box * share, box * math.sqrt(share * (1 - share) / samples)
+
+
+class TestClosedForms:
+    @DIMENSIONS
+    def test_no_points_cover_nothing(self, dimension):
+        assert fmc(np.zeros((0, dimension))) == 0.0
+        assert fmc([]) == 0.0
+
+    @DIMENSIONS
+    @pytest.mark.parametrize("radius", [RADIUS, 0.31])
+    def test_one_ball(self, dimension, radius):
+        expected = {1: 2 * radius, 2: math.pi * radius**2, 3: 4 / 3 * math.pi * radius**3}
+        # A lone ball is exact in 3-D too: its poles are taken care of.
+        assert fmc(np.full((1, dimension), 0.4), radius) == pytest.approx(
+            expected[dimension], rel=1e-12
+        )
+
+    def test_result_is_a_python_float(self):
+        assert type(fmc([[0.1, 0.2]])) is float
+
+    def test_the_balls_are_not_clipped_to_the_cube(self):
+        assert fmc([[0.0, 0.0]]) == fmc([[0.5, 0.5]])
+
+    @DIMENSIONS
+    @pytest.mark.parametrize("distance", [1e-6, 0.01, 0.05, 0.08, 0.0999, 0.1 - 1e-9])
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_two_overlapping_balls(self, dimension, distance, seed):
+        points = 0.3 + np.stack([np.zeros(dimension), distance * unit_vector(seed, dimension)])
+        expected = 2 * BALL[dimension] - lens(distance, dimension)
+        assert fmc(points) == pytest.approx(expected, rel=1e-9 if dimension < 3 else 1e-6)
+
+    @DIMENSIONS
+    @pytest.mark.parametrize("distance", [0.1, 0.1 + 1e-12, 0.2, 40.0])
+    def test_touching_and_distant_balls_add_up(self, dimension, distance):
+        points = np.outer(np.arange(5) * distance, unit_vector(3, dimension))
+        assert fmc(points) == pytest.approx(5 * BALL[dimension], rel=1e-9)
+
+    @DIMENSIONS
+    @pytest.mark.parametrize("distance", [0.003, 0.05, 0.07])
+    def test_a_row_of_balls(self, dimension, distance):
+        points = np.outer(np.arange(30) * distance, unit_vector(4, dimension))
+        assert fmc(points) == pytest.approx(chain(30, distance, dimension), rel=1e-6)
+
+    @pytest.mark.parametrize("distance", [0.02, 0.05, 0.08])
+    def test_balls_right_above_each_other_as_the_slices_see_them(self, distance):
+        # Concentric discs in every slice, and equal ones half-way between two balls.
+        up = Rotation.from_euler("xyz", fmc_module._TURNED_RAD).inv().apply([0.0, 0.0, 1.0])
+        points = np.outer(np.arange(4) * distance, up)
+        assert fmc(points) == pytest.approx(chain(4, distance, 3), rel=1e-4)
+
+    def test_equal_discs_of_two_balls_in_a_slice_count_once(self):
+        balls = np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]])
+        both, height = np.array([0, 1, 0, 1]), np.array([0.0, 0.0, 0.2, 0.2])
+        area = fmc_module._sliced_area(balls, cKDTree(balls), both, height)
+        assert area == pytest.approx(math.pi * (0.75 + 0.91), rel=1e-12)
+
+    @pytest.mark.parametrize("side", [0.01, 0.05, 0.07, 0.0866])
+    def test_three_discs_with_a_common_part(self, side):
+        r = RADIUS
+        angles = np.array([0.3, 0.3 + 2 * math.pi / 3, 0.3 + 4 * math.pi / 3])
+        centres = side / math.sqrt(3) * np.column_stack([np.cos(angles), np.sin(angles)])
+        # The common part is an equilateral triangle with a circular segment on each edge.
+        edge = math.sqrt(3) * (math.sqrt(r**2 - side**2 / 4) - side / math.sqrt(12))
+        segment = r**2 * math.asin(edge / (2 * r)) - edge / 4 * math.sqrt(4 * r**2 - edge**2)
+        common = math.sqrt(3) / 4 * edge**2 + 3 * segment
+        expected = 3 * BALL[2] - 3 * lens(side, 2) + common
+        assert fmc(centres) == pytest.approx(expected, rel=1e-12)
+
+    def test_the_hole_of_a_ring_does_not_count(self):
+        count, ring = 24, 0.3
+        angles = 2 * math.pi * np.arange(count) / count
+        points = 0.5 + ring * np.column_stack([np.cos(angles), np.sin(angles)])
+        step = 2 * ring * math.sin(math.pi / count)
+        assert step < 2 * RADIUS  # closed, so there is a hole
+        expected = count * (BALL[2] - lens(step, 2))
+        assert fmc(points) == pytest.approx(expected, rel=1e-12)
+
+    def test_the_cavity_of_a_shell_does_not_count(self):
+        normals = np.random.default_rng(5).normal(size=(300, 3))
+        points = 0.5 + 0.12 * normals / np.linalg.norm(normals, axis=1)[:, None]
+        shell = fmc(points)
+        cavity_and_shell = fmc(np.vstack([points, 0.5 + lattice(5, 0.035, 3) - 0.07]))
+        expected, error = monte_carlo(points, seed=6)
+        assert abs(shell - expected) < 4 * error
+        assert cavity_and_shell > shell + 0.5 * 4 / 3 * math.pi * 0.07**3
+
+
+class TestLattices:
+    """Many circles through one point, arcs that end where others begin, tangents."""
+
+    @pytest.mark.parametrize("count", [2, 5, 20])
+    @pytest.mark.parametrize("spacing", [math.sqrt(2) * RADIUS, RADIUS, RADIUS / 2, 0.0123])
+    def test_square_lattice_without_holes(self, count, spacing):
+        expected = covering_lattice_area(count, spacing)
+        assert fmc(lattice(count, spacing, 2)) == pytest.approx(expected, rel=1e-9)
+
+    def test_twenty_thousand_points_with_hundreds_of_neighbours_each(self):
+        points = lattice(141, 0.007, 2)
+        assert fmc(points) == pytest.approx(covering_lattice_area(141, 0.007), rel=1e-9)
+
+    @pytest.mark.parametrize(
+        ("dimension", "spacing"),
+        [(2, 2 * RADIUS), (2, 0.08), (3, 2 * RADIUS), (3, 0.08), (3, math.sqrt(2) * RADIUS)],
+    )
+    def test_lattice_with_holes_where_only_neighbours_overlap(self, dimension, spacing):
+        count = 6
+        edges = dimension * count ** (dimension - 1) * (count - 1)
+        expected = count**dimension * BALL[dimension] - edges * lens(spacing, dimension)
+        result = fmc(lattice(count, spacing, dimension))
+        assert result == pytest.approx(expected, rel=TOLERANCE[dimension])
+
+    def test_a_flat_lattice_in_space(self):
+        points = np.column_stack([lattice(8, 0.08, 2), np.full(64, 0.3)])
+        expected = 64 * BALL[3] - 2 * 8 * 7 * lens(0.08, 3)
+        assert fmc(points) == pytest.approx(expected, rel=1e-4)
+
+
+class TestReferences:
+    @pytest.mark.parametrize(
+        ("count", "width"), [(10, 0.2), (100, 1.0), (400, 1.0), (400, 0.3), (1500, 0.4)]
+    )
+    def test_between_inner_and_outer_polygons(self, count, width):
+        points = np.random.default_rng(count).random((count, 2)) * width
+        discs = shapely.points(points)
+        outer = RADIUS / math.cos(math.pi / 256)  # its 256-gon contains the disc
+        inside = shapely.union_all(shapely.buffer(discs, RADIUS, quad_segs=64)).area
+        outside = shapely.union_all(shapely.buffer(discs, outer, quad_segs=64)).area
+        assert inside < fmc(points) < outside
+        assert outside / inside - 1 < 3e-4  # so the check above says something
+
+    @pytest.mark.parametrize("dimension", [2, 3])
+    @pytest.mark.parametrize(("count", "width"), [(3, 0.08), (60, 0.3), (400, 0.2), (2000, 1.0)])
+    def test_monte_carlo_of_the_definition(self, dimension, count, width):
+        points = np.random.default_rng(count + dimension).random((count, dimension)) * width
+        expected, error = monte_carlo(points, seed=7)
+        assert error < 0.01 * expected
+        assert abs(fmc(points) - expected) < 4 * error
+
+    @pytest.mark.parametrize(
+        ("count", "width"), [(2, 0.05), (50, 0.1), (400, 0.02), (400, 0.15), (400, 1.0)]
+    )
+    def test_enough_slices(self, count, width, monkeypatch):
+        points = np.random.default_rng(8).random((count, 3)) * width
+        result = fmc(points)
+        monkeypatch.setattr(fmc_module, "_SLICES", 400)
+        monkeypatch.setattr(fmc_module, "_MAX_SLICES", 400)
+        finer = fmc(points)
+        assert result != finer
+        assert result == pytest.approx(finer, rel=1e-4)
+
+    @pytest.mark.parametrize("dimension", [2, 3])
+    def test_looking_at_the_nearest_balls_first_changes_nothing(self, dimension, monkeypatch):
+        points = np.random.default_rng(9).random((300, dimension)) * 0.3
+        result = fmc(points)
+        monkeypatch.setattr(fmc_module, "_FIRST_NEIGHBOURS", len(points))
+        assert fmc(points) == pytest.approx(result, rel=1e-12)
+
+
+# No deadline: a busy machine is no failure. Derandomised: neither is luck.
+examples = settings(max_examples=40, deadline=None, derandomize=True)
+
+# Coordinates with many ties, tangents and coincident intersections among them.
+coordinates = st.one_of(
+    st.integers(0, 20).map(lambda i: i * RADIUS / 2),
+    st.floats(0.0, 0.4),
+    st.floats(0.1, 0.1 + 1e-8),
+)
+
+
+@st.composite
+def point_sets(draw, dimension=None, most=12):
+    d = dimension or draw(st.sampled_from([1, 2, 3]))
+    count = draw(st.integers(1, most))
+    return draw(arrays(np.float64, (count, d), elements=coordinates))
+
+
+class TestWhatMustNotMatter:
+    @examples
+    @given(point_sets(), st.randoms(use_true_random=False))
+    def test_order_and_repetition(self, points, random):
+        result = fmc(points)
+        rows = list(range(len(points))) * 2
+        random.shuffle(rows)
+        assert fmc(points[rows]) == result
+
+    @examples
+    @given(point_sets(), st.floats(-1e-15, 1e-15))
+    def test_the_same_points_with_other_rounding(self, points, shift):
+        twice = np.vstack([points, points + shift])
+        assert fmc(twice) == pytest.approx(fmc(points), rel=1e-10)
+
+    @examples
+    @given(point_sets(), st.floats(-3.0, 3.0))
+    def test_translation(self, points, shift):
+        tolerance = max(TOLERANCE[points.shape[1]], 1e-9)
+        assert fmc(points + shift) == pytest.approx(fmc(points), rel=tolerance)
+
+    @examples
+    @given(point_sets(), st.integers(0, 2))
+    def test_reflection_and_swapped_axes(self, points, axis):
+        tolerance = max(TOLERANCE[points.shape[1]], 1e-9)
+        mirrored = points.copy()
+        mirrored[:, axis % points.shape[1]] *= -1.0
+        assert fmc(mirrored) == pytest.approx(fmc(points), rel=tolerance)
+        assert fmc(points[:, ::-1]) == pytest.approx(fmc(points), rel=tolerance)
+
+    @examples
+    @given(point_sets(dimension=2), st.floats(0.0, 2 * math.pi))
+    def test_rotation(self, points, angle):
+        c, s = math.cos(angle), math.sin(angle)
+        assert fmc(points @ np.array([[c, s], [-s, c]])) == pytest.approx(fmc(points), rel=1e-9)
+
+    @examples
+    @given(point_sets(), st.floats(0.01, 100.0))
+    def test_scale(self, points, factor):
+        d = points.shape[1]
+        scaled = fmc(points * factor, RADIUS * factor) / factor**d
+        assert scaled == pytest.approx(fmc(points), rel=max(TOLERANCE[d], 1e-9))
+
+    @examples
+    @given(point_sets())
+    def test_more_points_cover_more_but_no_more_than_their_balls(self, points):
+        d = points.shape[1]
+        slack = BALL[d] * len(points) * TOLERANCE[d]
+        covered = [fmc(points[:n]) for n in range(len(points) + 1)]
+        gains = np.diff(covered)
+        assert gains.min() >= -slack
+        assert gains.max() <= BALL[d] + slack
+
+    @examples
+    @given(point_sets(dimension=3))
+    def test_a_column_of_zeros_makes_discs_into_balls_and_keeps_their_regions(self, points):
+        flat = points.copy()
+        flat[:, 2] = 0.25
+        assert regions(flat).tolist() == regions(points[:, :2]).tolist()
+        # The middle slice of the balls is the discs, and each slice is at most that.
+        assert 4 / 3 * RADIUS * fmc(flat[:, :2]) * (1 - 1e-4) <= fmc(flat)
+        assert fmc(flat) <= 2 * RADIUS * fmc(flat[:, :2]) * (1 + 1e-4)
+
+    @examples
+    @given(point_sets(), st.integers(2, 1000))
+    def test_a_distant_copy_counts_twice(self, points, distance):
+        both = np.vstack([points, points + distance])
+        tolerance = max(TOLERANCE[points.shape[1]], 1e-9)
+        assert fmc(both) == pytest.approx(2 * fmc(points), rel=tolerance)
+
+    def test_the_points_are_left_alone(self):
+        points = np.random.default_rng(10).random((20, 3))
+        before = points.copy()
+        points.flags.writeable = False
+        fmc(points)
+        regions(points)
+        assert (points == before).all()
+
+
+class TestBadInput:
+    @pytest.mark.parametrize("function", [fmc, regions])
+    @pytest.mark.parametrize(
+        ("points", "sentence"),
+        [
+            ([0.1, 0.2], r"points must have shape \(n, d\) with d = 1, 2 or 3, got \(2,\)"),
+            ([[0.1] * 4], r"points must have shape .* got \(1, 4\)"),
+            (np.zeros((0, 4)), r"points must have shape .* got \(0, 4\)"),
+            (np.zeros((3, 0)), r"points must have shape .* got \(3, 0\)"),
+            (0.5, r"points must have shape .* got \(\)"),
+            ([[0.1, 0.2], [0.3, math.nan]], r"points must be finite, but point 1 is \[0.3, nan\]"),
+            ([[math.inf, 0.0]], r"points must be finite, but point 0 is \[inf, 0.0\]"),
+        ],
+    )
+    def test_points(self, function, points, sentence):
+        with pytest.raises(ValueError, match=sentence):
+            function(points)
+
+    @pytest.mark.parametrize("function", [fmc, regions])
+    @pytest.mark.parametrize("radius", [0.0, -0.05, math.nan, math.inf])
+    @pytest.mark.parametrize("points", [[[0.1, 0.2]], []])
+    def test_radius(self, function, radius, points):
+        with pytest.raises(ValueError, match="radius must be a positive finite number, got"):
+            function(points, radius)
+
+    @pytest.mark.parametrize("far", [1e6, 1.7e308])
+    def test_points_too_far_apart_for_the_precision(self, far):
+        with pytest.raises(ValueError, match="radii, more than 1e\\+06: normalise them"):
+            fmc([[-far, 0.0], [far, 0.0]])
+
+
+class TestRegions:
+    def test_by_hand(self):
+        points = [
+            [0.90, 0.9],  # alone
+            [0.10, 0.1],  # a chain of three: its ends are further apart than the radius
+            [0.14, 0.1],
+            [0.18, 0.1],
+            [0.50, 0.5],  # a pair
+            [0.50, 0.54],
+            [0.10, 0.9],  # alone, later than the other one
+        ]
+        assert regions(points).tolist() == [2, 0, 0, 0, 1, 1, 3]
+
+    def test_equal_sizes_are_in_the_order_of_their_first_point(self):
+        assert regions([[0.9], [0.1], [0.5], [0.1], [0.9], [0.5]]).tolist() == [0, 1, 2, 1, 0, 2]
+
+    def test_repeated_points_count(self):
+        assert regions([[0.1, 0.1], [0.5, 0.5], [0.5, 0.5]]).tolist() == [1, 0, 0]
+
+    def test_a_grid_with_the_spacing_of_the_radius_is_one_region(self):
+        axis = np.arange(11) * 0.05
+        assert not (np.diff(axis) <= 0.05).all()  # rounding
+        assert set(regions(axis[:, None])) == {0}
+        assert regions([[0.0], [0.0501]]).tolist() == [0, 1]
+
+    def test_the_radius_is_an_option(self):
+        points = [[0.0, 0.0, 0.0], [0.1, 0.1, 0.1]]
+        assert regions(points, 0.17).tolist() == [0, 1]  # 0.1732 apart
+        assert regions(points, 0.18).tolist() == [0, 0]
+
+    @pytest.mark.parametrize("points", [[], np.zeros((0, 2)), np.zeros((0, 3))])
+    def test_no_points(self, points):
+        labels = regions(points)
+        assert labels.shape == (0,)
+        assert labels.dtype == np.int64
+
+    @examples
+    @given(point_sets(most=25))
+    def test_against_walking_the_graph(self, points):
+        distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+        reach = distance <= RADIUS * (1 + 1e-9)
+        for _ in range(5):  # paths of up to 32 links
+            reach = reach @ reach
+        labels = regions(points)
+        assert labels.dtype == np.int64
+        assert ((labels[:, None] == labels[None]) == reach).all()
+        sizes = np.bincount(labels)
+        firsts = [int(np.flatnonzero(labels == label)[0]) for label in range(len(sizes))]
+        order = list(zip(-sizes, firsts, strict=True))
+        assert order == sorted(order)
