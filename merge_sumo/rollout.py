@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -16,6 +17,10 @@ from merge_sumo.trajectory import End, Trajectory
 
 RING_ROWS: Final = MAX_STEPS + 2
 """Rows of the record: an episode is copied out before its first row is written over."""
+
+
+IDLE: Final = -(2**62)
+"""Step count of a corridor without an episode: it never times out."""
 
 
 @dataclass(slots=True)
@@ -50,8 +55,10 @@ class _Rollout:
         self.step = np.zeros(corridors, dtype=np.int64)
         self.clipped = np.zeros(corridors, dtype=np.int64)
         self.errors: dict[int, str] = {}
+        self.a_min = np.full((2, corridors), A_MIN_MPS2)
+        self.a_max = np.full((2, corridors), A_MAX_MPS2)
         # One row per step of the world, shared by all corridors: x, v, a of POV and of VUT.
-        self.record = np.zeros((RING_ROWS, 3, 2, corridors))
+        self.record = np.zeros((RING_ROWS, 2, 3, corridors))
         self.row = 0
 
     def run(self) -> Iterator[tuple[int, Trajectory]]:
@@ -70,25 +77,23 @@ class _Rollout:
                 self.refill_all()
                 continue
             self.step += 1
-            arrived = world.x_m[VUT] >= 0.0
-            ended = (arrived | (self.step >= MAX_STEPS)) & self.active
-            ended[list(self.errors)] = True
-            if ended.any():
+            x_vut_m = world.x_m[VUT]
+            # Scalars first: in most steps no episode ends. Idle corridors stand before M.
+            if x_vut_m.max() >= 0.0 or self.step.max() >= MAX_STEPS or self.errors:
+                ended = (x_vut_m >= 0.0) | (self.step >= MAX_STEPS)
+                ended[list(self.errors)] = True
                 for corridor in np.flatnonzero(ended).tolist():
                     if corridor in self.errors:
                         yield self.finish(corridor, End.VUT_ERROR, self.errors.pop(corridor))
                     else:
-                        yield self.finish(
-                            corridor, End.MERGED if arrived[corridor] else End.TIMEOUT
-                        )
+                        arrived = x_vut_m[corridor] >= 0.0
+                        yield self.finish(corridor, End.MERGED if arrived else End.TIMEOUT)
                     self.refill(corridor)
-                world.read()
 
     def refill_all(self) -> None:
         """Begin an episode in every corridor."""
         for corridor in range(self.world.corridors):
             self.refill(corridor)
-        self.world.read()
 
     def refill(self, corridor: int) -> None:
         """Begin the next episode in a corridor, or park it when there is none."""
@@ -98,6 +103,8 @@ class _Rollout:
         if case is None:
             self.episodes[corridor] = None
             self.world.park(corridor)
+            self.step[corridor] = IDLE
+            self.a_min[:, corridor] = self.a_max[:, corridor] = 0.0
             return
         self.episodes[corridor] = _Episode(index, case, self.row)
         self.world.place(corridor, case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps)
@@ -112,11 +119,10 @@ class _Rollout:
         x_m, v_mps = self.world.x_m, self.world.v_mps
         scene = Scene(self.active, self.step, x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT])
         answer = np.array((self.pov.act(scene), self.ask_vut(scene)))
-        acceleration = np.minimum(np.maximum(answer, A_MIN_MPS2), A_MAX_MPS2) * self.active
+        acceleration = np.minimum(np.maximum(answer, self.a_min), self.a_max)
         self.clipped += acceleration[VUT] != answer[VUT]
         row = self.record[self.row % RING_ROWS]
-        # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
-        row[0], row[1], row[2] = x_m, v_mps, np.maximum(acceleration, v_mps / -DT_S)
+        row[:, 0], row[:, 1], row[:, 2] = x_m, v_mps, acceleration
         return acceleration
 
     def ask_vut(self, scene: Scene) -> FloatArray:
@@ -130,9 +136,9 @@ class _Rollout:
         except Exception as error:  # a black box may raise anything
             answer = np.full(corridors, np.nan)
             raised = f"{type(error).__name__}: {error}"
-        finite = np.isfinite(answer)
-        if finite.all():
+        if math.isfinite(answer.sum()):
             return answer
+        finite = np.isfinite(answer)
         for corridor in np.flatnonzero(~finite & self.active).tolist():
             reason = raised or self.vut.reason(corridor) or f"answered {answer[corridor]}"
             self.errors.setdefault(corridor, reason)
@@ -145,11 +151,11 @@ class _Rollout:
         rows = np.arange(episode.first_row, self.row + (error is None)) % RING_ROWS
         motion = self.record[rows, :, :, corridor]
         if error is None:
-            motion[-1, 0], motion[-1, 1] = (
-                self.world.x_m[:, corridor],
-                self.world.v_mps[:, corridor],
-            )
-        motion[-1, 2] = 0.0
-        columns = motion.transpose(0, 2, 1).reshape(len(rows), 6)
+            motion[-1, :, 0] = self.world.x_m[:, corridor]
+            motion[-1, :, 1] = self.world.v_mps[:, corridor]
+        motion[-1, :, 2] = 0.0
+        # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
+        motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
+        columns = motion.reshape(len(rows), 6)
         clipped = int(self.clipped[corridor])
         return episode.index, Trajectory(episode.case, columns, end, error, clipped)

@@ -229,7 +229,7 @@ class TestReferences:
 
 
 # No deadline: a busy machine is no failure. Derandomised: neither is luck.
-examples = settings(max_examples=40, deadline=None, derandomize=True)
+examples = settings(max_examples=25, deadline=None, derandomize=True)
 
 # Coordinates with many ties, tangents and coincident intersections among them.
 coordinates = st.one_of(

@@ -20,14 +20,12 @@ def level0_time_to(distance_m: FloatArray, v_vut_mps: FloatArray) -> FloatArray:
     The profile in continuous time: 1 m/s2 up to 28 m/s, then constant; a vehicle that is faster
     keeps its speed. Arrays of one shape, distances not negative.
     """
-    v_cruise = np.maximum(v_vut_mps, LEVEL0_V_MPS)
     v_squared = v_vut_mps * v_vut_mps
-    run_up = (v_cruise * v_cruise - v_squared) / (2.0 * LEVEL0_A_MPS2)
-    accelerating = (
-        np.sqrt(v_squared + 2.0 * LEVEL0_A_MPS2 * distance_m) - v_vut_mps
-    ) / LEVEL0_A_MPS2
-    cruising = (v_cruise - v_vut_mps) / LEVEL0_A_MPS2 + (distance_m - run_up) / v_cruise
-    return np.where(distance_m <= run_up, accelerating, cruising)
+    v_cruise = np.maximum(v_vut_mps, LEVEL0_V_MPS)
+    v_end = np.minimum(np.sqrt(v_squared + (2.0 * LEVEL0_A_MPS2) * distance_m), v_cruise)
+    # (v_end - v) / a for the run-up and (distance - run-up) / v_cruise for the rest, factored.
+    saved = (v_end + v_vut_mps) / (v_cruise + v_cruise)
+    return (v_end - v_vut_mps) * (1.0 - saved) / LEVEL0_A_MPS2 + distance_m / v_cruise
 
 
 class Level0Pov(Driver):

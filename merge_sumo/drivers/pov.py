@@ -22,17 +22,21 @@ class PovLibrary(Driver):
         super().__init__(corridors)
         self._drivers: dict[int, Driver] = {0: Level0Pov(corridors)}
         self._level = np.zeros(corridors, dtype=np.int64)
+        self._levels_playing = {0}
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the level of a case; KeyError when it has no policy."""
         self._drivers[case.level].begin(corridor, case)
         self._level[corridor] = case.level
+        self._levels_playing.add(case.level)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return each corridor's answer by the driver of its level."""
+        levels = self._levels_playing
+        if levels == {0}:
+            return self._drivers[0].act(scene)
         acceleration = np.zeros(self.corridors)
-        for level, driver in self._drivers.items():
+        for level in levels:
             mine = self._level == level
-            if mine.any():
-                acceleration = np.where(mine, driver.act(scene), acceleration)
+            acceleration[mine] = self._drivers[level].act(scene)[mine]
         return acceleration

@@ -75,28 +75,33 @@ class RuleBasedVut(Driver):
 
     def begin(self, corridor: int, case: Case) -> None:
         """Reset the PID and the actuator of a corridor."""
-        self._integral[corridor] = 0.0
         self._regulated[corridor] = False
         self._actuator[corridor] = 0.0
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the commanded acceleration, behind the actuator's lag if there is one."""
         design = self.design
-        distance = np.maximum(-scene.x_vut_m, 0.0)
+        distance = -scene.x_vut_m
         t_m = level0_time_to(distance, scene.v_vut_mps)
         dx_at_m = scene.x_pov_m + scene.v_pov_mps * t_m
+        command = level0_acceleration(scene.v_vut_mps)
         too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
+        command[too_close] = 0.0
         regulate = too_close & (distance <= design.x2_m)
-        error = dx_at_m - np.where(dx_at_m >= 0.0, design.target_m, -design.target_m)
-        # The PID starts afresh whenever it takes over: no integral, no rate from before.
-        rate = np.where(self._regulated, (error - self._last_error) / DT_S, 0.0)
-        self._integral = np.where(regulate, self._integral + error * DT_S, 0.0)
-        self._last_error, self._regulated = error, regulate
-        pid = design.kp * error + design.ki * self._integral + design.kd * rate
-        profile = level0_acceleration(scene.v_vut_mps)
-        command = np.where(regulate, pid, np.where(too_close, 0.0, profile))
-        command = np.minimum(np.maximum(command, A_MIN_MPS2), A_MAX_MPS2)
+        if regulate.any():
+            command[regulate] = self._pid(dx_at_m)[regulate]
+        self._regulated = regulate
         if design.lag_s <= 0.0:
             return command
         self._actuator = self._actuator + (command - self._actuator) * min(DT_S / design.lag_s, 1.0)
         return self._actuator
+
+    def _pid(self, dx_at_m: FloatArray) -> FloatArray:
+        """Return the PID's acceleration; integral and rate start afresh when it takes over."""
+        design = self.design
+        error = dx_at_m - np.copysign(design.target_m, dx_at_m)
+        self._integral = self._integral * self._regulated + error * DT_S
+        rate = (error - self._last_error) * self._regulated / DT_S
+        self._last_error = error
+        pid = design.kp * error + design.ki * self._integral + design.kd * rate
+        return np.minimum(np.maximum(pid, A_MIN_MPS2), A_MAX_MPS2)

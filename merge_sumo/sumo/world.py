@@ -28,7 +28,8 @@ VUT: Final = 1
 
 SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
-PARKING_SPEED_MPS: Final = 0.0
+PARKING_M: Final = 182.0
+"""Distance to M at which the vehicles of an idle corridor stand."""
 MAX_SPEED_MPS: Final = 200.0
 """Above what a POV can reach by the timeout, so that SUMO never caps a commanded speed."""
 
@@ -106,7 +107,7 @@ class World:
             for name in self._ids:
                 vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
                 vehicle.setLaneChangeMode(name, 0)
-                vehicle.setSpeed(name, PARKING_SPEED_MPS)
+                vehicle.setSpeed(name, 0.0)
         except libsumo.TraCIException as error:
             libsumo.close()
             raise UserError(f"SUMO cannot use the net {self.net.path}: {error}") from error
@@ -121,7 +122,7 @@ class World:
     def place(
         self, corridor: int, x_pov_m: float, v_pov_mps: float, x_vut_m: float, v_vut_mps: float
     ) -> None:
-        """Put both vehicles of a corridor where an episode starts, before M; then call `read`."""
+        """Put both vehicles of a corridor where an episode starts, before M, and read them back."""
         for row, edge, x, v in (
             (POV, MAIN_IN, x_pov_m, v_pov_mps),
             (VUT, RAMP, x_vut_m, v_vut_mps),
@@ -131,14 +132,14 @@ class World:
             self._move_to(name, f"{edge}.{corridor}_0", position)
             self._set_previous_speed(name, v, 0.0)
             self._set_speed(name, v)
-            self._position_m[row, corridor] = position
-        self._to_m[:, corridor] = self._before_m[:, corridor]
+            self._to_m[row, corridor] = self._before_m[row, corridor]
+            self._position_m[row, corridor] = position = self._get_position(name)
+            self.x_m[row, corridor] = position - self._before_m[row, corridor]
+            self.v_mps[row, corridor] = self._get_speed(name)
 
     def park(self, corridor: int) -> None:
-        """Stop both vehicles of a corridor that has no further episode."""
-        for name in self._ids[corridor :: self.corridors]:
-            self._set_previous_speed(name, PARKING_SPEED_MPS, 0.0)
-            self._set_speed(name, PARKING_SPEED_MPS)
+        """Put both vehicles of a corridor aside, at a stand before M."""
+        self.place(corridor, -PARKING_M, 0.0, -PARKING_M, 0.0)
 
     def step(self, a_mps2: FloatArray) -> None:
         """Advance all corridors by one step of eq. (4) and read the state.
@@ -149,19 +150,13 @@ class World:
         try:
             self._step_simulation()
             # A vehicle that keeps its speed needs no command: SUMO holds the last one.
-            changed = np.flatnonzero(v_next != self.v_mps)
-            ids, set_previous_speed, set_speed = (
-                self._ids,
-                self._set_previous_speed,
-                self._set_speed,
-            )
-            speeds, accelerations = v_next.ravel()[changed], a_mps2.ravel()[changed]
-            for index, v, a in zip(
-                changed.tolist(), speeds.tolist(), accelerations.tolist(), strict=True
-            ):
-                name = ids[index]
-                set_previous_speed(name, v, a)
-                set_speed(name, v)
+            speeds, accelerations = v_next.ravel().tolist(), a_mps2.ravel().tolist()
+            ids, set_previous_speed = self._ids, self._set_previous_speed
+            set_speed = self._set_speed
+            for index in np.flatnonzero(v_next != self.v_mps).tolist():
+                name, speed = ids[index], speeds[index]
+                set_previous_speed(name, speed, accelerations[index])
+                set_speed(name, speed)
             self.read()
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
@@ -172,7 +167,7 @@ class World:
         position = np.fromiter(map(self._get_position, self._ids), float, count).reshape(shape)
         self.v_mps = np.fromiter(map(self._get_speed, self._ids), float, count).reshape(shape)
         # Nothing drives backwards, so a lane position that falls means the lane behind M.
-        self._to_m[position < self._position_m] = 0.0
+        self._to_m *= position >= self._position_m
         self._position_m = position
         self.x_m = position - self._to_m
 

@@ -1,0 +1,159 @@
+"""How a batch is shared out over the POV levels."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_sumo.case import Case
+from merge_sumo.samplers.allocation import (
+    even_shares,
+    last_failure_share,
+    softmax_shares,
+    whole_shares,
+)
+from merge_sumo.score import Measures, Outcome
+from merge_sumo.trajectory import End
+
+
+@st.composite
+def weights_and_told(draw) -> tuple[dict[int, float], dict[int, int]]:
+    levels = draw(st.lists(st.sampled_from([0, 1, 2]), min_size=1, unique=True))
+    weights = {level: draw(st.floats(1e-3, 1e3)) for level in levels}
+    return weights, {level: draw(st.integers(0, 1000)) for level in levels}
+
+
+@st.composite
+def shares_of_failures(draw) -> tuple[dict[int, float], dict[int, int]]:
+    weights, told = draw(weights_and_told())
+    return {level: draw(st.floats(0.0, 1.0)) for level in weights}, told
+
+
+examples = settings(deadline=None)
+batch_sizes = st.integers(0, 300)
+
+
+def outcome(index: int, batch: int, level: int, *, failed: bool) -> Outcome:
+    nothing = dict.fromkeys(Measures.__dataclass_fields__)
+    end, score = (End.COLLISION, -700.0) if failed else (End.MERGED, -3.0)
+    measures = Measures(**{**nothing, "end": end, "score": score})
+    svo = 0.5 if level == 2 else None
+    return Outcome(
+        index, batch, Case(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo), measures
+    )
+
+
+class TestByHand:
+    def test_a_batch_that_divides_is_shared_equally(self):
+        assert even_shares({0: 0, 1: 0, 2: 0}, 60) == {0: 20, 1: 20, 2: 20}
+
+    def test_the_odd_cases_go_to_the_levels_with_the_fewest_so_far(self):
+        assert even_shares({0: 7, 1: 6, 2: 7}, 4) == {0: 1, 1: 2, 2: 1}
+        assert even_shares({0: 7, 1: 6, 2: 5}, 5) == {0: 1, 1: 2, 2: 2}
+
+    def test_odd_batches_even_out(self):
+        told = {0: 0, 1: 0, 2: 0}
+        for _ in range(3):
+            for level, share in even_shares(told, 20).items():
+                told[level] += share
+        assert told == {0: 20, 1: 20, 2: 20}
+
+    def test_a_batch_smaller_than_the_levels_serves_the_neediest(self):
+        assert even_shares({0: 5, 1: 2, 2: 9}, 1) == {0: 0, 1: 1, 2: 0}
+        assert even_shares({0: 5, 1: 2, 2: 9}, 2) == {0: 1, 1: 1, 2: 0}
+
+    def test_even_the_heaviest_level_waits_for_the_neediest(self):
+        assert whole_shares({0: 1.0, 1: 1000.0}, {0: 3, 1: 90}, 1) == {0: 1, 1: 0}
+
+    def test_softmax_of_equal_failure_shares_is_even(self):
+        assert softmax_shares({0: 0.4, 1: 0.4}, {0: 9, 1: 9}, 10, xi=3.0) == {0: 5, 1: 5}
+
+    def test_a_failure_share_of_log_2_over_xi_doubles_the_cases(self):
+        share = {0: 0.0, 1: math.log(2.0) / 3.0}
+        assert softmax_shares(share, {0: 0, 1: 0}, 9, xi=3.0) == {0: 3, 1: 6}
+
+    def test_a_batch_of_40_with_half_the_level_1_cases_failing(self):
+        # exp(1.5) = 4.48, so the quotas are 7.30 and 32.70.
+        assert softmax_shares({0: 0.0, 1: 0.5}, {0: 20, 1: 20}, 40, xi=3.0) == {0: 7, 1: 33}
+
+    def test_greed_0_shares_evenly(self):
+        assert softmax_shares({0: 0.0, 1: 1.0}, {0: 0, 1: 0}, 8, xi=0.0) == {0: 4, 1: 4}
+
+    def test_a_level_without_failures_keeps_one_case(self):
+        shares = softmax_shares({0: 0.0, 1: 1.0, 2: 1.0}, {0: 0, 1: 0, 2: 0}, 9, xi=20.0)
+        assert shares == {0: 1, 1: 4, 2: 4}
+
+
+class TestShares:
+    @examples
+    @given(weights_and_told(), batch_sizes)
+    def test_add_up_to_the_batch(self, levels, n):
+        weights, told = levels
+        shares = whole_shares(weights, told, n)
+        assert sum(shares.values()) == n
+        assert list(shares) == sorted(weights)
+        assert all(type(share) is int and share >= 0 for share in shares.values())
+
+    @examples
+    @given(weights_and_told(), batch_sizes)
+    def test_starve_no_level(self, levels, n):
+        weights, told = levels
+        shares = whole_shares(weights, told, n)
+        served = {level for level, share in shares.items() if share}
+        assert len(served) == min(n, len(weights))
+        starved = set(weights) - served
+        assert all(told[one] <= told[other] for one in served for other in starved)
+
+    @examples
+    @given(weights_and_told(), batch_sizes)
+    def test_are_within_one_of_the_quotas_where_those_are_one_or_more(self, levels, n):
+        weights, told = levels
+        total = sum(weights.values())
+        quota = {level: n * weight / total for level, weight in weights.items()}
+        if min(quota.values()) >= 1.0:
+            shares = whole_shares(weights, told, n)
+            assert all(abs(shares[level] - quota[level]) < 1.0 + 1e-9 for level in weights)
+
+    @examples
+    @given(weights_and_told(), batch_sizes)
+    def test_do_not_depend_on_the_order_of_the_levels(self, levels, n):
+        weights, told = levels
+        backwards = dict(reversed(weights.items()))
+        assert whole_shares(backwards, told, n) == whole_shares(weights, told, n)
+
+    @examples
+    @given(shares_of_failures(), st.integers(3, 300), st.floats(0.1, 10.0))
+    def test_grow_with_the_share_of_failures(self, levels, n, xi):
+        failure_share, told = levels
+        shares = softmax_shares(failure_share, told, n, xi)
+        assert sum(shares.values()) == n
+        for one, u_one in failure_share.items():
+            for other, u_other in failure_share.items():
+                if math.exp(xi * u_one) > math.exp(xi * u_other):
+                    assert shares[one] >= shares[other]
+
+
+class TestTheLastFailureShare:
+    def test_of_a_level_without_cases_is_0(self):
+        assert last_failure_share([outcome(0, 0, 0, failed=True)], 1) == 0.0
+
+    def test_counts_only_the_last_batch_that_had_cases_of_the_level(self):
+        outcomes = [
+            outcome(0, 0, 0, failed=False),
+            outcome(1, 0, 1, failed=True),
+            outcome(2, 1, 1, failed=True),
+            outcome(3, 1, 1, failed=False),
+            outcome(4, 1, 1, failed=False),
+            outcome(5, 1, 1, failed=False),
+            outcome(6, 2, 0, failed=True),
+        ]
+        assert last_failure_share(outcomes, 1) == 0.25
+        assert last_failure_share(outcomes, 0) == 1.0
+
+    @pytest.mark.parametrize("failed", [True, False])
+    def test_does_not_mind_the_order_of_the_outcomes(self, failed):
+        outcomes = [outcome(1, 1, 0, failed=failed), outcome(0, 0, 0, failed=not failed)]
+        assert last_failure_share(outcomes, 0) == last_failure_share(outcomes[::-1], 0) == failed

@@ -1,0 +1,130 @@
+"""An exported folder opens in a real sumo-gui, and what it shows is the road and two cars."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import require
+from lxml import etree
+from PIL import Image
+
+from merge_sumo.campaign import export_case
+from merge_sumo.journal import failures
+from merge_sumo.sumo.replay import COLOURS, CONFIG, VIEW
+
+PICTURE_TIMES_S = (2.0, 7.0)
+NEAR = 40
+"""Distance in each channel of 255 below which a pixel has a colour."""
+
+
+@pytest.fixture(scope="module")
+def display() -> Iterator[str]:
+    """Start an X server without a screen on a display that is free, and return its name."""
+    program = shutil.which("Xvfb")
+    require(program is not None, "Xvfb is not on the PATH")
+    end, start = os.pipe()
+    server = subprocess.Popen(
+        [program, "-displayfd", str(start), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
+        pass_fds=[start],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        os.close(start)
+        with os.fdopen(end) as ready:
+            number = ready.readline().strip()
+        assert number, "Xvfb did not start"
+        yield f":{number}"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+@pytest.fixture(scope="module")
+def pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
+    """Open an exported failure with `replay --gui`; return its pictures at two times as arrays.
+
+    Only a copy of the view settings asks for the pictures, and only the copied configuration
+    tells the window to close at the end instead of waiting for a person.
+    """
+    folder = tmp_path_factory.mktemp("gui") / "case"
+    export_case(run, failures(run.outcomes)[0].index, folder)
+    files = [folder / f"at-{time_s:g}-s.png" for time_s in PICTURE_TIMES_S]
+    view = etree.parse(folder / VIEW)
+    view.find("delay").set("value", "0")
+    for file, time_s in zip(files, PICTURE_TIMES_S, strict=True):
+        etree.SubElement(view.getroot(), "snapshot", file=str(file), time=str(time_s))
+    view.write(folder / VIEW)
+    config = etree.parse(folder / CONFIG)
+    config.find("gui_only/delay").set("value", "0")
+    etree.SubElement(config.find("gui_only"), "quit-on-end", value="true")
+    config.write(folder / CONFIG)
+    window = subprocess.Popen(
+        [sys.executable, "-m", "merge_sumo.cli", "replay", str(folder), "--gui"],
+        env={**os.environ, "DISPLAY": display},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        said, _ = window.communicate(timeout=120)
+    finally:
+        if window.poll() is None:
+            os.killpg(window.pid, signal.SIGKILL)
+    assert window.returncode == 0, said
+    return [picture(file) for file in files]
+
+
+def picture(file: Path) -> np.ndarray:
+    with Image.open(file) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def places(image: np.ndarray, colour: tuple[float, ...]) -> np.ndarray:
+    """Return the pixels near a colour as rows of (y, x)."""
+    return np.argwhere((np.abs(image - np.array(colour)) < NEAR).all(axis=2))
+
+
+def car(image: np.ndarray, who: str) -> np.ndarray:
+    """Return the pixels of a car."""
+    return places(image, tuple(255.0 * float(part) for part in COLOURS[who].split(",")))
+
+
+def test_the_picture_has_background_and_a_road_across_it(pictures):
+    for image in pictures:
+        height, width, _ = image.shape
+        assert min(height, width) > 300
+        road = places(image, (0.0, 0.0, 0.0))
+        assert np.unique(road[:, 1]).size > 0.9 * width, "the main road runs from side to side"
+        assert np.unique(road[:, 0]).size > 0.1 * height, "the ramp climbs towards it"
+        assert len(road) < 0.2 * height * width
+
+
+@pytest.mark.parametrize("who", ["pov", "vut"])
+def test_the_picture_has_a_car_in_its_colour(pictures, who):
+    for image in pictures:
+        pixels = car(image, who)
+        assert len(pixels) > 30
+        assert np.ptp(pixels, axis=0).max() < 0.1 * image.shape[1], "one car, in one place"
+
+
+@pytest.mark.parametrize("who", ["pov", "vut"])
+def test_the_car_moves_towards_the_merge_point(pictures, who):
+    early, late = (car(image, who)[:, 1].mean() for image in pictures)
+    assert late > early + 50
+
+
+def test_the_cars_meet(pictures):
+    apart = [
+        np.linalg.norm(car(image, "pov").mean(axis=0) - car(image, "vut").mean(axis=0))
+        for image in pictures
+    ]
+    assert apart[1] < apart[0]

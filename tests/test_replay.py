@@ -1,0 +1,417 @@
+"""Exported folders replay in real SUMO with nothing else running, and a replay tells the truth."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lxml import etree
+
+from merge_sumo.campaign import export_case
+from merge_sumo.case import Case
+from merge_sumo.errors import UserError
+from merge_sumo.journal import failures
+from merge_sumo.scenario import DT_S, V_VUT0_MAX_MPS, X_VUT0_M
+from merge_sumo.score import Outcome, measure
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.replay import (
+    CASE,
+    CONFIG,
+    HOLD_STEPS,
+    NET,
+    RECORD,
+    TYPES,
+    VIEW,
+    open_gui,
+    replay,
+    write_scenario,
+)
+from merge_sumo.trajectory import End, Trajectory
+
+SHIPPED = sorted(path.parent for path in Path(__file__).parents[1].glob(f"scenarios/*/{CONFIG}"))
+FILES = {CONFIG, NET, TYPES, RECORD, VIEW, CASE}
+ROW = 40
+"""A row of the record in the middle of the episode, at 4.0 s."""
+
+Command = Callable[[int], float]
+"""The acceleration that a vehicle is given at a step, m/s2."""
+
+
+def drive(case: Case, pov: Command, vut: Command, steps: int, end: End) -> Trajectory:
+    """Return the motion of eq. (4) under given accelerations; speeds do not fall below 0."""
+    x = np.array([case.x_pov0_m, X_VUT0_M])
+    v = np.array([case.v_pov0_mps, case.v_vut0_mps])
+    rows = []
+    for step in range(steps):
+        a = np.maximum([pov(step), vut(step)], -v / DT_S)
+        rows.append([x[0], v[0], a[0], x[1], v[1], a[1]])
+        x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
+    rows.append([x[0], v[0], 0.0, x[1], v[1], 0.0])
+    return Trajectory(case, np.array(rows), end)
+
+
+def constant(_: int) -> float:
+    return 0.0
+
+
+def brake_then_go(step: int) -> float:
+    """Stand from 7.5 s at the latest until 12 s, then accelerate."""
+    return -4.0 if step < 120 else 2.0
+
+
+def at_level_0(x_pov0_m: float, v_pov0_mps: float, v_vut0_mps: float = 18.0) -> Case:
+    return Case(level=0, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, v_vut0_mps=v_vut0_mps)
+
+
+def write(folder: Path, trajectory: Trajectory) -> Path:
+    write_scenario(folder, Net(), Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory)
+    return folder
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def edit_number(path: Path, who: str, column: str, by: float, row: int = ROW) -> None:
+    """Add to one number of one row of an FCD file."""
+    tree = etree.parse(path)
+    vehicle = [v for v in tree.iter("vehicle") if v.get("id") == who][row]
+    vehicle.set(column, f"{float(vehicle.get(column)) + by:.9f}")
+    tree.write(path)
+
+
+def play_from(folder: Path, name: str) -> Path:
+    """Let the folder's configuration play a copy of the record; return the copy."""
+    shutil.copy(folder / RECORD, folder / name)
+    config = (folder / CONFIG).read_text()
+    assert f'"{RECORD}"' in config
+    (folder / CONFIG).write_text(config.replace(f'"{RECORD}"', f'"{name}"'))
+    return folder / name
+
+
+def assert_identical(folder: Path, steps: int | None = None) -> None:
+    result = replay(folder)
+    assert (result.diverged_at_s, result.detail) == (None, "")
+    if steps is None:
+        assert result.rows > 0
+    else:
+        assert result.rows == 2 * (steps + 1 + HOLD_STEPS)
+
+
+def refusal(folder: Path) -> str:
+    """Return the sentence with which a replay is refused."""
+    with pytest.raises(UserError) as error:
+        replay(folder)
+    message = str(error.value)
+    assert "\n" not in message
+    assert str(folder) in message
+    return message
+
+
+@pytest.fixture(scope="module")
+def collision(run, tmp_path_factory) -> Path:
+    """Return an exported collision; tests copy it before they change it."""
+    folder = tmp_path_factory.mktemp("replay") / "collision"
+    export_case(run, failures(run.outcomes)[0].index, folder)
+    return folder
+
+
+@pytest.fixture
+def folder(collision, tmp_path) -> Path:
+    return Path(shutil.copytree(collision, tmp_path / "case"))
+
+
+class TestAnExport:
+    def test_is_exactly_six_files(self, collision):
+        assert {path.name for path in collision.iterdir()} == FILES
+
+    def test_returns_the_configuration_to_open(self, run, tmp_path):
+        assert export_case(run, 0, tmp_path / "case") == tmp_path / "case" / CONFIG
+
+    def test_holds_the_record_of_its_case(self, run, collision):
+        record = json.loads((collision / CASE).read_text())
+        assert record == failures(run.outcomes)[0].to_record()
+
+    def test_names_no_path_outside_itself(self, collision):
+        for name in FILES - {NET}:
+            text = (collision / name).read_text()
+            assert str(collision.parent) not in text
+            assert 'value="/' not in text
+            assert ".." not in text
+
+    def test_replays_after_it_was_moved_to_a_folder_with_an_awkward_name(self, folder, tmp_path):
+        assert_identical(folder.rename(tmp_path / "fälle & <mehr> 'hier'"))
+
+    def test_replays_from_a_relative_path(self, folder, monkeypatch):
+        monkeypatch.chdir(folder)
+        assert_identical(Path())
+
+    def test_is_not_changed_by_its_replay(self, folder):
+        before = contents(folder)
+        replay(folder)
+        assert contents(folder) == before
+
+    @pytest.mark.parametrize("kept", [(), ("notes.txt",), (CONFIG, RECORD)])
+    def test_refuses_a_folder_that_exists_and_leaves_it_alone(self, run, tmp_path, kept):
+        target = tmp_path / "case"
+        target.mkdir()
+        for name in kept:
+            (target / name).write_text("mine")
+        with pytest.raises(UserError, match="case exists"):
+            export_case(run, 0, target)
+        assert contents(tmp_path) == {target / name: b"mine" for name in kept}
+
+    def test_says_when_its_folder_cannot_be_made(self, run, tmp_path):
+        (tmp_path / "file").write_text("mine")
+        with pytest.raises(UserError, match="cannot write"):
+            export_case(run, 0, tmp_path / "file" / "case")
+        assert contents(tmp_path) == {tmp_path / "file": b"mine"}
+
+
+class TestAnHonestRecordReplaysIdentically:
+    @pytest.mark.parametrize("end", [End.MERGED, End.COLLISION])
+    def test_of_a_campaign(self, run, tmp_path, end):
+        outcome = next(o for o in run.outcomes if o.measures.end is end)
+        export_case(run, outcome.index, tmp_path / "case")
+        steps = len(run.trajectory(outcome.index).motion) - 1
+        assert_identical(tmp_path / "case", steps)
+
+    @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
+    def test_that_is_shipped(self, folder):
+        assert {path.name for path in folder.iterdir()} >= FILES
+        assert_identical(folder)
+
+    def test_of_a_vehicle_that_stands_and_goes_on(self, tmp_path):
+        case = at_level_0(-340.0, 25.0)
+        trajectory = drive(case, brake_then_go, brake_then_go, 245, End.MERGED)
+        assert (trajectory.v_vut_mps == 0.0).sum() > 50
+        assert (trajectory.v_pov_mps == 0.0).sum() > 50
+        assert trajectory.x_vut_m[-1] >= 0.0
+        assert_identical(write(tmp_path / "case", trajectory), 245)
+
+    def test_of_a_timeout(self, tmp_path):
+        trajectory = drive(at_level_0(-250.0, 30.0), constant, lambda _: -4.0, 300, End.TIMEOUT)
+        assert_identical(write(tmp_path / "case", trajectory), 300)
+
+    def test_of_vehicles_that_start_from_a_stand(self, tmp_path):
+        case = at_level_0(-200.0, 0.0, v_vut0_mps=0.0)
+        trajectory = drive(case, lambda _: 1.0, lambda _: 2.0, 136, End.MERGED)
+        assert_identical(write(tmp_path / "case", trajectory), 136)
+
+    def test_of_vehicles_that_overlap_all_the_way(self, tmp_path):
+        trajectory = drive(at_level_0(-182.0, 18.0), constant, constant, 102, End.MERGED)
+        assert_identical(write(tmp_path / "case", trajectory), 102)
+
+    def test_of_a_pov_that_accelerates_until_the_timeout(self, tmp_path):
+        case = at_level_0(-180.0, 35.0)
+        trajectory = drive(case, lambda _: 2.0, lambda _: -4.0, 300, End.TIMEOUT)
+        assert_identical(write(tmp_path / "case", trajectory), 300)
+
+    def test_of_an_episode_that_ended_before_its_first_step(self, tmp_path):
+        trajectory = drive(at_level_0(-250.0, 30.0), constant, constant, 0, End.VUT_ERROR)
+        assert_identical(write(tmp_path / "case", trajectory), 0)
+
+    def test_of_a_case_at_level_2(self, tmp_path):
+        case = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6)
+        trajectory = drive(case, lambda s: (s // 5) % 7 - 4.0, lambda _: 1.0, 83, End.MERGED)
+        assert_identical(write(tmp_path / "case", trajectory), 83)
+
+    def test_of_the_fastest_vut_that_a_campaign_may_have(self, tmp_path):
+        case = at_level_0(-300.0, 30.0, v_vut0_mps=V_VUT0_MAX_MPS)
+        trajectory = drive(case, constant, constant, 41, End.MERGED)
+        assert_identical(write(tmp_path / "case", trajectory), 41)
+
+    @pytest.mark.parametrize("beyond_m", [-0.0005, 0.0, 0.0005])
+    def test_of_a_pov_that_is_at_the_merge_point_at_a_step(self, tmp_path, beyond_m):
+        trajectory = drive(at_level_0(-240.0 + beyond_m, 30.0), constant, constant, 110, End.MERGED)
+        assert abs(trajectory.x_pov_m[80]) < 0.001
+        assert_identical(write(tmp_path / "case", trajectory), 110)
+
+
+def test_at_least_one_scenario_is_shipped():
+    assert SHIPPED, "scenarios/ has no folder with a replay.sumocfg"
+
+
+class TestAReplayThatIsNotTheRecord:
+    """What SUMO plays is made to differ from the record that the replay is compared with.
+
+    The record is what SUMO plays. So that only one of the two changes, the configuration is made
+    to name a copy.
+    """
+
+    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("column", ["x", "y", "speed"])
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_diverges_where_a_vehicle_is_elsewhere_or_at_another_speed(
+        self, folder, who, column, by
+    ):
+        edit_number(play_from(folder, "played.fcd.xml"), who, column, by)
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx(ROW * DT_S)
+        assert result.detail.startswith(f"{column} of {who} ")
+
+    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_diverges_where_a_position_along_the_lane_differs(self, folder, who, by):
+        # SUMO takes that position from x and y, so only the record can have another.
+        play_from(folder, "played.fcd.xml")
+        edit_number(folder / RECORD, who, "pos", by)
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx(ROW * DT_S)
+        assert result.detail.startswith(f"pos of {who} ")
+
+    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("row", [0, -1])
+    def test_diverges_in_the_first_row_and_in_the_last(self, folder, row, by):
+        play_from(folder, "played.fcd.xml")
+        edit_number(folder / RECORD, "vut", "x", by, row)
+        rows = len(etree.parse(folder / RECORD).findall("timestep"))
+        assert replay(folder).diverged_at_s == pytest.approx((row % rows) * DT_S)
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_may_differ_by_rounding_and_no_more(self, folder, sign):
+        play_from(folder, "played.fcd.xml")
+        edit_number(folder / RECORD, "vut", "pos", sign * 0.5e-6)
+        assert replay(folder).diverged_at_s is None
+        edit_number(folder / RECORD, "vut", "pos", sign * 1.0e-6)
+        assert replay(folder).diverged_at_s == pytest.approx(ROW * DT_S)
+
+    def test_diverges_where_it_stops_early(self, folder):
+        config = etree.parse(folder / CONFIG)
+        config.find("time/end").set("value", "3.0")
+        config.write(folder / CONFIG)
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx(3.0)
+        assert "not there" in result.detail
+
+    def test_diverges_where_nobody_drives(self, folder):
+        play_from(folder, "played.fcd.xml").write_text("<fcd-export/>")
+        assert replay(folder).diverged_at_s == 0.0
+
+    @pytest.mark.parametrize("column", ["x", "y", "pos", "speed"])
+    def test_is_not_identical_to_a_record_that_is_no_number(self, folder, column):
+        play_from(folder, "played.fcd.xml")
+        record = etree.parse(folder / RECORD)
+        record.findall("timestep")[ROW][0].set(column, "nan")
+        record.write(folder / RECORD)
+        assert_not_identical(folder)
+
+
+class TestARecordThatSumoPlays:
+    """The record itself is changed, and so what SUMO plays and what the replay compares."""
+
+    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("column", ["x", "y", "pos", "speed"])
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_is_not_identical_when_a_number_of_it_was_changed(self, folder, who, column, by):
+        edit_number(folder / RECORD, who, column, by)
+        assert_not_identical(folder)
+
+    def test_is_not_identical_when_it_is_empty(self, folder):
+        (folder / RECORD).write_text("<fcd-export/>")
+        assert_not_identical(folder)
+
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_is_not_identical_when_a_vehicle_is_missing(self, folder, who):
+        record = etree.parse(folder / RECORD)
+        for vehicle in record.xpath(f"//vehicle[@id='{who}']"):
+            vehicle.getparent().remove(vehicle)
+        record.write(folder / RECORD)
+        assert_not_identical(folder)
+
+    def test_is_not_identical_when_its_end_is_missing(self, folder):
+        record = etree.parse(folder / RECORD)
+        for timestep in record.findall("timestep")[ROW:]:
+            record.getroot().remove(timestep)
+        record.write(folder / RECORD)
+        assert_not_identical(folder)
+
+
+def assert_not_identical(folder: Path) -> None:
+    """The replay diverges, or the folder is refused with a sentence."""
+    try:
+        result = replay(folder)
+    except UserError as error:
+        assert "\n" not in str(error)  # noqa: PT017 (either answer is honest)
+    else:
+        assert result.diverged_at_s is not None
+
+
+class TestAFolderThatCannotBeReplayed:
+    @pytest.mark.parametrize("name", [CONFIG, NET, TYPES, RECORD, VIEW])
+    def test_lacks_a_file(self, folder, name):
+        (folder / name).unlink()
+        assert name in refusal(folder)
+
+    @pytest.mark.parametrize("name", [CONFIG, RECORD])
+    def test_is_missing_or_something_else(self, tmp_path, name):
+        assert "is not a replay folder" in refusal(tmp_path / "nowhere")
+        (tmp_path / name).mkdir()
+        assert "is not a replay folder" in refusal(tmp_path)
+
+    @pytest.mark.parametrize("text", [b"", b"\x00\x01", b"<fcd-export><timestep", b"not XML"])
+    @pytest.mark.parametrize("name", [CONFIG, NET, TYPES, RECORD])
+    def test_has_a_file_that_is_no_xml(self, folder, name, text):
+        (folder / name).write_bytes(text)
+        assert refusal(folder)
+
+    def test_has_a_record_that_is_cut_off(self, folder):
+        text = (folder / RECORD).read_bytes()
+        (folder / RECORD).write_bytes(text[: len(text) // 2])
+        assert RECORD in refusal(folder)
+
+    @pytest.mark.parametrize(
+        ("old", "new"),
+        [(' pos="', ' position="'), (' speed="', ' speed="fast '), (' time="', ' at="')],
+    )
+    def test_has_a_record_with_other_columns(self, folder, old, new):
+        play_from(folder, "played.fcd.xml")
+        text = (folder / RECORD).read_text()
+        assert old in text
+        (folder / RECORD).write_text(text.replace(old, new))
+        assert RECORD in refusal(folder)
+
+    @pytest.mark.parametrize(
+        ("old", "new"),
+        [
+            ("<begin ", "<departure-time "),
+            ('<step-length value="0.1"', '<step-length value="soon"'),
+            ('value="us23.net.xml"', 'value="i75.net.xml"'),
+        ],
+    )
+    def test_has_a_configuration_that_sumo_rejects(self, folder, old, new):
+        text = (folder / CONFIG).read_text()
+        assert old in text
+        (folder / CONFIG).write_text(text.replace(old, new))
+        assert "SUMO cannot replay" in refusal(folder)
+
+    def test_has_types_that_its_record_does_not_use(self, folder):
+        text = (folder / TYPES).read_text()
+        (folder / TYPES).write_text(text.replace('id="vut"', 'id="tuv"'))
+        assert "vut" in refusal(folder)
+
+
+def test_a_record_shows_no_file_that_an_external_entity_names(folder, tmp_path):
+    honest = replay(folder)
+    secret = tmp_path / "secret.xml"
+    secret.write_text(
+        '<timestep time="999"><vehicle id="vut" x="1" y="2" pos="3" speed="4"/></timestep>'
+    )
+    play_from(folder, "played.fcd.xml")
+    text = (folder / RECORD).read_text()
+    doctype = f'<!DOCTYPE fcd-export [<!ENTITY e SYSTEM "{secret.as_uri()}">]>\n<fcd-export>&e;'
+    assert "<fcd-export>" in text
+    (folder / RECORD).write_text(text.replace("<fcd-export>", doctype))
+    assert replay(folder) == honest
+
+
+def test_the_gui_needs_a_display(folder, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(UserError, match="DISPLAY") as error:
+        open_gui(folder)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,225 @@
+"""The contract of every sampler, without SUMO: a band of failures with a score in closed form."""
+
+from __future__ import annotations
+
+import math
+import statistics
+
+import numpy as np
+import pytest
+
+from merge_sumo.case import Case, Pool, dimensions, to_unit
+from merge_sumo.errors import UserError
+from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.registry import DEFAULT_SAMPLER, SAMPLERS, make_sampler
+from merge_sumo.score import Measures, Outcome
+from merge_sumo.trajectory import End
+
+HALF_WIDTH = 0.03
+"""Of the band of failures in the unit square; about 7 % of the square."""
+
+
+def play_case(index: int, batch: int, case: Case) -> Outcome:
+    """Return an outcome with a score like the real one: graded, with a jump at the failures."""
+    x, v = to_unit([case], case.level)[0, :2].tolist()
+    distance = abs(0.6 * x + 0.8 * v - 0.7)
+    if distance < HALF_WIDTH:
+        end, score = End.COLLISION, -550.0 - 450.0 * (1.0 - distance / HALF_WIDTH)
+    else:
+        end, score = End.MERGED, -450.0 * math.exp((HALF_WIDTH - distance) / 0.15)
+    nothing = dict.fromkeys(Measures.__dataclass_fields__)
+    return Outcome(index, batch, case, Measures(**{**nothing, "end": end, "score": score}))
+
+
+def without_verdict(index: int, batch: int, case: Case, end: End) -> Outcome:
+    nothing = dict.fromkeys(Measures.__dataclass_fields__)
+    return Outcome(index, batch, case, Measures(**{**nothing, "end": end, "error": "no answer"}))
+
+
+def play(sampler: Sampler, batches: int, n: int) -> list[Outcome]:
+    """Ask, run and tell some batches; return all outcomes."""
+    outcomes: list[Outcome] = []
+    for batch in range(batches):
+        cases = sampler.ask(n)
+        ran = [play_case(len(outcomes) + i, batch, case) for i, case in enumerate(cases)]
+        sampler.tell(ran)
+        outcomes += ran
+    return outcomes
+
+
+@pytest.fixture(scope="module", params=sorted(SAMPLERS))
+def name(request) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module", params=[(0,), (2,), (0, 1, 2)], ids=str)
+def pool(request) -> Pool:
+    return Pool(levels=request.param, v_vut0_mps=17.5)
+
+
+@pytest.fixture(scope="module")
+def played(name, pool) -> tuple[Sampler, list[Outcome]]:
+    """Return a sampler after three batches, and what it was told; tests must not tell it more."""
+    sampler = make_sampler(name, pool, seed=5)
+    return sampler, play(sampler, 3, 14)
+
+
+class TestEverySampler:
+    @pytest.mark.parametrize("n", [1, 2, 3, 7, 20])
+    def test_proposes_as_many_cases_as_asked_for(self, name, pool, played, n):
+        assert len(make_sampler(name, pool, 1).ask(n)) == n
+        assert len(played[0].ask(n)) == n
+
+    def test_proposes_cases_of_the_pool_in_plain_numbers(self, name, pool, played):
+        for case in make_sampler(name, pool, 1).ask(30) + played[0].ask(30):
+            assert case.level in pool.levels
+            assert type(case.level) is int
+            assert case.v_vut0_mps == pool.v_vut0_mps
+            assert (case.svo_rad is None) == (case.level != 2)
+            for dimension in dimensions(case.level):
+                value = getattr(case, dimension.field)
+                assert type(value) is float
+                assert dimension.low <= value <= dimension.high
+
+    def test_proposes_no_case_twice(self, played):
+        sampler, outcomes = played
+        cases = [outcome.case for outcome in outcomes] + sampler.ask(14)
+        assert len(set(cases)) == len(cases)
+
+    def test_answers_the_same_question_with_the_same_cases(self, played):
+        sampler, _ = played
+        first = sampler.ask(9)
+        sampler.ask(4)
+        assert sampler.ask(9) == first
+
+    def test_does_not_mind_in_what_order_it_is_told(self, name, pool, played):
+        sampler, outcomes = played
+        order = np.random.default_rng(0).permutation(len(outcomes))
+        other = make_sampler(name, pool, 5)
+        other.tell([outcomes[i] for i in order])
+        assert other.ask(14) == sampler.ask(14)
+
+    def test_does_not_mind_being_told_twice(self, name, pool, played):
+        sampler, outcomes = played
+        other = make_sampler(name, pool, 5)
+        for outcome in outcomes:
+            other.tell([outcome, outcome])
+        other.tell(outcomes)
+        assert other.ask(14) == sampler.ask(14)
+
+    @pytest.mark.parametrize("end", [End.VUT_ERROR, End.SIM_ERROR])
+    def test_learns_nothing_from_an_outcome_without_a_verdict(self, name, pool, played, end):
+        sampler, outcomes = played
+        other = make_sampler(name, pool, 5)
+        other.tell(outcomes)
+        other.tell([without_verdict(900 + i, 3, o.case, end) for i, o in enumerate(outcomes[:5])])
+        assert other.ask(14) == sampler.ask(14)
+
+    def test_goes_on_from_a_journal_as_if_it_had_never_stopped(self, name, pool, played):
+        _, outcomes = played
+        for batches in range(3):
+            resumed = make_sampler(name, pool, 5)
+            resumed.tell(outcome for outcome in outcomes if outcome.batch < batches)
+            expected = [outcome.case for outcome in outcomes if outcome.batch == batches]
+            assert resumed.ask(14) == expected
+
+    def test_goes_on_from_a_journal_read_from_its_records(self, name, pool, played):
+        sampler, outcomes = played
+        resumed = make_sampler(name, pool, 5)
+        resumed.tell(Outcome.from_record(outcome.to_record()) for outcome in outcomes)
+        assert resumed.ask(14) == sampler.ask(14)
+
+    def test_proposes_other_cases_for_another_seed(self, name, pool, played):
+        sampler, outcomes = played
+        other = make_sampler(name, pool, 6)
+        assert not set(other.ask(14)) & set(make_sampler(name, pool, 5).ask(14))
+        other.tell(outcomes)
+        assert other.ask(14) != sampler.ask(14)
+
+    def test_proposes_cases_at_every_level(self, pool, played):
+        sampler, outcomes = played
+        for batch in range(3):
+            assert {o.case.level for o in outcomes if o.batch == batch} == set(pool.levels)
+        assert {case.level for case in sampler.ask(len(pool.levels))} == set(pool.levels)
+
+    def test_reaches_every_level_even_case_by_case(self, name, pool):
+        sampler = make_sampler(name, pool, 5)
+        outcomes = play(sampler, len(pool.levels), 1)
+        assert {outcome.case.level for outcome in outcomes} == set(pool.levels)
+
+    def test_neither_uses_nor_moves_the_global_random_state(self, name, pool, played):
+        sampler, _ = played
+        first = sampler.ask(14)
+        np.random.seed(1)  # noqa: NPY002 (the global state is what this test is about)
+        before = np.random.get_state()[1].copy()  # noqa: NPY002
+        assert sampler.ask(14) == first
+        assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
+
+    def test_leaves_the_list_that_it_is_told_alone(self, name, pool, played):
+        _, outcomes = played
+        backwards = outcomes[::-1]
+        sampler = make_sampler(name, pool, 5)
+        sampler.tell(backwards)
+        sampler.ask(3)
+        assert backwards == outcomes[::-1]
+
+
+class TestTheRegistry:
+    def test_has_the_default_sampler(self):
+        assert DEFAULT_SAMPLER in SAMPLERS
+
+    def test_names_the_samplers_that_there_are(self):
+        with pytest.raises(UserError) as error:
+            make_sampler("grp", Pool(levels=(0,)), 0)
+        for word in ("'grp'", *SAMPLERS):
+            assert word in str(error.value)
+
+
+def failures_found(name: str, levels: tuple[int, ...], seed: int, batches: int) -> int:
+    sampler = make_sampler(name, Pool(levels=levels), seed)
+    return sum(outcome.failed for outcome in play(sampler, batches, 20))
+
+
+def test_uniform_covers_the_pool_evenly():
+    cases = make_sampler("uniform", Pool(levels=(2,)), 3).ask(2000)
+    points = to_unit(cases, 2)
+    assert points.shape == (2000, 3)
+    assert np.abs(points.mean(axis=0) - 0.5).max() < 0.03
+    assert points.min() < 0.005
+    assert points.max() > 0.995
+
+
+@pytest.mark.parametrize("levels", [(0,), (2,)], ids=str)
+def test_gpr_finds_more_failures_than_uniform_with_the_same_budget(levels):
+    uniform, gpr = (
+        statistics.median(failures_found(name, levels, seed, batches=6) for seed in (1, 2, 3))
+        for name in ("uniform", "gpr")
+    )
+    assert 0 < uniform < 24, "the band must be neither invisible nor easy"
+    assert gpr > 2 * uniform
+
+
+def test_gpr_spreads_its_batch_out():
+    sampler = make_sampler("gpr", Pool(levels=(0,)), 4)
+    play(sampler, 4, 20)
+    points = to_unit(sampler.ask(20), 0)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2) + np.eye(20)
+    assert np.median(apart.min(axis=0)) > 0.02
+
+
+def test_gpr_gives_more_cases_to_the_level_with_the_failures():
+    sampler = make_sampler("gpr", Pool(levels=(0, 1)), 4)
+    cases = sampler.ask(20)
+    # Level 0 never fails, all of level 1 does.
+    nothing = dict.fromkeys(Measures.__dataclass_fields__)
+    ends = {0: (End.MERGED, -5.0), 1: (End.COLLISION, -700.0)}
+    outcomes = []
+    for index, case in enumerate(cases):
+        end, score = ends[case.level]
+        outcomes.append(
+            Outcome(index, 0, case, Measures(**{**nothing, "end": end, "score": score}))
+        )
+    sampler.tell(outcomes)
+    levels = [case.level for case in sampler.ask(20)]
+    # exp(3) : 1 over 20 cases is 19.05 : 0.95.
+    assert (levels.count(0), levels.count(1)) == (1, 19)
