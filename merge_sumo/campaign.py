@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.case import Pool
+from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.pov import PovLibrary, available_levels
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
@@ -125,7 +126,13 @@ def run_campaign(
 
 def record_of(settings: CampaignSettings, net: Net) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
-    return {**asdict(settings), "versions": versions(), "net_sha256": net.sha256}
+    policies = {name: entry["sha256"] for name, entry in read_manifest().items()}
+    return {
+        **asdict(settings),
+        "versions": versions(),
+        "net_sha256": net.sha256,
+        "policies_sha256": policies,
+    }
 
 
 def case_name(index: int) -> str:

@@ -95,12 +95,12 @@ def campaign(
         seed=seed,
         v_vut0_mps=v_vut0,
     )
-    if level == "all" and len(levels) < 3:
-        named = ", ".join(map(str, levels))
-        say(f"--level all: policies are there for level {named}; `merge-sumo train` makes others")
     folder = out or Path("runs") / f"{vut}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
     with CaseProgress(f"{vut} v level {'/'.join(map(str, levels))}", cases) as progress:
         run = conductor.run_campaign(settings, folder, Net(net), progress.case_ended)
+    if level == "all" and len(levels) < 3:
+        named = ", ".join(map(str, levels))
+        say(f"--level all: policies are there for level {named}; `merge-sumo train` makes others")
     report_file = write_report(run)
     summary = summarise(run.outcomes, levels)
     if as_json:
@@ -129,10 +129,13 @@ def export(
 
     loaded = Run(run)
     target = out or run / SCENARIOS
-    for index in case:
+    folders = {index: target / case_name(index) for index in case}
+    for index, folder in folders.items():
         loaded.outcome(index)
-    for index in case:
-        typer.echo(export_case(loaded, index, target / case_name(index), Net(net)))
+        if folder.exists():
+            raise UserError(f"{folder} exists: choose another folder with --out")
+    for index, folder in folders.items():
+        typer.echo(export_case(loaded, index, folder, Net(net)))
 
 
 @app.command()
@@ -172,6 +175,79 @@ def report(run: RunArgument) -> None:
     from merge_sumo.report import write_report
 
     typer.echo(write_report(Run(run)))
+
+
+@app.command()
+def train(
+    only: Annotated[
+        list[str] | None, typer.Option(help="Network to train: pov1, vut1, pov2 or vut2.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same weights.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder.  [default: the policies in use]")
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Train nothing: measure regret of what is there.")
+    ] = False,
+    cases: Annotated[int, typer.Option(help="Random cases of a check.")] = 300,
+    as_json: JsonOption = False,
+) -> None:
+    """Train the learned drivers in SUMO, level by level, and measure their regret.
+
+    The regret is what a driver loses to its best response, as a share of what that gains over
+    level-0 behaviour. An interrupted training goes on with the first network that is not finished.
+
+    Example:  merge-sumo train --out my-policies --seed 1
+    """
+    from merge_sumo.drivers.policies import NETWORKS, read_manifest
+    from merge_sumo.resources import resource
+
+    folder = out or resource("policies")
+    unknown = set(only or ()) - set(NETWORKS)
+    if unknown:
+        raise UserError(f"there is no network {unknown.pop()!r}: choose {', '.join(NETWORKS)}")
+    names = tuple(name for name in NETWORKS if name in (only or NETWORKS))
+    if not check:
+        _train(folder, names, seed)
+    missing = set(names) - set(read_manifest(folder))
+    if missing:
+        raise UserError(f"{folder} has no {missing.pop()}: run `merge-sumo train` to make it")
+    _need_training_packages()
+    from merge_sumo.training.check import check_policy
+
+    checks = {name: asdict(check_policy(name, folder, count=cases)) for name in names}
+    if as_json:
+        typer.echo(json.dumps(checks))
+        return
+    typer.echo(
+        "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0"
+    )
+    for name, found in checks.items():
+        typer.echo(
+            f"{name:<7}  {found['mean_regret']:11.2%}  {found['p99_regret']:10.2%}  "
+            f"{found['collisions']:10d}  {found['avoidable_collisions']:9d}  "
+            f"{found['mean_return']:11.3f}  {found['mean_best']:.3f}  {found['mean_level0']:.3f}"
+        )
+
+
+def _need_training_packages() -> None:
+    from importlib.util import find_spec
+
+    for package in ("torch", "gymnasium"):
+        if find_spec(package) is None:
+            raise UserError(
+                f"training needs {package}, which is not installed: run "
+                "`pip install 'merge-sumo[train]'`"
+            )
+
+
+def _train(folder: Path, names: tuple[str, ...], seed: int) -> None:
+    _need_training_packages()
+    from merge_sumo.progress import TrainingBar
+    from merge_sumo.training.helix import train_library
+
+    with TrainingBar() as bar:
+        train_library(folder, names, seed, on_progress=bar.progressed, on_done=bar.done)
 
 
 def _print_summary(run: Run, summary: Summary, report_file: Path) -> None:

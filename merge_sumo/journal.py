@@ -87,6 +87,8 @@ class Run:
             ) from error
         except ValueError as error:
             raise UserError(f"{settings} is not readable JSON: {error}") from error
+        if not isinstance(self.settings, dict):
+            raise UserError(f"{settings} is not a JSON object")
         self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES))
         self._batches: dict[int, dict[int, np.ndarray[Any, Any]]] = {}
 
@@ -107,7 +109,14 @@ class Run:
                 with np.load(path, allow_pickle=False) as data:
                     parts = np.split(data["motion"], np.cumsum(data["rows"])[:-1])
                     batch = dict(zip(data["index"].tolist(), parts, strict=True))
-            except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            except (
+                OSError,
+                EOFError,
+                ValueError,
+                TypeError,
+                KeyError,
+                zipfile.BadZipFile,
+            ) as error:
                 raise UserError(f"cannot read the trajectories in {path}: {error}") from error
             self._batches[outcome.batch] = batch
         motion = self._batches[outcome.batch].get(index)

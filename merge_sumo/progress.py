@@ -1,14 +1,25 @@
-"""What a person sees while cases run: a bar with the rate and the failures so far."""
+"""What a person sees while something runs."""
 
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 from merge_sumo.score import Outcome
+
+if TYPE_CHECKING:
+    from merge_sumo.training.check import PolicyCheck
+    from merge_sumo.training.ddqn import TrainingProgress
 
 
 class CaseProgress:
@@ -29,7 +40,9 @@ class CaseProgress:
         self._task = self._progress.add_task(title, total=cases, rate="-", failures=0)
 
     def case_ended(self, outcome: Outcome) -> None:
-        """Count a case."""
+        """Count a case; the bar appears with the first, so that a refused campaign shows none."""
+        if not self._progress.live.is_started:
+            self._progress.start()
         self._failures += outcome.failed
         task = self._progress.tasks[0]
         elapsed = task.elapsed or 0.0
@@ -37,8 +50,7 @@ class CaseProgress:
         self._progress.update(self._task, advance=1, rate=rate, failures=self._failures)
 
     def __enter__(self) -> Self:
-        """Start the bar."""
-        self._progress.start()
+        """Return the bar."""
         return self
 
     def __exit__(
@@ -48,4 +60,52 @@ class CaseProgress:
         traceback: TracebackType | None,
     ) -> None:
         """Leave the bar as it is."""
+        if self._progress.live.is_started:
+            self._progress.stop()
+
+
+class TrainingBar:
+    """A bar per network with return and share of crashes, and its regret when it is finished."""
+
+    def __init__(self) -> None:
+        """Show nothing yet."""
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self._tasks: dict[str, TaskID] = {}
+
+    def progressed(self, name: str, now: TrainingProgress, updates: int) -> None:
+        """Show where a network is."""
+        if name not in self._tasks:
+            self._tasks[name] = self._progress.add_task(name, total=updates, note="")
+        note = f"return {now.mean_return:.3f}  crashes {now.crash_share:.2%}"
+        self._progress.update(self._tasks[name], completed=now.updates, note=note)
+
+    def done(self, name: str, check: PolicyCheck | None) -> None:
+        """Say how a network turned out, or that it was there already."""
+        if check is None:
+            self._progress.console.print(f"{name} is there already: same seed, settings, opponent")
+        else:
+            self._progress.console.print(
+                f"{name}: mean regret {check.mean_regret:.2%}, "
+                f"{check.avoidable_collisions} avoidable collisions in {check.cases} cases"
+            )
+
+    def __enter__(self) -> Self:
+        """Start the bars."""
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Leave the bars as they are."""
         self._progress.stop()

@@ -9,7 +9,7 @@ from typing import Any, Final
 from merge_sumo.case import V_POV0, X_POV0, to_unit
 from merge_sumo.errors import UserError
 from merge_sumo.fmc import RADIUS
-from merge_sumo.journal import Run, failures
+from merge_sumo.journal import SETTINGS, Run, failures
 from merge_sumo.score import Outcome
 from merge_sumo.summary import summarise
 
@@ -20,12 +20,12 @@ MAP_PX: Final = 360
 
 def write_report(run: Run) -> Path:
     """Write `report.html` into the folder of a run, in place of an older one; return its path."""
-    from jinja2 import Environment, PackageLoader, select_autoescape
+    from jinja2 import Environment, PackageLoader
 
-    environment = Environment(
-        loader=PackageLoader("merge_sumo"), autoescape=select_autoescape(), trim_blocks=True
-    )
-    levels = run.settings["levels"]
+    environment = Environment(loader=PackageLoader("merge_sumo"), autoescape=True, trim_blocks=True)
+    levels = run.settings.get("levels")
+    if not isinstance(levels, list):
+        raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
     summary = summarise(run.outcomes, levels)
     worst = failures(run.outcomes)
     near = [o for o in run.outcomes if o.measures.score is not None and not o.failed]

@@ -119,7 +119,7 @@ class _Rollout:
         x_m, v_mps = self.world.x_m, self.world.v_mps
         scene = Scene(self.active, self.step, x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT])
         answer = np.array((self.pov.act(scene), self.ask_vut(scene)))
-        acceleration = np.minimum(np.maximum(answer, self.a_min), self.a_max)
+        acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
         self.clipped += acceleration[VUT] != answer[VUT]
         row = self.record[self.row % RING_ROWS]
         row[:, 0], row[:, 1], row[:, 2] = x_m, v_mps, acceleration

@@ -127,7 +127,18 @@ class Outcome:
             raise TypeError("index and batch must be whole numbers")
         case = Case(**{name: values.pop(name) for name in Case.__dataclass_fields__})
         values["end"] = End(values["end"])
+        for name, annotation in Measures.__annotations__.items():
+            if name != "end" and not _is_a(values[name], annotation):
+                raise TypeError(f"{name} is {values[name]!r}")
         return cls(index=index, batch=batch, case=case, measures=Measures(**values))
+
+
+def _is_a(value: object, annotation: str) -> bool:
+    """Return whether a value read from JSON is what a field of `Measures` holds."""
+    names = annotation.split(" | ")
+    if value is None:
+        return "None" in names
+    return type(value).__name__ in names and not (isinstance(value, float) and math.isnan(value))
 
 
 def measure(trajectory: Trajectory) -> Measures:

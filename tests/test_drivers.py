@@ -44,16 +44,24 @@ class TestLevel0:
         ("distance", "v", "expected"),
         [
             (0.0, 18.0, 0.0),
-            (18.5, 18.0, 1.0),  # 18 * 1 + 1/2
-            (230.0, 18.0, 10.0),  # 18 * 10 + 50: just reaches 28
-            (230.0 + 56.0, 18.0, 12.0),  # and two seconds at 28
-            (50.0, 0.0, 10.0),  # from a stand: t^2 / 2
+            (18.45, 18.0, 1.0),  # 10 steps of 18, 18.1, ... 18.9 m/s
+            (229.5, 18.0, 10.0),  # 100 steps: just reaches 28
+            (229.5 + 56.0, 18.0, 12.0),  # and two seconds at 28
+            (49.5, 0.0, 10.0),  # from a stand
             (56.0, 28.0, 2.0),
             (80.0, 40.0, 2.0),  # faster than 28: keeps its speed
         ],
     )
     def test_time_on_the_level0_profile_by_hand(self, distance, v, expected):
         assert seconds_to_m(distance, v) == pytest.approx(expected, abs=1e-12)
+
+    @pytest.mark.parametrize("v", [0.3, 18.0, 26.0, 28.0, 33.0])
+    def test_the_predicted_time_of_arrival_does_not_drift_along_the_profile(self, v):
+        x, arrivals = -300.0, []
+        for step in range(60):
+            arrivals.append(step * 0.1 + seconds_to_m(-x, v))
+            x, v = x + v * 0.1, v + float(Level0Vut(1).act(scene(v_vut=v))[0]) * 0.1
+        assert np.ptp(arrivals) < 1e-9
 
 
 class TestRuleBased:
@@ -78,12 +86,12 @@ class TestRuleBased:
             x_pov = pov_that_meets(gap, x_vut, 20.0)
             assert self.make().act(scene(x_pov, 30.0, x_vut, 20.0)).tolist() == [1.0]
 
-    @pytest.mark.parametrize(("gap", "sign"), [(5.0, -1.0), (-5.0, 1.0)])
-    def test_stage_3_falls_back_behind_a_pov_ahead_and_pulls_away_from_one_behind(self, gap, sign):
-        # Error of 10 m: 0.2 * 10 + 0.1 * 10 * 0.1 s = 2.1 m/s2, no rate in the first step.
+    @pytest.mark.parametrize(("gap", "expected"), [(12.0, -0.63), (5.0, -2.1), (-5.0, -4.0)])
+    def test_stage_3_falls_back_behind_the_pov_on_whichever_side_it_is(self, gap, expected):
+        # Errors of -3, -10, -20 m: 0.2 e + 0.1 e * 0.1 s, no rate in the first step.
         x_pov = pov_that_meets(gap, -30.0, 20.0)
         answer = self.make().act(scene(x_pov, 30.0, -30.0, 20.0))
-        assert answer == pytest.approx([min(sign * 2.1, 2.0)])
+        assert answer == pytest.approx([max(expected, -4.0)])
 
     def test_the_pid_adds_integral_and_rate_in_the_second_step(self):
         vut = self.make()
@@ -103,8 +111,8 @@ class TestRuleBased:
         assert vut.act(near) == pytest.approx(first)
 
     def test_the_command_stays_within_the_limits(self):
-        strong = RuleBasedDesign(x1_m=100, x2_m=40, gap_m=15, target_m=15, kp=50.0)
-        for gap, limit in ((5.0, -4.0), (-5.0, 2.0)):
+        strong = RuleBasedDesign(x1_m=100, x2_m=40, gap_m=15, target_m=5, kp=50.0)
+        for gap, limit in ((-5.0, -4.0), (10.0, 2.0)):
             x_pov = pov_that_meets(gap, -30.0, 20.0)
             answer = self.make(strong).act(scene(x_pov, 30.0, -30.0, 20.0))
             assert answer.tolist() == [limit]

@@ -121,7 +121,7 @@ class TestClosedForms:
         assert fmc(points) == pytest.approx(chain(4, distance, 3), rel=1e-4)
 
     def test_equal_discs_of_two_balls_in_a_slice_count_once(self):
-        balls = np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]])
+        balls = np.array([[3.0, -2.0, -0.5], [3.0, -2.0, 0.5]])
         both, height = np.array([0, 1, 0, 1]), np.array([0.0, 0.0, 0.2, 0.2])
         area = fmc_module._sliced_area(balls, cKDTree(balls), both, height)
         assert area == pytest.approx(math.pi * (0.75 + 0.91), rel=1e-12)
@@ -182,8 +182,9 @@ class TestLattices:
         assert result == pytest.approx(expected, rel=TOLERANCE[dimension])
 
     def test_a_flat_lattice_in_space(self):
-        points = np.column_stack([lattice(8, 0.08, 2), np.full(64, 0.3)])
-        expected = 64 * BALL[3] - 2 * 8 * 7 * lens(0.08, 3)
+        # All slices would meet the balls at the same heights if they were parallel to it.
+        points = np.column_stack([lattice(20, 0.08, 2), np.full(400, 0.3)])
+        expected = 400 * BALL[3] - 2 * 20 * 19 * lens(0.08, 3)
         assert fmc(points) == pytest.approx(expected, rel=1e-4)
 
 
@@ -209,13 +210,14 @@ class TestReferences:
         assert abs(fmc(points) - expected) < 4 * error
 
     @pytest.mark.parametrize(
-        ("count", "width"), [(2, 0.05), (50, 0.1), (400, 0.02), (400, 0.15), (400, 1.0)]
+        ("count", "width"), [(2, 0.05), (50, 0.1), (600, 0.03), (400, 0.15), (400, 1.0)]
     )
     def test_enough_slices(self, count, width, monkeypatch):
         points = np.random.default_rng(8).random((count, 3)) * width
         result = fmc(points)
-        monkeypatch.setattr(fmc_module, "_SLICES", 400)
-        monkeypatch.setattr(fmc_module, "_MAX_SLICES", 400)
+        slices = 150 if count >= 400 else 400
+        monkeypatch.setattr(fmc_module, "_SLICES", slices)
+        monkeypatch.setattr(fmc_module, "_MAX_SLICES", slices)
         finer = fmc(points)
         assert result != finer
         assert result == pytest.approx(finer, rel=1e-4)
@@ -261,6 +263,16 @@ class TestWhatMustNotMatter:
         twice = np.vstack([points, points + shift])
         assert fmc(twice) == pytest.approx(fmc(points), rel=1e-10)
 
+    @DIMENSIONS
+    def test_nearly_equal_points_are_one(self, dimension):
+        noise = np.random.default_rng(11).normal(size=(400, dimension))
+        for size, one in [(1e-16, True), (1e-10, False), (1e-7, False)]:
+            heap = 0.3 + size * noise
+            assert (len(fmc_module._in_radii(heap, RADIUS)) <= 2**dimension) == one
+            grown = 8 * dimension * size / RADIUS  # in volume; the noise reaches 4 size
+            low, high = BALL[dimension] * (1 - 2e-5), BALL[dimension] * (1 + 2e-5 + grown)
+            assert low <= fmc(heap) <= high
+
     @examples
     @given(point_sets(), st.floats(-3.0, 3.0))
     def test_translation(self, points, shift):
@@ -281,6 +293,13 @@ class TestWhatMustNotMatter:
     def test_rotation(self, points, angle):
         c, s = math.cos(angle), math.sin(angle)
         assert fmc(points @ np.array([[c, s], [-s, c]])) == pytest.approx(fmc(points), rel=1e-9)
+
+    def test_the_direction_of_a_lattice_in_space(self):
+        # Face-centred cubic: each pole of a ball lies on five others, and all at the same heights.
+        points = lattice(8, RADIUS, 3)
+        points = points[np.rint(points.sum(axis=1) / RADIUS) % 2 == 0]
+        turned = Rotation.from_rotvec([0.4, -1.1, 0.8]).apply(points)
+        assert fmc(points) == pytest.approx(fmc(turned), rel=5e-5)
 
     @examples
     @given(point_sets(), st.floats(0.01, 100.0))

@@ -92,6 +92,7 @@ def test_three_corridors_are_three_equal_roads_for_sumo(net, tmp_path):
         lines = {MAIN_IN: net.main_in, MAIN_OUT: net.main_out, RAMP: net.ramp}
         for k in range(3):
             shift = k * CORRIDOR_SPACING_M
+            assert libsumo.junction.getPosition(f"M.{k}") == (0.0, 1.6 - shift)
             for edge, line in lines.items():
                 lane = f"{edge}.{k}_0"
                 assert libsumo.lane.getLength(lane) == line.length_m

@@ -7,8 +7,8 @@
     step     the same vehicles at constant speeds, and nothing at all but simulation steps
     process  a TraCI server started for every case, with the same drivers
 
-Host, bare and step take turns, several rounds for each number of corridors K; the figures are medians
-over the rounds, with the spread in brackets.
+Host, bare and step take turns, several rounds for each number of corridors K; the figures are
+medians over the rounds, with the spread in brackets.
 """
 
 from __future__ import annotations
@@ -202,7 +202,8 @@ def main() -> None:
         print(json.dumps(result))
         return
     print(
-        f"{'K':>4} {'us per pair-step':>24} {'cases per s':>24} {'ratio to bare':>20} {'to step':>20}"
+        f"{'K':>4} {'us per pair-step':>24} {'cases per s':>24} "
+        f"{'ratio to bare':>20} {'to step':>20}"
     )
     for k, row in rows.items():
         cells = [f"{statistics.median(x):.2f} [{min(x):.2f}, {max(x):.2f}]" for x in row.values()]

@@ -17,15 +17,19 @@ def level0_acceleration(v_vut_mps: FloatArray) -> FloatArray:
 def level0_time_to(distance_m: FloatArray, v_vut_mps: FloatArray) -> FloatArray:
     """Return the seconds that a vehicle needs for a distance on the level-0 profile.
 
-    The profile in continuous time: 1 m/s2 up to 28 m/s, then constant; a vehicle that is faster
-    keeps its speed. Arrays of one shape, distances not negative.
+    The profile as eq. (4) drives it: 1 m/s2 up to 28 m/s, then constant; a vehicle that is faster
+    keeps its speed. The steps of eq. (4) lie on the parabola that begins slower by half a step's
+    gain of speed, so this time, and what is predicted with it, does not drift while the vehicle
+    follows the profile. Arrays of one shape, distances not negative.
     """
-    v_squared = v_vut_mps * v_vut_mps
+    lag = 0.5 * LEVEL0_A_MPS2 * DT_S
     v_cruise = np.maximum(v_vut_mps, LEVEL0_V_MPS)
-    v_end = np.minimum(np.sqrt(v_squared + (2.0 * LEVEL0_A_MPS2) * distance_m), v_cruise)
-    # (v_end - v) / a for the run-up and (distance - run-up) / v_cruise for the rest, factored.
-    saved = (v_end + v_vut_mps) / (v_cruise + v_cruise)
-    return (v_end - v_vut_mps) * (1.0 - saved) / LEVEL0_A_MPS2 + distance_m / v_cruise
+    v_start = v_vut_mps - lag
+    v_squared = v_start * v_start
+    v_end = np.minimum(np.sqrt(v_squared + (2.0 * LEVEL0_A_MPS2) * distance_m), v_cruise - lag)
+    run_up = (v_end * v_end - v_squared) / (2.0 * LEVEL0_A_MPS2)
+    time: FloatArray = (v_end - v_start) / LEVEL0_A_MPS2 + (distance_m - run_up) / v_cruise
+    return time
 
 
 class Level0Pov(Driver):

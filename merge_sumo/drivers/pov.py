@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov
+from merge_sumo.drivers.policies import load_driver, read_manifest
+
+POLICIES: Final = {1: "pov1", 2: "pov2"}
+"""The learned POVs by their level."""
 
 
 def available_levels() -> tuple[int, ...]:
     """Return the levels for which a policy is there; level 0 needs none."""
-    return (0,)
+    trained = read_manifest()
+    return (0, *(level for level, name in POLICIES.items() if name in trained))
 
 
 class PovLibrary(Driver):
@@ -21,6 +28,8 @@ class PovLibrary(Driver):
         """Prepare the drivers of all available levels."""
         super().__init__(corridors)
         self._drivers: dict[int, Driver] = {0: Level0Pov(corridors)}
+        for level in available_levels()[1:]:
+            self._drivers[level] = load_driver(POLICIES[level], corridors)
         self._level = np.zeros(corridors, dtype=np.int64)
         self._levels_playing = {0}
 

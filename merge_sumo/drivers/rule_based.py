@@ -23,7 +23,7 @@ class RuleBasedDesign:
         x1_m: distance before M at which stage 2 begins.
         x2_m: distance before M at which stage 3 begins.
         gap_m: a predicted |dx| at M below this is "too close".
-        target_m: the |dx| at M that the PID of stage 3 aims at.
+        target_m: the dx at M that the PID of stage 3 aims at; positive, so the VUT yields.
         kp: proportional gain, m/s2 per m of gap error.
         ki: integral gain, m/s2 per m s.
         kd: derivative gain, m/s2 per m/s.
@@ -60,8 +60,8 @@ class RuleBasedVut(Driver):
 
     All stages predict dx at M with the POV at constant speed and the VUT on the level-0 profile.
     Before x1 the VUT follows that profile. From x1 to x2 it coasts while |dx| is predicted too
-    close. From x2 on it then sets its acceleration by a PID on the error of the predicted gap:
-    towards +target when the POV is predicted ahead, towards -target when it is predicted behind.
+    close. From x2 on it then sets its acceleration by a PID on the predicted dx, towards +target:
+    it gives way and falls back behind the POV.
     """
 
     def __init__(self, corridors: int, design: RuleBasedDesign) -> None:
@@ -99,7 +99,7 @@ class RuleBasedVut(Driver):
     def _pid(self, dx_at_m: FloatArray) -> FloatArray:
         """Return the PID's acceleration; integral and rate start afresh when it takes over."""
         design = self.design
-        error = dx_at_m - np.copysign(design.target_m, dx_at_m)
+        error = dx_at_m - design.target_m
         self._integral = self._integral * self._regulated + error * DT_S
         rate = (error - self._last_error) * self._regulated / DT_S
         self._last_error = error

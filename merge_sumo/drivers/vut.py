@@ -7,6 +7,7 @@ from functools import partial
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut
+from merge_sumo.drivers.policies import load_driver, read_manifest
 from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.errors import UserError
 
@@ -17,7 +18,12 @@ VutFactory = Callable[[int], Driver]
 def built_in_vuts() -> dict[str, VutFactory]:
     """Return the VUTs that the package brings, by name."""
     designs = {name: partial(RuleBasedVut, design=design) for name, design in DESIGNS.items()}
-    return {"level0": Level0Vut, **designs}
+    learned = {
+        f"level{name[-1]}": partial(load_driver, name)
+        for name in read_manifest()
+        if name.startswith("vut")
+    }
+    return {"level0": Level0Vut, **learned, **designs}
 
 
 def vut_factory(spec: str) -> VutFactory:

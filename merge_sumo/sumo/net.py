@@ -69,7 +69,9 @@ class Net:
             self._bytes = self.path.read_bytes()
         except OSError as error:
             raise UserError(f"cannot read the net {self.path}: {error.strerror}") from error
-        parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+        parser = etree.XMLParser(
+            resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
+        )
         try:
             self._root = etree.fromstring(self._bytes, parser)
         except etree.XMLSyntaxError as error:
@@ -83,7 +85,7 @@ class Net:
             (self.main_out, self.main_out.x0_m, self.main_out.y0_m),
         ):
             drawn = math.hypot(lane.x1_m - lane.x0_m, lane.y1_m - lane.y0_m)
-            if math.hypot(x, y) > 1e-6 or abs(drawn - lane.length_m) > 1e-6:
+            if not (math.hypot(x, y) <= 1e-6 and abs(drawn - lane.length_m) <= 1e-6):
                 raise self._broken("lanes must meet at M = (0, 0) and be as long as they are drawn")
         if any(edge.get("function") == "internal" for edge in self._root.iterfind("edge")):
             raise self._broken("it has internal links; build it with --no-internal-links")
@@ -122,6 +124,13 @@ class Net:
     def replicate(self, corridors: int) -> bytes:
         """Return a net of `corridors` copies, `CORRIDOR_SPACING_M` apart, ids suffixed ".k"."""
         root = copy.deepcopy(self._root)
+        try:
+            return self._replicated(root, corridors)
+        except ValueError as error:
+            raise self._broken(f"it has a coordinate that is no number ({error})") from error
+
+    @staticmethod
+    def _replicated(root: etree._Element, corridors: int) -> bytes:
         # SUMO reads edges before the junctions that name their lanes, and connections last.
         for tag in ("edge", "junction", "connection"):
             parts = list(root.iterfind(tag))

@@ -10,7 +10,11 @@ is had by stepping at v(t) and then telling SUMO that the speed now is v(t+1).
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -88,10 +92,14 @@ class World:
         with tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder:
             net_file = Path(folder) / "corridors.net.xml"
             net_file.write_bytes(self.net.replicate(self.corridors))
+            messages = Path(folder) / "messages"
             try:
-                libsumo.start(["sumo", "--net-file", str(net_file), *SUMO_OPTIONS])
+                with _standard_error_into(messages):
+                    libsumo.start(["sumo", "--net-file", str(net_file), *SUMO_OPTIONS])
             except libsumo.TraCIException as error:
-                raise UserError(f"SUMO cannot load the net {self.net.path}: {error}") from error
+                said = messages.read_text(encoding="utf-8", errors="replace").split("\n")[0]
+                reason = said.removeprefix("Error: ") or error
+                raise UserError(f"SUMO cannot load the net {self.net.path}: {reason}") from error
         vehicle = libsumo.vehicle
         self._ids = [f"{who}.{k}" for who in ("pov", "vut") for k in range(self.corridors)]
         try:
@@ -122,19 +130,19 @@ class World:
     def place(
         self, corridor: int, x_pov_m: float, v_pov_mps: float, x_vut_m: float, v_vut_mps: float
     ) -> None:
-        """Put both vehicles of a corridor where an episode starts, before M, and read them back."""
+        """Put both vehicles of a corridor where an episode starts, and read them back."""
         for row, edge, x, v in (
             (POV, MAIN_IN, x_pov_m, v_pov_mps),
             (VUT, RAMP, x_vut_m, v_vut_mps),
         ):
             name = self._ids[row * self.corridors + corridor]
-            position = float(self._before_m[row, corridor]) + x
-            self._move_to(name, f"{edge}.{corridor}_0", position)
+            to_m = float(self._before_m[row, corridor]) if x < 0.0 else 0.0
+            self._move_to(name, f"{edge if x < 0.0 else MAIN_OUT}.{corridor}_0", to_m + x)
             self._set_previous_speed(name, v, 0.0)
             self._set_speed(name, v)
-            self._to_m[row, corridor] = self._before_m[row, corridor]
+            self._to_m[row, corridor] = to_m
             self._position_m[row, corridor] = position = self._get_position(name)
-            self.x_m[row, corridor] = position - self._before_m[row, corridor]
+            self.x_m[row, corridor] = position - to_m
             self.v_mps[row, corridor] = self._get_speed(name)
 
     def park(self, corridor: int) -> None:
@@ -194,6 +202,20 @@ class World:
     ) -> None:
         """Close the world."""
         self.close()
+
+
+@contextmanager
+def _standard_error_into(path: Path) -> Iterator[None]:
+    """Send what a C++ library writes to standard error into a file."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with path.open("wb") as file:
+            os.dup2(file.fileno(), 2)
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _raw(libsumo: Any, *names: str) -> list[Any]:

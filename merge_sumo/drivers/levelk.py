@@ -1,0 +1,142 @@
+"""Level-k drivers: greedy on a learned action-value function Q (Wang et al., section IV-C).
+
+The networks are trained by `merge_sumo.training` with torch; here they act in float64 numpy, so
+that a campaign needs no torch, and each corridor is evaluated on its own, so that an episode does
+not depend on how many others run beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.case import Case, FloatArray
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, LEVEL0_V_MPS, V_HW_MIN_MPS
+
+ACTIONS_MPS2: Final = np.arange(A_MIN_MPS2, A_MAX_MPS2 + 1.0)
+"""The accelerations that a learned driver chooses from, -4 to +2 m/s2."""
+DECISION_STEPS: Final = 5
+"""A learned driver decides every 0.5 s and holds its acceleration in between."""
+
+FEATURES: Final = 26
+SVO_FEATURES: Final = 2
+_HORIZON_S: Final = 20.0
+_GAP_SCALES_M: Final = (80.0, 25.0, 8.0)
+
+
+def features(
+    x_pov_m: FloatArray,
+    v_pov_mps: FloatArray,
+    x_vut_m: FloatArray,
+    v_vut_mps: FloatArray,
+    svo_rad: FloatArray | None = None,
+) -> FloatArray:
+    """Return what the network sees of n states, (n, 26), or (n, 28) with an orientation.
+
+    All are functions of the state [x_POV, v_POV, x_VUT, v_VUT] and psi alone: the state itself,
+    scaled; the VUT's time to M on the level-0 profile, at constant speed and at full
+    acceleration; the gap at M that follows from them for a POV that keeps its speed, accelerates
+    or brakes, each on three scales; and final speeds. A gap decides the reward, so a network that
+    is given gaps learns in minutes what it would otherwise have to work out first.
+    """
+    distance = np.maximum(-x_vut_m, 0.0)
+    t_level0 = np.minimum(level0_time_to(distance, v_vut_mps), _HORIZON_S)
+    t_constant = np.minimum(distance / np.maximum(v_vut_mps, 0.5), _HORIZON_S)
+    t_full = (np.sqrt(v_vut_mps * v_vut_mps + 4.0 * distance) - v_vut_mps) / 2.0
+    t_brake = np.minimum(t_level0, v_pov_mps / 4.0)
+    gaps = (
+        x_pov_m + v_pov_mps * t_level0,
+        x_pov_m + (v_pov_mps + t_level0) * t_level0,
+        x_pov_m + (v_pov_mps - 2.0 * t_brake) * t_brake,
+        x_pov_m + v_pov_mps * t_constant,
+        x_pov_m + v_pov_mps * t_full,
+    )
+    v_level0 = np.maximum(v_vut_mps, np.minimum(v_vut_mps + t_level0, LEVEL0_V_MPS))
+    columns = [
+        x_pov_m / 100.0 + 1.0,
+        (v_pov_mps - 28.0) / 6.0,
+        x_vut_m / 100.0 + 1.0,
+        (v_vut_mps - 22.0) / 6.0,
+        t_level0 / 5.0 - 1.0,
+        t_constant / 5.0 - 1.0,
+        t_full / 5.0 - 1.0,
+        *(np.tanh(gap / scale) for gap in gaps for scale in _GAP_SCALES_M),
+        (v_level0 - V_HW_MIN_MPS) / 4.0,
+        (v_vut_mps + 2.0 * t_full - V_HW_MIN_MPS) / 8.0,
+        np.tanh((v_pov_mps - v_level0) / 3.0),
+        (v_pov_mps - V_HW_MIN_MPS) / 4.0,
+    ]
+    if svo_rad is not None:
+        columns += [np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0]
+    return np.stack(columns, axis=-1)
+
+
+class QNetwork:
+    """A multilayer perceptron with rectified units that gives Q of every action.
+
+    `layers` are pairs of weights (outputs, inputs) and biases (outputs,).
+    """
+
+    def __init__(self, layers: Sequence[tuple[FloatArray, FloatArray]]) -> None:
+        """Take the layers, as float64."""
+        self.layers = [
+            (np.ascontiguousarray(weight, dtype=np.float64), np.asarray(bias, dtype=np.float64))
+            for weight, bias in layers
+        ]
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, FloatArray]) -> QNetwork:
+        """Return the network whose tensors are named 0.weight, 0.bias, 1.weight, ..."""
+        count = len(tensors) // 2
+        return cls([(tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(count)])
+
+    @property
+    def sees_svo(self) -> bool:
+        """Whether the network's input has the social value orientation."""
+        return bool(self.layers[0][0].shape[1] == FEATURES + SVO_FEATURES)
+
+    def values(self, inputs: FloatArray) -> FloatArray:
+        """Return Q, (n, actions), of inputs, (n, features).
+
+        Every row is a matrix-vector product of its own, so that it is the same to the last bit
+        whatever rows stand beside it.
+        """
+        hidden = inputs[..., None]
+        for weight, bias in self.layers[:-1]:
+            hidden = np.maximum(np.matmul(weight, hidden) + bias[:, None], 0.0)
+        weight, bias = self.layers[-1]
+        values: FloatArray = (np.matmul(weight, hidden) + bias[:, None])[..., 0]
+        return values
+
+
+class LevelKDriver(Driver):
+    """Takes the action of the highest Q every 0.5 s and holds it."""
+
+    def __init__(self, corridors: int, network: QNetwork) -> None:
+        """Drive with a network; whether it plays POV or VUT is in what it was trained for."""
+        super().__init__(corridors)
+        self.network = network
+        self._svo_rad = np.zeros(corridors)
+        self._held = np.zeros(corridors)
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Take the social value orientation of the case."""
+        self._svo_rad[corridor] = case.svo_rad or 0.0
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the held accelerations, decided anew where a decision is due."""
+        due = np.flatnonzero((scene.step % DECISION_STEPS == 0) & scene.active)
+        if due.size:
+            inputs = features(
+                scene.x_pov_m[due],
+                scene.v_pov_mps[due],
+                scene.x_vut_m[due],
+                scene.v_vut_mps[due],
+                self._svo_rad[due] if self.network.sees_svo else None,
+            )
+            self._held[due] = ACTIONS_MPS2[self.network.values(inputs).argmax(axis=1)]
+        return self._held

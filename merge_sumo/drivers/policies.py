@@ -1,0 +1,69 @@
+"""The shipped policies: safetensors with a manifest that says what they are."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
+from merge_sumo.errors import UserError
+from merge_sumo.resources import resource
+
+MANIFEST: Final = "manifest.json"
+NETWORKS: Final = ("pov1", "vut1", "pov2", "vut2")
+"""In the order of the helix: each is trained against an earlier one, or against level 0."""
+
+
+def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
+    """Return what is known of each network, by name; empty where nothing was trained yet."""
+    path = (folder or resource("policies")) / MANIFEST
+    if not path.is_file():
+        return {}
+    try:
+        networks = json.loads(path.read_text(encoding="utf-8"))["networks"]
+        return {name: networks[name] for name in NETWORKS if name in networks}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is not a readable manifest of policies: {error}") from error
+
+
+def load_network(name: str, folder: Path | None = None) -> QNetwork:
+    """Return a network; `UserError` when it is missing or is not the file of its manifest."""
+    folder = folder or resource("policies")
+    entry = read_manifest(folder).get(name)
+    if entry is None:
+        raise UserError(f"there is no policy {name!r}: run `merge-sumo train` to make it")
+    path = folder / f"{name}.safetensors"
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"cannot read the policy {path}: {error.strerror}") from error
+    return _parse(content, str(path), str(entry.get("sha256")), name)
+
+
+@cache
+def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise UserError(
+            f"{path} is not the file that its manifest describes: get it again, or run "
+            f"`merge-sumo train --only {name}`"
+        )
+    try:
+        network = QNetwork.from_tensors(load(content))
+        inputs, outputs = network.layers[0][0].shape[1], network.layers[-1][0].shape[0]
+    except (SafetensorError, KeyError, ValueError, IndexError) as error:
+        raise UserError(f"{path} holds no action-value network: {error}") from error
+    expected = FEATURES + (SVO_FEATURES if name == "pov2" else 0)
+    if (inputs, outputs) != (expected, len(ACTIONS_MPS2)):
+        raise UserError(f"{path} has {inputs} inputs and {outputs} actions: train it again")
+    return network
+
+
+def load_driver(name: str, corridors: int, folder: Path | None = None) -> LevelKDriver:
+    """Return the driver that acts by a network."""
+    return LevelKDriver(corridors, load_network(name, folder))

@@ -1,0 +1,1 @@
+"""Training of the POV library: rewards, environments, DDQN, the helix, and what proves them."""

@@ -1,0 +1,168 @@
+"""Are the drivers rational? Their returns in SUMO beside the best response."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.case import SVO, Case, FloatArray, from_unit
+from merge_sumo.drivers.base import Driver
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
+from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
+from merge_sumo.drivers.policies import load_network
+from merge_sumo.rollout import rollout
+from merge_sumo.sumo.world import World
+from merge_sumo.training.best_response import (
+    beam_search,
+    best_response_pov1,
+    best_response_vut1,
+)
+from merge_sumo.training.reward import (
+    RewardWeights,
+    pov_reward,
+    pov_step,
+    safety,
+    vut_end,
+    vut_step,
+)
+from merge_sumo.trajectory import End, Trajectory
+
+CHECK_CASES: Final = 300
+CHECK_SEED: Final = 20_201
+CORRIDORS: Final = 32
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyCheck:
+    """How near a driver is to its best response, over random cases of the pool.
+
+    Attributes:
+        cases: number of cases.
+        mean_return: mean return of the driver, played in SUMO.
+        mean_best: mean return of the best response.
+        mean_level0: mean return of level-0 behaviour in the driver's place.
+        mean_regret: mean of best - return, as a share of the mean gain of the best response over
+            level-0 behaviour.
+        p99_regret: 99th percentile of the same.
+        collisions: collisions of the driver.
+        avoidable_collisions: those in cases where the best response has none.
+    """
+
+    cases: int
+    mean_return: float
+    mean_best: float
+    mean_level0: float
+    mean_regret: float
+    p99_regret: float
+    collisions: int
+    avoidable_collisions: int
+
+
+@dataclass(frozen=True, slots=True)
+class Returns:
+    """Returns of n games in parts, (n,) each, and who collided."""
+
+    safe: FloatArray
+    pov_ego: FloatArray
+    vut_ego: FloatArray
+    collided: np.ndarray
+
+
+def returns_of(trajectories: list[Trajectory], weights: RewardWeights) -> Returns:
+    """Return the reward parts of episodes that were played in SUMO.
+
+    The accelerations that count are the commanded ones; at a stand, those that were possible.
+    """
+    parts = np.zeros((3, len(trajectories)))
+    collided = np.zeros(len(trajectories), dtype=bool)
+    for n, trajectory in enumerate(trajectories):
+        _, v_pov, a_pov, _, v_vut, a_vut = trajectory.motion[:-1].T
+        parts[1, n] = pov_step(v_pov, a_pov, weights).sum()
+        parts[2, n] = vut_step(v_vut, a_vut, weights).sum()
+        if trajectory.end is End.MERGED:
+            x_pov, v_pov_end, _, x_vut, v_vut_end, _ = trajectory.motion[-1]
+            dx = np.array([x_pov - x_vut])
+            parts[0, n] = safety(dx, np.array([v_pov_end - v_vut_end]), weights)[0]
+            parts[2, n] += vut_end(np.array([v_vut_end]), weights)[0]
+            collided[n] = abs(dx[0]) < 6.0
+    return Returns(parts[0], parts[1], parts[2], collided)
+
+
+def play(
+    cases: list[Case], make_pov: type[Driver] | QNetwork, make_vut: type[Driver] | QNetwork
+) -> list[Trajectory]:
+    """Play cases in SUMO between two drivers; return the trajectories in order."""
+    played: list[Trajectory | None] = [None] * len(cases)
+    with World(CORRIDORS) as world:
+        pov, vut = _driver(make_pov), _driver(make_vut)
+        for index, trajectory in rollout(world, pov, vut, cases):
+            played[index] = trajectory
+    return [trajectory for trajectory in played if trajectory is not None]
+
+
+def _driver(maker: type[Driver] | QNetwork) -> Driver:
+    return LevelKDriver(CORRIDORS, maker) if isinstance(maker, QNetwork) else maker(CORRIDORS)
+
+
+def check_cases(name: str, count: int = CHECK_CASES, seed: int = CHECK_SEED) -> list[Case]:
+    """Return random cases of the pool in which to check a network."""
+    rng = np.random.default_rng(seed)
+    level = 2 if name == "pov2" else 1
+    return from_unit(rng.random((count, 3 if level == 2 else 2)), level)
+
+
+def opponents(name: str, folder: Path | None) -> type[Driver] | QNetwork:
+    """Return the driver that a network was trained against."""
+    if name in ("pov1", "vut1"):
+        return Level0Vut if name == "pov1" else Level0Pov
+    return load_network("vut1" if name == "pov2" else "pov1", folder)
+
+
+def check_policy(
+    name: str,
+    folder: Path | None = None,
+    weights: RewardWeights | None = None,
+    count: int = CHECK_CASES,
+) -> PolicyCheck:
+    """Return how near a network is to its best response over `count` cases of the pool."""
+    weights = weights or RewardWeights()
+    network, opponent = load_network(name, folder), opponents(name, folder)
+    cases = check_cases(name, count)
+    x0 = np.array([case.x_pov0_m for case in cases])
+    v0 = np.array([case.v_pov0_mps for case in cases])
+    svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
+    is_pov = name.startswith("pov")
+
+    def returns(driver: type[Driver] | QNetwork) -> tuple[FloatArray, np.ndarray]:
+        pair = (driver, opponent) if is_pov else (opponent, driver)
+        got = returns_of(play(cases, *pair), weights)
+        if is_pov:
+            return pov_reward(got.safe, got.pov_ego, got.vut_ego, svo_rad), got.collided
+        return got.safe + got.vut_ego, got.collided
+
+    reached, collided = returns(network)
+    level0, _ = returns(Level0Pov if is_pov else Level0Vut)
+    if name == "pov1":
+        best = best_response_pov1(x0, v0, weights)
+    elif name == "vut1":
+        best = best_response_vut1(x0, v0, weights)
+    else:
+        assert isinstance(opponent, QNetwork)  # noqa: S101 (level 2 faces level 1)
+        best = beam_search(name[:3], x0, v0, svo_rad, network, opponent, weights)
+        # The driver's own sequence is one that a search may find.
+        best = np.maximum(best, reached)
+    gain = float((best - level0).mean())
+    regret = (best - reached) / gain
+    return PolicyCheck(
+        cases=count,
+        mean_return=float(reached.mean()),
+        mean_best=float(best.mean()),
+        mean_level0=float(level0.mean()),
+        mean_regret=float(regret.mean()),
+        p99_regret=float(np.quantile(regret, 0.99)),
+        collisions=int(collided.sum()),
+        avoidable_collisions=int((collided & (best > -weights.crash / 2)).sum()),
+    )

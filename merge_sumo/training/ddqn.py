@@ -1,0 +1,295 @@
+"""Double deep Q-learning (van Hasselt et al., 2016) of one level-k driver; read top to bottom.
+
+What differs from the textbook, and why:
+
+- Targets are squashed by an increasing function, the identity above -2 and logarithmic below. The
+  game is deterministic, so that does not change which action is best, and the crash term no longer
+  drowns the rest.
+- The target network follows by Polyak averaging, and that average is what is kept.
+- Exploring starts (`env.exploring_starts`).
+- psi is drawn anew for every replayed transition: the reward is stored in its three parts.
+- No discount: every game ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from merge_sumo.case import SVO, FloatArray
+from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, QNetwork, features
+from merge_sumo.training.env import MergeGame, exploring_starts
+
+SQUASH_BELOW: Final = -2.0
+MAX_DECISIONS: Final = 60
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingSettings:
+    """What `train` does; the defaults train a network in a few minutes on one core.
+
+    Attributes:
+        transitions: size of the replay; every transition is kept.
+        updates: gradient steps; the transitions are all in after `collecting` of them.
+        collecting: share of the updates during which transitions are collected.
+        warm_up: transitions before the first update.
+        batch: transitions per update.
+        width: units of each of the two hidden layers.
+        learning_rate: at the start; falls to `last_learning_rate` along a cosine.
+        last_learning_rate: at the end.
+        polyak: share of the network that the target network takes over per update.
+        exploration: share of random actions at the start; falls linearly to `last_exploration`
+            when half of the transitions are in.
+        last_exploration: share of random actions from then on.
+        gradient_norm: bound to which the gradient is clipped.
+    """
+
+    transitions: int = 600_000
+    updates: int = 60_000
+    collecting: float = 0.6
+    warm_up: int = 20_000
+    batch: int = 512
+    width: int = 128
+    learning_rate: float = 1e-3
+    last_learning_rate: float = 1e-5
+    polyak: float = 0.005
+    exploration: float = 1.0
+    last_exploration: float = 0.1
+    gradient_norm: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingProgress:
+    """Where training is: told after every thousand updates."""
+
+    updates: int
+    transitions: int
+    loss: float
+    mean_return: float
+    crash_share: float
+    network: QNetwork
+
+
+def squash(q: Tensor) -> Tensor:
+    """Return q above -2 and a logarithm of it below."""
+    return torch.where(
+        q >= SQUASH_BELOW,
+        q,
+        SQUASH_BELOW - torch.log1p(torch.clamp(SQUASH_BELOW - q, min=0.0)),
+    )
+
+
+def unsquash(squashed: Tensor) -> Tensor:
+    """Return the inverse of `squash`, bounded so that an early estimate cannot overflow."""
+    depth = torch.clamp(SQUASH_BELOW - squashed, min=0.0, max=4.0)
+    return torch.where(squashed >= SQUASH_BELOW, squashed, SQUASH_BELOW - torch.expm1(depth))
+
+
+class Replay:
+    """All transitions so far: features before and after, action, reward in parts, end."""
+
+    def __init__(self, size: int) -> None:
+        """Make room for `size` transitions."""
+        self.before = np.zeros((size, FEATURES), dtype=np.float32)
+        self.after = np.zeros((size, FEATURES), dtype=np.float32)
+        self.parts = np.zeros((size, 3), dtype=np.float32)
+        self.action = np.zeros(size, dtype=np.int64)
+        self.goes_on = np.zeros(size, dtype=np.float32)
+        self.filled = 0
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no room left."""
+        return self.filled == len(self.action)
+
+    def add(
+        self,
+        before: FloatArray,
+        action: np.ndarray,
+        parts: FloatArray,
+        after: FloatArray,
+        goes_on: np.ndarray,
+    ) -> None:
+        """Add a transition per game, as far as there is room."""
+        rows = slice(self.filled, min(self.filled + len(action), len(self.action)))
+        n = rows.stop - rows.start
+        self.before[rows], self.after[rows] = before[:n], after[:n]
+        self.parts[rows], self.action[rows] = parts[:n], action[:n]
+        self.goes_on[rows] = goes_on[:n]
+        self.filled = rows.stop
+
+
+def train(
+    game: MergeGame,
+    seed: int,
+    settings: TrainingSettings | None = None,
+    *,
+    sees_svo: bool = False,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
+) -> QNetwork:
+    """Train the agent of a game and return its network; same seed, same weights."""
+    s = settings or TrainingSettings()
+    # One thread: the result must not depend on the number of cores.
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    inputs = FEATURES + SVO_FEATURES * sees_svo
+    online, target = _network(inputs, s.width), _network(inputs, s.width)
+    target.load_state_dict(online.state_dict())
+    optimiser = torch.optim.Adam(online.parameters(), lr=s.learning_rate, fused=True)
+    replay = Replay(s.transitions)
+    collector = _Collector(game, rng, sees_svo=sees_svo)
+    loss = torch.zeros(())
+    update = 0
+    while update < s.updates:
+        if not replay.full:
+            explored = min(2.0 * replay.filled / s.transitions, 1.0)
+            epsilon = s.exploration + explored * (s.last_exploration - s.exploration)
+            collector.collect(online, epsilon, replay)
+        share = (replay.filled - s.warm_up) / (s.transitions - s.warm_up)
+        due = s.updates if replay.full else int(s.updates * s.collecting * share)
+        while update < due:
+            cosine = 0.5 * (1.0 + math.cos(math.pi * update / s.updates))
+            rate = s.last_learning_rate + (s.learning_rate - s.last_learning_rate) * cosine
+            for group in optimiser.param_groups:
+                group["lr"] = rate * min(1.0, (update + 1) / 500)
+            loss = _loss(online, target, replay, s.batch, rng, game.role, sees_svo=sees_svo)
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(online.parameters(), s.gradient_norm)
+            optimiser.step()
+            with torch.no_grad():
+                torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), s.polyak)
+            update += 1
+            if on_progress and update % 1000 == 0:
+                mean_return, crash_share = collector.recent()
+                on_progress(
+                    TrainingProgress(
+                        update,
+                        replay.filled,
+                        float(loss.detach()),
+                        mean_return,
+                        crash_share,
+                        _export(target),
+                    )
+                )
+    return _export(target)
+
+
+class _Collector:
+    """Plays all games of a `MergeGame` and writes what happened into the replay."""
+
+    def __init__(self, game: MergeGame, rng: np.random.Generator, *, sees_svo: bool) -> None:
+        self.game, self.rng, self.sees_svo = game, rng, sees_svo
+        self.decisions = np.zeros(game.corridors, dtype=np.int64)
+        self.svo_rad = np.zeros(game.corridors)
+        self.returns = np.zeros(game.corridors)
+        self.ended: list[tuple[float, bool]] = []
+        self._begin(np.arange(game.corridors))
+        self.state = game.state()
+
+    def _begin(self, which: np.ndarray) -> None:
+        starts = exploring_starts(len(which), self.rng)
+        self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, len(which)) * self.sees_svo
+        for corridor, start in zip(which.tolist(), starts, strict=True):
+            self.game.begin(corridor, start)
+        self.decisions[which] = 0
+        self.returns[which] = 0.0
+
+    def collect(self, online: nn.Sequential, epsilon: float, replay: Replay) -> None:
+        """Take one decision in every game, a random one with probability epsilon."""
+        games = self.game.corridors
+        before = features(*self.state.T)
+        seen = before
+        if self.sees_svo:
+            seen = np.column_stack([before, *_svo_columns(self.svo_rad)])
+        with torch.no_grad():
+            action = online(torch.from_numpy(seen.astype(np.float32))).argmax(-1).numpy()
+        random = self.rng.integers(0, len(ACTIONS_MPS2), games)
+        action = np.where(self.rng.random(games) < epsilon, random, action)
+        state, parts, over = self.game.decide(ACTIONS_MPS2[action])
+        in_parts = np.stack([parts.safe, parts.pov_ego, parts.vut_ego], axis=1)
+        replay.add(before, action, in_parts, features(*state.T), ~over)
+        self.returns += parts.of(self.game.role, self.svo_rad)
+        self.decisions += 1
+        again = np.flatnonzero(over | (self.decisions >= MAX_DECISIONS))
+        if again.size:
+            crash = self.game.weights.crash
+            self.ended += zip(
+                self.returns[again].tolist(), (parts.safe[again] < -crash / 2).tolist(), strict=True
+            )
+            self._begin(again)
+            state[again] = self.game.state()[again]
+        self.state = state
+
+    def recent(self) -> tuple[float, float]:
+        """Return mean return and share of crashes of the games that ended last."""
+        last = self.ended = self.ended[-2000:]
+        if not last:
+            return math.nan, math.nan
+        return (
+            float(np.mean([value for value, _ in last])),
+            float(np.mean([crashed for _, crashed in last])),
+        )
+
+
+def _loss(
+    online: nn.Sequential,
+    target: nn.Sequential,
+    replay: Replay,
+    batch: int,
+    rng: np.random.Generator,
+    role: str,
+    *,
+    sees_svo: bool,
+) -> Tensor:
+    rows = rng.integers(0, replay.filled, batch)
+    before, after = replay.before[rows], replay.after[rows]
+    safe, pov_ego, vut_ego = replay.parts[rows].T
+    if role == "vut":
+        reward = safe + vut_ego
+    elif sees_svo:
+        svo_rad = rng.uniform(SVO.low, SVO.high, batch).astype(np.float32)
+        columns = _svo_columns(svo_rad)
+        before, after = np.column_stack([before, *columns]), np.column_stack([after, *columns])
+        reward = safe + pov_ego * np.cos(svo_rad) + vut_ego * np.sin(svo_rad)
+    else:
+        reward = safe + pov_ego
+    with torch.no_grad():
+        # Double: the online network picks the action, the target network rates it.
+        picked = online(torch.from_numpy(after)).argmax(-1, keepdim=True)
+        rated = unsquash(target(torch.from_numpy(after)).gather(1, picked)[:, 0])
+        goal = squash(torch.from_numpy(reward) + torch.from_numpy(replay.goes_on[rows]) * rated)
+    action = torch.from_numpy(replay.action[rows])[:, None]
+    q = online(torch.from_numpy(before)).gather(1, action)[:, 0]
+    return nn.functional.smooth_l1_loss(q, goal)
+
+
+def _svo_columns(svo_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0
+
+
+def _network(inputs: int, width: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(inputs, width),
+        nn.ReLU(),
+        nn.Linear(width, width),
+        nn.ReLU(),
+        nn.Linear(width, len(ACTIONS_MPS2)),
+    )
+
+
+def _export(network: nn.Sequential) -> QNetwork:
+    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
+    return QNetwork(
+        [
+            (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
+            for layer in linear
+        ]
+    )

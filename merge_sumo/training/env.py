@@ -1,0 +1,292 @@
+"""The merging game as gymnasium environments in SUMO, one decision of 0.5 s per step.
+
+    env = gymnasium.make("merge_sumo/Merge-v0", role="pov", opponent="level0", svo=None)
+
+The agent plays the POV or the VUT; its opponent is a driver of this package. Observations are
+[x_POV, v_POV, x_VUT, v_VUT] in m and m/s, and psi for a POV with a social value orientation;
+actions 0 to 6 are accelerations of -4 to +2 m/s2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from merge_sumo.case import SVO, V_POV0, X_POV0, Case, FloatArray
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
+from merge_sumo.drivers.levelk import ACTIONS_MPS2, DECISION_STEPS
+from merge_sumo.drivers.policies import load_driver
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import MAX_STEPS, V_VUT0_MPS, X_VUT0_M
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.world import POV, VUT, World
+from merge_sumo.training.reward import (
+    RewardWeights,
+    pov_reward,
+    pov_step,
+    safety,
+    vut_end,
+    vut_step,
+)
+
+Role = Literal["pov", "vut"]
+ENV_ID: Final = "merge_sumo/Merge-v0"
+
+STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
+STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])
+
+
+@dataclass(frozen=True, slots=True)
+class RewardParts:
+    """The reward of one decision in its three parts, (K,) each; psi mixes them for the POV."""
+
+    safe: FloatArray
+    pov_ego: FloatArray
+    vut_ego: FloatArray
+
+    def of(self, role: Role, svo_rad: FloatArray) -> FloatArray:
+        """Return the agent's reward, (K,); `svo_rad` is psi of the POV."""
+        if role == "vut":
+            return self.safe + self.vut_ego
+        return pov_reward(self.safe, self.pov_ego, self.vut_ego, svo_rad)
+
+
+class MergeGame:
+    """K games in the corridors of one SUMO world, each advanced by decisions of 0.5 s."""
+
+    def __init__(
+        self, role: Role, opponent: Driver, weights: RewardWeights, net: Net | None = None
+    ) -> None:
+        """Open a world with as many corridors as the opponent drives in."""
+        if role not in ("pov", "vut"):
+            raise UserError(f"there is no role {role!r}: choose pov or vut")
+        self.role, self.opponent, self.weights = role, opponent, weights
+        self.corridors = opponent.corridors
+        self.world = World(self.corridors, net)
+        self.step_count = np.zeros(self.corridors, dtype=np.int64)
+
+    def begin(self, corridor: int, state: FloatArray, svo_rad: float | None = None) -> None:
+        """Start a game in a corridor from a state [x_POV, v_POV, x_VUT, v_VUT]."""
+        x_pov, v_pov, x_vut, v_vut = state.tolist()
+        self.world.place(corridor, x_pov, v_pov, x_vut, v_vut)
+        level = 1 if svo_rad is None else 2
+        case = Case(level=level, x_pov0_m=X_POV0.low, v_pov0_mps=V_POV0.low, svo_rad=svo_rad)
+        self.opponent.begin(corridor, case)
+        self.step_count[corridor] = 0
+
+    def state(self) -> FloatArray:
+        """Return the states of all games, (K, 4), as read from SUMO."""
+        x, v = self.world.x_m, self.world.v_mps
+        return np.stack([x[POV], v[POV], x[VUT], v[VUT]], axis=1)
+
+    def decide(self, a_mps2: FloatArray) -> tuple[FloatArray, RewardParts, NDArray[np.bool_]]:
+        """Hold the agent's accelerations, (K,), for one decision.
+
+        Returns the states at its end (or at t1, where that came first), the reward in parts, and
+        which games are over because the VUT is at M. Those stand until they begin anew.
+        """
+        world, weights = self.world, self.weights
+        parts = RewardParts(*np.zeros((3, self.corridors)))
+        over = np.zeros(self.corridors, dtype=bool)
+        state = self.state()
+        agent, other = (POV, VUT) if self.role == "pov" else (VUT, POV)
+        a = np.empty((2, self.corridors))
+        for _ in range(DECISION_STEPS):
+            live = ~over
+            x, v = world.x_m, world.v_mps
+            scene = Scene(live, self.step_count, x[POV], v[POV], x[VUT], v[VUT])
+            a[agent] = a_mps2
+            a[other] = self.opponent.act(scene)
+            a[:, over] = 0.0
+            parts.pov_ego[live] += pov_step(v[POV], a[POV], weights)[live]
+            parts.vut_ego[live] += vut_step(v[VUT], a[VUT], weights)[live]
+            world.step(a)
+            self.step_count += 1
+            arrived = live & (world.x_m[VUT] >= 0.0)
+            state = np.where(over[:, None], state, self.state())
+            if arrived.any():
+                dx, dv = world.x_m[POV] - world.x_m[VUT], world.v_mps[POV] - world.v_mps[VUT]
+                parts.safe[arrived] += safety(dx, dv, weights)[arrived]
+                parts.vut_ego[arrived] += vut_end(world.v_mps[VUT], weights)[arrived]
+                over |= arrived
+        return state, parts, over
+
+    def close(self) -> None:
+        """Close the world and the opponent."""
+        self.world.close()
+        self.opponent.close()
+
+
+def pool_starts(n: int, rng: np.random.Generator) -> FloatArray:
+    """Return `n` starting states, (n, 4), uniform over the pool."""
+    x_pov = rng.uniform(X_POV0.low, X_POV0.high, n)
+    v_pov = rng.uniform(V_POV0.low, V_POV0.high, n)
+    return np.stack([x_pov, v_pov, np.full(n, X_VUT0_M), np.full(n, V_VUT0_MPS)], axis=1)
+
+
+def exploring_starts(n: int, rng: np.random.Generator) -> FloatArray:
+    """Return `n` starting states, (n, 4): 40 % from the pool, 60 % from the middle of a game.
+
+    Most of the latter are states from which both would reach M together, because that is where
+    a small error of Q is a collision; some are anywhere, because a black-box VUT brings the
+    drivers there.
+    """
+    x_vut = rng.uniform(X_VUT0_M, -1.0, n)
+    on_profile = np.sqrt(V_VUT0_MPS**2 + 2.0 * (x_vut - X_VUT0_M)) + rng.normal(0.0, 3.0, n)
+    v_vut = np.where(rng.random(n) < 0.6, on_profile, rng.uniform(2.0, 35.0, n)).clip(1.0, 36.0)
+    v_pov = np.where(rng.random(n) < 0.7, rng.uniform(20.0, 37.0, n), rng.uniform(8.0, 42.0, n))
+    gap = np.where(rng.random(n) < 0.7, rng.normal(0.0, 25.0, n), rng.uniform(-120.0, 120.0, n))
+    x_pov = (gap - v_pov * level0_time_to(-x_vut, v_vut)).clip(-420.0, 150.0)
+    midway = np.stack([x_pov, v_pov, x_vut, v_vut], axis=1)
+    return np.where(rng.random((n, 1)) < 0.6, midway, pool_starts(n, rng))
+
+
+class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
+    """K merging games as one gymnasium vector environment; games begin anew by themselves."""
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 32,
+        role: Role = "pov",
+        opponent: str = "level0",
+        svo: float | Literal["random"] | None = None,
+        weights: RewardWeights | None = None,
+    ) -> None:
+        """Play `role` against `opponent`: "level0", or a policy such as "vut1" or "pov1".
+
+        `svo` is psi of a POV of level 2, or "random" for one drawn anew for every game; psi is
+        then part of the observation.
+        """
+        if role == "vut" and svo is not None:
+            raise UserError("svo is the orientation of a POV: leave it out for role='vut'")
+        self.num_envs, self.role, self.svo = num_envs, role, svo
+        self.game = MergeGame(
+            role, make_opponent(role, opponent, num_envs), weights or RewardWeights()
+        )
+        low, high = STATE_LOW, STATE_HIGH
+        if svo is not None:
+            low, high = np.append(low, SVO.low), np.append(high, SVO.high)
+        self._low, self._high = low, high
+        self.single_observation_space = spaces.Box(low, high, dtype=np.float64)
+        self.single_action_space = spaces.Discrete(len(ACTIONS_MPS2))
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._rng = np.random.default_rng()
+        self._svo_rad = np.zeros(num_envs)
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+
+    def reset(
+        self,
+        *,
+        seed: int | list[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Begin all games, from starts of the pool."""
+        if seed is not None:
+            self._rng = np.random.default_rng([s or 0 for s in np.atleast_1d(np.array(seed))])
+        self._begin(np.arange(self.num_envs))
+        return self._observe(self.game.state()), {}
+
+    def step(
+        self, actions: NDArray[np.int64]
+    ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Take one decision in every game; `info` has the last observation of those that ended."""
+        state, parts, terminated = self.game.decide(ACTIONS_MPS2[np.asarray(actions)])
+        self._steps += DECISION_STEPS
+        truncated = ~terminated & (self._steps >= MAX_STEPS)
+        reward = parts.of(self.role, self._svo_rad)
+        observation = self._observe(state)
+        info: dict[str, Any] = {}
+        ended = terminated | truncated
+        if ended.any():
+            info = {"final_obs": observation.copy(), "_final_obs": ended}
+            self._begin(np.flatnonzero(ended))
+            observation = np.where(ended[:, None], self._observe(self.game.state()), observation)
+        return observation, reward, terminated, truncated, info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close SUMO."""
+        self.game.close()
+
+    def _begin(self, which: NDArray[np.int64]) -> None:
+        starts = pool_starts(len(which), self._rng)
+        for corridor, start in zip(which.tolist(), starts, strict=True):
+            if self.svo is not None:
+                draw = self._rng.uniform(SVO.low, SVO.high) if self.svo == "random" else self.svo
+                self._svo_rad[corridor] = draw
+            self.game.begin(corridor, start)
+        self._steps[which] = 0
+
+    def _observe(self, state: FloatArray) -> FloatArray:
+        if self.svo is not None:
+            state = np.column_stack([state, self._svo_rad])
+        return np.clip(state, self._low, self._high)
+
+
+class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
+    """One merging game, `merge_sumo/Merge-v0`; SUMO starts with the first reset."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(
+        self,
+        role: Role = "pov",
+        opponent: str = "level0",
+        svo: float | Literal["random"] | None = None,
+        weights: RewardWeights | None = None,
+        render_mode: None = None,
+    ) -> None:
+        """See `MergeVectorEnv`."""
+        self.render_mode = render_mode
+        self._games = MergeVectorEnv(1, role, opponent, svo, weights)
+        self.observation_space = self._games.single_observation_space
+        self.action_space = self._games.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Begin a game from a start of the pool."""
+        super().reset(seed=seed)
+        observations, _ = self._games.reset(seed=int(self.np_random.integers(2**31)))
+        return observations[0], {}
+
+    def step(self, action: np.int64) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        """Take one decision."""
+        observations, reward, terminated, truncated, info = self._games.step(np.array([action]))
+        last = info["final_obs"] if info else observations
+        return last[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+    def close(self) -> None:
+        """Close SUMO."""
+        self._games.close()
+
+
+def make_opponent(role: Role, opponent: str, corridors: int) -> Driver:
+    """Return the driver that plays against `role`; `UserError` for a name nobody knows."""
+    if opponent == "level0":
+        return Level0Vut(corridors) if role == "pov" else Level0Pov(corridors)
+    wanted = "vut" if role == "pov" else "pov"
+    if not opponent.startswith(wanted):
+        raise UserError(f"a {role} cannot play against {opponent!r}: choose level0 or a {wanted}")
+    return load_driver(opponent, corridors)
+
+
+def register() -> None:
+    """Make `gymnasium.make("merge_sumo/Merge-v0")` work, once."""
+    if ENV_ID not in gymnasium.registry:
+        gymnasium.register(
+            ENV_ID,
+            entry_point="merge_sumo.training.env:MergeEnv",
+            vector_entry_point="merge_sumo.training.env:MergeVectorEnv",
+            max_episode_steps=MAX_STEPS // DECISION_STEPS,
+        )

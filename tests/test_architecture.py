@@ -1,0 +1,188 @@
+"""Who may import whom, and a few things that no file may do; read from the sources."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "merge_sumo"
+FILES = sorted(path for path in PACKAGE.rglob("*.py") if "shipped" not in path.parts)
+
+SUMO_MODULES = {"libsumo", "sumolib", "traci", "sumo"}
+LEARNING_MODULES = {"torch", "gymnasium"}
+UNSAFE_MODULES = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal", "yaml"}
+HEAVY_MODULES = {"numpy", "scipy", "sklearn", "libsumo", "torch"}
+
+
+def module_of(file: Path) -> str:
+    """Return the dotted name of a file of the package."""
+    parts = list(file.relative_to(PACKAGE.parent).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(source: str, module: str = "merge_sumo.here", *, is_package: bool = False) -> set[str]:
+    """Return the dotted names that a source imports, by statement or by name, at any depth."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                package = module.split(".")[: None if is_package else -1]
+                above = package[: len(package) - node.level + 1]
+                base = ".".join([*above, base] if base else above)
+            found |= {base} | {f"{base}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Call) and called(node) in ("import_module", "__import__"):
+            names = [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
+            found |= {str(name) for name in names}
+    return found
+
+
+def called(node: ast.Call) -> str:
+    """Return the last name of what is called."""
+    return getattr(node.func, "attr", getattr(node.func, "id", ""))
+
+
+def imports_any(found: set[str], modules: set[str]) -> set[str]:
+    """Return which of the imported names are one of the modules or inside of it."""
+    return {name for name in found for m in modules if name == m or name.startswith(f"{m}.")}
+
+
+def imports_of(file: Path) -> set[str]:
+    is_package = file.name == "__init__.py"
+    return imports(file.read_text(encoding="utf-8"), module_of(file), is_package=is_package)
+
+
+def unsafe_calls(source: str) -> list[str]:
+    """Return the calls that would run a shell, or code that hides in data."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        options = {option.arg: option.value for option in node.keywords}
+        shell = options.get("shell")
+        if shell is not None and not (isinstance(shell, ast.Constant) and shell.value is False):
+            found.append(f"line {node.lineno}: shell")
+        if called(node) in ("eval", "exec", "system", "popen"):
+            found.append(f"line {node.lineno}: {called(node)}")
+        if ast.unparse(node.func) in ("np.load", "numpy.load"):
+            allowed = options.get("allow_pickle")
+            if not (isinstance(allowed, ast.Constant) and allowed.value is False):
+                found.append(f"line {node.lineno}: np.load without allow_pickle=False")
+    return found
+
+
+def files_below(*folders: str) -> list[Path]:
+    return [file for file in FILES if file.relative_to(PACKAGE).parts[0] in folders]
+
+
+def offenders(files: list[Path], modules: set[str]) -> dict[str, set[str]]:
+    """Return the files that import one of the modules, with what they import."""
+    found = {module_of(file): imports_any(imports_of(file), modules) for file in files}
+    return {module: names for module, names in found.items() if names}
+
+
+class TestImports:
+    def test_of_sumo_are_only_in_the_sumo_folder(self):
+        others = [file for file in FILES if file not in files_below("sumo")]
+        assert offenders(others, SUMO_MODULES) == {}
+        assert offenders(files_below("sumo"), SUMO_MODULES), "the check itself sees imports"
+
+    def test_of_samplers_know_neither_sumo_nor_drivers_nor_the_rollout(self):
+        samplers = files_below("samplers")
+        assert len(samplers) > 3
+        forbidden = {f"merge_sumo.{name}" for name in ("sumo", "drivers", "rollout", "campaign")}
+        assert offenders(samplers, forbidden) == {}
+
+    def test_of_drivers_know_no_sampler(self):
+        drivers = files_below("drivers")
+        assert len(drivers) > 3
+        assert offenders(drivers, {"merge_sumo.samplers", "merge_sumo.campaign"}) == {}
+
+    def test_of_learning_libraries_are_only_in_the_training_folder(self):
+        others = [file for file in FILES if file not in files_below("training")]
+        assert offenders(others, LEARNING_MODULES) == {}
+
+    def test_of_plain_values_know_no_layer_above_them(self):
+        values = [PACKAGE / f"{n}.py" for n in ("case", "trajectory", "score", "fmc", "scenario")]
+        allowed = {"errors", "scenario", "case", "trajectory", "score", "fmc"}
+        for file in values:
+            ours = imports_any(imports_of(file), {"merge_sumo"})
+            assert {name.split(".")[1] for name in ours} <= allowed, file.name
+
+    def test_of_the_command_line_are_nobodys_but_its_own(self):
+        others = [file for file in FILES if module_of(file) != "merge_sumo.cli"]
+        assert offenders(others, {"merge_sumo.cli", "typer"}) == {}
+
+    def test_unpickle_nothing(self):
+        assert offenders(FILES, UNSAFE_MODULES) == {}
+
+    def test_of_the_command_line_load_nothing_heavy(self):
+        script = "import sys, merge_sumo.cli; print('\\n'.join(sys.modules))"
+        done = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, check=True
+        )
+        loaded = {name.split(".")[0] for name in done.stdout.split()}
+        assert "merge_sumo" in loaded
+        assert loaded & HEAVY_MODULES == set()
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_no_file_runs_a_shell_or_code_that_hides_in_data(file):
+    assert unsafe_calls(file.read_text(encoding="utf-8")) == []
+
+
+class TestTheChecksThemselves:
+    @pytest.mark.parametrize(
+        "source",
+        [
+            "import libsumo",
+            "import numpy, libsumo.vehicle as v",
+            "from libsumo import vehicle",
+            "def f():\n    from libsumo.vehicle import getSpeed",
+            "if TYPE_CHECKING:\n    import libsumo",
+            "importlib.import_module('libsumo')",
+            "__import__('libsumo')",
+        ],
+    )
+    def test_see_an_import_however_it_is_written(self, source):
+        assert imports_any(imports(source), {"libsumo"})
+
+    @pytest.mark.parametrize(
+        ("source", "module"),
+        [
+            ("from ..sumo.net import Net", "merge_sumo.samplers.gpr"),
+            ("from ..sumo import net", "merge_sumo.samplers.gpr"),
+            ("from .. import sumo", "merge_sumo.samplers.gpr"),
+            ("from . import sumo", "merge_sumo.campaign"),
+            ("from merge_sumo import sumo", "merge_sumo.campaign"),
+        ],
+    )
+    def test_see_an_import_relative_to_the_file(self, source, module):
+        assert imports_any(imports(source, module), {"merge_sumo.sumo"})
+
+    def test_do_not_mistake_a_name_for_its_beginning(self):
+        assert not imports_any(imports("import sumolibrary, merge_sumo.sumo"), {"sumolib", "sumo"})
+
+    @pytest.mark.parametrize(
+        "source",
+        [
+            "subprocess.run('ls', shell=True)",
+            "subprocess.run('ls', shell=yes)",
+            "os.system('ls')",
+            "eval('1')",
+            "np.load(path)",
+            "np.load(path, allow_pickle=True)",
+            "numpy.load(path, allow_pickle=flag)",
+        ],
+    )
+    def test_see_an_unsafe_call(self, source):
+        assert unsafe_calls(source)
+
+    def test_let_safe_calls_pass(self):
+        assert unsafe_calls("np.load(p, allow_pickle=False)\nrun(['ls'], shell=False)") == []
