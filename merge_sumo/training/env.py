@@ -66,8 +66,6 @@ class MergeGame:
         self, role: Role, opponent: Driver, weights: RewardWeights, net: Net | None = None
     ) -> None:
         """Open a world with as many corridors as the opponent drives in."""
-        if role not in ("pov", "vut"):
-            raise UserError(f"there is no role {role!r}: choose pov or vut")
         self.role, self.opponent, self.weights = role, opponent, weights
         self.corridors = opponent.corridors
         self.world = World(self.corridors, net)
@@ -170,9 +168,9 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         if role == "vut" and svo is not None:
             raise UserError("svo is the orientation of a POV: leave it out for role='vut'")
         self.num_envs, self.role, self.svo = num_envs, role, svo
-        self.game = MergeGame(
-            role, make_opponent(role, opponent, num_envs), weights or RewardWeights()
-        )
+        self._opponent = make_opponent(role, opponent, num_envs)
+        self._weights = weights or RewardWeights()
+        self._game: MergeGame | None = None
         low, high = STATE_LOW, STATE_HIGH
         if svo is not None:
             low, high = np.append(low, SVO.low), np.append(high, SVO.high)
@@ -184,6 +182,13 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         self._rng = np.random.default_rng()
         self._svo_rad = np.zeros(num_envs)
         self._steps = np.zeros(num_envs, dtype=np.int64)
+
+    @property
+    def game(self) -> MergeGame:
+        """The games; SUMO starts when they are first needed, for one process holds only one."""
+        if self._game is None:
+            self._game = MergeGame(self.role, self._opponent, self._weights)
+        return self._game
 
     def reset(
         self,
@@ -216,7 +221,9 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close SUMO."""
-        self.game.close()
+        if self._game is not None:
+            self._game.close()
+            self._game = None
 
     def _begin(self, which: NDArray[np.int64]) -> None:
         starts = pool_starts(len(which), self._rng)
@@ -273,6 +280,8 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
 
 def make_opponent(role: Role, opponent: str, corridors: int) -> Driver:
     """Return the driver that plays against `role`; `UserError` for a name nobody knows."""
+    if role not in ("pov", "vut"):
+        raise UserError(f"there is no role {role!r}: choose pov or vut")
     if opponent == "level0":
         return Level0Vut(corridors) if role == "pov" else Level0Pov(corridors)
     wanted = "vut" if role == "pov" else "pov"

@@ -16,7 +16,7 @@ from safetensors.numpy import save
 from merge_sumo.drivers.levelk import QNetwork
 from merge_sumo.drivers.policies import MANIFEST, NETWORKS, load_driver, read_manifest
 from merge_sumo.errors import UserError
-from merge_sumo.training.check import PolicyCheck, check_policy
+from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_policy
 from merge_sumo.training.ddqn import TrainingProgress, TrainingSettings, train
 from merge_sumo.training.env import MergeGame, Role, make_opponent
 from merge_sumo.training.reward import RewardWeights
@@ -41,6 +41,8 @@ def train_library(
     seed: int = 0,
     weights: RewardWeights | None = None,
     settings: TrainingSettings | None = None,
+    *,
+    check_count: int = CHECK_CASES,
     on_progress: OnProgress | None = None,
     on_done: Callable[[str, PolicyCheck | None], None] | None = None,
 ) -> None:
@@ -79,7 +81,7 @@ def train_library(
         }
         (folder / f"{name}.safetensors").write_bytes(content)
         _write_entry(folder, name, entry)
-        checked = check_policy(name, folder, weights)
+        checked = check_policy(name, folder, weights, check_count)
         _write_entry(folder, name, {**entry, "check": asdict(checked)})
         if on_done is not None:
             on_done(name, checked)

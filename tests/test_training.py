@@ -1,0 +1,274 @@
+"""Environments, DDQN, best responses and the helix, in real SUMO and small."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+from merge_sumo.case import Case
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
+from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, QNetwork
+from merge_sumo.drivers.policies import MANIFEST, load_network, read_manifest
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import DT_S
+from merge_sumo.training import best_response, ddqn, reward
+from merge_sumo.training.check import play, returns_of
+from merge_sumo.training.env import (
+    ENV_ID,
+    MergeGame,
+    MergeVectorEnv,
+    exploring_starts,
+    pool_starts,
+    register,
+)
+from merge_sumo.training.helix import train_library
+
+WEIGHTS = reward.RewardWeights()
+TINY = ddqn.TrainingSettings(transitions=6_000, warm_up=2_000, updates=1_000, width=16, batch=64)
+
+
+@pytest.fixture
+def env():
+    register()
+    made = gymnasium.make(ENV_ID, role="pov", opponent="level0")
+    yield made
+    made.close()
+
+
+class TestEnvironments:
+    def test_the_single_environment_passes_gymnasiums_checker(self, env):
+        check_env(env.unwrapped, skip_render_check=True)
+
+    def test_a_vut_environment_passes_it_too(self):
+        register()
+        made = gymnasium.make(ENV_ID, role="vut", opponent="level0")
+        try:
+            check_env(made.unwrapped, skip_render_check=True)
+        finally:
+            made.close()
+
+    def test_psi_is_part_of_what_a_pov_with_an_orientation_sees(self):
+        register()
+        made = gymnasium.make(ENV_ID, role="pov", opponent="level0", svo=0.6)
+        try:
+            observation, _ = made.reset(seed=3)
+            assert observation.shape == (5,)
+            assert observation[4] == 0.6
+        finally:
+            made.close()
+
+    def test_a_step_is_half_a_second_of_eq_4_against_the_level0_vut(self, env):
+        (x_pov, v_pov, x_vut, v_vut), _ = env.reset(seed=1)
+        (x, v, xv, vv), r, terminated, truncated, _ = env.step(5)  # +1 m/s2
+        assert x == pytest.approx(x_pov + 0.5 * v_pov + 0.1, abs=1e-9)
+        assert v == pytest.approx(v_pov + 0.5, abs=1e-9)
+        assert xv == pytest.approx(x_vut + 0.5 * v_vut + 0.1, abs=1e-9)
+        assert vv == pytest.approx(v_vut + 0.5, abs=1e-9)
+        assert r == pytest.approx(-0.5 * WEIGHTS.pov_acc)
+        assert not terminated
+        assert not truncated
+
+    def test_the_return_of_an_episode_is_the_reward_of_its_trajectory(self):
+        games = MergeVectorEnv(4, role="pov", opponent="level0")
+        try:
+            start, _ = games.reset(seed=2)
+            returns, open_games = np.zeros(4), np.ones(4, dtype=bool)
+            while open_games.any():
+                _, r, terminated, truncated, _ = games.step(np.full(4, 4))
+                returns[open_games] += r[open_games]
+                open_games &= ~(terminated | truncated)
+        finally:
+            games.close()
+        cases = [Case(level=1, x_pov0_m=x, v_pov0_mps=v) for x, v in start[:, :2].tolist()]
+        played = returns_of(play(cases, Level0Pov, Level0Vut), WEIGHTS)
+        assert returns == pytest.approx(played.safe + played.pov_ego, abs=1e-9)
+
+    def test_games_of_a_vector_environment_begin_anew_by_themselves(self):
+        games = MergeVectorEnv(3, role="vut", opponent="level0")
+        try:
+            games.reset(seed=0)
+            ends = 0
+            for _ in range(45):
+                observation, _, terminated, _, info = games.step(np.full(3, 5))
+                if terminated.any():
+                    ends += int(terminated.sum())
+                    assert (info["final_obs"][terminated, 2] >= 0.0).all()
+                    assert (observation[terminated, 2] == -182.0).all()
+            assert ends >= 6
+        finally:
+            games.close()
+
+    def test_same_seed_same_starts(self):
+        for starts in (pool_starts, exploring_starts):
+            one, two = (starts(50, np.random.default_rng(7)) for _ in range(2))
+            assert np.array_equal(one, two)
+
+    def test_exploring_starts_are_in_the_game_and_near_conflict(self):
+        starts = exploring_starts(4000, np.random.default_rng(0))
+        assert (starts[:, 2] < 0.0).all()
+        assert (starts[:, 1] > 0.0).all()
+        assert 0.55 < (starts[:, 2] > -181.9).mean() < 0.65
+
+    @pytest.mark.parametrize(
+        ("settings", "sentence"),
+        [
+            ({"role": "bus"}, "no role 'bus'"),
+            ({"role": "vut", "svo": 0.5}, "svo is the orientation of a POV"),
+            ({"role": "pov", "opponent": "pov1"}, "cannot play against 'pov1'"),
+        ],
+    )
+    def test_settings_that_make_no_game_are_refused_in_a_sentence(self, settings, sentence):
+        with pytest.raises(UserError, match=sentence):
+            MergeVectorEnv(1, **settings)
+
+    def test_another_library_trains_on_it(self, env):
+        from stable_baselines3 import DQN
+
+        agent = DQN("MlpPolicy", env, learning_starts=50, seed=0, device="cpu")
+        before = [p.clone() for p in agent.policy.parameters()]
+        agent.learn(300)
+        changed = [not torch.equal(*p) for p in zip(before, agent.policy.parameters(), strict=True)]
+        assert any(changed)
+
+
+class TestDdqn:
+    def train(self, seed=0):
+        game = MergeGame("pov", Level0Vut(16), WEIGHTS)
+        try:
+            return ddqn.train(game, seed, TINY)
+        finally:
+            game.close()
+
+    def test_same_seed_same_weights_and_another_seed_other_weights(self):
+        one, two, other = self.train(), self.train(), self.train(seed=1)
+        for (w1, b1), (w2, b2) in zip(one.layers, two.layers, strict=True):
+            assert np.array_equal(w1, w2)
+            assert np.array_equal(b1, b2)
+        assert not np.array_equal(one.layers[0][0], other.layers[0][0])
+
+    def test_squash_keeps_order_and_is_undone(self):
+        q = torch.linspace(-30.0, 3.0, 200, dtype=torch.float64)
+        squashed = ddqn.squash(q)
+        assert (squashed.diff() > 0).all()
+        assert torch.equal(squashed[q >= -2], q[q >= -2])
+        assert torch.allclose(ddqn.unsquash(squashed), q)
+
+    def test_the_numpy_network_equals_the_torch_network(self):
+        torch.manual_seed(0)
+        network = ddqn._network(FEATURES, 32)
+        inputs = np.random.default_rng(0).normal(size=(20, FEATURES))
+        with torch.no_grad():
+            expected = network.double()(torch.from_numpy(inputs)).numpy()
+        assert ddqn._export(network).values(inputs) == pytest.approx(expected, abs=1e-12)
+
+
+class TestBestResponse:
+    def replayed(self, role, case, actions):
+        """Return the return of an action sequence of 0.5 s holds by eq. (4)."""
+        xp, vp, xv, vv = case.x_pov0_m, case.v_pov0_mps, -182.0, 18.0
+        total = 0.0
+        for step in range(300):
+            hold = actions[min(step // 5, len(actions) - 1)]
+            level0 = float(level0_acceleration(np.array([vv]))[0])
+            ap, av = (hold, level0) if role == "pov" else (0.0, hold)
+            ego = reward.pov_step(np.array([vp]), np.array([ap]), WEIGHTS)
+            if role == "vut":
+                ego = reward.vut_step(np.array([vv]), np.array([av]), WEIGHTS)
+            total += float(ego[0])
+            xp, vp = xp + vp * DT_S, max(vp + ap * DT_S, 0.0)
+            xv, vv = xv + vv * DT_S, max(vv + av * DT_S, 0.0)
+            if xv >= 0.0:
+                total += float(reward.safety(np.array([xp - xv]), np.array([vp - vv]), WEIGHTS)[0])
+                if role == "vut":
+                    total += float(reward.vut_end(np.array([vv]), WEIGHTS)[0])
+                return total
+        return -np.inf
+
+    @pytest.mark.parametrize(
+        ("role", "best_of"),
+        [("pov", best_response.best_response_pov1), ("vut", best_response.best_response_vut1)],
+    )
+    def test_no_sequence_that_changes_twice_beats_it_and_it_beats_level0(self, role, best_of):
+        rng = np.random.default_rng(4)
+        x, v = rng.uniform(-340, -180, 2), rng.uniform(25, 35, 2)
+        best = best_of(x, v, WEIGHTS)
+        for x0, v0, bound in zip(x.tolist(), v.tolist(), best.tolist(), strict=True):
+            case = Case(level=1, x_pov0_m=x0, v_pov0_mps=v0)
+            tried = [
+                self.replayed(role, case, [a] * n + [b] * m + [1.0 if role == "vut" else 0.0])
+                for a, b in itertools.product(ACTIONS_MPS2.tolist(), repeat=2)
+                for n, m in itertools.product((0, 1, 4, 8), (0, 3))
+            ]
+            assert max(tried) <= bound + 1e-5
+            assert max(tried) > bound - 0.3, "the bound is near what simple sequences reach"
+
+    def test_a_beam_search_against_a_driver_that_ignores_it_finds_the_exact_answer(self):
+        # A network whose action +1 is always the best is the level-0 VUT until 28 m/s.
+        zeros = np.zeros((len(ACTIONS_MPS2), FEATURES))
+        always_1 = QNetwork([(zeros, (ACTIONS_MPS2 == 1.0).astype(float))])
+        rng = np.random.default_rng(5)
+        x, v = rng.uniform(-340, -180, 6), rng.uniform(25, 35, 6)
+        exact = best_response.best_response_pov1(x, v, WEIGHTS)
+        found = best_response.beam_search(
+            "pov", x, v, np.zeros(6), always_1, always_1, WEIGHTS, width=400
+        )
+        assert (found <= exact + 1e-5).all()
+        assert np.median(exact - found) < 0.02
+
+
+class TestHelix:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def library(cls, tmp_path_factory):
+        folder = tmp_path_factory.mktemp("policies")
+        train_library(folder, ("pov1",), settings=TINY, check_count=12)
+        return folder
+
+    def test_a_network_has_a_manifest_entry_and_a_log(self, library):
+        entry = read_manifest(library)["pov1"]
+        assert entry["command"] == "merge-sumo train --only pov1 --seed 0"
+        assert entry["check"]["cases"] == 12
+        lines = (library / "pov1.training.jsonl").read_text().splitlines()
+        assert json.loads(lines[-1])["updates"] == TINY.updates
+        assert load_network("pov1", library).layers[-1][0].shape[0] == 7
+
+    def test_a_finished_network_is_not_trained_again(self, library):
+        before = (library / "pov1.safetensors").stat().st_mtime_ns
+        told = []
+        train_library(library, ("pov1",), settings=TINY, on_done=lambda *said: told.append(said))
+        assert told == [("pov1", None)]
+        assert (library / "pov1.safetensors").stat().st_mtime_ns == before
+
+    def test_level_2_needs_level_1_first(self, library):
+        with pytest.raises(UserError, match="pov2 is trained against vut1: train that one first"):
+            train_library(library, ("pov2",), settings=TINY)
+
+    @pytest.mark.parametrize("cut", [0, 7, 100, -1])
+    def test_a_truncated_or_altered_file_is_refused_with_a_sentence(self, library, tmp_path, cut):
+        content = (library / "pov1.safetensors").read_bytes()
+        (tmp_path / MANIFEST).write_text((library / MANIFEST).read_text())
+        altered = content[:-1] + bytes([content[-1] ^ 1]) if cut == -1 else content[:cut]
+        (tmp_path / "pov1.safetensors").write_bytes(altered)
+        with pytest.raises(UserError, match="is not the file that its manifest describes"):
+            load_network("pov1", tmp_path)
+
+    def test_a_file_that_is_no_network_is_refused_even_with_its_own_hash(self, library, tmp_path):
+        import hashlib
+
+        content = b"\x08\x00\x00\x00\x00\x00\x00\x00not json"
+        manifest = json.loads((library / MANIFEST).read_text())
+        manifest["networks"]["pov1"]["sha256"] = hashlib.sha256(content).hexdigest()
+        (tmp_path / MANIFEST).write_text(json.dumps(manifest))
+        (tmp_path / "pov1.safetensors").write_bytes(content)
+        with pytest.raises(UserError, match="holds no action-value network"):
+            load_network("pov1", tmp_path)
+
+    def test_a_missing_network_says_how_to_make_it(self, tmp_path):
+        with pytest.raises(UserError, match="run `merge-sumo train`"):
+            load_network("vut1", tmp_path)
