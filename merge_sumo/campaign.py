@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from types import TracebackType
+from typing import Any, Final, Self
 
-from merge_sumo.case import Pool
+from merge_sumo.case import Case, Pool
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.pov import PovLibrary, available_levels
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
 from merge_sumo.journal import Journal, Run, failures
 from merge_sumo.rollout import rollout
+from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import DEFAULT_SAMPLER, make_sampler
 from merge_sumo.scenario import LEVELS, V_VUT0_MAX_MPS, V_VUT0_MPS
 from merge_sumo.score import Outcome, measure
@@ -87,10 +88,71 @@ def parse_levels(text: str) -> tuple[int, ...]:
     return (level,)
 
 
+def one_level(text: str) -> int:
+    """Return the one level that `--level` names."""
+    if text == "all":
+        raise UserError("--level all does not go here: choose 0, 1 or 2")
+    return parse_levels(text)[0]
+
+
 def versions() -> dict[str, str]:
     """Return the versions that decide the outcome of a case."""
     packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn")
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+class Testbed:
+    """A VUT and the POV library in a SUMO world: takes cases, gives trajectories."""
+
+    def __init__(self, vut: str, corridors: int = MAX_CORRIDORS, net: Net | None = None) -> None:
+        """Start SUMO and the VUT."""
+        self.world = World(corridors, net)
+        try:
+            self.vut = vut_factory(vut)(corridors)
+            self.pov = PovLibrary(corridors)
+        except BaseException:
+            self.world.close()
+            raise
+
+    def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
+        """Run cases; yield (place in `cases`, trajectory) as they end."""
+        return rollout(self.world, self.pov, self.vut, cases)
+
+    def __enter__(self) -> Self:
+        """Return the testbed."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Stop the VUT, then SUMO."""
+        try:
+            self.vut.close()
+        finally:
+            self.world.close()
+
+
+def conduct(
+    sampler: Sampler,
+    testbed: Testbed,
+    cases: int,
+    batch: int,
+    on_case: OnCase | None = None,
+) -> Iterator[list[tuple[Outcome, Trajectory]]]:
+    """Ask, run, tell, batch by batch; yield what each batch gave, in order of the cases."""
+    for number, first in enumerate(range(0, cases, batch)):
+        ran: list[tuple[Outcome, Trajectory]] = []
+        for place, trajectory in testbed.run(sampler.ask(min(batch, cases - first))):
+            outcome = Outcome(first + place, number, trajectory.case, measure(trajectory))
+            ran.append((outcome, trajectory))
+            if on_case is not None:
+                on_case(outcome)
+        ran.sort(key=lambda pair: pair[0].index)
+        sampler.tell(outcome for outcome, _ in ran)
+        yield ran
 
 
 def run_campaign(
@@ -103,21 +165,10 @@ def run_campaign(
     """
     net = net or Net()
     sampler = make_sampler(settings.sampler, settings.pool, settings.seed)
-    corridors = min(MAX_CORRIDORS, settings.batch)
-    with World(corridors, net) as world, closing(vut_factory(settings.vut)(corridors)) as vut:
-        pov = PovLibrary(corridors)
+    with Testbed(settings.vut, min(MAX_CORRIDORS, settings.batch), net) as testbed:
         journal = Journal(folder, record_of(settings, net))
-        for batch, first in enumerate(range(0, settings.cases, settings.batch)):
-            cases = sampler.ask(min(settings.batch, settings.cases - first))
-            ran: list[tuple[Outcome, Trajectory]] = []
-            for place, trajectory in rollout(world, pov, vut, cases):
-                outcome = Outcome(first + place, batch, trajectory.case, measure(trajectory))
-                ran.append((outcome, trajectory))
-                if on_case is not None:
-                    on_case(outcome)
-            ran.sort(key=lambda pair: pair[0].index)
+        for ran in conduct(sampler, testbed, settings.cases, settings.batch, on_case):
             journal.append(ran)
-            sampler.tell(outcome for outcome, _ in ran)
     run = Run(folder)
     for outcome in failures(run.outcomes)[:EXPORTED_FAILURES]:
         export_case(run, outcome.index, folder / SCENARIOS / case_name(outcome.index), net)

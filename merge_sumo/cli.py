@@ -14,6 +14,7 @@ import typer
 from merge_sumo.errors import UserError
 
 if TYPE_CHECKING:
+    from merge_sumo.experiments import Truth
     from merge_sumo.journal import Run
     from merge_sumo.summary import Summary
 
@@ -175,6 +176,130 @@ def report(run: RunArgument) -> None:
     from merge_sumo.report import write_report
 
     typer.echo(write_report(Run(run)))
+
+
+@app.command()
+def truth(
+    vut: Annotated[str, typer.Option(help="Vehicle under test.")],
+    level: Annotated[str, typer.Option(help="POV level: 0, 1 or 2.")],
+    cases: Annotated[
+        int | None, typer.Option(help="Uniform cases.  [default: 10000, at level 2 20000]")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
+    workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the ground truth of a VUT at a level, by uniform cases on all cores.
+
+    It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of everything
+    that it depends on.
+
+    Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
+    """
+    from merge_sumo import experiments
+    from merge_sumo.campaign import one_level
+    from merge_sumo.fmc import fmc, regions
+
+    chosen = one_level(level)
+    found = _truth(vut, chosen, cases, seed, workers)
+    labels = regions(found.failures).tolist()
+    sizes = [labels.count(label) for label in range(max(labels, default=-1) + 1)]
+    result = {
+        "vut": vut,
+        "level": chosen,
+        "cases": len(found.score),
+        "failures": len(found.failures),
+        "fmc": fmc(found.failures),
+        "region_sizes": sizes,
+        "real_regions": len(found.real_regions()),
+    }
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    typer.echo(
+        f"{vut} at level {chosen}: {result['failures']} failures in {result['cases']} cases, "
+        f"FMC {result['fmc']:.4f}, {result['real_regions']} regions with at least "
+        f"{experiments.REAL_REGION:.0%} of the failures"
+    )
+
+
+@app.command()
+def compare(
+    vut: Annotated[str, typer.Option(help="Vehicle under test.")],
+    level: Annotated[str, typer.Option(help="POV level: 0, 1 or 2.")],
+    samplers: Annotated[str, typer.Option(help="Names, separated by commas.")] = "uniform,gpr",
+    seeds: Annotated[int, typer.Option(help="Runs of each sampler.")] = 10,
+    cases: Annotated[int, typer.Option(help="Cases of each run.")] = 400,
+    batch: Annotated[int, typer.Option(help="Cases per batch.")] = 20,
+    truth_cases: Annotated[
+        int | None, typer.Option(help="Cases of the truth.  [default: 10000, at level 2 20000]")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare samplers with each other and with the ground truth, over several seeds.
+
+    Example:  merge-sumo compare --vut design1 --level 0 --samplers uniform,gpr --seeds 3
+    """
+    from merge_sumo import experiments
+    from merge_sumo.campaign import CampaignSettings, one_level
+    from merge_sumo.fmc import fmc
+    from merge_sumo.progress import Counter
+
+    chosen = one_level(level)
+    names = [name.strip() for name in samplers.split(",")]
+    for name in names:
+        CampaignSettings(vut=vut, levels=(chosen,), sampler=name, cases=cases, batch=batch)
+    if seeds < 1:
+        raise UserError(f"--seeds is {seeds}: it must be 1 or more")
+    found = _truth(vut, chosen, truth_cases, 0, workers)
+    with Counter(f"{vut} v level {chosen}", len(names) * seeds, "runs") as counter:
+        compared = experiments.compare(
+            vut,
+            chosen,
+            names,
+            seeds=seeds,
+            cases=cases,
+            batch=batch,
+            truth=found,
+            workers=workers,
+            on_search=lambda name, _: counter.ended(1, name),
+        )
+    truth_fmc = fmc(found.failures)
+    if as_json:
+        by_name = {name: asdict(result) for name, result in compared.items()}
+        typer.echo(json.dumps({"truth_fmc": truth_fmc, **by_name}))
+        return
+    real = len(found.real_regions())
+    typer.echo(f"truth: FMC {truth_fmc:.4f}, {len(found.failures)} failures, {real} regions")
+    typer.echo(
+        f"{'sampler':<10} {'FMC / truth':>22} {'FMC':>7} {'failures':>9} {'regions':>8} "
+        f"{'to 50 %':>8} {'to 90 %':>8} {'sampler s':>10}"
+    )
+    for name, result in compared.items():
+        low, high = result.fmc_over_truth_quartiles
+        share = f"{result.fmc_over_truth_median:.3f} [{low:.3f}, {high:.3f}]"
+        half, most = result.cases_to_50_percent_median, result.cases_to_90_percent_median
+        typer.echo(
+            f"{name:<10} {share:>22} {result.fmc_median:7.4f} {result.failures_median:9.0f} "
+            f"{result.regions_found_median:8.1f} {half or '-':>8} {most or '-':>8} "
+            f"{result.sampler_s_median:10.2f}"
+        )
+
+
+def _truth(vut: str, level: int, cases: int | None, seed: int, workers: int | None) -> Truth:
+    from merge_sumo import experiments
+    from merge_sumo.drivers.vut import vut_factory
+    from merge_sumo.progress import Counter
+
+    vut_factory(vut)
+    total = experiments.TRUTH_CASES[level] if cases is None else cases
+    if total < 1:
+        raise UserError(f"--cases is {total}: it must be 1 or more")
+    with Counter(f"truth of {vut} at level {level}", total, "cases") as counter:
+        return experiments.ground_truth(
+            vut, level, total, seed, workers=workers, on_cases=counter.ended
+        )
 
 
 @app.command()

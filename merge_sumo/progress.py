@@ -64,6 +64,46 @@ class CaseProgress:
             self._progress.stop()
 
 
+class Counter:
+    """A bar with a rate that appears with the first thing counted."""
+
+    def __init__(self, title: str, total: int, unit: str) -> None:
+        """Count up to `total` things called `unit`."""
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self._unit = unit
+        self._task = self._progress.add_task(title, total=total, note="")
+
+    def ended(self, count: int, note: str = "") -> None:
+        """Count things that have ended."""
+        if not self._progress.live.is_started:
+            self._progress.start()
+        task = self._progress.tasks[0]
+        rate = (task.completed + count) / task.elapsed if task.elapsed else 0.0
+        shown = f"{rate:.0f} {self._unit}/s" if rate >= 10 else f"{rate:.1f} {self._unit}/s"
+        self._progress.update(self._task, advance=count, note=f"{shown}  {note}")
+
+    def __enter__(self) -> Self:
+        """Return the bar."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Leave the bar as it is."""
+        if self._progress.live.is_started:
+            self._progress.stop()
+
+
 class TrainingBar:
     """A bar per network with return and share of crashes, and its regret when it is finished."""
 

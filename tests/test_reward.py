@@ -11,7 +11,7 @@ from merge_sumo.training import reward
 
 W = reward.RewardWeights(
     pov_acc=0.1, pov_v_hw=0.2, vut_acc=0.04, vut_v_min=0.3, vut_v_end=0.5,
-    ttc=1.4, gap=0.6, gap_from_m=15.0, gap_full_m=60.0, critical=0.9, crash=20.0,
+    ttc=1.4, gap=0.6, gap_full_m=60.0, critical=0.9, crash=20.0,
 )  # fmt: skip
 
 
@@ -48,9 +48,9 @@ def test_ttc_below_7_s_costs_when_the_gap_closes(sign):
 def test_a_wide_gap_is_rewarded_and_a_critical_one_is_penalised(sign):
     assert of(reward.phi_dx, sign * 60.0, W) == pytest.approx(0.6)
     assert of(reward.phi_dx, sign * 90.0, W) == pytest.approx(0.6)
-    assert of(reward.phi_dx, sign * 37.5, W) == pytest.approx(0.3)
-    assert of(reward.phi_dx, sign * 15.0, W) == pytest.approx(0.0)
-    assert of(reward.phi_dx, sign * 5.0, W) == pytest.approx(-0.6)
+    assert of(reward.phi_dx, sign * 30.0, W) == pytest.approx(0.3)
+    assert of(reward.phi_dx, sign * 15.0, W) == pytest.approx(0.15)
+    assert of(reward.phi_dx, sign * 5.0, W) == pytest.approx(0.05 - 0.6)
 
 
 def test_a_crash_is_a_gap_below_6_m():
@@ -58,10 +58,10 @@ def test_a_crash_is_a_gap_below_6_m():
 
 
 def test_the_parts_of_the_reward_by_hand():
-    # 21 m ahead, closing at 6 m/s: -1.4 / 2 + 0.6 * 6 / 45
-    assert of(reward.safety, 21.0, -6.0, W) == pytest.approx(-0.7 + 0.08)
-    # 3 m behind, opening: -0.9 * 0.8 - 20
-    assert of(reward.safety, -3.0, -6.0, W) == pytest.approx(-20.72)
+    # 21 m ahead, closing at 6 m/s: -1.4 / 2 + 0.6 * 21 / 60
+    assert of(reward.safety, 21.0, -6.0, W) == pytest.approx(-0.7 + 0.21)
+    # 3 m behind, opening: 0.6 * 3 / 60 - 0.9 * 0.8 - 20
+    assert of(reward.safety, -3.0, -6.0, W) == pytest.approx(0.03 - 20.72)
     assert of(reward.pov_step, 22.6, 2.0, W) == pytest.approx(0.1 * (-0.1 * 4 - 0.2 * 2))
     assert of(reward.vut_step, 10.0, -1.0, W) == pytest.approx(0.1 * (-0.04 - 0.3 * 2))
     assert of(reward.vut_end, 22.6, W) == pytest.approx(-1.0)

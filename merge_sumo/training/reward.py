@@ -38,8 +38,7 @@ class RewardWeights:
         vut_v_min: per s and m/s below 12.
         vut_v_end: once, per m/s outside [24.6, 35] at t1.
         ttc: once, for TTC = 0; falls linearly to 0 at 7 s.
-        gap: once, the reward of |dx| >= `gap_full_m`.
-        gap_from_m: |dx| from which the reward of a gap grows, linearly.
+        gap: once, the reward of |dx| >= `gap_full_m`; grows linearly from 0 at dx = 0.
         gap_full_m: |dx| from which the reward of a gap is full.
         critical: once, for dx = 0; falls linearly to 0 at 15 m.
         crash: once, for |dx| < 6 m.
@@ -47,14 +46,13 @@ class RewardWeights:
 
     pov_acc: float = 0.1
     pov_v_hw: float = 0.1
-    vut_acc: float = 0.08
+    vut_acc: float = 0.15
     vut_v_min: float = 0.1
-    vut_v_end: float = 0.6
-    ttc: float = 0.0
-    gap: float = 0.6
-    gap_from_m: float = 15.0
+    vut_v_end: float = 1.5
+    ttc: float = 0.2
+    gap: float = 1.0
     gap_full_m: float = 60.0
-    critical: float = 0.3
+    critical: float = 0.5
     crash: float = 20.0
 
 
@@ -88,11 +86,9 @@ def phi_ttc(dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
 def phi_dx(dx_m: FloatArray, weights: RewardWeights) -> FloatArray:
     """Return the reward of a wide gap less the penalty of one below 15 m, both weighted."""
     gap = np.abs(dx_m)
-    wide = (gap - weights.gap_from_m) / (weights.gap_full_m - weights.gap_from_m)
+    wide = np.minimum(gap / weights.gap_full_m, 1.0)
     near = np.maximum(1.0 - gap / DX_CRITICAL_M, 0.0)
-    reward: FloatArray = (
-        weights.gap * np.minimum(np.maximum(wide, 0.0), 1.0) - weights.critical * near
-    )
+    reward: FloatArray = weights.gap * wide - weights.critical * near
     return reward
 
 

@@ -1,0 +1,200 @@
+"""The shipped drivers: deterministic, rational, and with the paper's picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from merge_sumo.case import from_unit, to_unit
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
+from merge_sumo.drivers.levelk import FEATURES, QNetwork, features
+from merge_sumo.drivers.policies import NETWORKS, load_network, read_manifest
+from merge_sumo.drivers.pov import PovLibrary
+from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.fmc import fmc, regions
+from merge_sumo.rollout import rollout
+from merge_sumo.score import measure
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.world import World
+from merge_sumo.training import check as checking
+from merge_sumo.training.reward import RewardWeights
+from merge_sumo.trajectory import End
+
+TOOLS = Path(__file__).resolve().parent.parent / "tools"
+
+
+def uniform_cases(level, count, seed=0):
+    points = np.random.default_rng(seed).random((count, 3 if level == 2 else 2))
+    return from_unit(points, level)
+
+
+def played(vut, cases, corridors=32):
+    """Return the measures of cases, in order, and the trajectories."""
+    with World(corridors) as world:
+        driver = vut_factory(vut)(corridors)
+        got = dict(rollout(world, PovLibrary(corridors), driver, cases))
+    trajectories = [got[index] for index in range(len(cases))]
+    return [measure(t) for t in trajectories], trajectories
+
+
+def picture(vut, level, count):
+    """Return FMC and sizes of the failure regions over uniform cases."""
+    cases = uniform_cases(level, count, seed=1)
+    measures, _ = played(vut, cases)
+    failing = (c for c, m in zip(cases, measures, strict=True) if m.end is End.COLLISION)
+    points = to_unit(failing, level)
+    return fmc(points), np.bincount(regions(points)) if len(points) else np.array([])
+
+
+def test_the_library_is_complete_and_its_manifest_says_how_it_was_made():
+    manifest = read_manifest()
+    assert tuple(manifest) == NETWORKS
+    for name, entry in manifest.items():
+        assert load_network(name).sees_svo == (name == "pov2")
+        assert entry["command"].startswith(f"merge-sumo train --only {name} ")
+        assert RewardWeights(**entry["reward_weights"]) == RewardWeights()
+        assert entry["check"]["mean_regret"] <= 0.02
+        assert entry["check"]["p99_regret"] <= 0.15
+        assert entry["check"]["avoidable_collisions"] == 0
+    for name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
+        assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
+
+
+def test_1000_learned_episodes_are_the_same_in_1_and_in_32_corridors():
+    cases = [case for level in (1, 2) for case in uniform_cases(level, 500, seed=3)]
+    one, many = (played("level1", cases, corridors)[1] for corridors in (1, 32))
+    for alone, beside in zip(one, many, strict=True):
+        assert np.array_equal(alone.motion, beside.motion)
+
+
+def test_a_row_of_q_does_not_depend_on_the_rows_beside_it():
+    rng = np.random.default_rng(0)
+    layers = [
+        (rng.normal(size=(64, FEATURES)), rng.normal(size=64)),
+        (rng.normal(size=(7, 64)), np.zeros(7)),
+    ]
+    network = QNetwork(layers)
+    inputs = rng.normal(size=(33, FEATURES))
+    together = network.values(inputs)
+    for row in range(33):
+        assert np.array_equal(network.values(inputs[row : row + 1])[0], together[row])
+
+
+def test_features_are_finite_and_bounded_wherever_a_vut_may_take_a_driver():
+    rng = np.random.default_rng(0)
+    n = 20_000
+    found = features(
+        rng.uniform(-900, 1800, n), rng.uniform(0, 95, n), rng.uniform(-182, 20, n),
+        rng.uniform(0, 80, n), rng.uniform(0, math.pi / 2, n),
+    )  # fmt: skip
+    assert found.shape == (n, 28)
+    assert np.isfinite(found).all()
+    standing = features(*(np.array([x]) for x in (-200.0, 0.0, -100.0, 0.0)))
+    assert np.isfinite(standing).all()
+
+
+class TestTheExampleRuns:
+    """Wang et al., Fig. 5, as they ship in scenarios/."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def examples(cls):
+        spec = importlib.util.spec_from_file_location("make_scenarios", TOOLS / "make_scenarios.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        with World(1, Net()) as world:
+            return {name: module.play(e, world) for name, e in module.EXAMPLES.items()}
+
+    def test_1_the_level1_pov_slows_and_the_level0_vut_merges_first(self, examples):
+        run = examples["pov-yields"]
+        assert run.v_pov_mps.min() < 33.0 - 0.9
+        assert measure(run).end is End.MERGED
+        assert measure(run).merged_first == "VUT"
+
+    def test_2_the_level1_vut_waits_the_pov_accelerates_and_merges_first(self, examples):
+        run = examples["vut-waits"]
+        assert run.a_vut_mps2[0] <= 0.0
+        assert run.a_vut_mps2.max() >= 1.0
+        assert run.v_pov_mps.max() > 33.0
+        assert measure(run).end is End.MERGED
+        assert measure(run).merged_first == "POV"
+
+    def test_3_both_yield_and_collide(self, examples):
+        run = examples["stalemate"]
+        assert measure(run).end is End.COLLISION
+        assert run.a_pov_mps2.min() <= -1.0
+        assert run.a_vut_mps2[:20].min() >= 0.9
+        assert run.a_vut_mps2.min() <= -1.0
+
+
+@pytest.mark.long
+class TestRationality:
+    @pytest.mark.parametrize("name", ["pov1", "vut1", "pov2"])
+    def test_no_collision_in_10000_uniform_cases(self, name):
+        cases = checking.check_cases(name, 10_000, seed=5)
+        network, opponent = load_network(name), checking.opponents(name, None)
+        pair = (network, opponent) if name.startswith("pov") else (opponent, network)
+        returns = checking.returns_of(checking.play(cases, *pair), RewardWeights())
+        assert returns.collided.sum() == 0
+
+    @pytest.mark.parametrize("name", NETWORKS)
+    def test_regret_over_300_cases_that_training_never_saw(self, name):
+        found = checking.check_policy(name)
+        assert found.mean_regret <= 0.02
+        assert found.p99_regret <= 0.15
+        assert found.avoidable_collisions == 0
+
+    def test_a_level0_driver_in_their_place_would_collide(self):
+        cases = checking.check_cases("pov1", 2000, seed=5)
+        returns = checking.returns_of(checking.play(cases, Level0Pov, Level0Vut), RewardWeights())
+        assert returns.collided.sum() > 20
+
+    def test_a_prosocial_pov_gives_up_its_own_return_for_the_vuts(self):
+        cases = checking.check_cases("pov2", 4000, seed=6)
+        pov2, vut1, weights = load_network("pov2"), load_network("vut1"), RewardWeights()
+        vut_ego, pov_ego = [], []
+        for svo_rad in (0.0, 0.375, 0.75, 1.125, 1.5):
+            turned = [dataclasses.replace(case, svo_rad=svo_rad) for case in cases]
+            returns = checking.returns_of(checking.play(turned, pov2, vut1), weights)
+            vut_ego.append(returns.vut_ego)
+            pov_ego.append(returns.pov_ego)
+        for rising in (vut_ego, [-x for x in pov_ego]):
+            steps = [after - before for before, after in pairwise(rising)]
+            for step in steps:
+                assert step.mean() > -standard_error(step)
+            whole = rising[-1] - rising[0]
+            ends = math.hypot(standard_error(rising[-1]), standard_error(rising[0]))
+            assert whole.mean() > 5.0 * ends
+
+
+def standard_error(values):
+    return values.std(ddof=1) / math.sqrt(len(values))
+
+
+@pytest.mark.long
+class TestThePapersPicture:
+    """SPEC section 8: where the designs fail, and in how many regions."""
+
+    def test_design1_fails_against_level_0_in_one_band(self):
+        found, sizes = picture("design1", 0, 10_000)
+        assert 0.10 <= found <= 0.16
+        assert len(sizes) == 1
+
+    def test_design2_never_fails_against_level_0(self):
+        assert picture("design2", 0, 10_000)[0] == 0.0
+
+    def test_design2_fails_against_level_1_in_at_least_three_regions(self):
+        found, sizes = picture("design2", 1, 10_000)
+        assert 0.05 <= found <= 0.12
+        assert (sizes >= 0.03 * sizes.sum()).sum() >= 3
+
+    def test_design2_has_two_far_apart_modes_at_level_2(self):
+        found, sizes = picture("design2", 2, 20_000)
+        assert 0.003 <= found <= 0.02
+        assert len(sizes) >= 2

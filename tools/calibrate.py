@@ -1,0 +1,172 @@
+"""Search parameters of design1 and design2 against the policies: `python tools/calibrate.py`.
+
+The paper does not give its parameters. This draws designs at random and keeps those that show the
+paper's picture: design1 fails against the level-0 POV in one band; design2 never fails there, has
+several failure regions at level 1, and few failures in modes far apart at level 2. Each design is
+played in thousands of cases at once by eq. (4), which SUMO follows to 1e-9; winners are confirmed
+in SUMO by `merge-sumo truth`. One JSON object per design that passes, on standard output.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from merge_sumo.case import Case, FloatArray, Pool, from_unit, to_unit
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.level0 import Level0Pov
+from merge_sumo.drivers.policies import load_driver
+from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
+from merge_sumo.fmc import fmc, regions
+from merge_sumo.scenario import (
+    A_MAX_MPS2,
+    A_MIN_MPS2,
+    DT_S,
+    DX_CRASH_M,
+    MAX_STEPS,
+    V_VUT0_MPS,
+    X_VUT0_M,
+)
+
+STALEMATE = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6)
+"""The third example run of the paper."""
+
+
+def gaps_at_m(cases: list[Case], pov: Driver, vut: Driver) -> tuple[FloatArray, FloatArray]:
+    """Play cases side by side by eq. (4); return dx at M and the VUT's lowest acceleration, (n,).
+
+    dx is infinite where the VUT does not arrive.
+    """
+    n = len(cases)
+    for k, case in enumerate(cases):
+        pov.begin(k, case)
+        vut.begin(k, case)
+    x_pov = np.array([case.x_pov0_m for case in cases])
+    v_pov = np.array([case.v_pov0_mps for case in cases])
+    x_vut, v_vut = np.full(n, X_VUT0_M), np.full(n, V_VUT0_MPS)
+    active, dx, lowest = np.ones(n, dtype=bool), np.full(n, np.inf), np.zeros(n)
+    for step in range(MAX_STEPS):
+        scene = Scene(active, np.full(n, step), x_pov, v_pov, x_vut, v_vut)
+        a_pov = pov.act(scene) * active
+        a_vut = np.clip(vut.act(scene), A_MIN_MPS2, A_MAX_MPS2) * active
+        lowest = np.minimum(lowest, a_vut)
+        x_pov, x_vut = x_pov + v_pov * DT_S * active, x_vut + v_vut * DT_S * active
+        v_pov = np.maximum(v_pov + a_pov * DT_S, 0.0)
+        v_vut = np.maximum(v_vut + a_vut * DT_S, 0.0)
+        arrived = active & (x_vut >= 0.0)
+        dx[arrived] = (x_pov - x_vut)[arrived]
+        active = active & ~arrived
+        # What has arrived stands at M, where no driver is asked for a distance before it.
+        x_vut = np.minimum(x_vut, 0.0)
+        if not active.any():
+            break
+    return dx, lowest
+
+
+class Bench:
+    """The cases and POVs that designs are tried on."""
+
+    def __init__(self, cases: int, policies: Path | None, levels: tuple[int, ...]) -> None:
+        """Draw cases for each level, and load the POVs."""
+        rng = np.random.default_rng(0)
+        self.cases = {
+            level: from_unit(rng.random((cases, 3 if level == 2 else 2)), level) for level in levels
+        }
+        self.povs: dict[int, Driver] = {0: Level0Pov(cases)}
+        for level in levels:
+            if level:
+                self.povs[level] = load_driver(f"pov{level}", cases, policies)
+        self.one_pov = load_driver("pov2", 1, policies) if 2 in levels else None
+        self.count = cases
+
+    def at_level(self, design: RuleBasedDesign, level: int) -> dict[str, object]:
+        """Return failures, FMC, sizes of regions and the smallest gap at a level."""
+        dx, _ = gaps_at_m(self.cases[level], self.povs[level], RuleBasedVut(self.count, design))
+        failed = np.abs(dx) < DX_CRASH_M
+        failing = (case for case, fails in zip(self.cases[level], failed, strict=True) if fails)
+        points = to_unit(failing, level)
+        return {
+            "failures": int(failed.sum()),
+            "fmc": round(fmc(points), 4),
+            "regions": np.bincount(regions(points)).tolist() if len(points) else [],
+            "smallest_gap_m": round(float(np.abs(dx).min()), 2),
+        }
+
+    def stalemate(self, design: RuleBasedDesign) -> dict[str, float]:
+        """Return dx and the hardest braking of the VUT in the third example run."""
+        assert self.one_pov is not None, "only asked where there is a level-2 POV"  # noqa: S101
+        dx, lowest = gaps_at_m([STALEMATE], self.one_pov, RuleBasedVut(1, design))
+        return {"dx_m": round(float(dx[0]), 2), "braking_mps2": round(-float(lowest[0]), 2)}
+
+
+def draw(rng: np.random.Generator, around: RuleBasedDesign | None) -> RuleBasedDesign:
+    """Draw a design at random, or near another one."""
+    if around is not None:
+        values = {
+            name: value * float(np.exp(rng.normal(0.0, 0.08)))
+            for name, value in asdict(around).items()
+        }
+        values["x2_m"] = min(values["x2_m"], values["x1_m"])
+        return RuleBasedDesign(**values)
+    x1 = rng.uniform(90.0, 180.0)
+    gap = rng.uniform(12.0, 32.0)
+    kp = 10.0 ** rng.uniform(-1.6, 0.5)
+    return RuleBasedDesign(
+        x1_m=x1,
+        x2_m=rng.uniform(25.0, 0.75 * x1),
+        gap_m=gap,
+        target_m=gap * rng.uniform(0.3, 1.3),
+        kp=kp,
+        kd=kp * 10.0 ** rng.uniform(-1.0, 0.5) * rng.integers(0, 2),
+        lag_s=float(rng.choice([0.0, 0.0, 0.3, 0.6])),
+    )
+
+
+def try_design2(bench: Bench, design: RuleBasedDesign) -> dict[str, object] | None:
+    """Return the figures of a design that has the picture of design2 so far, else None."""
+    level0 = bench.at_level(design, 0)
+    if float(str(level0["smallest_gap_m"])) < DX_CRASH_M + 0.5:
+        return None
+    level1 = bench.at_level(design, 1)
+    sizes = level1["regions"]
+    assert isinstance(sizes, list)  # noqa: S101
+    real = [size for size in sizes if size >= 0.04 * sum(sizes)]
+    if not (0.05 <= float(str(level1["fmc"])) <= 0.12 and len(real) >= 3):
+        return None
+    found = {"level0": level0, "level1": level1, "real_regions": len(real)}
+    if 2 in bench.cases:
+        found |= {"level2": bench.at_level(design, 2), "stalemate": bench.stalemate(design)}
+    return {"design": asdict(design), **found}
+
+
+def main() -> None:
+    """Search."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--designs", type=int, default=200, help="designs to draw")
+    parser.add_argument("--cases", type=int, default=3000, help="cases per level")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--policies", type=Path, help="folder of policies")
+    parser.add_argument("--around", help="JSON of a design to draw near")
+    parser.add_argument("--levels", default="0,1,2")
+    options = parser.parse_args()
+    levels = Pool(levels=tuple(map(int, options.levels.split(",")))).levels
+    bench = Bench(options.cases, options.policies, levels)
+    around = RuleBasedDesign(**json.loads(options.around)) if options.around else None
+    rng = np.random.default_rng(options.seed)
+    passed = 0
+    for number in range(options.designs):
+        found = try_design2(bench, draw(rng, around))
+        if found is not None:
+            passed += 1
+            print(json.dumps(found), flush=True)
+        sys.stderr.write(f"\r{number + 1} designs, {passed} passed")
+    sys.stderr.write("\n")
+
+
+if __name__ == "__main__":
+    main()
