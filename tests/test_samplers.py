@@ -19,13 +19,16 @@ HALF_WIDTH = 0.03
 """Of the band of failures in the unit square; about 7 % of the square."""
 
 
-def measures(end: End, score: float | None, error: str | None = None) -> Measures:
-    """Return measures that say no more than a verdict."""
+def measures(
+    end: End, score: float | None, error: str | None = None, dx_m: float | None = None
+) -> Measures:
+    """Return measures that say no more than a verdict and perhaps a gap."""
     return Measures(
         **{
             **dict.fromkeys(Measures.__dataclass_fields__),
             "end": end,
             "score": score,
+            "dx_m": dx_m,
             "t_end_s": 8.3,
             "vut_max_brake_mps2": 0.0,
             "pov_max_brake_mps2": 0.0,
@@ -38,12 +41,13 @@ def measures(end: End, score: float | None, error: str | None = None) -> Measure
 def play_case(index: int, batch: int, case: Case) -> Outcome:
     """Return an outcome with a score like the real one: graded, with a jump at the failures."""
     x, v = to_unit([case], case.level)[0, :2].tolist()
-    distance = abs(0.6 * x + 0.8 * v - 0.7)
+    offset = 0.6 * x + 0.8 * v - 0.7
+    distance = abs(offset)
     if distance < HALF_WIDTH:
         end, score = End.COLLISION, -550.0 - 450.0 * (1.0 - distance / HALF_WIDTH)
     else:
         end, score = End.MERGED, -450.0 * math.exp((HALF_WIDTH - distance) / 0.15)
-    return Outcome(index, batch, case, measures(end, score))
+    return Outcome(index, batch, case, measures(end, score, dx_m=6.0 * offset / HALF_WIDTH))
 
 
 def without_verdict(index: int, batch: int, case: Case, end: End) -> Outcome:

@@ -20,14 +20,13 @@ from merge_sumo.scenario import DT_S
 from merge_sumo.training import best_response, ddqn, reward
 from merge_sumo.training.check import play, returns_of
 from merge_sumo.training.env import (
-    ENV_ID,
     MergeGame,
     MergeVectorEnv,
     exploring_starts,
     pool_starts,
-    register,
 )
 from merge_sumo.training.helix import train_library
+from merge_sumo.training.registration import ENV_ID
 
 WEIGHTS = reward.RewardWeights()
 TINY = ddqn.TrainingSettings(transitions=6_000, warm_up=2_000, updates=1_000, width=16, batch=64)
@@ -35,7 +34,6 @@ TINY = ddqn.TrainingSettings(transitions=6_000, warm_up=2_000, updates=1_000, wi
 
 @pytest.fixture
 def env():
-    register()
     made = gymnasium.make(ENV_ID, role="pov", opponent="level0")
     yield made
     made.close()
@@ -46,7 +44,6 @@ class TestEnvironments:
         check_env(env.unwrapped, skip_render_check=True)
 
     def test_a_vut_environment_passes_it_too(self):
-        register()
         made = gymnasium.make(ENV_ID, role="vut", opponent="level0")
         try:
             check_env(made.unwrapped, skip_render_check=True)
@@ -54,7 +51,6 @@ class TestEnvironments:
             made.close()
 
     def test_psi_is_part_of_what_a_pov_with_an_orientation_sees(self):
-        register()
         made = gymnasium.make(ENV_ID, role="pov", opponent="level0", svo=0.6)
         try:
             observation, _ = made.reset(seed=3)

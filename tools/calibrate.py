@@ -1,10 +1,14 @@
-"""Search parameters of design1 and design2 against the policies: `python tools/calibrate.py`.
+"""Search what the paper does not give: the designs of the rule-based VUT, and reward weights.
 
-The paper does not give its parameters. This draws designs at random and keeps those that show the
-paper's picture: design1 fails against the level-0 POV in one band; design2 never fails there, has
-several failure regions at level 1, and few failures in modes far apart at level 2. Each design is
-played in thousands of cases at once by eq. (4), which SUMO follows to 1e-9; winners are confirmed
-in SUMO by `merge-sumo truth`. One JSON object per design that passes, on standard output.
+    python tools/calibrate.py designs                  designs at random, against the policies
+    python tools/calibrate.py designs --around JSON    designs near one
+    python tools/calibrate.py weights FILE             reward weights, one JSON object a line
+
+A design2 passes when it shows the paper's picture: no failure against the level-0 POV, several
+failure regions at level 1; its figures at level 2 and in the third example run are printed too.
+For each set of weights, POV-1, VUT-1 and POV-2 are trained briefly in SUMO, and the first two
+example runs are played. Designs are played in thousands of cases at once by eq. (4), which SUMO
+follows to 1e-9. One JSON object per result, on standard output.
 """
 
 from __future__ import annotations
@@ -12,14 +16,15 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray, Pool, from_unit, to_unit
+from merge_sumo.case import Case, FloatArray, from_unit, to_unit
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.drivers.level0 import Level0Pov
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
 from merge_sumo.fmc import fmc, regions
@@ -33,8 +38,10 @@ from merge_sumo.scenario import (
     X_VUT0_M,
 )
 
+YIELDING = Case(level=1, x_pov0_m=-273.0, v_pov0_mps=33.0)
+"""The first example run of the paper."""
 STALEMATE = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6)
-"""The third example run of the paper."""
+"""The second and the third."""
 
 
 def gaps_at_m(cases: list[Case], pov: Driver, vut: Driver) -> tuple[FloatArray, FloatArray]:
@@ -144,18 +151,9 @@ def try_design2(bench: Bench, design: RuleBasedDesign) -> dict[str, object] | No
     return {"design": asdict(design), **found}
 
 
-def main() -> None:
-    """Search."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--designs", type=int, default=200, help="designs to draw")
-    parser.add_argument("--cases", type=int, default=3000, help="cases per level")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--policies", type=Path, help="folder of policies")
-    parser.add_argument("--around", help="JSON of a design to draw near")
-    parser.add_argument("--levels", default="0,1,2")
-    options = parser.parse_args()
-    levels = Pool(levels=tuple(map(int, options.levels.split(",")))).levels
-    bench = Bench(options.cases, options.policies, levels)
+def search_designs(options: argparse.Namespace) -> None:
+    """Draw designs and print those that pass."""
+    bench = Bench(options.cases, options.policies, tuple(map(int, options.levels.split(","))))
     around = RuleBasedDesign(**json.loads(options.around)) if options.around else None
     rng = np.random.default_rng(options.seed)
     passed = 0
@@ -166,6 +164,51 @@ def main() -> None:
             print(json.dumps(found), flush=True)
         sys.stderr.write(f"\r{number + 1} designs, {passed} passed")
     sys.stderr.write("\n")
+
+
+def search_weights(options: argparse.Namespace) -> None:
+    """Train a brief library for each set of weights and print how the example runs end."""
+    from merge_sumo.training.ddqn import TrainingSettings
+    from merge_sumo.training.helix import train_library
+    from merge_sumo.training.reward import RewardWeights
+
+    for line in options.file.read_text(encoding="utf-8").splitlines():
+        weights = RewardWeights(**json.loads(line))
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            settings = TrainingSettings(updates=options.updates)
+            names = ("pov1", "vut1", "pov2")
+            train_library(folder, names, options.seed, weights, settings, check_count=20)
+            run1 = gaps_at_m([YIELDING], load_driver("pov1", 1, folder), Level0Vut(1))
+            learned = load_driver("pov2", 1, folder), load_driver("vut1", 1, folder)
+            run2 = gaps_at_m([STALEMATE], *learned)
+            result = {
+                "weights": asdict(weights),
+                "run1_dx_m": round(float(run1[0][0]), 2),
+                "run2_dx_m": round(float(run2[0][0]), 2),
+            }
+        print(json.dumps(result), flush=True)
+
+
+def main() -> None:
+    """Search."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    commands = parser.add_subparsers(required=True)
+    designs = commands.add_parser("designs", help="search designs against the policies")
+    designs.add_argument("--designs", type=int, default=200, help="designs to draw")
+    designs.add_argument("--cases", type=int, default=10_000, help="cases per level")
+    designs.add_argument("--seed", type=int, default=0)
+    designs.add_argument("--policies", type=Path, help="folder of policies")
+    designs.add_argument("--around", help="JSON of a design to draw near")
+    designs.add_argument("--levels", default="0,1,2")
+    designs.set_defaults(search=search_designs)
+    weights = commands.add_parser("weights", help="screen sets of reward weights")
+    weights.add_argument("file", type=Path, help="one JSON object of weights a line")
+    weights.add_argument("--updates", type=int, default=15_000, help="of each brief training")
+    weights.add_argument("--seed", type=int, default=0)
+    weights.set_defaults(search=search_weights)
+    options = parser.parse_args()
+    options.search(options)
 
 
 if __name__ == "__main__":

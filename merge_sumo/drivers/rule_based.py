@@ -50,9 +50,10 @@ class RuleBasedDesign:
 
 
 DESIGNS: Final = {
-    "design1": RuleBasedDesign(x1_m=80.0, x2_m=30.0, gap_m=15.0, target_m=15.0, kp=0.3, kd=0.1),
-    "design2": RuleBasedDesign(x1_m=160.0, x2_m=51.0, gap_m=22.0, target_m=22.0, kp=0.05, kd=0.1),
+    "design1": RuleBasedDesign(x1_m=96.1, x2_m=30.8, gap_m=13.7, target_m=13.8, kp=0.683, kd=0.252),
+    "design2": RuleBasedDesign(x1_m=133.7, x2_m=40.7, gap_m=17.0, target_m=13.5, kp=2.89, kd=3.77),
 }
+"""Found by `tools/calibrate.py`: `design1` reacts late, `design2` sooner and harder."""
 
 
 class RuleBasedVut(Driver):

@@ -22,12 +22,14 @@ class LevelHistory:
         points: cases in the unit cube, (N, d).
         score: P, (N,).
         failed: P < lambda, (N,).
+        dx_m: signed gap at M, (N,); NaN where the VUT never arrived or gives no trajectory.
         batch: batch of the campaign in which the case ran, (N,).
     """
 
     points: FloatArray
     score: FloatArray
     failed: NDArray[np.bool_]
+    dx_m: FloatArray
     batch: NDArray[np.int64]
 
 
@@ -69,12 +71,18 @@ class Sampler(ABC):
             points=to_unit((o.case for o in outcomes), level),
             score=np.array([o.measures.score for o in outcomes], dtype=np.float64),
             failed=np.array([o.failed for o in outcomes], dtype=bool),
+            # None becomes NaN.
+            dx_m=np.array([o.measures.dx_m for o in outcomes], dtype=np.float64),
             batch=np.array([o.batch for o in outcomes], dtype=np.int64),
         )
 
     def rng(self, *key: int) -> np.random.Generator:
         """Return the generator of this proposal: seed, cases told so far, and a key."""
         return np.random.default_rng([self.seed, len(self.told()), *key])
+
+    def batch_rng(self, level: int, batch: int) -> np.random.Generator:
+        """Return a generator that is the same whenever a batch of the past is replayed."""
+        return np.random.default_rng([self.seed, level, batch, 0])
 
 
 class LevelwiseSampler(Sampler):
@@ -103,3 +111,9 @@ class LevelwiseSampler(Sampler):
 def uniform_points(n: int, level: int, rng: np.random.Generator) -> FloatArray:
     """Return `n` points, (n, d), drawn uniformly from the level's unit cube."""
     return rng.random((n, len(dimensions(level))))
+
+
+def reflect(points: FloatArray) -> FloatArray:
+    """Return points, (n, d), folded back into the unit cube at its faces."""
+    folded = np.mod(points, 2.0)
+    return np.asarray(np.minimum(folded, 2.0 - folded), dtype=np.float64)

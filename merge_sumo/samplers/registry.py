@@ -6,11 +6,20 @@ from typing import Final
 
 from merge_sumo.case import Pool
 from merge_sumo.errors import UserError
+from merge_sumo.samplers.annealing import AnnealingSampler
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.gpr import GprSampler
+from merge_sumo.samplers.subset import SubsetSampler
 from merge_sumo.samplers.uniform import UniformSampler
 
-SAMPLERS: Final[dict[str, type[Sampler]]] = {"uniform": UniformSampler, "gpr": GprSampler}
+SAMPLERS: Final[dict[str, type[Sampler]]] = {
+    "uniform": UniformSampler,
+    "annealing": AnnealingSampler,
+    "subset": SubsetSampler,
+    "gpr": GprSampler,
+    "coverage": CoverageSampler,
+}
 DEFAULT_SAMPLER: Final = "gpr"
 
 

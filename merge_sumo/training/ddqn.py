@@ -48,6 +48,10 @@ class TrainingSettings:
             when half of the transitions are in.
         last_exploration: share of random actions from then on.
         gradient_norm: bound to which the gradient is clipped.
+        midway: share of games that begin mid-way at the start; falls linearly to `last_midway`
+            when half of the transitions are in. Coverage first, then precision where a pool case
+            leads.
+        last_midway: share of games that begin mid-way from then on.
     """
 
     transitions: int = 600_000
@@ -62,6 +66,8 @@ class TrainingSettings:
     exploration: float = 1.0
     last_exploration: float = 0.1
     gradient_norm: float = 10.0
+    midway: float = 0.6
+    last_midway: float = 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,13 +150,14 @@ def train(
     target.load_state_dict(online.state_dict())
     optimiser = torch.optim.Adam(online.parameters(), lr=s.learning_rate, fused=True)
     replay = Replay(s.transitions)
-    collector = _Collector(game, rng, sees_svo=sees_svo)
+    collector = _Collector(game, rng, s.midway, sees_svo=sees_svo)
     loss = torch.zeros(())
     update = 0
     while update < s.updates:
         if not replay.full:
             explored = min(2.0 * replay.filled / s.transitions, 1.0)
             epsilon = s.exploration + explored * (s.last_exploration - s.exploration)
+            collector.midway = s.midway + explored * (s.last_midway - s.midway)
             collector.collect(online, epsilon, replay)
         share = (replay.filled - s.warm_up) / (s.transitions - s.warm_up)
         due = s.updates if replay.full else int(s.updates * s.collecting * share)
@@ -185,8 +192,10 @@ def train(
 class _Collector:
     """Plays all games of a `MergeGame` and writes what happened into the replay."""
 
-    def __init__(self, game: MergeGame, rng: np.random.Generator, *, sees_svo: bool) -> None:
-        self.game, self.rng, self.sees_svo = game, rng, sees_svo
+    def __init__(
+        self, game: MergeGame, rng: np.random.Generator, midway: float, *, sees_svo: bool
+    ) -> None:
+        self.game, self.rng, self.midway, self.sees_svo = game, rng, midway, sees_svo
         self.decisions = np.zeros(game.corridors, dtype=np.int64)
         self.svo_rad = np.zeros(game.corridors)
         self.returns = np.zeros(game.corridors)
@@ -195,7 +204,7 @@ class _Collector:
         self.state = game.state()
 
     def _begin(self, which: np.ndarray) -> None:
-        starts = exploring_starts(len(which), self.rng)
+        starts = exploring_starts(len(which), self.rng, self.midway)
         self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, len(which)) * self.sees_svo
         for corridor, start in zip(which.tolist(), starts, strict=True):
             self.game.begin(corridor, start)

@@ -1,5 +1,6 @@
 """The merging game as gymnasium environments in SUMO, one decision of 0.5 s per step.
 
+    import merge_sumo.training.registration
     env = gymnasium.make("merge_sumo/Merge-v0", role="pov", opponent="level0", svo=None)
 
 The agent plays the POV or the VUT; its opponent is a driver of this package. Observations are
@@ -38,8 +39,6 @@ from merge_sumo.training.reward import (
 )
 
 Role = Literal["pov", "vut"]
-ENV_ID: Final = "merge_sumo/Merge-v0"
-
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])
 
@@ -130,10 +129,10 @@ def pool_starts(n: int, rng: np.random.Generator) -> FloatArray:
     return np.stack([x_pov, v_pov, np.full(n, X_VUT0_M), np.full(n, V_VUT0_MPS)], axis=1)
 
 
-def exploring_starts(n: int, rng: np.random.Generator) -> FloatArray:
-    """Return `n` starting states, (n, 4): 40 % from the pool, 60 % from the middle of a game.
+def exploring_starts(n: int, rng: np.random.Generator, midway: float = 0.6) -> FloatArray:
+    """Return `n` starting states, (n, 4): a share from mid-way in a game, the rest of the pool.
 
-    Most of the latter are states from which both would reach M together, because that is where
+    Most of the former are states from which both would reach M together, because that is where
     a small error of Q is a collision; some are anywhere, because a black-box VUT brings the
     drivers there.
     """
@@ -143,8 +142,8 @@ def exploring_starts(n: int, rng: np.random.Generator) -> FloatArray:
     v_pov = np.where(rng.random(n) < 0.7, rng.uniform(20.0, 37.0, n), rng.uniform(8.0, 42.0, n))
     gap = np.where(rng.random(n) < 0.7, rng.normal(0.0, 25.0, n), rng.uniform(-120.0, 120.0, n))
     x_pov = (gap - v_pov * level0_time_to(-x_vut, v_vut)).clip(-420.0, 150.0)
-    midway = np.stack([x_pov, v_pov, x_vut, v_vut], axis=1)
-    return np.where(rng.random((n, 1)) < 0.6, midway, pool_starts(n, rng))
+    states = np.stack([x_pov, v_pov, x_vut, v_vut], axis=1)
+    return np.where(rng.random((n, 1)) < midway, states, pool_starts(n, rng))
 
 
 class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
@@ -288,14 +287,3 @@ def make_opponent(role: Role, opponent: str, corridors: int) -> Driver:
     if not opponent.startswith(wanted):
         raise UserError(f"a {role} cannot play against {opponent!r}: choose level0 or a {wanted}")
     return load_driver(opponent, corridors)
-
-
-def register() -> None:
-    """Make `gymnasium.make("merge_sumo/Merge-v0")` work, once."""
-    if ENV_ID not in gymnasium.registry:
-        gymnasium.register(
-            ENV_ID,
-            entry_point="merge_sumo.training.env:MergeEnv",
-            vector_entry_point="merge_sumo.training.env:MergeVectorEnv",
-            max_episode_steps=MAX_STEPS // DECISION_STEPS,
-        )

@@ -28,6 +28,25 @@ OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "vut2": ("vut", "pov1"),
 }
 """Role and opponent of each network, in the order of the helix."""
+SETTINGS: Final = {
+    "pov1": TrainingSettings(),
+    "vut1": TrainingSettings(),
+    # What level 2 gains over level 0 is small, because level 1 makes room for it: so precision.
+    "pov2": TrainingSettings(
+        updates=140_000,
+        transitions=1_000_000,
+        collecting=0.7,
+        last_exploration=0.05,
+        last_midway=0.15,
+    ),
+    "vut2": TrainingSettings(
+        updates=140_000,
+        transitions=1_000_000,
+        collecting=0.7,
+        last_exploration=0.05,
+        last_midway=0.15,
+    ),
+}
 GAMES: Final = 64
 """Corridors in which transitions are collected."""
 
@@ -53,19 +72,20 @@ def train_library(
     network lies a log, `<name>.training.jsonl`. Raises `UserError` when an opponent is missing or
     the folder cannot be written.
     """
-    weights, settings = weights or RewardWeights(), settings or TrainingSettings()
+    weights = weights or RewardWeights()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror}") from error
     for name in (name for name in NETWORKS if name in names):
-        plan = _plan(folder, name, seed, weights, settings)
+        chosen = settings or SETTINGS[name]
+        plan = _plan(folder, name, seed, weights, chosen)
         known = read_manifest(folder).get(name, {})
         if {key: known.get(key) for key in plan} == plan:
             if on_done is not None:
                 on_done(name, None)
             continue
-        network, seconds = _train_one(folder, name, seed, weights, settings, on_progress)
+        network, seconds = _train_one(folder, name, seed, weights, chosen, on_progress)
         content = save(
             {
                 f"{i}.{part}": tensor.astype("float32")

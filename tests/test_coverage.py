@@ -1,0 +1,134 @@
+"""`coverage`: what it takes a case to be worth, and that it finds what others do not."""
+
+from __future__ import annotations
+
+import math
+import statistics
+
+import numpy as np
+import pytest
+
+from merge_sumo.case import Case, Pool, to_unit
+from merge_sumo.fmc import RADIUS, fmc
+from merge_sumo.samplers.base import LevelHistory, Sampler
+from merge_sumo.samplers.coverage import CoverageSampler, Ground, learn_margin
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.score import Measures, Outcome
+from merge_sumo.trajectory import End
+
+NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
+
+
+def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = True) -> Outcome:
+    """Return what came of a case: a band of gaps below 6 m, unless this level never fails."""
+    x, v = to_unit([case], case.level)[0, :2].tolist()
+    dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7) if fails else 80.0
+    overlap_m = 6.0 - abs(dx_m)
+    end = End.COLLISION if overlap_m > 0.0 else End.MERGED
+    score = -560.0 - 75.0 * overlap_m if overlap_m > 0.0 else -450.0 * math.exp(overlap_m / 15.0)
+    values = {**NOTHING, "end": end, "score": score, "dx_m": None if blind else dx_m}
+    return Outcome(index, batch, case, Measures(**values))
+
+
+def play(
+    sampler: Sampler, batches: int, n: int = 20, *, blind: bool = False, level_that_fails: int = -1
+) -> list[Outcome]:
+    outcomes: list[Outcome] = []
+    for batch in range(batches):
+        ran = [
+            outcome(
+                len(outcomes) + i,
+                batch,
+                case,
+                blind=blind,
+                fails=level_that_fails in (-1, case.level),
+            )
+            for i, case in enumerate(sampler.ask(n))
+        ]
+        sampler.tell(ran)
+        outcomes += ran
+    return outcomes
+
+
+def coverage_of(outcomes: list[Outcome], level: int) -> float:
+    return fmc(to_unit([o.case for o in outcomes if o.failed], level))
+
+
+class TestTheGround:
+    @pytest.mark.parametrize("dims", [2, 3])
+    def test_counts_what_fmc_measures(self, dims):
+        points = np.random.default_rng(dims).uniform(0.3, 0.5, (30, dims))
+        ground = Ground(dims)
+        ground.cover(ground.balls(points), 1.0)
+        one = np.array([[0.5] * dims])
+        assert ground.covered_balls() == pytest.approx(fmc(points) / fmc(one), rel=0.05)
+
+    @pytest.mark.parametrize("dims", [2, 3])
+    def test_holds_the_balls_at_the_corners_of_the_cube(self, dims):
+        corners = np.array([[0.0] * dims, [1.0] * dims])
+        ground = Ground(dims)
+        ground.cover(ground.balls(corners), 1.0)
+        assert ground.covered_balls() == pytest.approx(2.0)
+
+    def test_a_pick_that_fails_with_a_chance_of_60_percent_leaves_40_percent_uncovered(self):
+        ground = Ground(2)
+        here = ground.balls(np.array([[0.4, 0.4]]))
+        ground.cover(here[0], 0.6)
+        assert ground.new(here) == pytest.approx([0.4], rel=1e-6)
+
+    def test_a_ball_two_radii_away_is_all_new(self):
+        ground = Ground(2)
+        ground.cover(ground.balls(np.array([[0.4, 0.4]])), 1.0)
+        beside = np.array([[0.4 + 2.0 * RADIUS + 0.02, 0.4]])
+        assert ground.new(ground.balls(beside)) == pytest.approx([1.0])
+
+
+@pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
+@pytest.mark.parametrize("level", [0, 2])
+def test_covers_more_than_twice_of_what_uniform_covers(level, blind):
+    uniform, ours = (
+        statistics.median(
+            coverage_of(
+                play(make_sampler(name, Pool(levels=(level,)), seed), 5, blind=blind), level
+            )
+            for seed in (1, 2, 3)
+        )
+        for name in ("uniform", "coverage")
+    )
+    assert uniform > 0.0, "the band must not be invisible"
+    assert ours > 2.0 * uniform
+
+
+def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
+    points = np.random.default_rng(0).random((30, 2))
+    gap_m = 60.0 * (points[:, 0] - 0.5)
+    missing = np.where(points[:, 0] > 0.9, np.nan, gap_m)
+    score, batch = np.full(30, -5.0), np.zeros(30, dtype=np.int64)
+    history = LevelHistory(points, score, np.abs(gap_m) < 6.0, missing, batch)
+    odds = learn_margin(history).at(np.array([[0.5, 0.5], [0.97, 0.5]])).log_odds()
+    assert odds[0] > 0.0 > odds[1]
+
+
+def test_gives_more_cases_to_the_level_with_more_to_cover_but_starves_none():
+    sampler = make_sampler("coverage", Pool(levels=(0, 1, 2)), 4)
+    outcomes = play(sampler, 5, 30, level_that_fails=1)
+    last = [o.case.level for o in outcomes if o.batch == 4]
+    assert last.count(1) > 20
+    assert min(last.count(0), last.count(2)) >= 1
+
+
+def test_expects_less_of_the_next_batch_the_more_it_has_covered():
+    sampler = CoverageSampler(Pool(levels=(0,)), 2)
+    assert sampler.expected_gain(20) == math.inf
+    play(sampler, 4)
+    early = sampler.expected_gain(20)
+    play(later := CoverageSampler(Pool(levels=(0,)), 2), 14)
+    assert later.expected_gain(20) < 0.5 * early
+
+
+def test_learns_from_a_bounded_number_of_cases_in_a_long_campaign():
+    cases = make_sampler("uniform", Pool(levels=(0,)), 0).ask(1200)
+    sampler = make_sampler("coverage", Pool(levels=(0,)), 0)
+    sampler.tell(outcome(i, i // 40, case, blind=False) for i, case in enumerate(cases))
+    points = to_unit(sampler.ask(10), 0)
+    assert points.shape == (10, 2)
