@@ -61,9 +61,13 @@ def _version(
 
 @app.command()
 def campaign(
-    vut: Annotated[str, typer.Option(help="Vehicle under test: level0, design1 or design2.")],
+    vut: Annotated[
+        str, typer.Option(help="Vehicle under test: level0, level1, level2, design1 or design2.")
+    ],
     level: Annotated[str, typer.Option(help="POV level: 0, 1, 2 or all.")] = "all",
-    sampler: Annotated[str, typer.Option(help="Who chooses the cases: gpr or uniform.")] = "gpr",
+    sampler: Annotated[
+        str, typer.Option(help="Who chooses: uniform, annealing, subset, gpr or coverage.")
+    ] = "gpr",
     cases: Annotated[int, typer.Option(help="Number of test cases.")] = 800,
     batch: Annotated[
         int | None, typer.Option(help="Cases per batch.  [default: 40, or all if fewer]")
@@ -227,7 +231,9 @@ def truth(
 def compare(
     vut: Annotated[str, typer.Option(help="Vehicle under test.")],
     level: Annotated[str, typer.Option(help="POV level: 0, 1 or 2.")],
-    samplers: Annotated[str, typer.Option(help="Names, separated by commas.")] = "uniform,gpr",
+    samplers: Annotated[
+        str, typer.Option(help="Names, separated by commas.")
+    ] = "uniform,annealing,subset,gpr,coverage",
     seeds: Annotated[int, typer.Option(help="Runs of each sampler.")] = 10,
     cases: Annotated[int, typer.Option(help="Cases of each run.")] = 400,
     batch: Annotated[int, typer.Option(help="Cases per batch.")] = 20,

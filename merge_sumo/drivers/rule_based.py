@@ -51,7 +51,7 @@ class RuleBasedDesign:
 
 DESIGNS: Final = {
     "design1": RuleBasedDesign(x1_m=96.1, x2_m=30.8, gap_m=13.7, target_m=13.8, kp=0.683, kd=0.252),
-    "design2": RuleBasedDesign(x1_m=133.7, x2_m=40.7, gap_m=17.0, target_m=13.5, kp=2.89, kd=3.77),
+    "design2": RuleBasedDesign(x1_m=122.2, x2_m=38.2, gap_m=17.2, target_m=13.2, kp=2.68, kd=3.29),
 }
 """Found by `tools/calibrate.py`: `design1` reacts late, `design2` sooner and harder."""
 
