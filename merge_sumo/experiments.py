@@ -20,6 +20,7 @@ from merge_sumo.case import Case, FloatArray, Pool, dimensions, from_unit, to_un
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.fmc import RADIUS, fmc, regions
+from merge_sumo.journal import UNREADABLE_NPZ
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario import V_VUT0_MPS
 from merge_sumo.score import FAILURE_SCORE, Outcome, measure
@@ -93,7 +94,7 @@ def ground_truth(
         try:
             with np.load(path, allow_pickle=False) as data:
                 return Truth(data["points"], data["score"])
-        except (OSError, EOFError, ValueError, KeyError):
+        except UNREADABLE_NPZ:
             path.unlink()  # a torn file of the cache is made again
     points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
     chunks = [points[first : first + CHUNK] for first in range(0, count, CHUNK)]

@@ -24,6 +24,9 @@ SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
 
+UNREADABLE_NPZ: Final = (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile)
+"""What numpy raises when a file is not the archive of arrays that it should be."""
+
 
 class Journal:
     """Writes a campaign's folder; raises `UserError` when it exists or cannot be written."""
@@ -109,14 +112,7 @@ class Run:
                 with np.load(path, allow_pickle=False) as data:
                     parts = np.split(data["motion"], np.cumsum(data["rows"])[:-1])
                     batch = dict(zip(data["index"].tolist(), parts, strict=True))
-            except (
-                OSError,
-                EOFError,
-                ValueError,
-                TypeError,
-                KeyError,
-                zipfile.BadZipFile,
-            ) as error:
+            except UNREADABLE_NPZ as error:
                 raise UserError(f"cannot read the trajectories in {path}: {error}") from error
             self._batches[outcome.batch] = batch
         motion = self._batches[outcome.batch].get(index)
