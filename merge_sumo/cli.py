@@ -338,15 +338,19 @@ def train(
     if unknown:
         raise UserError(f"there is no network {unknown.pop()!r}: choose {', '.join(NETWORKS)}")
     names = tuple(name for name in NETWORKS if name in (only or NETWORKS))
+    _need_training_packages()
     if not check:
         _train(folder, names, seed)
-    missing = set(names) - set(read_manifest(folder))
+    manifest = read_manifest(folder)
+    missing = [name for name in names if name not in manifest]
     if missing:
-        raise UserError(f"{folder} has no {missing.pop()}: run `merge-sumo train` to make it")
-    _need_training_packages()
-    from merge_sumo.training.check import check_policy
+        raise UserError(f"{folder} has no {missing[0]}: run `merge-sumo train` to make it")
+    if check:
+        from merge_sumo.training.check import check_policy
 
-    checks = {name: asdict(check_policy(name, folder, count=cases)) for name in names}
+        checks = {name: asdict(check_policy(name, folder, count=cases)) for name in names}
+    else:
+        checks = {name: manifest[name]["check"] for name in names}
     if as_json:
         typer.echo(json.dumps(checks))
         return
@@ -373,7 +377,6 @@ def _need_training_packages() -> None:
 
 
 def _train(folder: Path, names: tuple[str, ...], seed: int) -> None:
-    _need_training_packages()
     from merge_sumo.progress import TrainingBar
     from merge_sumo.training.helix import train_library
 

@@ -241,6 +241,12 @@ class TestHelix:
         assert told == [("pov1", None)]
         assert (library / "pov1.safetensors").stat().st_mtime_ns == before
 
+    def test_another_seed_does_not_overwrite_a_network(self, library):
+        before = (library / "pov1.safetensors").read_bytes()
+        with pytest.raises(UserError, match="has a pov1 of another seed.*--out"):
+            train_library(library, ("pov1",), seed=1, settings=TINY)
+        assert (library / "pov1.safetensors").read_bytes() == before
+
     def test_level_2_needs_level_1_first(self, library):
         with pytest.raises(UserError, match="pov2 is trained against vut1: train that one first"):
             train_library(library, ("pov2",), settings=TINY)

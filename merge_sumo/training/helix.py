@@ -69,8 +69,8 @@ def train_library(
 
     A network that the folder's manifest already has with the same seed, weights, settings and
     opponent is not trained again, so an interrupted training goes on where it stood. Next to each
-    network lies a log, `<name>.training.jsonl`. Raises `UserError` when an opponent is missing or
-    the folder cannot be written.
+    network lies a log, `<name>.training.jsonl`. Raises `UserError` when an opponent is missing, the
+    folder has such a network of another plan, or the folder cannot be written.
     """
     weights = weights or RewardWeights()
     try:
@@ -85,6 +85,11 @@ def train_library(
             if on_done is not None:
                 on_done(name, None)
             continue
+        if known:
+            raise UserError(
+                f"{folder} has a {name} of another seed, opponent or setting: choose another "
+                "folder with --out, or remove it first"
+            )
         network, seconds = _train_one(folder, name, seed, weights, chosen, on_progress)
         content = save(
             {
