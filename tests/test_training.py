@@ -243,7 +243,7 @@ class TestHelix:
 
     def test_another_seed_does_not_overwrite_a_network(self, library):
         before = (library / "pov1.safetensors").read_bytes()
-        with pytest.raises(UserError, match="has a pov1 of another seed.*--out"):
+        with pytest.raises(UserError, match=r"has a pov1 of another seed.*--out"):
             train_library(library, ("pov1",), seed=1, settings=TINY)
         assert (library / "pov1.safetensors").read_bytes() == before
 
