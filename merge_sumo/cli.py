@@ -377,11 +377,11 @@ def _need_training_packages() -> None:
 
 
 def _train(folder: Path, names: tuple[str, ...], seed: int) -> None:
-    from merge_sumo.progress import TrainingBar
+    from merge_sumo.progress import TrainingBars
     from merge_sumo.training.helix import train_library
 
-    with TrainingBar() as bar:
-        train_library(folder, names, seed, on_progress=bar.progressed, on_done=bar.done)
+    with TrainingBars() as bars:
+        train_library(folder, names, seed, on_progress=bars.progressed, on_done=bars.done)
 
 
 def _print_summary(run: Run, summary: Summary, report_file: Path) -> None:
