@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 from merge_sumo.case import Case, Pool
@@ -101,7 +100,7 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
-class Testbed:
+class ProvingGround:
     """A VUT and the POV library in a SUMO world: takes cases, gives trajectories."""
 
     def __init__(self, vut: str, corridors: int = MAX_CORRIDORS, net: Net | None = None) -> None:
@@ -119,15 +118,10 @@ class Testbed:
         return rollout(self.world, self.pov, self.vut, cases)
 
     def __enter__(self) -> Self:
-        """Return the testbed."""
+        """Return the proving ground."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop the VUT, then SUMO."""
         try:
             self.vut.close()
@@ -137,7 +131,7 @@ class Testbed:
 
 def conduct(
     sampler: Sampler,
-    testbed: Testbed,
+    ground: ProvingGround,
     cases: int,
     batch: int,
     on_case: OnCase | None = None,
@@ -145,7 +139,7 @@ def conduct(
     """Ask, run, tell, batch by batch; yield what each batch gave, in order of the cases."""
     for number, first in enumerate(range(0, cases, batch)):
         ran: list[tuple[Outcome, Trajectory]] = []
-        for place, trajectory in testbed.run(sampler.ask(min(batch, cases - first))):
+        for place, trajectory in ground.run(sampler.ask(min(batch, cases - first))):
             outcome = Outcome(first + place, number, trajectory.case, measure(trajectory))
             ran.append((outcome, trajectory))
             if on_case is not None:
@@ -165,9 +159,9 @@ def run_campaign(
     """
     net = net or Net()
     sampler = make_sampler(settings.sampler, settings.pool, settings.seed)
-    with Testbed(settings.vut, min(MAX_CORRIDORS, settings.batch), net) as testbed:
+    with ProvingGround(settings.vut, min(MAX_CORRIDORS, settings.batch), net) as ground:
         journal = Journal(folder, record_of(settings, net))
-        for ran in conduct(sampler, testbed, settings.cases, settings.batch, on_case):
+        for ran in conduct(sampler, ground, settings.cases, settings.batch, on_case):
             journal.append(ran)
     run = Run(folder)
     for outcome in failures(run.outcomes)[:EXPORTED_FAILURES]:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaign import Testbed, conduct, versions
+from merge_sumo.campaign import ProvingGround, conduct, versions
 from merge_sumo.case import Case, FloatArray, Pool, dimensions, from_unit, to_unit
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.errors import UserError
@@ -140,23 +140,23 @@ def _key(**what: Any) -> str:
     return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
 
 
-_testbed: Testbed | None = None
-"""The testbed of a worker process."""
+_ground: ProvingGround | None = None
+"""The ground of a worker process."""
 
 
-def _open_testbed(vut: str) -> None:
-    global _testbed  # noqa: PLW0603 (one SUMO per process, opened once)
-    _testbed = Testbed(vut)
+def _open_ground(vut: str) -> None:
+    global _ground  # noqa: PLW0603 (one SUMO per process, opened once)
+    _ground = ProvingGround(vut)
 
 
 def _pool(workers: int, vut: str) -> ProcessPoolExecutor:
     # Spawned, because libsumo's simulation must not be forked.
-    return ProcessPoolExecutor(workers, get_context("spawn"), _open_testbed, (vut,))
+    return ProcessPoolExecutor(workers, get_context("spawn"), _open_ground, (vut,))
 
 
 def _run(cases: list[Case]) -> Iterator[tuple[int, Outcome]]:
-    assert _testbed is not None, "the pool's initialiser opens it"  # noqa: S101
-    for place, trajectory in _testbed.run(cases):
+    assert _ground is not None, "the pool's initialiser opens it"  # noqa: S101
+    for place, trajectory in _ground.run(cases):
         yield place, Outcome(place, 0, trajectory.case, measure(trajectory))
 
 
@@ -188,14 +188,14 @@ class Search:
 
 def _search(task: tuple[str, int, int, int, int]) -> Search:
     name, level, cases, batch, seed = task
-    assert _testbed is not None, "the pool's initialiser opens it"  # noqa: S101
+    assert _ground is not None, "the pool's initialiser opens it"  # noqa: S101
     sampler = make_sampler(name, Pool(levels=(level,)), seed)
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
     found: list[Case] = []
     curve = []
-    for ran in conduct(sampler, _testbed, cases, batch):
+    for ran in conduct(sampler, _ground, cases, batch):
         found += [outcome.case for outcome, _ in ran if outcome.failed]
         curve.append(fmc(to_unit(found, level)))
     return Search(curve, len(found), to_unit(found, level), spent.seconds)

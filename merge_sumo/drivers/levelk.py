@@ -24,6 +24,9 @@ DECISION_STEPS: Final = 5
 
 FEATURES: Final = 26
 SVO_FEATURES: Final = 2
+LEVEL0_GAP_FEATURE: Final = 8
+"""Column with the gap at M if the POV keeps its speed and the VUT the level-0 profile, as
+tanh(gap / 25 m)."""
 _HORIZON_S: Final = 20.0
 _GAP_SCALES_M: Final = (80.0, 25.0, 8.0)
 

@@ -17,7 +17,13 @@ import numpy as np
 
 from merge_sumo.case import FloatArray
 from merge_sumo.drivers.level0 import level0_acceleration
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, DECISION_STEPS, QNetwork, features
+from merge_sumo.drivers.levelk import (
+    ACTIONS_MPS2,
+    DECISION_STEPS,
+    LEVEL0_GAP_FEATURE,
+    QNetwork,
+    features,
+)
 from merge_sumo.scenario import DT_S, MAX_STEPS, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.training.reward import (
     RewardWeights,
@@ -297,7 +303,7 @@ def _prune(
     inputs = features(*_columns(state), svo_rad[cases] if agent.sees_svo else None)
     # The networks rate with squashed returns; only the order matters here.
     promise = so_far + agent.values(inputs).max(axis=1)
-    gap_class = np.clip(np.rint(inputs[:, 8] * 8.0), -8, 8)  # of the gap on the level-0 profile
+    gap_class = np.clip(np.rint(inputs[:, LEVEL0_GAP_FEATURE] * 8.0), -8, 8)
     rows = np.arange(len(cases))
 
     def first(order: np.ndarray, group: tuple[np.ndarray, ...], count: int) -> np.ndarray:

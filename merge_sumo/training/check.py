@@ -14,6 +14,7 @@ from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.rollout import rollout
+from merge_sumo.scenario import DX_CRASH_M
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import (
     beam_search,
@@ -87,7 +88,7 @@ def returns_of(trajectories: list[Trajectory], weights: RewardWeights) -> Return
             dx = np.array([x_pov - x_vut])
             parts[0, n] = safety(dx, np.array([v_pov_end - v_vut_end]), weights)[0]
             parts[2, n] += vut_end(np.array([v_vut_end]), weights)[0]
-            collided[n] = abs(dx[0]) < 6.0
+            collided[n] = abs(dx[0]) < DX_CRASH_M
     return Returns(parts[0], parts[1], parts[2], collided)
 
 

@@ -28,24 +28,19 @@ OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "vut2": ("vut", "pov1"),
 }
 """Role and opponent of each network, in the order of the helix."""
+# What level 2 gains over level 0 is small, because level 1 makes room for it: so precision.
+_LEVEL_2: Final = TrainingSettings(
+    updates=140_000,
+    transitions=1_000_000,
+    collecting=0.7,
+    last_exploration=0.05,
+    last_midway=0.15,
+)
 SETTINGS: Final = {
     "pov1": TrainingSettings(),
     "vut1": TrainingSettings(),
-    # What level 2 gains over level 0 is small, because level 1 makes room for it: so precision.
-    "pov2": TrainingSettings(
-        updates=140_000,
-        transitions=1_000_000,
-        collecting=0.7,
-        last_exploration=0.05,
-        last_midway=0.15,
-    ),
-    "vut2": TrainingSettings(
-        updates=140_000,
-        transitions=1_000_000,
-        collecting=0.7,
-        last_exploration=0.05,
-        last_midway=0.15,
-    ),
+    "pov2": _LEVEL_2,
+    "vut2": _LEVEL_2,
 }
 GAMES: Final = 64
 """Corridors in which transitions are collected."""
