@@ -4,32 +4,44 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from multiprocessing import get_context
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
-from merge_sumo.campaign import ProvingGround, conduct, versions
-from merge_sumo.case import Case, FloatArray, Pool, dimensions, from_unit, to_unit
+from merge_sumo.case import FloatArray, Pool, dimensions, from_unit, to_unit
+from merge_sumo.conductor import (
+    MAX_CORRIDORS,
+    GroundPlan,
+    conduct,
+    run_cases,
+    versions,
+    workers_or_here,
+)
 from merge_sumo.drivers.policies import read_manifest
+from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
 from merge_sumo.fmc import RADIUS, fmc, regions
 from merge_sumo.journal import UNREADABLE_NPZ
+from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario import V_VUT0_MPS
-from merge_sumo.score import FAILURE_SCORE, Outcome, measure
+from merge_sumo.score import FAILURE_SCORE, Outcome
 from merge_sumo.sumo.net import Net
+from merge_sumo.workers import Workers
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
-CHUNK: Final = 500
-"""Cases that a worker takes at a time."""
+PROGRESS_CASES: Final = 100
+"""Cases after which a person is told."""
 REAL_REGION: Final = 0.03
 """A region of the truth counts when it holds at least this share of its failures."""
 
@@ -59,15 +71,19 @@ class Truth:
         return [group for group in groups if len(group) >= REAL_REGION * len(points)]
 
 
+DECIDES_OUTCOMES: Final = (
+    "scenario.py",
+    "case.py",
+    "trajectory.py",
+    "score.py",
+    "rollout.py",
+    "sumo",
+    "drivers",
+)
+"""Sources of this package that decide what becomes of a case."""
+
 OnCases = Callable[[int], None]
 """Told how many cases have just ended."""
-
-
-def workers_or_cores(workers: int | None) -> int:
-    """Return the number of worker processes: as asked, or one for each core."""
-    if workers is not None and workers < 1:
-        raise UserError(f"--workers is {workers}: it must be 1 or more")
-    return workers or os.cpu_count() or 1
 
 
 def ground_truth(
@@ -76,35 +92,35 @@ def ground_truth(
     cases: int | None = None,
     seed: int = 0,
     *,
-    workers: int | None = None,
+    workers: Workers | None = None,
     cache: Path | None = None,
     on_cases: OnCases | None = None,
 ) -> Truth:
     """Return the ground truth of a VUT at a level, from the cache where it is there.
 
     The cache's key is a hash of everything that the outcomes depend on: VUT, cases, seed, net,
-    policies, versions, and the sources of this package.
+    policies, versions, and the sources that decide outcomes. Cases run on `workers`, by default in
+    this process.
     """
     count = cases or TRUTH_CASES[level]
     if count < 1:
         raise UserError(f"--cases is {count}: it must be 1 or more")
     folder = cache or cache_folder()
     path = folder / f"truth-{_key(vut=vut, level=level, cases=count, seed=seed)}.npz"
-    if path.is_file():
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                return Truth(data["points"], data["score"])
-        except UNREADABLE_NPZ:
-            path.unlink()  # a torn file of the cache is made again
+    kept = _read_truth(path)
+    if kept is not None:
+        return kept
     points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
-    chunks = [points[first : first + CHUNK] for first in range(0, count, CHUNK)]
-    scores = []
-    with _pool(workers_or_cores(workers), vut) as pool:
-        for score in pool.map(_scores, [(level, chunk) for chunk in chunks]):
-            scores.append(score)
-            if on_cases is not None:
-                on_cases(len(score))
-    truth = Truth(points, np.concatenate(scores))
+    scores = np.full(count, np.nan)
+    plan = GroundPlan(vut=vut_factory(vut), corridors=MAX_CORRIDORS, net=Net())
+    with workers_or_here(workers) as there:
+        rows = cast("Sequence[FloatArray]", points)
+        scored = there.run(partial(_scores, plan, level), rows, lambda _: np.nan)
+        for ended, (place, score) in enumerate(scored, start=1):
+            scores[place] = score
+            if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
+                on_cases((ended - 1) % PROGRESS_CASES + 1)
+    truth = Truth(points, scores)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         torn = path.with_suffix(f".{os.getpid()}.tmp")
@@ -114,6 +130,21 @@ def ground_truth(
     except OSError as error:
         raise UserError(f"cannot write the cache {folder}: {error.strerror}") from error
     return truth
+
+
+def cached_truth(vut: str, level: int, cache: Path | None = None) -> Truth | None:
+    """Return the ground truth with the default cases and seed if it is in the cache, else None."""
+    key = _key(vut=vut, level=level, cases=TRUTH_CASES[level], seed=0)
+    return _read_truth((cache or cache_folder()) / f"truth-{key}.npz")
+
+
+def _read_truth(path: Path) -> Truth | None:
+    """Return what a file of the cache holds; None where there is none, or a torn one."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return Truth(data["points"], data["score"])
+    except UNREADABLE_NPZ:
+        return None
 
 
 def cache_folder() -> Path:
@@ -127,10 +158,12 @@ def cache_folder() -> Path:
 def _key(**what: Any) -> str:
     package = Path(__file__).resolve().parent
     sources = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        sources.update(source.read_bytes())
+    for part in DECIDES_OUTCOMES:
+        for source in sorted((package / part).rglob("*.py")) or [package / part]:
+            sources.update(source.read_bytes())
     depends = {
         **what,
+        "vut_sha256": vut_factory(what["vut"]).sha256,
         "v_vut0_mps": V_VUT0_MPS,
         "versions": versions(),
         "sources": sources.hexdigest(),
@@ -140,65 +173,50 @@ def _key(**what: Any) -> str:
     return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
 
 
-_ground: ProvingGround | None = None
-"""The ground of a worker process."""
-
-
-def _open_ground(vut: str) -> None:
-    global _ground  # noqa: PLW0603 (one SUMO per process, opened once)
-    _ground = ProvingGround(vut)
-
-
-def _pool(workers: int, vut: str) -> ProcessPoolExecutor:
-    # Spawned, because libsumo's simulation must not be forked.
-    return ProcessPoolExecutor(workers, get_context("spawn"), _open_ground, (vut,))
-
-
-def _run(cases: list[Case]) -> Iterator[tuple[int, Outcome]]:
-    assert _ground is not None, "the pool's initialiser opens it"  # noqa: S101
-    for place, trajectory in _ground.run(cases):
-        yield place, Outcome(place, 0, trajectory.case, measure(trajectory))
-
-
-def _scores(task: tuple[int, FloatArray]) -> FloatArray:
-    level, points = task
-    scores = np.full(len(points), np.nan)
-    for place, outcome in _run(from_unit(points, level)):
-        if outcome.measures.score is not None:
-            scores[place] = outcome.measures.score
-    return scores
+def _scores(plan: GroundPlan, level: int, points: Sequence[FloatArray]) -> Sequence[float]:
+    ran = run_cases(plan, from_unit(np.asarray(points), level))
+    return [np.nan if done.measures.score is None else done.measures.score for done in ran]
 
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """What one sampler found with one seed.
+    """What one sampler did with one seed.
 
     Attributes:
-        fmc: failure mode coverage after each batch.
-        failures: failures found in all.
-        points: points of the failures, (m, d).
+        outcomes: what became of every case, in order.
+        fmc: failure mode coverage after each batch, summed over the levels.
         sampler_s: seconds spent in the sampler, without simulation.
     """
 
+    outcomes: list[Outcome]
     fmc: list[float]
-    failures: int
-    points: FloatArray
     sampler_s: float
 
+    def failures(self, level: int) -> FloatArray:
+        """Return the failing cases of a level as points, (m, d)."""
+        return to_unit((o.case for o in self.outcomes if o.failed and o.case.level == level), level)
 
-def _search(task: tuple[str, int, int, int, int]) -> Search:
-    name, level, cases, batch, seed = task
-    assert _ground is not None, "the pool's initialiser opens it"  # noqa: S101
-    sampler = make_sampler(name, Pool(levels=(level,)), seed)
+
+Task = tuple[str, tuple[int, ...], int, int, int]
+"""A search: sampler, levels, cases, batch, seed."""
+
+
+def _searches(plan: GroundPlan, tasks: Sequence[Task]) -> list[Search]:
+    return [_search(plan, *task) for task in tasks]
+
+
+def _search(
+    plan: GroundPlan, name: str, levels: tuple[int, ...], cases: int, batch: int, seed: int
+) -> Search:
+    sampler = make_sampler(name, Pool(levels=levels), seed)
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
-    found: list[Case] = []
-    curve = []
-    for ran in conduct(sampler, _ground, cases, batch):
-        found += [outcome.case for outcome, _ in ran if outcome.failed]
-        curve.append(fmc(to_unit(found, level)))
-    return Search(curve, len(found), to_unit(found, level), spent.seconds)
+    search = Search([], [], 0.0)
+    for ran in conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), cases, batch):
+        search.outcomes.extend(outcome for outcome, _ in ran)
+        search.fmc.append(sum(fmc(search.failures(level)) for level in levels))
+    return replace(search, sampler_s=spent.seconds)
 
 
 class _Stopwatch:
@@ -217,83 +235,149 @@ class _Stopwatch:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
-    """One sampler over all seeds: medians, with quartiles where they are named.
+class LevelShare:
+    """What one sampler did at one level, as medians over all seeds."""
 
-    `cases_to_50_percent_median` and `cases_to_90_percent_median` are cases until that share of
-    the truth's FMC, None where the median seed does not reach it.
+    cases_median: float
+    failures_median: float
+    fmc_median: float
+
+
+Quartiles = tuple[float | None, float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One sampler over all seeds, as medians and as quartiles (25 % and 75 %).
+
+    Coverage is summed over the levels. `cases_to_50_percent` and `cases_to_90_percent` are cases
+    until that share of the truth's FMC, None where too few seeds reach it. `fmc_over_truth` is None
+    where the truth has no failure.
     """
 
     fmc_median: float
-    fmc_quartiles: tuple[float, float]
-    fmc_over_truth_median: float
-    fmc_over_truth_quartiles: tuple[float, float]
+    fmc_quartiles: Quartiles
+    fmc_over_truth_median: float | None
+    fmc_over_truth_quartiles: Quartiles
     failures_median: float
+    failures_quartiles: Quartiles
     regions_found_median: float
+    regions_found_quartiles: Quartiles
     seeds_with_all_regions: int
     cases_to_50_percent_median: float | None
+    cases_to_50_percent_quartiles: Quartiles
     cases_to_90_percent_median: float | None
+    cases_to_90_percent_quartiles: Quartiles
     sampler_s_median: float
+    cases_by_batch: list[int]
     fmc_by_batch_median: list[float]
+    fmc_by_batch_quartiles: tuple[list[float], list[float]]
+    levels: dict[int, LevelShare]
 
 
-def compare(
+def search(
     vut: str,
-    level: int,
+    levels: tuple[int, ...],
     samplers: Sequence[str],
     *,
     seeds: int = 10,
     cases: int = 400,
     batch: int = 20,
-    truth: Truth,
-    workers: int | None = None,
+    workers: Workers | None = None,
     on_search: Callable[[str, int], None] | None = None,
-) -> dict[str, Comparison]:
-    """Run samplers with several seeds each and compare what they find with the truth."""
-    tasks = [(name, level, cases, batch, seed) for name in samplers for seed in range(seeds)]
-    searches: dict[str, list[Search]] = {name: [] for name in samplers}
-    with _pool(workers_or_cores(workers), vut) as pool:
-        for (name, *_, seed), search in zip(tasks, pool.map(_search, tasks), strict=True):
-            searches[name].append(search)
+) -> dict[str, list[Search]]:
+    """Let samplers search a pool, with the seeds 0 to `seeds` - 1 each.
+
+    A search runs on one of the `workers`, by default in this process.
+    """
+    tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
+    plan = GroundPlan(vut=vut_factory(vut), corridors=min(MAX_CORRIDORS, batch), net=Net())
+    found: dict[int, Search] = {}
+    with workers_or_here(workers) as there:
+        for place, one in there.run(partial(_searches, plan), tasks, _lost_search, chunk=1):
+            found[place] = one
             if on_search is not None:
+                name, *_, seed = tasks[place]
                 on_search(name, seed)
-    truth_fmc, real = fmc(truth.failures), truth.real_regions()
-    return {
-        name: _compared(found, truth_fmc, real, batch, cases) for name, found in searches.items()
-    }
+    searches: dict[str, list[Search]] = {name: [] for name in samplers}
+    for place, (name, *_) in enumerate(tasks):
+        searches[name].append(found[place])
+    return searches
 
 
-def _compared(
-    searches: list[Search], truth_fmc: float, real: list[FloatArray], batch: int, cases: int
-) -> Comparison:
-    final = np.array([search.fmc[-1] for search in searches])
-    share = final / truth_fmc if truth_fmc > 0.0 else np.full(len(final), np.nan)
-    found = np.array([sum(_found(search.points, region) for region in real) for search in searches])
+def _lost_search(task: Task) -> Search:
+    name, *_, seed = task
+    raise UserError(f"the search of {name} with seed {seed} ended its worker process each time")
 
-    def cases_to(part: float) -> float | None:
-        needed = []
-        for search in searches:
-            reached = np.flatnonzero(np.array(search.fmc) >= part * truth_fmc)
-            needed.append(min((reached[0] + 1) * batch, cases) if reached.size else np.inf)
-        median = float(np.median(needed))
-        return median if np.isfinite(median) else None
 
-    def quartiles(values: FloatArray) -> tuple[float, float]:
-        low, high = np.quantile(values, [0.25, 0.75])
-        return float(low), float(high)
-
+def compare(searches: Sequence[Search], truths: Mapping[int, Truth]) -> Comparison:
+    """Compare what one sampler found, one search a seed, with the truth at each level."""
+    truth_fmc = sum(fmc(truth.failures) for truth in truths.values())
+    real = [(level, region) for level, truth in truths.items() for region in truth.real_regions()]
+    curves = np.array([search.fmc for search in searches])
+    share = curves[:, -1] / truth_fmc if truth_fmc > 0.0 else np.full(len(curves), np.nan)
+    failures = np.array([sum(o.failed for o in search.outcomes) for search in searches])
+    found = np.array(
+        [sum(_found(s.failures(level), region) for level, region in real) for s in searches]
+    )
+    after = _cases_by_batch(searches[0])
+    half, most = (_cases_to(part * truth_fmc, curves, after) for part in (0.5, 0.9))
+    by_batch = [np.quantile(curves, part, axis=0).tolist() for part in (0.25, 0.75)]
     return Comparison(
-        fmc_median=float(np.median(final)),
-        fmc_quartiles=quartiles(final),
-        fmc_over_truth_median=float(np.median(share)),
-        fmc_over_truth_quartiles=quartiles(share),
-        failures_median=float(np.median([search.failures for search in searches])),
+        fmc_median=float(np.median(curves[:, -1])),
+        fmc_quartiles=_quartiles(curves[:, -1]),
+        fmc_over_truth_median=_quantile(share, 0.5),
+        fmc_over_truth_quartiles=_quartiles(share),
+        failures_median=float(np.median(failures)),
+        failures_quartiles=_quartiles(failures),
         regions_found_median=float(np.median(found)),
+        regions_found_quartiles=_quartiles(found),
         seeds_with_all_regions=int((found == len(real)).sum()),
-        cases_to_50_percent_median=cases_to(0.5),
-        cases_to_90_percent_median=cases_to(0.9),
+        cases_to_50_percent_median=_quantile(half, 0.5),
+        cases_to_50_percent_quartiles=_quartiles(half),
+        cases_to_90_percent_median=_quantile(most, 0.5),
+        cases_to_90_percent_quartiles=_quartiles(most),
         sampler_s_median=float(np.median([search.sampler_s for search in searches])),
-        fmc_by_batch_median=np.median([search.fmc for search in searches], axis=0).tolist(),
+        cases_by_batch=after,
+        fmc_by_batch_median=np.median(curves, axis=0).tolist(),
+        fmc_by_batch_quartiles=(by_batch[0], by_batch[1]),
+        levels={level: _level_share(searches, level) for level in truths},
+    )
+
+
+def _cases_by_batch(search: Search) -> list[int]:
+    """Return the number of cases that have run after each batch."""
+    sizes = Counter(outcome.batch for outcome in search.outcomes)
+    return list(accumulate(sizes.values()))
+
+
+def _cases_to(target: float, curves: FloatArray, after: list[int]) -> FloatArray:
+    """Return the cases that each search needs to reach a coverage; infinite where it does not."""
+    reached = curves >= target
+    return np.where(reached.any(axis=1), np.array(after)[reached.argmax(axis=1)], np.inf)
+
+
+def _quantile(values: FloatArray, part: float) -> float | None:
+    """Return a quantile, linear between two values; None where one of them is not finite."""
+    ordered = np.sort(values)
+    place = part * (len(ordered) - 1)
+    low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
+    if not np.isfinite(high):
+        return None
+    return float(low + (place - math.floor(place)) * (high - low))
+
+
+def _quartiles(values: FloatArray) -> Quartiles:
+    return _quantile(values, 0.25), _quantile(values, 0.75)
+
+
+def _level_share(searches: Sequence[Search], level: int) -> LevelShare:
+    cases = [sum(o.case.level == level for o in search.outcomes) for search in searches]
+    points = [search.failures(level) for search in searches]
+    return LevelShare(
+        cases_median=float(np.median(cases)),
+        failures_median=float(np.median([len(failing) for failing in points])),
+        fmc_median=float(np.median([fmc(failing) for failing in points])),
     )
 
 
@@ -303,3 +387,41 @@ def _found(points: FloatArray, region: FloatArray) -> bool:
         return False
     distance = np.linalg.norm(points[:, None, :] - region[None, :, :], axis=2)
     return bool((distance <= RADIUS).any())
+
+
+def oracle(truths: Mapping[int, Truth], cases: int, batch: int) -> dict[int, float]:
+    """Return the coverage of an oracle by number of cases, summed over the levels.
+
+    It knows the failures of the truth and takes, one after the other, the one whose ball adds the
+    most volume: greedy maximum coverage, which no order beats by more than a factor of e / (e - 1)
+    (Nemhauser, Wolsey and Fisher, 1978). A sampler may still pass its end, the truth's FMC: it may
+    fail in places that the truth's cases have missed.
+
+    Returns:
+        FMC after every case of the first batch, and then after every batch, up to `cases`.
+    """
+    greedy = {level: _greedy(truth.failures) for level, truth in truths.items()}
+    ball = {level: fmc(np.zeros((1, len(dimensions(level))))) for level in truths}
+    gains = [(-g * ball[level], level) for level, (_, gain) in greedy.items() for g in gain]
+    order = [level for _, level in sorted(gains)]
+    shown = sorted({*range(min(batch, cases) + 1), *range(0, cases, batch), cases})
+    return {
+        n: sum(fmc(points[: order[:n].count(level)]) for level, (points, _) in greedy.items())
+        for n in shown
+    }
+
+
+def _greedy(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points, (m, d), in greedy order and what each adds, in balls; it never grows."""
+    ground = Ground(points.shape[1])
+    balls = ground.balls(points)
+    left = np.ones(len(points), dtype=bool)
+    order, gains = [], []
+    for _ in points:
+        new = np.where(left, ground.new(balls), -1.0)
+        best = int(np.argmax(new))
+        left[best] = False
+        ground.cover(balls[best], 1.0)
+        order.append(best)
+        gains.append(float(new[best]))
+    return points[order], np.array(gains)

@@ -93,7 +93,7 @@ def regions(points: ArrayLike, radius: float = RADIUS) -> IntArray:
     Returns:
         Shape (n,): the region of each point. Region 0 has the most points, then 1 and so on;
         regions of equal size are in the order of their first point. Empty for no points. Memory
-        grows with the number of linked pairs of distinct points: 16 bytes each.
+        grows with the number of points, however dense they are.
 
     Raises:
         ValueError: points of another shape or dimension, points that are not finite, or a radius
@@ -105,15 +105,66 @@ def regions(points: ArrayLike, radius: float = RADIUS) -> IntArray:
     # Pairs grow with the square of the number of copies of a point, so link each place once.
     places, place = np.unique(cases, axis=0, return_inverse=True)
     place = place.reshape(-1)  # a column in NumPy 2.0.0
-    pairs = cKDTree(places).query_pairs(radius * (1.0 + _LINK_SLACK), output_type="ndarray")
-    links = (np.ones(len(pairs), dtype=np.bool_), (pairs[:, 0], pairs[:, 1]))
-    graph = coo_array(links, shape=(len(places), len(places)))
-    component: IntArray = connected_components(graph, directed=False)[1][place]
+    component = _linked(places, radius * (1.0 + _LINK_SLACK))[place]
     _, first, size = np.unique(component, return_index=True, return_counts=True)
     rank = np.empty(len(size), dtype=np.int64)
     rank[np.lexsort((first, -size))] = np.arange(len(size))
     ranked: IntArray = rank[component]
     return ranked
+
+
+def _linked(places: FloatArray, limit: float) -> IntArray:
+    """Return the component of each of n distinct points, (n,), linked at `limit` or less.
+
+    Dense points have too many links to list. Their nearest neighbours link most of them; points in
+    one cell of a grid with a diagonal of `limit` are linked anyhow; what these leave apart is
+    looked at cell by cell, where a point has more neighbours than were looked at.
+    """
+    n, dimension = places.shape
+    near = min(_FIRST_NEIGHBOURS + 1, n)
+    distance, other = cKDTree(places).query(places, k=np.arange(1, near + 1))
+    point, column = np.nonzero(distance <= limit)
+    all_looked_at = (distance[:, -1] > limit) | (near == n)
+    cells, cell = np.unique(
+        np.floor(places / (limit / np.sqrt(dimension))).astype(np.int64),
+        axis=0,
+        return_inverse=True,
+    )
+    cell = cell.reshape(-1)
+    by_cell = np.argsort(cell, kind="stable")
+    members = np.split(by_cell, np.cumsum(np.bincount(cell))[:-1])
+    first = np.array([group[0] for group in members])
+    links = [
+        np.column_stack([point, other[point, column]]),
+        np.column_stack([np.arange(n), first[cell]]),
+    ]
+    crowded = np.unique(cell[~all_looked_at])
+    crowds = {tuple(cells[index]): members[index] for index in crowded.tolist()}
+    reach = int(np.ceil(np.sqrt(dimension)))
+    component = _components(links, n)
+    for offset in np.ndindex(*[2 * reach + 1] * dimension):
+        step = np.array(offset) - reach
+        if tuple(step) <= (0,) * dimension:
+            continue  # each pair of cells once
+        if len({int(component[group[0]]) for group in crowds.values()}) < 2:
+            break
+        for corner, group in crowds.items():
+            beside = crowds.get(tuple(np.array(corner) + step))
+            if beside is None or component[group[0]] == component[beside[0]]:
+                continue
+            nearest, _ = cKDTree(places[beside]).query(places[group])
+            if nearest.min() <= limit:
+                links.append(np.array([[group[0], beside[0]]]))
+        component = _components(links, n)
+    return component
+
+
+def _components(links: list[IntArray], n: int) -> IntArray:
+    """Return the component of each of n points, (n,), from arrays of linked pairs, (m, 2)."""
+    pairs = np.concatenate(links)
+    graph = coo_array((np.ones(len(pairs), dtype=np.bool_), pairs.T), shape=(n, n))
+    component: IntArray = connected_components(graph, directed=False)[1]
+    return component
 
 
 def _checked(points: ArrayLike, radius: float) -> FloatArray:

@@ -7,15 +7,25 @@ trajectories/00007.npz    the motion of every case of a batch
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import os
+import secrets
+import shutil
+import struct
+import sys
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
+from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
 from merge_sumo.score import Outcome
 from merge_sumo.trajectory import End, Trajectory
@@ -23,52 +33,136 @@ from merge_sumo.trajectory import End, Trajectory
 SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
+COLUMNS: Final = 6
+"""Of the motion of a trajectory."""
 
-UNREADABLE_NPZ: Final = (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile)
+UNREADABLE_NPZ: Final = (
+    *(OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError),
+    *(SyntaxError, RuntimeError, ArithmeticError, MemoryError),
+    *(zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error, tokenize.TokenError),
+)
 """What numpy raises when a file is not the archive of arrays that it should be."""
+UNREADABLE_RECORD: Final = (
+    *(ValueError, TypeError, KeyError, AttributeError, RecursionError, UserError),
+)
+"""What is raised when a line is not the record of an outcome."""
 
 
 class Journal:
-    """Writes a campaign's folder; raises `UserError` when it exists or cannot be written."""
+    """Writes a campaign's folder, as the only process that does; to be used in `with`.
 
-    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
-        """Create the folder and write its settings; nothing that exists is touched."""
+    The folder appears whole or not at all, and what was appended once stays.
+    """
+
+    def __init__(self, folder: Path, outcomes: io.FileIO) -> None:
+        """Take the folder and its open outcomes; use `create` or `reopen`."""
         self.folder = folder
+        self._outcomes = outcomes
+        _lock(outcomes, folder)
+
+    @classmethod
+    def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
+        """Create the folder with its settings; `UserError` when it exists or cannot be written."""
+        new = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}") if folder.name else folder
         try:
-            folder.mkdir(parents=True)
-            (folder / TRAJECTORIES).mkdir()
-            text = json.dumps(settings, indent=2, allow_nan=False) + "\n"
-            (folder / SETTINGS).write_text(text, encoding="utf-8")
-            (folder / OUTCOMES).touch()
-        except FileExistsError as error:
-            raise UserError(
-                f"{folder} exists: choose another folder with --out, or remove it first"
-            ) from error
+            if folder.exists():
+                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
+            (new / TRAJECTORIES).mkdir(parents=True)
+            _write(new / SETTINGS, _settings_text(settings))
+            journal = cls(folder, (new / OUTCOMES).open("wb", buffering=0))
+            _sync_folder(new)
+            new.rename(folder)
+            _sync_folder(folder.parent)
         except OSError as error:
+            shutil.rmtree(new, ignore_errors=True)
+            if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
+                raise UserError(
+                    f"{folder} exists: choose another folder with --out, or remove it first"
+                ) from error
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
+        return journal
+
+    @classmethod
+    def reopen(cls, folder: Path) -> tuple[Self, Run, int]:
+        """Return the journal of a campaign to go on with, what it holds, and what was dropped.
+
+        Dropped are outcomes, whole or torn, of a batch that was not written to its end: they are
+        run again. Raises `UserError` when another process writes the folder, or as `Run` does.
+        """
+        try:
+            outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
+        except OSError as error:
+            if error.errno in (errno.ENOENT, errno.ENOTDIR):
+                raise UserError(
+                    f"{folder} is not a campaign to go on with: it has no {OUTCOMES}"
+                ) from error
+            raise UserError(f"cannot write {folder}: {error.strerror}") from error
+        try:
+            journal = cls(folder, outcomes)
+            run = Run(folder)
+            whole = run.outcomes[: run.whole_batches()]
+            dropped = len(run.outcomes) - len(whole) + run.torn
+            run.outcomes = whole
+            if dropped:
+                outcomes.seek(0)
+                length = sum(len(line) for line, _ in zip(outcomes, whole, strict=False))
+                outcomes.truncate(length)
+                os.fsync(outcomes.fileno())
+        except OSError as error:
+            outcomes.close()
+            raise UserError(f"cannot write {folder}: {error.strerror}") from error
+        except BaseException:
+            outcomes.close()
+            raise
+        return journal, run, dropped
 
     def append(self, ran: list[tuple[Outcome, Trajectory]]) -> None:
         """Write the outcomes of one batch and its trajectories, and sync them to the disk.
 
-        The trajectories go first, so that every outcome on disk has its trajectory there.
+        The trajectories go first, so that every outcome on disk has its trajectory there. Raises
+        `UserError` when they cannot be written; what was there before stays.
         """
         outcomes, trajectories = zip(*ran, strict=True)
+        arrays = io.BytesIO()
+        np.savez(
+            arrays,
+            index=np.array([o.index for o in outcomes]),
+            rows=np.array([len(t.motion) for t in trajectories]),
+            motion=np.concatenate([t.motion for t in trajectories]),
+        )
         try:
-            with _batch_file(self.folder, outcomes[0].batch).open("wb") as file:
-                np.savez(
-                    file,
-                    index=np.array([o.index for o in outcomes]),
-                    rows=np.array([len(t.motion) for t in trajectories]),
-                    motion=np.concatenate([t.motion for t in trajectories]),
-                )
-                file.flush()
-                os.fsync(file.fileno())
-            with (self.folder / OUTCOMES).open("a", encoding="utf-8") as file:
-                file.writelines(to_line(outcome) for outcome in outcomes)
-                file.flush()
-                os.fsync(file.fileno())
+            end = self._outcomes.seek(0, os.SEEK_END)
+            path = _batch_file(self.folder, outcomes[0].batch)
+            _write(path, arrays.getvalue())
+            _sync_folder(path.parent)
+            try:
+                _write_all(self._outcomes, "".join(map(to_line, outcomes)).encode())
+            except OSError:
+                self._outcomes.truncate(end)
+                raise
+        except OSError as error:
+            raise UserError(
+                f"cannot write {self.folder}: {error.strerror}; what ran before is kept: go on "
+                f"with `merge-sumo campaign --resume {self.folder}`"
+            ) from error
+
+    def rewrite_settings(self, settings: dict[str, Any]) -> None:
+        """Put other settings in the place of those that were there, all or nothing."""
+        new = self.folder / f".{SETTINGS}"
+        try:
+            _write(new, _settings_text(settings))
+            new.replace(self.folder / SETTINGS)
+            _sync_folder(self.folder)
         except OSError as error:
             raise UserError(f"cannot write {self.folder}: {error.strerror}") from error
+
+    def __enter__(self) -> Self:
+        """Return the journal."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the folder; another process may write it."""
+        self._outcomes.close()
 
 
 class Run:
@@ -80,20 +174,13 @@ class Run:
     def __init__(self, folder: Path) -> None:
         """Read settings and outcomes; trajectories are read when they are asked for."""
         self.folder = folder
-        settings = folder / SETTINGS
+        self.settings = read_settings(folder)
         try:
-            self.settings: dict[str, Any] = json.loads(settings.read_text(encoding="utf-8"))
             text = (folder / OUTCOMES).read_bytes()
         except OSError as error:
-            raise UserError(
-                f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror})"
-            ) from error
-        except ValueError as error:
-            raise UserError(f"{settings} is not readable JSON: {error}") from error
-        if not isinstance(self.settings, dict):
-            raise UserError(f"{settings} is not a JSON object")
+            raise _no_campaign(folder, error) from error
         self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES))
-        self._batches: dict[int, dict[int, np.ndarray[Any, Any]]] = {}
+        self._batches: dict[int, dict[int, FloatArray]] = {}
 
     def outcome(self, index: int) -> Outcome:
         """Return the outcome of a case; `UserError` when the campaign has no such case."""
@@ -106,21 +193,56 @@ class Run:
     def trajectory(self, index: int) -> Trajectory:
         """Return the trajectory of a case; `UserError` when it is missing or unreadable."""
         outcome = self.outcome(index)
-        path = _batch_file(self.folder, outcome.batch)
-        if outcome.batch not in self._batches:
-            try:
-                with np.load(path, allow_pickle=False) as data:
-                    parts = np.split(data["motion"], np.cumsum(data["rows"])[:-1])
-                    batch = dict(zip(data["index"].tolist(), parts, strict=True))
-            except UNREADABLE_NPZ as error:
-                raise UserError(f"cannot read the trajectories in {path}: {error}") from error
-            self._batches[outcome.batch] = batch
-        motion = self._batches[outcome.batch].get(index)
+        motion = self._batch(outcome.batch).get(index)
         if motion is None:
+            path = _batch_file(self.folder, outcome.batch)
             raise UserError(f"{path} has no trajectory of case {index}")
         measures = outcome.measures
         end = End.MERGED if measures.end is End.COLLISION else measures.end
         return Trajectory(outcome.case, motion, end, measures.error, measures.clipped_steps)
+
+    def whole_batches(self) -> int:
+        """Return the number of outcomes without those of a last batch that is not complete.
+
+        The trajectories are written first: a batch is complete when it has an outcome for each.
+        """
+        if not self.outcomes:
+            return 0
+        last = self.outcomes[-1].batch
+        indices = [outcome.index for outcome in self.outcomes if outcome.batch == last]
+        try:
+            complete = sorted(self._batch(last)) == indices
+        except UserError:
+            complete = False
+        return len(self.outcomes) if complete else indices[0]
+
+    def _batch(self, batch: int) -> dict[int, FloatArray]:
+        """Return the motion of the cases of a batch by index."""
+        if batch not in self._batches:
+            path = _batch_file(self.folder, batch)
+            try:
+                with np.load(path, allow_pickle=False) as data:
+                    self._batches[batch] = _motion_by_case(**data)
+            except UNREADABLE_NPZ as error:
+                raise UserError(f"cannot read the trajectories in {path}: {error}") from error
+        return self._batches[batch]
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """Return what `campaign.json` says; `UserError` when it is no campaign's."""
+    path = folder / SETTINGS
+    try:
+        settings = _decode(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise _no_campaign(folder, error) from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not readable JSON: {error}") from error
+    if not isinstance(settings, dict):
+        raise UserError(f"{path} is not a JSON object")
+    levels = settings.get("levels", [])
+    if not (isinstance(levels, list) and all(type(level) is int for level in levels)):
+        raise UserError(f"{path} is no campaign's: its levels are not a list of numbers")
+    return settings
 
 
 def to_line(outcome: Outcome) -> str:
@@ -134,15 +256,16 @@ def read_outcomes(text: bytes, name: str) -> tuple[list[Outcome], bool]:
     A last line without its end was being written when the campaign stopped: it is dropped. Any
     other line that is not the outcome of its place is an error that names the line.
     """
-    lines = text.split(b"\n")
-    torn = lines.pop() != b""
-    outcomes = []
-    for number, line in enumerate(lines, start=1):
+    outcomes: list[Outcome] = []
+    torn = not text.endswith(b"\n") and bool(text)
+    for number, line in enumerate(io.BytesIO(text), start=1):
+        if not line.endswith(b"\n"):
+            break
         try:
-            outcome = Outcome.from_record(json.loads(line))
+            outcome = Outcome.from_record(_decode(line.decode()))
             if outcome.index != number - 1:
                 raise ValueError(f"index is {outcome.index}")
-        except (ValueError, TypeError, KeyError, AttributeError, UserError) as error:
+        except UNREADABLE_RECORD as error:
             raise UserError(
                 f"line {number} of {name} is not the outcome of case {number - 1}: "
                 f"{type(error).__name__} {error}"
@@ -158,3 +281,76 @@ def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
 
 def _batch_file(folder: Path, batch: int) -> Path:
     return folder / TRAJECTORIES / f"{batch:05d}.npz"
+
+
+def _no_campaign(folder: Path, error: OSError) -> UserError:
+    return UserError(f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror})")
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no JSON")
+
+
+_decoder: Final = json.JSONDecoder(parse_constant=_no_constant)
+
+
+def _decode(text: str) -> Any:
+    """Return what JSON says; ValueError or RecursionError for what is none, or no text."""
+    value = _decoder.decode(text)
+    if "\\u" in text:
+        json.dumps(value, ensure_ascii=False).encode()  # half a character cannot be written
+    return value
+
+
+def _motion_by_case(
+    index: NDArray[np.int64], rows: NDArray[np.int64], motion: FloatArray
+) -> dict[int, FloatArray]:
+    """Return the rows of each case; ValueError or TypeError where the arrays do not fit."""
+    if motion.dtype != np.float64 or motion.ndim != 2 or motion.shape[1] != COLUMNS:
+        raise ValueError(f"the motion is {motion.dtype} of shape {motion.shape}")
+    if rows.dtype.kind != "i" or rows.ndim != 1 or (rows < 1).any() or rows.sum() != len(motion):
+        raise ValueError("the rows of the cases are not those of the motion")
+    parts = np.split(motion, np.cumsum(rows)[:-1])
+    return dict(zip(index.tolist(), parts, strict=True))
+
+
+def _settings_text(settings: dict[str, Any]) -> bytes:
+    return (json.dumps(settings, indent=2, allow_nan=False) + "\n").encode()
+
+
+def _lock(outcomes: io.FileIO, folder: Path) -> None:
+    """Refuse when another process holds the lock; it goes with the process, however that ends."""
+    if sys.platform == "win32":  # no flock there
+        return
+    import fcntl
+
+    try:
+        fcntl.flock(outcomes, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        outcomes.close()
+        raise UserError(f"another process writes {folder}: wait until it has ended") from error
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file and sync it to the disk."""
+    with path.open("wb", buffering=0) as file:
+        _write_all(file, content)
+
+
+def _write_all(file: io.FileIO, content: bytes) -> None:
+    # Unbuffered: after an error, nothing is left that closing the file would write after all.
+    rest = memoryview(content)
+    while rest:
+        rest = rest[file.write(rest) :]
+    os.fsync(file.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    """Sync the entries of a folder to the disk, so that a new file is found after a crash."""
+    if sys.platform == "win32":  # folders cannot be opened there
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,10 +1,14 @@
-"""What a person sees while something runs: bars on standard error, with rates."""
+"""What a person sees while something runs: a panel or bars on standard error, with rates."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Self
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final, Self
 
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -13,12 +17,17 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
 
+from merge_sumo.case import Case, to_unit
+from merge_sumo.fmc import fmc
 from merge_sumo.score import Outcome
 
 if TYPE_CHECKING:
     from merge_sumo.training.check import PolicyCheck
-    from merge_sumo.training.ddqn import TrainingProgress
+    from merge_sumo.training.helix import TrainingProgress
 
 
 class Bars:
@@ -83,27 +92,132 @@ class Counter(Bars):
         self.show(self._title, self._count, self._total, f"{rate} {self._unit}/s  {note}")
 
 
-class CaseProgress(Counter):
-    """Counts test cases, and the failures among them."""
+PLAIN_LINES: Final = 10
+"""Lines that a campaign says where there is no terminal to draw on."""
+FRESH_S: Final = 0.5
+"""Seconds for which a coverage that is shown may be old."""
 
-    def __init__(self, title: str, cases: int) -> None:
-        """Count up to `cases`."""
-        super().__init__(title, cases, "cases")
-        self._failures = 0
+
+class CampaignPanel:
+    """What a campaign has found so far, on standard error.
+
+    A live panel on a terminal, a line after every tenth of the cases elsewhere, nothing when quiet.
+    It appears with the first case, so a command that is refused shows its sentence and no panel.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        cases: int,
+        levels: Sequence[int],
+        *,
+        quiet: bool = False,
+        console: Console | None = None,
+    ) -> None:
+        """Show nothing yet."""
+        self._title, self._total, self._quiet = title, cases, quiet
+        self._console = console or Console(stderr=True)
+        self._live: Live | None = None
+        self._start_s = self._fresh_s = 0.0
+        self._ran = 0
+        self._cases = dict.fromkeys(levels, 0)
+        self._failing: dict[int, list[Case]] = {level: [] for level in levels}
+        self._fmc = dict.fromkeys(levels, 0.0)
+        self._stale: set[int] = set()
 
     def case_ended(self, outcome: Outcome) -> None:
         """Count a case."""
-        self._failures += outcome.failed
-        self.ended(1, f"{self._failures} failures")
+        if self._ran == 0:
+            self._start_s = time.monotonic()
+            if self._console.is_terminal and not self._quiet:
+                self._live = Live(console=self._console, get_renderable=self._panel)
+                self._live.start()
+        level = outcome.case.level
+        self._ran += 1
+        self._cases[level] += 1
+        if outcome.failed:
+            self._failing[level].append(outcome.case)
+            self._stale.add(level)
+        if self._live is not None:
+            if time.monotonic() - self._fresh_s > FRESH_S:
+                self._refresh()
+        elif not self._quiet and self._is_plain_line():
+            self._console.print(self._line(), highlight=False, markup=False, soft_wrap=True)
+
+    def _is_plain_line(self) -> bool:
+        tenth = -(-self._total // PLAIN_LINES)
+        return self._ran % tenth == 0 or self._ran == self._total
+
+    def _refresh(self) -> None:
+        """Bring the coverages up to date."""
+        for level in self._stale:
+            self._fmc[level] = fmc(to_unit(self._failing[level], level))
+        self._stale.clear()
+        self._fresh_s = time.monotonic()
+
+    def _rate(self) -> float:
+        return self._ran / max(time.monotonic() - self._start_s, 1e-9)
+
+    def _failures(self) -> int:
+        return sum(map(len, self._failing.values()))
+
+    def _line(self) -> str:
+        return (
+            f"{self._title}: {self._ran}/{self._total} cases, {self._failures()} failures, "
+            f"{self._rate():.3g} cases/s"
+        )
+
+    def _panel(self) -> Panel:
+        left_s = (self._total - self._ran) / self._rate() if self._ran else 0.0
+        head = Table.grid(padding=(0, 2))
+        head.add_row(
+            ProgressBar(total=self._total, completed=self._ran, width=30),
+            f"{self._ran}/{self._total} cases",
+            f"{self._failures()} failures",
+            f"{self._rate():.3g} cases/s",
+            f"{int(left_s) // 60}:{int(left_s) % 60:02d} left",
+        )
+        table = Table(box=None, padding=(0, 2), pad_edge=False, header_style="dim")
+        table.add_column("POV level")
+        for name in ("cases", "failures", "FMC so far"):
+            table.add_column(name, justify="right")
+        for level, cases in self._cases.items():
+            failing = len(self._failing[level])
+            style = "bold dark_orange" if failing else ""
+            table.add_row(
+                str(level), str(cases), Text(str(failing), style), f"{self._fmc[level]:.4f}"
+            )
+        title = Text(self._title)
+        return Panel(Group(head, "", table), title=title, title_align="left", expand=False)
+
+    def __enter__(self) -> Self:
+        """Return the panel."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the last state on the terminal."""
+        if self._live is not None:
+            self._refresh()
+            self._live.stop()
 
 
 class TrainingBars(Bars):
     """A bar per network with return and share of crashes, and its regret when it is finished."""
 
-    def progressed(self, name: str, now: TrainingProgress, updates: int) -> None:
+    def __init__(self) -> None:
+        """Show nothing yet."""
+        super().__init__()
+        self._regret: dict[str, str] = {}
+
+    def progressed(self, now: TrainingProgress) -> None:
         """Show where a network is."""
-        note = f"return {now.mean_return:.3f}  crashes {now.crash_share:.2%}"
-        self.show(name, now.updates, updates, note)
+        note = f"return {now.mean_return:.3f}"
+        if now.crash_share is not None:
+            note += f"  crashes {now.crash_share:.2%}"
+        if now.regret is not None:
+            self._regret[now.network] = f"  regret at least {now.regret:.2%}"
+        note += self._regret.get(now.network, "")
+        self.show(f"{now.network} {now.stage}", now.done, now.total, note)
 
     def done(self, name: str, check: PolicyCheck | None) -> None:
         """Say how a network turned out, or that it was there already."""

@@ -19,6 +19,12 @@ RING_ROWS: Final = MAX_STEPS + 2
 """Rows of the record: an episode is copied out before its first row is written over."""
 
 
+ROUNDING_MPS2: Final = 1e-9
+"""An answer this little outside the limits is a rounding error, not a wish for more."""
+
+WRONGS: Final = (Exception, SystemExit)
+"""A black box may raise anything; only a person's own interruption is not its doing."""
+
 IDLE: Final = -(2**62)
 """Step count of a corridor without an episode: it never times out."""
 
@@ -65,10 +71,10 @@ class _Rollout:
         world = self.world
         self.refill_all()
         while self.active.any():
-            acceleration = self.ask_drivers()
-            self.row += 1
+            self.observe()
             try:
-                world.step(acceleration)
+                world.advance()
+                world.command(self.ask_drivers())
             except SimulationError as error:
                 for corridor in np.flatnonzero(self.active).tolist():
                     yield self.finish(corridor, End.SIM_ERROR, f"SUMO failed: {error}")
@@ -111,8 +117,14 @@ class _Rollout:
         self.pov.begin(corridor, case)
         try:
             self.vut.begin(corridor, case)
-        except Exception as error:  # a black box may raise anything
+        except WRONGS as error:
             self.errors[corridor] = f"reset raised {type(error).__name__}: {error}"
+
+    def observe(self) -> None:
+        """Write the state into the next row of the record."""
+        row = self.record[self.row % RING_ROWS]
+        row[:, 0], row[:, 1] = self.world.x_m, self.world.v_mps
+        self.row += 1
 
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of both vehicles, (2, K), within limits; write the record."""
@@ -120,9 +132,8 @@ class _Rollout:
         scene = Scene(self.active, self.step, x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT])
         answer = np.array((self.pov.act(scene), self.ask_vut(scene)))
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
-        self.clipped += acceleration[VUT] != answer[VUT]
-        row = self.record[self.row % RING_ROWS]
-        row[:, 0], row[:, 1], row[:, 2] = x_m, v_mps, acceleration
+        self.clipped += np.abs(acceleration[VUT] - answer[VUT]) > ROUNDING_MPS2
+        self.record[(self.row - 1) % RING_ROWS, :, 2] = acceleration
         return acceleration
 
     def ask_vut(self, scene: Scene) -> FloatArray:
@@ -133,7 +144,9 @@ class _Rollout:
             answer = np.asarray(self.vut.act(scene), dtype=np.float64)
             if answer.shape != (corridors,):
                 raise ValueError(f"answered shape {answer.shape} instead of ({corridors},)")
-        except Exception as error:  # a black box may raise anything
+        except SimulationError:
+            raise
+        except WRONGS as error:
             answer = np.full(corridors, np.nan)
             raised = f"{type(error).__name__}: {error}"
         if math.isfinite(answer.sum()):

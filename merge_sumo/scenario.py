@@ -34,3 +34,6 @@ DX_CRITICAL_M: Final = 15.0
 LEVEL0_A_MPS2: Final = 1.0
 LEVEL0_V_MPS: Final = 28.0
 """A level-0 VUT accelerates by `LEVEL0_A_MPS2` to this speed and holds it, section VI-B."""
+
+DEADLINE_S: Final = 5.0
+"""A VUT that takes longer than this for one step, or for one reset, is a VUT_ERROR."""

@@ -127,18 +127,21 @@ class Outcome:
             raise TypeError("index and batch must be whole numbers")
         case = Case(**{name: values.pop(name) for name in Case.__dataclass_fields__})
         values["end"] = End(values["end"])
-        for name, annotation in Measures.__annotations__.items():
-            if name != "end" and not _is_a(values[name], annotation):
-                raise TypeError(f"{name} is {values[name]!r}")
+        for name, types in _TYPES.items():
+            if type(value := values[name]) not in types:
+                raise TypeError(f"{name} is {value!r}")
+            if type(value) is float and not math.isfinite(value):
+                raise ValueError(f"{name} is {value!r}")
         return cls(index=index, batch=batch, case=case, measures=Measures(**values))
 
 
-def _is_a(value: object, annotation: str) -> bool:
-    """Return whether a value read from JSON is what a field of `Measures` holds."""
-    names = annotation.split(" | ")
-    if value is None:
-        return "None" in names
-    return type(value).__name__ in names and not (isinstance(value, float) and math.isnan(value))
+_JSON_TYPES: Final = {"None": type(None), "float": float, "str": str, "bool": bool, "int": int}
+_TYPES: Final = {
+    name: frozenset(_JSON_TYPES[part] for part in annotation.split(" | "))
+    for name, annotation in Measures.__annotations__.items()
+    if name != "end"
+}
+"""What the fields of `Measures` may hold when they are read from JSON."""
 
 
 def measure(trajectory: Trajectory) -> Measures:
@@ -178,7 +181,8 @@ def measure(trajectory: Trajectory) -> Measures:
         last_avoidable_s=last_avoidable,
         avoidable=avoidable,
         clipped_steps=trajectory.clipped_steps,
-        error=trajectory.error,
+        # Half a character, which a VUT's message may hold, cannot be written.
+        error=trajectory.error and trajectory.error.encode("utf-8", "replace").decode(),
     )
 
 

@@ -40,13 +40,14 @@ class Summary:
 
 
 def summarise(outcomes: Sequence[Outcome], levels: Sequence[int]) -> Summary:
-    """Return the summary of outcomes at the given levels."""
+    """Return the summary of outcomes, at the given levels and where else there are any."""
+    every = sorted({*levels, *(outcome.case.level for outcome in outcomes)})
     ends = Counter(outcome.measures.end for outcome in outcomes)
     return Summary(
         cases=len(outcomes),
         failures=sum(outcome.failed for outcome in outcomes),
         ends={end.value: ends[end] for end in End if ends[end]},
-        levels={level: _level(outcomes, level) for level in levels},
+        levels={level: _level(outcomes, level) for level in every},
     )
 
 

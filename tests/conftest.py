@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from merge_sumo.campaign import CampaignSettings, run_campaign
+from merge_sumo.conductor import CampaignSettings, run_campaign
 from merge_sumo.journal import Run
 
 

@@ -11,8 +11,10 @@ import pytest
 from merge_sumo.case import Case, Pool, to_unit
 from merge_sumo.fmc import RADIUS, fmc
 from merge_sumo.samplers.base import LevelHistory, Sampler
-from merge_sumo.samplers.coverage import CoverageSampler, Ground, learn_margin
+from merge_sumo.samplers.coverage import CoverageSampler, _trust, margin_of
+from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.surrogate import Margin
 from merge_sumo.score import Measures, Outcome
 from merge_sumo.trajectory import End
 
@@ -105,8 +107,10 @@ def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
     missing = np.where(points[:, 0] > 0.9, np.nan, gap_m)
     score, batch = np.full(30, -5.0), np.zeros(30, dtype=np.int64)
     history = LevelHistory(points, score, np.abs(gap_m) < 6.0, missing, batch)
-    odds = learn_margin(history).at(np.array([[0.5, 0.5], [0.97, 0.5]])).log_odds()
-    assert odds[0] > 0.0 > odds[1]
+    values, low, high = margin_of(history)
+    assert values[np.isnan(missing)] == pytest.approx(np.arcsinh(200.0 / 6.0) / np.arcsinh(1.0))
+    sure = Margin(points, values, low, high, rough=False).at(np.array([[0.5, 0.5], [0.97, 0.5]]))
+    assert sure[0] > 0.5 > sure[1]
 
 
 def test_gives_more_cases_to_the_level_with_more_to_cover_but_starves_none():
@@ -132,3 +136,28 @@ def test_learns_from_a_bounded_number_of_cases_in_a_long_campaign():
     sampler.tell(outcome(i, i // 40, case, blind=False) for i, case in enumerate(cases))
     points = to_unit(sampler.ask(10), 0)
     assert points.shape == (10, 2)
+
+
+class TestTheTrust:
+    """What came of the last picks says how far P(fail) is to be trusted."""
+
+    def history(self, failing_late: bool) -> LevelHistory:
+        """Return 200 cases with a band of failures; the last 100 in it, failing there or not."""
+        rng = np.random.default_rng(5)
+        points = rng.random((200, 2))
+        points[100:, 0] = 0.5 + 0.04 * (rng.random(100) - 0.5)
+        in_band = np.abs(points[:, 0] - 0.5) < 0.05
+        failed = in_band & ((np.arange(200) < 100) | failing_late)
+        gap_m = np.where(failed, 0.0, np.where(points[:, 0] < 0.5, -20.0, 20.0))
+        score = np.where(failed, -600.0, -50.0)
+        return LevelHistory(points, score, failed, gap_m, np.arange(200) // 20)
+
+    def test_is_whole_where_the_picks_came_true(self):
+        assert _trust(self.history(failing_late=True))[0] == 1.0
+
+    def test_is_small_where_they_did_not(self):
+        assert _trust(self.history(failing_late=False)).min() < 0.5
+
+    def test_is_whole_while_there_is_little_to_judge_by(self):
+        first = self.history(failing_late=False).take(slice(120))
+        assert _trust(first).tolist() == [1.0, 1.0]

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
 from merge_sumo import experiments
-from merge_sumo.errors import UserError
-from merge_sumo.experiments import Search, Truth, compare, ground_truth
+from merge_sumo.case import from_unit, to_unit
+from merge_sumo.experiments import Search, Truth, compare, ground_truth, oracle, search
 from merge_sumo.fmc import fmc
+from merge_sumo.score import Measures, Outcome
+from merge_sumo.trajectory import End
+from merge_sumo.workers import open_workers
+
+NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
 
 
 @pytest.fixture(scope="module")
@@ -18,11 +26,12 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def truth(cache):
-    return ground_truth("design1", 0, 600, workers=1, cache=cache)
+    return ground_truth("design1", 0, 600, cache=cache)
 
 
 def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
-    both = ground_truth("design1", 0, 600, workers=2, cache=tmp_path)
+    with open_workers(2) as workers:
+        both = ground_truth("design1", 0, 600, workers=workers, cache=tmp_path)
     assert np.array_equal(both.points, truth.points)
     assert np.array_equal(both.score, truth.score)
     assert len(truth.failures) > 0
@@ -31,11 +40,11 @@ def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
 def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch):
     (kept,) = cache.glob("truth-*.npz")
     counted = []
-    again = ground_truth("design1", 0, 600, workers=1, cache=cache, on_cases=counted.append)
+    again = ground_truth("design1", 0, 600, cache=cache, on_cases=counted.append)
     assert np.array_equal(again.score, truth.score)
     assert counted == []
     kept.write_bytes(kept.read_bytes()[:100])
-    remade = ground_truth("design1", 0, 600, workers=1, cache=cache, on_cases=counted.append)
+    remade = ground_truth("design1", 0, 600, cache=cache, on_cases=counted.append)
     assert np.array_equal(remade.score, truth.score)
     assert sum(counted) == 600
 
@@ -48,28 +57,109 @@ def test_the_key_of_the_cache_names_what_the_truth_depends_on(change):
 
 
 def test_a_comparison_says_what_samplers_found_of_the_truth(truth):
-    found = compare("design1", 0, ["uniform"], seeds=2, cases=40, batch=20, truth=truth, workers=1)
-    result = found["uniform"]
-    assert len(result.fmc_by_batch_median) == 2
+    (found,) = search("design1", (0,), ["uniform"], seeds=2, cases=50, batch=20).values()
+    result = compare(found, {0: truth})
+    assert result.cases_by_batch == [20, 40, 50]
+    assert len(result.fmc_by_batch_median) == 3
     assert result.fmc_by_batch_median == sorted(result.fmc_by_batch_median)
     assert result.fmc_over_truth_median == pytest.approx(result.fmc_median / fmc(truth.failures))
     low, high = result.fmc_quartiles
     assert low <= result.fmc_median <= high
+    assert result.levels[0].cases_median == 50
 
 
-def test_cases_to_a_share_of_the_truth_and_regions_by_hand():
+def test_a_search_of_all_levels_sums_their_coverage():
+    (found,) = search("design1", (0, 1), ["uniform"], seeds=1, cases=40, batch=40)["uniform"]
+    assert {outcome.case.level for outcome in found.outcomes} == {0, 1}
+    assert found.fmc[-1] == sum(fmc(found.failures(level)) for level in (0, 1))
+
+
+def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float = 0.0) -> Search:
+    """Return a search at level 0 with failures at points, and one safe case in each batch."""
+    outcomes: list[Outcome] = []
+    curve = []
+    for batch, points in enumerate(points_by_batch):
+        for failed, point in [(False, (0.0, 0.0)), *((True, point) for point in points)]:
+            (case,) = from_unit(np.array([point]), 0)
+            end, score = (End.COLLISION, -600.0) if failed else (End.MERGED, -1.0)
+            measures = Measures(**{**NOTHING, "end": end, "score": score})
+            outcomes.append(Outcome(len(outcomes), batch, case, measures))
+        curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0)))
+    return Search(outcomes, curve, sampler_s)
+
+
+class TestAComparisonByHand:
     truth = Truth(np.array([[0.2, 0.2], [0.8, 0.8], [0.5, 0.5]]), np.array([-600.0, -700.0, -1.0]))
-    whole = fmc(truth.failures)
-    half = Search([0.0, whole / 2], 1, np.array([[0.2, 0.24]]), 1.0)
-    most = Search([whole / 2, whole], 2, truth.failures, 3.0)
-    found = experiments._compared([half, most], whole, truth.real_regions(), 20, 40)
-    assert found.regions_found_median == 1.5
-    assert found.seeds_with_all_regions == 1
-    assert found.cases_to_50_percent_median == 30.0  # 40 and 20
-    assert found.cases_to_90_percent_median is None  # never and 40
-    assert found.sampler_s_median == 2.0
+    half = searched([[], [(0.2, 0.24)]], 1.0)  # 1 case, then 3
+    most = searched([[(0.2, 0.2)], [(0.8, 0.8)]], 3.0)  # 2 cases, then 4
+
+    def test_has_medians_over_the_seeds(self):
+        found = compare([self.most, self.half], {0: self.truth})
+        assert found.regions_found_median == 1.5
+        assert found.seeds_with_all_regions == 1
+        assert found.failures_median == 1.5
+        assert found.fmc_over_truth_median == pytest.approx(0.75)
+        assert found.sampler_s_median == 2.0
+
+    def test_has_quartiles_over_the_seeds(self):
+        found = compare([self.most, self.half], {0: self.truth})
+        assert found.regions_found_quartiles == (1.25, 1.75)
+        assert found.failures_quartiles == (1.25, 1.75)
+        assert found.fmc_over_truth_quartiles == pytest.approx((0.625, 0.875))
+        low, high = found.fmc_by_batch_quartiles
+        assert high[0] == pytest.approx(0.75 * fmc(np.zeros((1, 2))))
+        assert low[0] == pytest.approx(0.25 * fmc(np.zeros((1, 2))))
+
+    def test_counts_cases_to_a_share_of_the_truth(self):
+        found = compare([self.most] * 2, {0: self.truth})
+        assert found.cases_to_50_percent_median == 2.0
+        assert found.cases_to_50_percent_quartiles == (2.0, 2.0)
+        assert found.cases_to_90_percent_median == 4.0
+
+    def test_has_no_cases_to_a_share_that_too_few_seeds_reach(self):
+        found = compare([self.most, self.half, self.half], {0: self.truth})
+        assert found.cases_to_90_percent_median is None
+        assert found.cases_to_90_percent_quartiles == (None, None)
+        assert json.dumps(asdict(found), allow_nan=False)
+        found = compare([self.most, self.most, self.half], {0: self.truth})
+        assert found.cases_to_90_percent_median == 4.0, "just enough seeds reach it"
+        assert found.cases_to_90_percent_quartiles == (4.0, None)
+
+    def test_without_failures_in_the_truth_has_no_share_of_it(self):
+        nothing = Truth(np.array([[0.5, 0.5]]), np.array([-1.0]))
+        found = compare([self.half], {0: nothing})
+        assert found.fmc_over_truth_median is None
+        assert json.dumps(asdict(found), allow_nan=False)
 
 
-def test_no_workers_are_refused_in_a_sentence():
-    with pytest.raises(UserError, match="--workers is 0"):
-        experiments.workers_or_cores(0)
+class TestTheOracle:
+    def test_takes_the_most_useful_failure_first(self):
+        # Two that overlap and one apart: one of the two, the one apart, then the rest.
+        points = np.array([[0.2, 0.2], [0.22, 0.2], [0.8, 0.8]])
+        truth = Truth(points, np.full(3, -600.0))
+        curve = oracle({0: truth}, 10, 5)
+        one = fmc(points[:1])
+        assert curve[0] == 0.0
+        assert curve[1] == pytest.approx(one)
+        assert curve[2] == pytest.approx(2.0 * one)
+        assert curve[3] == pytest.approx(fmc(points))
+        assert curve[10] == curve[3]
+
+    def test_is_never_below_another_order(self, truth):
+        curve = oracle({0: truth}, 20, 20)
+        points = truth.failures
+        for n in (1, 5, 10):
+            assert curve[n] >= fmc(points[:n]) - 1e-9
+        values = list(curve.values())
+        assert values == sorted(values)
+
+    def test_of_two_levels_takes_volume_where_there_is_most(self):
+        flat = Truth(np.array([[0.5, 0.5]]), np.array([-600.0]))
+        solid = Truth(np.array([[0.5, 0.5, 0.5]]), np.array([-600.0]))
+        curve = oracle({2: solid, 1: flat}, 2, 2)
+        assert curve[1] == pytest.approx(fmc(flat.failures))
+        assert curve[2] == pytest.approx(fmc(flat.failures) + fmc(solid.failures))
+
+    def test_of_a_vut_that_never_fails_finds_nothing(self):
+        truth = Truth(np.array([[0.5, 0.5]]), np.array([-1.0]))
+        assert oracle({0: truth}, 40, 20) == dict.fromkeys([*range(21), 40], 0.0)

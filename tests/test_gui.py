@@ -16,7 +16,7 @@ from conftest import require
 from lxml import etree
 from PIL import Image
 
-from merge_sumo.campaign import export_case
+from merge_sumo.conductor import export_case
 from merge_sumo.journal import failures
 from merge_sumo.sumo.replay import COLOURS, CONFIG, VIEW
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import resource
 import shutil
 from dataclasses import fields, replace
 
@@ -240,7 +241,7 @@ class TestReading:
 class TestAJournal:
     def test_gives_back_settings_outcomes_and_trajectories_to_the_last_bit(self, tmp_path):
         settings = {"vut": "design1", "levels": [0], "seed": 3, "v_vut0_mps": 0.1 + 0.2}
-        journal = Journal(tmp_path / "run", settings)
+        journal = Journal.create(tmp_path / "run", settings)
         ran = [episode(index, batch=index // 2, steps=20 + 7 * index) for index in range(5)]
         for batch in range(3):
             journal.append([pair for pair in ran if pair[0].batch == batch])
@@ -255,14 +256,14 @@ class TestAJournal:
             assert again.case == ran[index][1].case
 
     def test_has_on_disk_what_was_appended_so_far(self, tmp_path):
-        journal = Journal(tmp_path / "run", {})
+        journal = Journal.create(tmp_path / "run", {})
         assert Run(tmp_path / "run").outcomes == []
         for batch in range(2):
             journal.append([episode(batch, batch)])
             assert len(Run(tmp_path / "run").outcomes) == batch + 1
 
     def test_syncs_the_trajectories_before_the_outcomes(self, tmp_path, monkeypatch):
-        journal = Journal(tmp_path / "run", {})
+        journal = Journal.create(tmp_path / "run", {})
         synced, fsync = [], os.fsync
 
         def note(file: int) -> None:
@@ -273,7 +274,8 @@ class TestAJournal:
         journal.append([episode(0)])
         (trajectories,) = (tmp_path / "run" / "trajectories").iterdir()
         outcomes = tmp_path / "run" / "outcomes.jsonl"
-        assert synced == [trajectories.stat().st_ino, outcomes.stat().st_ino]
+        files = [trajectories, trajectories.parent, outcomes]
+        assert synced == [file.stat().st_ino for file in files]
 
     @pytest.mark.parametrize("kept", [(), ("notes.txt",), ("campaign.json", "outcomes.jsonl")])
     def test_refuses_a_folder_that_exists_and_leaves_it_alone(self, tmp_path, kept):
@@ -283,7 +285,7 @@ class TestAJournal:
             (folder / name).write_text("mine")
         before = contents(tmp_path)
         with pytest.raises(UserError) as error:
-            Journal(folder, {"vut": "design1"})
+            Journal.create(folder, {"vut": "design1"})
         assert_sentence(error, "run exists", "--out")
         assert contents(tmp_path) == before
         assert sorted(path.name for path in folder.iterdir()) == sorted(kept)
@@ -291,19 +293,19 @@ class TestAJournal:
     def test_refuses_a_file_in_place_of_the_folder(self, tmp_path):
         (tmp_path / "run").write_text("mine")
         with pytest.raises(UserError) as error:
-            Journal(tmp_path / "run", {})
+            Journal.create(tmp_path / "run", {})
         assert_sentence(error, "run exists")
         assert (tmp_path / "run").read_text() == "mine"
 
     def test_says_when_the_folder_cannot_be_made(self, tmp_path):
         (tmp_path / "runs").write_text("mine")
         with pytest.raises(UserError) as error:
-            Journal(tmp_path / "runs" / "first", {})
+            Journal.create(tmp_path / "runs" / "first", {})
         assert_sentence(error, "cannot write")
         assert (tmp_path / "runs").read_text() == "mine"
 
     def test_says_when_the_folder_cannot_be_written_any_more(self, tmp_path):
-        journal = Journal(tmp_path / "run", {})
+        journal = Journal.create(tmp_path / "run", {})
         journal.append([episode(0, 0)])
         shutil.rmtree(tmp_path / "run" / "trajectories")
         with pytest.raises(UserError) as error:
@@ -311,11 +313,32 @@ class TestAJournal:
         assert_sentence(error, "cannot write")
         assert len(Run(tmp_path / "run").outcomes) == 1, "no outcome without its trajectory"
 
+    @pytest.mark.parametrize("most", [1_000, 12_000], ids=["trajectories", "outcomes"])
+    def test_takes_back_what_it_wrote_when_the_rest_does_not_fit(self, tmp_path, most):
+        with Journal.create(tmp_path / "run", {}) as journal:
+            journal.append([episode(0, 0, steps=2)])
+            before = (tmp_path / "run" / "outcomes.jsonl").read_bytes()
+            batch = [episode(index, 1, steps=2) for index in range(1, 41)]
+            # Python ignores SIGXFSZ: beyond the limit a write fails as on a full disk.
+            limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
+            try:
+                with pytest.raises(UserError) as error:
+                    journal.append(batch)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+            assert_sentence(error, "cannot write", "File too large", "--resume")
+            written = (tmp_path / "run" / "trajectories" / "00001.npz").stat().st_size
+            assert (written < most) == (most == 12_000), "the outcomes are the larger file"
+            assert (tmp_path / "run" / "outcomes.jsonl").read_bytes() == before
+            journal.append(batch)
+        assert len(Run(tmp_path / "run").outcomes) == 41
+
 
 class TestARun:
     @pytest.fixture
     def folder(self, tmp_path):
-        journal = Journal(tmp_path / "run", {"levels": [0]})
+        journal = Journal.create(tmp_path / "run", {"levels": [0]})
         journal.append([episode(0), episode(1)])
         journal.append([episode(2, 1)])
         return tmp_path / "run"

@@ -26,11 +26,11 @@ from merge_sumo.training.reward import RewardWeights
 from merge_sumo.trajectory import End
 
 REGRET_BOUNDS = {
-    "pov1": (0.02, 0.15),
-    "vut1": (0.02, 0.15),
-    # Short of the 2 % and 15 % aimed at: the whole gain over level 0 is only 0.10 and 0.31 here.
-    "pov2": (0.15, 0.90),
-    "vut2": (0.12, 0.50),
+    "pov1": (0.01, 0.05),
+    "vut1": (0.01, 0.05),
+    # The 99th percentiles are short of the 15 % aimed at: `policies/README.md` says why.
+    "pov2": (0.02, 0.40),
+    "vut2": (0.02, 0.20),
 }
 """Mean and 99th percentile of the regret, as shares of the mean gain over level-0 behaviour."""
 
@@ -135,7 +135,8 @@ class TestTheExampleRuns:
         run = examples["stalemate"]
         assert measure(run).end is End.COLLISION
         assert run.a_pov_mps2.min() <= -1.0
-        assert run.a_vut_mps2[:20].min() >= 0.9
+        assert run.a_vut_mps2[5:20].min() >= 0.5, "at first it accelerates, behind its lag"
+        assert np.abs(run.a_vut_mps2[30:60]).max() <= 0.3, "then it coasts"
         assert run.a_vut_mps2.min() <= -1.0
 
 
@@ -186,7 +187,7 @@ def standard_error(values):
 
 @pytest.mark.long
 class TestThePapersPicture:
-    """SPEC section 8: where the designs fail, and in how many regions."""
+    """Wang et al., Table II: where the designs fail, and in how many regions."""
 
     def test_design1_fails_against_level_0_in_one_band(self):
         found, sizes = picture("design1", 0, 10_000)

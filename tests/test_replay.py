@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from lxml import etree
 
-from merge_sumo.campaign import export_case
 from merge_sumo.case import Case
+from merge_sumo.conductor import export_case
 from merge_sumo.errors import UserError
 from merge_sumo.journal import failures
 from merge_sumo.scenario import DT_S, V_VUT0_MAX_MPS, X_VUT0_M

@@ -10,8 +10,9 @@ import pytest
 
 from merge_sumo.case import Case, Pool, dimensions, to_unit
 from merge_sumo.errors import UserError
-from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.registry import DEFAULT_SAMPLER, SAMPLERS, make_sampler
+from merge_sumo.samplers import DEFAULT_SAMPLER
+from merge_sumo.samplers.base import LevelHistory, Sampler
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.score import Measures, Outcome
 from merge_sumo.trajectory import End
 
@@ -131,14 +132,39 @@ class TestEverySampler:
         assert other.ask(9) == expected
 
     @pytest.mark.parametrize("end", [End.VUT_ERROR, End.SIM_ERROR])
-    def test_learns_nothing_from_an_outcome_without_a_verdict(
-        self, name, pool, played, expected, end
-    ):
-        _, outcomes = played
+    def test_learns_nothing_from_an_outcome_without_a_verdict(self, name, pool, played, end):
+        sampler, outcomes = played
         other = make_sampler(name, pool, 5)
         other.tell(outcomes)
         other.tell([without_verdict(900 + i, 3, o.case, end) for i, o in enumerate(outcomes[:5])])
-        assert other.ask(9) == expected
+        for level in pool.levels:
+            for column in LevelHistory.__dataclass_fields__:
+                known, now = (getattr(s.history(level), column) for s in (sampler, other))
+                assert np.array_equal(known, now, equal_nan=True)
+
+    @pytest.mark.parametrize("end", [End.VUT_ERROR, End.SIM_ERROR])
+    @pytest.mark.parametrize("with_history", [False, True])
+    def test_proposes_other_cases_after_a_batch_without_a_verdict(
+        self, name, pool, played, end, with_history
+    ):
+        sampler = make_sampler(name, pool, 5)
+        if with_history:
+            sampler.tell(played[1])
+        seen: set[Case] = set()
+        for batch in range(3, 6):
+            cases = sampler.ask(9)
+            assert not seen & set(cases)
+            seen |= set(cases)
+            sampler.tell(
+                without_verdict(9 * batch + i, batch, case, end) for i, case in enumerate(cases)
+            )
+
+    def test_reaches_every_level_even_if_no_case_gets_a_verdict(self, name, pool):
+        sampler = make_sampler(name, pool, 5)
+        for index in range(len(pool.levels)):
+            (case,) = sampler.ask(1)
+            sampler.tell([without_verdict(index, index, case, End.VUT_ERROR)])
+        assert {sampler.proposed(level) for level in pool.levels} == {1}
 
     def test_goes_on_from_a_journal_as_if_it_had_never_stopped(self, name, pool, played):
         _, outcomes = played

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 
@@ -17,19 +18,22 @@ from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, QNetwork
 from merge_sumo.drivers.policies import MANIFEST, load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.scenario import DT_S
-from merge_sumo.training import best_response, ddqn, reward
-from merge_sumo.training.check import play, returns_of
+from merge_sumo.training import best_response, ddqn, helix, refine, reward
+from merge_sumo.training.check import QuickRegret, play, returns_of
 from merge_sumo.training.env import (
     MergeGame,
     MergeVectorEnv,
     exploring_starts,
     pool_starts,
 )
+from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
 
 WEIGHTS = reward.RewardWeights()
-TINY = ddqn.TrainingSettings(transitions=6_000, warm_up=2_000, updates=1_000, width=16, batch=64)
+TINY = ddqn.DdqnSettings(transitions=6_000, warm_up=2_000, updates=1_000, width=16, batch=64)
+QUICK = refine.RefineSettings(rounds=2, starts=40, searched=10, beam=8, updates=50, batch=64)
+SMALL = helix.TrainingSettings(ddqn=TINY, refine=QUICK, check_cases=12)
 
 
 @pytest.fixture
@@ -157,11 +161,11 @@ class TestDdqn:
 
     def test_the_numpy_network_equals_the_torch_network(self):
         torch.manual_seed(0)
-        network = ddqn._network(FEATURES, 32)
+        network = ddqn.make_network(FEATURES, 32)
         inputs = np.random.default_rng(0).normal(size=(20, FEATURES))
         with torch.no_grad():
             expected = network.double()(torch.from_numpy(inputs)).numpy()
-        assert ddqn._export(network).values(inputs) == pytest.approx(expected, abs=1e-12)
+        assert ddqn.export(network).values(inputs) == pytest.approx(expected, abs=1e-12)
 
 
 class TestBestResponse:
@@ -211,11 +215,96 @@ class TestBestResponse:
         rng = np.random.default_rng(5)
         x, v = rng.uniform(-340, -180, 6), rng.uniform(25, 35, 6)
         exact = best_response.best_response_pov1(x, v, WEIGHTS)
-        found = best_response.beam_search(
-            "pov", x, v, np.zeros(6), always_1, always_1, WEIGHTS, width=400
-        )
+        starts = np.stack([x, v, np.full(6, -182.0), np.full(6, 18.0)], axis=1)
+        game = Game("pov", always_1, WEIGHTS)
+        found = best_response.beam_search(game, starts, np.zeros(6), always_1, width=400).returns
         assert (found <= exact + 1e-5).all()
         assert np.median(exact - found) < 0.02
+
+
+class TestGame:
+    """The game as a function of states, beside the one in SUMO."""
+
+    @pytest.fixture
+    def policy(self):
+        torch.manual_seed(1)
+        return greedy(ddqn.export(ddqn.make_network(FEATURES, 32)))
+
+    def test_a_decision_is_half_a_second_of_eq_4(self):
+        game = Game("vut", None, WEIGHTS)
+        state, rewards, over = game.advance(
+            np.array([[-300.0, 33.0, -100.0, 20.0]]), np.zeros(1), np.array([-2.0])
+        )
+        # x: 20 + 19.8 + 19.6 + 19.4 + 19.2 = 98 steps of 0.1 s
+        assert state[0] == pytest.approx([-283.5, 33.0, -90.2, 19.0], abs=1e-9)
+        assert rewards[0] == pytest.approx(-0.5 * 4.0 * WEIGHTS.vut_acc)
+        assert not over[0]
+
+    def test_the_level0_vut_stops_accelerating_at_28_in_the_middle_of_a_decision(self):
+        game = Game("pov", None, WEIGHTS)
+        state, _, _ = game.advance(
+            np.array([[-300.0, 33.0, -100.0, 27.85]]), np.zeros(1), np.zeros(1)
+        )
+        assert state[0, 3] == 28.0
+
+    @pytest.mark.parametrize("role", ["pov", "vut"])
+    def test_its_returns_are_those_of_the_game_in_sumo(self, role, policy):
+        rng = np.random.default_rng(2)
+        start = pool_starts(8, rng)
+        expected = Game(role, None, WEIGHTS).play(start, np.zeros(8), policy)
+        game = MergeGame(role, Level0Vut(8) if role == "pov" else Level0Pov(8), WEIGHTS)
+        try:
+            for corridor, state in enumerate(start):
+                game.begin(corridor, state)
+            returns, over = np.zeros(8), np.zeros(8, dtype=bool)
+            for _ in range(60):
+                actions = ACTIONS_MPS2[policy(game.state(), np.zeros(8))]
+                _, parts, ended = game.decide(np.where(over, 0.0, actions))
+                returns += np.where(over, 0.0, parts.of(role, np.zeros(8)))
+                over |= ended
+        finally:
+            game.close()
+        assert returns[over] == pytest.approx(expected[over], abs=1e-9)
+        assert over.any()
+
+    def test_playing_every_action_out_is_never_worse_than_the_policy(self, policy):
+        game = Game("pov", None, WEIGHTS)
+        start, svo_rad = pool_starts(40, np.random.default_rng(3)), np.zeros(40)
+        before = game.play(start, svo_rad, policy)
+        after = game.play(start, svo_rad, game.improved(policy))
+        assert (after >= before - 1e-9).all()
+        assert after.mean() > before.mean() + 0.1
+
+    def test_the_plan_of_a_beam_search_has_the_return_that_it_states(self, policy):
+        torch.manual_seed(2)
+        agent = ddqn.export(ddqn.make_network(FEATURES, 16))
+        game = Game("vut", None, WEIGHTS)
+        start, svo_rad = pool_starts(5, np.random.default_rng(4)), np.zeros(5)
+        found = best_response.beam_search(game, start, svo_rad, agent, width=16)
+        for n in range(5):
+            actions = iter(found.plans[n])
+            returns = game.play(start[[n]], np.zeros(1), lambda *_, a=actions: np.array([next(a)]))
+            assert returns[0] == pytest.approx(found.returns[n], abs=1e-9)
+
+
+class TestRefinement:
+    def refined(self, seed):
+        torch.manual_seed(0)
+        network = ddqn.export(ddqn.make_network(FEATURES, 32))
+        settings = dataclasses.replace(QUICK, updates=200)
+        return network, refine.refine(Game("pov", None, WEIGHTS), network, seed, settings)
+
+    def test_it_lowers_the_regret(self):
+        regret = QuickRegret(Game("pov", None, WEIGHTS), sees_svo=False)
+        before, after = map(regret, self.refined(seed=0))
+        assert after < 0.5 * before
+
+    def test_same_seed_same_weights_and_another_seed_other_weights(self):
+        one, two, other = (self.refined(seed)[1] for seed in (0, 0, 1))
+        for (w1, b1), (w2, b2) in zip(one.layers, two.layers, strict=True):
+            assert np.array_equal(w1, w2)
+            assert np.array_equal(b1, b2)
+        assert not np.array_equal(one.layers[0][0], other.layers[0][0])
 
 
 class TestHelix:
@@ -223,7 +312,7 @@ class TestHelix:
     @classmethod
     def library(cls, tmp_path_factory):
         folder = tmp_path_factory.mktemp("policies")
-        train_library(folder, ("pov1",), settings=TINY, check_count=12)
+        train_library(folder, ("pov1",), settings=SMALL)
         return folder
 
     def test_a_network_has_a_manifest_entry_and_a_log(self, library):
@@ -231,25 +320,28 @@ class TestHelix:
         assert entry["command"] == "merge-sumo train --only pov1 --seed 0"
         assert entry["check"]["cases"] == 12
         lines = (library / "pov1.training.jsonl").read_text().splitlines()
-        assert json.loads(lines[-1])["updates"] == TINY.updates
+        first, last = json.loads(lines[0]), json.loads(lines[-1])
+        assert (first["stage"], first["done"]) == ("ddqn", TINY.updates)
+        assert (last["stage"], last["done"]) == ("refine", QUICK.rounds)
+        assert last["regret"] >= 0.0
         assert load_network("pov1", library).layers[-1][0].shape[0] == 7
 
     def test_a_finished_network_is_not_trained_again(self, library):
         before = (library / "pov1.safetensors").stat().st_mtime_ns
         told = []
-        train_library(library, ("pov1",), settings=TINY, on_done=lambda *said: told.append(said))
+        train_library(library, ("pov1",), settings=SMALL, on_done=lambda *said: told.append(said))
         assert told == [("pov1", None)]
         assert (library / "pov1.safetensors").stat().st_mtime_ns == before
 
     def test_another_seed_does_not_overwrite_a_network(self, library):
         before = (library / "pov1.safetensors").read_bytes()
         with pytest.raises(UserError, match=r"has a pov1 of another seed.*--out"):
-            train_library(library, ("pov1",), seed=1, settings=TINY)
+            train_library(library, ("pov1",), seed=1, settings=SMALL)
         assert (library / "pov1.safetensors").read_bytes() == before
 
     def test_level_2_needs_level_1_first(self, library):
         with pytest.raises(UserError, match="pov2 is trained against vut1: train that one first"):
-            train_library(library, ("pov2",), settings=TINY)
+            train_library(library, ("pov2",), settings=SMALL)
 
     @pytest.mark.parametrize("cut", [0, 7, 100, -1])
     def test_a_truncated_or_altered_file_is_refused_with_a_sentence(self, library, tmp_path, cut):

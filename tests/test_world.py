@@ -226,20 +226,24 @@ def test_answers_outside_the_limits_are_clipped_and_counted():
             assert (trajectory.a_vut_mps2[:-1] == A_MAX_MPS2).all()
 
 
-def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(monkeypatch):
+@pytest.mark.parametrize("half_step", ["advance", "command"])
+def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
+    monkeypatch, half_step
+):
     cases = random_cases(30)
     with World(4) as world:
-        step, calls = world.step, iter(range(10_000))
+        call, calls = getattr(world, half_step), iter(range(10_000))
 
-        def failing_step(acceleration):
+        def failing(*arguments):
             if next(calls) == 100:
                 raise SimulationError("the simulation broke")
-            step(acceleration)
+            call(*arguments)
 
-        monkeypatch.setattr(world, "step", failing_step)
+        monkeypatch.setattr(world, half_step, failing)
         trajectories = run_all(world, PovLibrary(4), Level0Vut(4), cases)
     broken = [t for t in trajectories if t.end is End.SIM_ERROR]
     assert len(broken) == 4
     assert all("the simulation broke" in t.error for t in broken)
+    assert all(len(t.motion) > 0 for t in broken)
     assert all(measure(t).score is None for t in broken)
     assert sum(t.end is End.MERGED for t in trajectories) == 26

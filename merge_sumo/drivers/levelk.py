@@ -8,9 +8,11 @@ not depend on how many others run beside it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
@@ -114,6 +116,22 @@ class QNetwork:
         weight, bias = self.layers[-1]
         values: FloatArray = (np.matmul(weight, hidden) + bias[:, None])[..., 0]
         return values
+
+    def values_at_once(self, inputs: FloatArray) -> NDArray[np.float32]:
+        """Return Q, (n, actions), in float32 by products of whole matrices.
+
+        Several times faster for many rows, but the last bits of a row depend on the others: for
+        training and searching, not for driving.
+        """
+        hidden = inputs.astype(np.float32)
+        for weight, bias in self._single[:-1]:
+            hidden = np.maximum(hidden @ weight + bias, 0.0)
+        weight, bias = self._single[-1]
+        return np.asarray(hidden @ weight + bias, dtype=np.float32)
+
+    @cached_property
+    def _single(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        return [(w.T.astype(np.float32), b.astype(np.float32)) for w, b in self.layers]
 
 
 class LevelKDriver(Driver):

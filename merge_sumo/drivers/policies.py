@@ -8,6 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
 from merge_sumo.errors import UserError
 from merge_sumo.resources import resource
@@ -24,8 +26,12 @@ def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
         return {}
     try:
         networks = json.loads(path.read_text(encoding="utf-8"))["networks"]
-        return {name: networks[name] for name in NETWORKS if name in networks}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        found = {name: dict(networks[name]) for name in NETWORKS if name in networks}
+        for name, entry in found.items():
+            if not isinstance(entry["sha256"], str):
+                raise TypeError(f"the sha256 of {name} is no text")
+        return found
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path} is not a readable manifest of policies: {error}") from error
 
 
@@ -56,7 +62,8 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
     try:
         network = QNetwork.from_tensors(load(content))
         inputs, outputs = network.layers[0][0].shape[1], network.layers[-1][0].shape[0]
-    except (SafetensorError, KeyError, ValueError, IndexError) as error:
+        network.values(np.zeros((1, inputs)))
+    except (SafetensorError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise UserError(f"{path} holds no action-value network: {error}") from error
     expected = FEATURES + (SVO_FEATURES if name == "pov2" else 0)
     if (inputs, outputs) != (expected, len(ACTIONS_MPS2)):

@@ -51,7 +51,9 @@ class RuleBasedDesign:
 
 DESIGNS: Final = {
     "design1": RuleBasedDesign(x1_m=96.1, x2_m=30.8, gap_m=13.7, target_m=13.8, kp=0.683, kd=0.252),
-    "design2": RuleBasedDesign(x1_m=122.2, x2_m=38.2, gap_m=17.2, target_m=13.2, kp=2.68, kd=3.29),
+    "design2": RuleBasedDesign(
+        x1_m=145.5, x2_m=20.6, gap_m=15.8, target_m=8.7, kp=1.76, lag_s=0.356
+    ),
 }
 """Found by `tools/calibrate.py`: `design1` reacts late, `design2` sooner and harder."""
 

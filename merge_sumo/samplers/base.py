@@ -32,6 +32,16 @@ class LevelHistory:
     dx_m: FloatArray
     batch: NDArray[np.int64]
 
+    def take(self, places: slice | NDArray[np.int64]) -> LevelHistory:
+        """Return some of the outcomes."""
+        return LevelHistory(
+            points=self.points[places],
+            score=self.score[places],
+            failed=self.failed[places],
+            dx_m=self.dx_m[places],
+            batch=self.batch[places],
+        )
+
 
 class Sampler(ABC):
     """Proposes cases; knows nothing of SUMO and never runs anything.
@@ -52,7 +62,7 @@ class Sampler(ABC):
         """Return the next `n` cases."""
 
     def tell(self, outcomes: Iterable[Outcome]) -> None:
-        """Take outcomes; those without a verdict (VUT_ERROR, SIM_ERROR) teach nothing."""
+        """Take outcomes; those without a verdict (VUT_ERROR, SIM_ERROR) only count as proposed."""
         for outcome in outcomes:
             self._outcomes[outcome.index] = outcome
 
@@ -63,6 +73,10 @@ class Sampler(ABC):
             for _, outcome in sorted(self._outcomes.items())
             if outcome.measures.score is not None and level in (None, outcome.case.level)
         ]
+
+    def proposed(self, level: int | None = None) -> int:
+        """Return how many cases were told, with a verdict or without, of one level or of all."""
+        return sum(level in (None, outcome.case.level) for outcome in self._outcomes.values())
 
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays."""
@@ -77,8 +91,11 @@ class Sampler(ABC):
         )
 
     def rng(self, *key: int) -> np.random.Generator:
-        """Return the generator of this proposal: seed, cases told so far, and a key."""
-        return np.random.default_rng([self.seed, len(self.told()), *key])
+        """Return the generator of this proposal: seed, cases told so far, and a key.
+
+        Cases without a verdict count, so that a batch that gave none is not proposed again.
+        """
+        return np.random.default_rng([self.seed, self.proposed(), *key])
 
     def batch_rng(self, level: int, batch: int) -> np.random.Generator:
         """Return a generator that is the same whenever a batch of the past is replayed."""
@@ -99,7 +116,7 @@ class LevelwiseSampler(Sampler):
 
     def allocate(self, n: int) -> dict[int, int]:
         """Return the number of cases for each level; they add up to `n`."""
-        return even_shares({level: len(self.told(level)) for level in self.pool.levels}, n)
+        return even_shares({level: self.proposed(level) for level in self.pool.levels}, n)
 
     @abstractmethod
     def propose(

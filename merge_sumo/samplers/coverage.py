@@ -1,46 +1,67 @@
 """Ours: ask for what users want, the batch that maximises the expected new coverage.
 
 A case is worth P(fail) times the share of its ball (radius rho of the FMC) that is not covered
-yet. P(fail) comes in two steps. A Gaussian process learns the signed gap dx at M, where failing
-means |dx| < 6 m; a VUT that gives no trajectory has its score learned instead. Because dx jumps
-where another car goes first, the odds that the process gives are wrong near jumps, by how much
-differs from VUT to VUT, and the history tells: a logistic regression corrects the leave-one-out
-odds of the cases that were run by their distances to the nearest failing and the nearest safe one
-(the idea of Platt, 1999).
+yet. Failing means that the signed gap dx at M is within 6 m, so failures lie where the gap changes
+its sign: where another car goes first. Gaussian processes learn the gap; a VUT that gives no
+trajectory has its score learned instead. A process believes that the gap passes through 0 between
+a safe case on either side, but often it jumps, and then no test between them ever fails. So the
+odds of a case that is bracketed, the nearest safe case on either side being nearer than any
+failure, are lowered by h / (h + w): h is the width of the bracket, w the typical width of what
+fails, which is learned. Together that bisects the curve where the order of merging flips, gives
+up where it is a jump, and goes on along it where it is a strip of failures.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import expit
 
 from merge_sumo.case import Case, FloatArray, dimensions, from_unit
 from merge_sumo.fmc import RADIUS
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import LevelHistory, Sampler, uniform_points
-from merge_sumo.samplers.surrogate import Margin, evenly
+from merge_sumo.samplers.ground import Ground
+from merge_sumo.samplers.surrogate import Margin, most_telling
 from merge_sumo.scenario import DX_CRASH_M
 from merge_sumo.score import FAILURE_SCORE
 
 UNIFORM_QUERIES: Final = 1500
-LOCAL_QUERIES: Final = 1500
-"""Candidates per batch: anywhere, and within LOCAL_REACH of a failure."""
+LOCAL_QUERIES: Final = 600
+BETWEEN_QUERIES: Final = 600
+LINES: Final = 40
+LINE_STEPS: Final = 120
+REFINED_QUERIES: Final = 600
+"""Candidates per batch: anywhere, within LOCAL_REACH of a failure, between safe cases on either
+side, on lines across the cube along the slope of the margin, and around the best of all these."""
 LOCAL_REACH: Final = 2.0 * RADIUS
-MAX_GAP_M: Final = 40.0
-"""Gaps are learned up to here: beyond, they say nothing about failures."""
+BEST: Final = 150
+REFINED_REACH: Final = 0.03
+SHORTLIST: Final = 2000
+"""Candidates from which the batch is picked."""
+PICKED: Final = 0.6
+"""Share of a pick's ball that counts as covered at least for the later picks of the batch."""
+NO_GAP_M: Final = 200.0
+"""Gap of a VUT that never arrives: the POV goes first, as far ahead as one can be."""
 MAX_LEARNED: Final = 1000
-"""Cases that the process learns from; what bounds the time per batch in a long campaign."""
-CALIBRATE_FROM: Final = 3
-"""Failures that it takes to correct the odds."""
-CELL: Final = {2: 0.01, 3: 0.0125}
-"""Spacing of the grid, per dimension, on which coverage is counted."""
-SOFTENING: Final = 0.01
-"""Distances below this are not told apart."""
+"""Cases that a process learns from; what bounds the time per batch in a long campaign."""
+WIDTHS: Final = np.geomspace(0.001, 0.5, 25)
+SHARPNESSES: Final = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
+"""Factors of the log odds that are tried: how sure of themselves the processes should be."""
+LOG_PRIOR_WIDTH: Final = (np.log(0.02), 1.5)
+"""Widths w that are tried, and mean and standard deviation of log w before anything is known."""
+SURE: Final = 1e-3
+"""Probabilities nearer to 0 or 1 than this are not told apart."""
+JUDGED_FROM: Final = 3
+"""Failures, and safe cases, that it takes to tell somebody else P(fail)."""
+FORETOLD: Final = 100
+"""Cases, the last ones, that a belief without them foretells, to see how far it can be trusted."""
+EVEN_IF_COVERED: Final = 1e-3
+"""Where all is covered, the likeliest failures still come before the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,140 +117,222 @@ class CoverageSampler(Sampler):
 
         history, rng = self.history(level), self.rng(level)
         if len(history.points) < 2:
-            return Proposal(uniform_points(n, level, rng), np.ones(n))
+            return Proposal(_spread_out(n, len(dimensions(level)), rng), np.ones(n))
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
             return _Search(history, level, rng, n).batch(n)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: one each, the rest by the largest next gain."""
-        told = {level: len(self.told(level)) for level in self.pool.levels}
-        if min(told.values()) < 2:
-            return even_shares(told, n)
-        shares = even_shares(told, min(n, len(told)))
+        proposed = {level: self.proposed(level) for level in self.pool.levels}
+        if min(len(self.told(level)) for level in self.pool.levels) < 2:
+            return even_shares(proposed, n)
+        shares = even_shares(proposed, min(n, len(proposed)))
         for _ in range(n - sum(shares.values())):
             best = max(shares, key=lambda level: proposals[level].gain[shares[level]])
             shares[best] += 1
         return shares
 
 
-class Ground:
-    """The unit cube with a margin of one radius, as cells with the chance not to be covered."""
+class _Belief:
+    """P(fail) at a level, from its history."""
 
-    def __init__(self, dims: int) -> None:
-        """Prepare an uncovered ground of `dims` dimensions."""
-        self._cell = CELL[dims]
-        reach = int(RADIUS / self._cell) + 1
-        side = round((1.0 + 2.0 * RADIUS) / self._cell) + 5
-        self._strides = side ** np.arange(dims)[::-1]
-        axes = np.meshgrid(*[np.arange(-reach, reach + 1)] * dims, indexing="ij")
-        offsets = np.stack(axes, axis=-1).reshape(-1, dims)
-        inside = np.square(offsets * self._cell).sum(axis=1) <= RADIUS**2
-        self._ball = offsets[inside] @ self._strides
-        self._open = np.ones(side**dims, dtype=np.float32)
+    def __init__(self, history: LevelHistory) -> None:
+        learned = most_telling(history, MAX_LEARNED)
+        values, low, high = margin_of(learned)
+        self._margins = [
+            Margin(learned.points, values, low, high, rough=rough) for rough in (False, True)
+        ]
+        self._groups = _groups(history)
+        self._history = history
+        self.rotation = self._margins[0].rotation
+        self._judge(learned)
 
-    def balls(self, points: FloatArray) -> NDArray[np.int64]:
-        """Return the cells of the ball around each point, (n, cells)."""
-        corner = np.rint((points + RADIUS) / self._cell).astype(np.int64) + 2
-        return np.asarray((corner @ self._strides)[:, None] + self._ball, dtype=np.int64)
+    def of(self, cases: FloatArray) -> FloatArray:
+        """Return P(fail) of cases, (m, d)."""
+        distances = [_nearest(cases, self._history.points[group]) for group in self._groups]
+        odds = [margin.at(cases) for margin in self._margins]
+        mean = np.average(odds, axis=0, weights=self._weights)
+        return _sharpened(_lowered(mean, distances, self._width), self._sharpness)
 
-    def new(self, balls: NDArray[np.int64]) -> FloatArray:
-        """Return the expected share of each ball that is not covered, (n,)."""
-        return np.asarray(self._open[balls].mean(axis=1), dtype=np.float64)
+    def between(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Return `n` places, (n, d), or none, between safe cases on either side, most in narrow
+        brackets.
+        """
+        _, before, behind = (self._history.points[group] for group in self._groups)
+        if not (len(before) and len(behind)):
+            return np.empty((0, self._history.points.shape[1]))
+        near = [*range(1, 1 + min(3, len(before), len(behind)))]
+        pairs = np.concatenate(
+            [
+                _pairs(before, behind, near),
+                _pairs(behind, before, near)[:, ::-1],
+            ]
+        )
+        first, second = before[pairs[:, 0]], behind[pairs[:, 1]]
+        weight = (np.linalg.norm(first - second, axis=1) + REFINED_REACH) ** -2.0
+        chosen = rng.choice(len(pairs), size=n, p=weight / weight.sum())
+        part = rng.random((n, 1))
+        return np.asarray(first[chosen] * (1.0 - part) + second[chosen] * part, dtype=np.float64)
 
-    def cover(self, balls: NDArray[np.int64], probability: float) -> None:
-        """Cover balls with a probability."""
-        self._open[balls] *= np.float32(1.0 - probability)
-
-    def covered_balls(self) -> float:
-        """Return the expected covered volume in balls."""
-        return float((1.0 - self._open).sum()) / len(self._ball)
+    def _judge(self, learned: LevelHistory) -> None:
+        """Weigh the processes and learn the width w by how well they foretold each case."""
+        failed = learned.failed
+        distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
+        odds = [margin.left_out() for margin in self._margins]
+        log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
+        scores = np.empty((len(odds), len(WIDTHS), len(SHARPNESSES)))
+        for i, p in enumerate(odds):
+            for j, width in enumerate(WIDTHS.tolist()):
+                lowered = _lowered(p, distances, width)
+                for k, sharpness in enumerate(SHARPNESSES):
+                    likelihood = _log_likelihood(_sharpened(lowered, sharpness), failed)
+                    scores[i, j, k] = likelihood + log_prior[j] - 0.5 * np.log(sharpness) ** 2
+        best = scores.max(axis=(1, 2))
+        self._weights = np.exp(best - best.max())
+        _, width_at, sharpness_at = np.unravel_index(np.argmax(scores), scores.shape)
+        self._width, self._sharpness = float(WIDTHS[width_at]), SHARPNESSES[int(sharpness_at)]
 
 
 class _Search:
     """One batch at one level."""
 
     def __init__(self, history: LevelHistory, level: int, rng: np.random.Generator, n: int) -> None:
-        learned = _learned_from(history)
-        margin = learn_margin(learned)
         failing = history.points[history.failed]
-        safe = history.points[~history.failed]
-        self._candidates = _candidates(history, level, rng, n)
-        self._to_failing = _nearest(self._candidates, failing)
-        self._to_safe = _nearest(self._candidates, safe)
-        self._odds = margin.at(self._candidates)
         self._ground = Ground(failing.shape[1])
         self._ground.cover(self._ground.balls(failing), 1.0)
-        self._balls = self._ground.balls(self._candidates)
-        self._correction = _correction(margin, learned)
+        belief = _Belief(history)
+        trust = _trust(history)
+        candidates = _candidates(history, belief, level, rng, n)
+        probability = belief.of(candidates) * trust[_far(candidates, failing)]
+        worth = probability * self._ground.new(self._ground.balls(candidates))
+        best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
+        refined = _around(best, REFINED_QUERIES, REFINED_REACH, rng)
+        candidates = np.concatenate([candidates, refined])
+        probability = np.concatenate(
+            [probability, belief.of(refined) * trust[_far(refined, failing)]]
+        )
+        worth = probability * (self._ground.new(self._ground.balls(candidates)) + EVEN_IF_COVERED)
+        kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
+        self._candidates, self._probability = candidates[kept], probability[kept]
 
     def batch(self, n: int) -> Proposal:
-        """Return the greedy batch of `n` cases: each knows what is expected of the earlier ones."""
+        """Return the greedy batch of `n` cases.
+
+        Most of the ball of a pick counts as covered for the later ones: if the pick fails, it is
+        covered, and if it does not, picks near it would mostly have been as wrong.
+        """
+        balls = self._ground.balls(self._candidates)
         picks: list[int] = []
         gains: list[float] = []
-        taken = np.zeros(len(self._candidates), dtype=bool)
+        free = np.ones(len(balls), dtype=bool)
         for _ in range(n):
-            probability = self._probability()
-            value = probability * self._ground.new(self._balls)
-            # Where all is covered, the likeliest failures still come before the others.
-            best = int(np.argmax(np.where(taken, -1.0, value + 1e-3 * probability)))
-            taken[best] = True
+            new = self._ground.new(balls)
+            worth = np.where(free, self._probability * (new + EVEN_IF_COVERED), -1.0)
+            best = int(np.argmax(worth))
+            free[best] = False
             picks.append(best)
-            gains.append(float(value[best]))
-            self._ground.cover(self._balls[best], float(probability[best]))
-            self._odds.run(best)
-            if probability[best] <= 0.5:
-                # What it teaches if it is safe, as expected: others near it are, too.
-                apart = np.linalg.norm(self._candidates - self._candidates[best], axis=1)
-                self._to_safe = np.minimum(self._to_safe, apart)
+            gains.append(float(self._probability[best] * new[best]))
+            self._ground.cover(balls[best], max(PICKED, float(self._probability[best])))
         return Proposal(self._candidates[picks], np.array(gains))
 
-    def _probability(self) -> FloatArray:
-        """Return P(fail) of each candidate, (m,)."""
-        odds = self._odds.log_odds()
-        if self._correction is None:
-            return np.asarray(expit(odds), dtype=np.float64)
-        features = _features(odds, self._to_failing, self._to_safe)
-        return np.asarray(self._correction.predict_proba(features)[:, 1], dtype=np.float64)
+
+def _far(points: FloatArray, failing: FloatArray) -> NDArray[np.int64]:
+    """Return for each point, (n,), 1 where no failure is within LOCAL_REACH, else 0."""
+    return (_nearest(points, failing) > LOCAL_REACH).astype(np.int64)
 
 
-def learn_margin(history: LevelHistory) -> Margin:
-    """Return the surrogate of the signed gap or, where there is none, of the score."""
+def _trust(history: LevelHistory) -> FloatArray:
+    """Return what P(fail) is multiplied by, near failures and far from them, (2,).
+
+    Cases are picked where P(fail) is large, so among them it is too large more often than not.
+    What came of the last picks tells by how much.
+    """
+    first = len(history.points) - FORETOLD
+    if first < FORETOLD // 2:
+        return np.ones(2)
+    before, since = history.take(slice(first)), history.take(slice(first, None))
+    failing = before.points[before.failed]
+    chance = _Belief(before).of(since.points)
+    far = _far(since.points, failing)
+    foretold = np.bincount(far, chance, minlength=2)
+    failed = np.bincount(far, since.failed, minlength=2)
+    return np.minimum((failed + 1.0) / (foretold + 1.0), 1.0)
+
+
+def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | None:
+    """Return a function that gives P(fail), (n,), at points, (n, d), of the unit cube.
+
+    None while too few cases failed, or too few did not, to judge it by.
+    """
+    if min(history.failed.sum(), (~history.failed).sum()) < JUDGED_FROM:
+        return None
+    return _Belief(history).of
+
+
+def margin_of(history: LevelHistory) -> tuple[FloatArray, float, float]:
+    """Return what is learned, (N,), and the interval of it that means failure.
+
+    The signed gap in units of 6 m, compressed like a logarithm where it is large: a gap of 100 m
+    says little more about failures than one of 50 m. Without gaps, the score in units of lambda.
+    """
     if np.isnan(history.dx_m).all():
-        badness = history.score / FAILURE_SCORE - 1.0
-        return Margin(history.points, np.minimum(badness, 1.0), 0.0, np.inf)
-    # A VUT that never arrives lets the POV go first, as far ahead as one can be.
-    gap_m = np.clip(np.nan_to_num(history.dx_m, nan=MAX_GAP_M), -MAX_GAP_M, MAX_GAP_M)
-    return Margin(history.points, gap_m / DX_CRASH_M, -1.0, 1.0)
+        return np.minimum(history.score / FAILURE_SCORE - 1.0, 1.0), 0.0, np.inf
+    gap = np.nan_to_num(history.dx_m, nan=NO_GAP_M) / DX_CRASH_M
+    return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
 
 
-def _learned_from(history: LevelHistory) -> LevelHistory:
-    """Return at most MAX_LEARNED cases: half of them the worst ones, half spread over the rest."""
-    if len(history.points) <= MAX_LEARNED:
-        return history
-    order = np.argsort(history.score, kind="stable")
-    half = MAX_LEARNED // 2
-    rest = np.sort(order[half:])
-    kept = np.sort(np.concatenate([order[:half], rest[evenly(len(rest), half)]]))
-    return LevelHistory(
-        points=history.points[kept],
-        score=history.score[kept],
-        failed=history.failed[kept],
-        dx_m=history.dx_m[kept],
-        batch=history.batch[kept],
+def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
+    """Return which cases failed, and which safe ones are on either side, each (N,).
+
+    The side is who goes first; without a trajectory a safe case is on both.
+    """
+    safe = ~history.failed
+    if np.isnan(history.dx_m).all():
+        return [history.failed, safe, safe]
+    pov_first = np.nan_to_num(history.dx_m, nan=NO_GAP_M) >= 0.0
+    return [history.failed, safe & ~pov_first, safe & pov_first]
+
+
+def _spread_out(n: int, dims: int, rng: np.random.Generator) -> FloatArray:
+    """Return `n` points, (n, d), of a scrambled Halton sequence: no two of them close by chance."""
+    from scipy.stats.qmc import Halton
+
+    return np.asarray(Halton(dims, seed=rng).random(n), dtype=np.float64)
+
+
+def _candidates(
+    history: LevelHistory, belief: _Belief, level: int, rng: np.random.Generator, n: int
+) -> FloatArray:
+    """Return more than `n` candidates, (m, d)."""
+    worst = history.points[np.argsort(history.score, kind="stable")[:20]]
+    failing = history.points[history.failed]
+    along = np.linspace(-1.0, 1.0, LINE_STEPS) + rng.uniform(-0.01, 0.01, (LINES, LINE_STEPS))
+    base = uniform_points(LINES, level, rng)
+    lines = base[:, None] + along[..., None] * belief.rotation[:, 0]
+    lines = lines.reshape(-1, base.shape[1])
+    return np.concatenate(
+        [
+            uniform_points(UNIFORM_QUERIES + n, level, rng),
+            _around(failing if len(failing) else worst, LOCAL_QUERIES, LOCAL_REACH, rng),
+            belief.between(BETWEEN_QUERIES, rng),
+            lines[((lines >= 0.0) & (lines <= 1.0)).all(axis=1)],
+        ]
     )
 
 
-def _candidates(history: LevelHistory, level: int, rng: np.random.Generator, n: int) -> FloatArray:
-    """Return more than `n` candidates, (m, d): anywhere, and around the worst cases."""
-    worst = np.argsort(history.score, kind="stable")[: max(int(history.failed.sum()), 20)]
-    around = history.points[history.failed if history.failed.any() else worst]
-    centres = around[rng.integers(len(around), size=LOCAL_QUERIES)]
+def _around(points: FloatArray, n: int, reach: float, rng: np.random.Generator) -> FloatArray:
+    """Return `n` places of the unit cube, (n, d), within reach of some of the points."""
+    centres = points[rng.integers(len(points), size=n)]
     direction = rng.standard_normal(centres.shape)
     direction /= np.linalg.norm(direction, axis=1)[:, None]
-    reach = LOCAL_REACH * np.sqrt(rng.random((len(centres), 1)))
-    local = np.clip(centres + reach * direction, 0.0, 1.0)
-    return np.concatenate([uniform_points(UNIFORM_QUERIES + n, level, rng), local])
+    return np.clip(centres + reach * np.sqrt(rng.random((n, 1))) * direction, 0.0, 1.0)
+
+
+def _pairs(points: FloatArray, others: FloatArray, near: list[int]) -> NDArray[np.int64]:
+    """Return pairs (place, place of one of its nearest others), (m, 2)."""
+    _, place = cKDTree(others).query(points, k=near)
+    return np.column_stack([np.repeat(np.arange(len(points)), len(near)), place.ravel()])
 
 
 def _nearest(points: FloatArray, others: FloatArray) -> FloatArray:
@@ -239,26 +342,35 @@ def _nearest(points: FloatArray, others: FloatArray) -> FloatArray:
     return np.asarray(cKDTree(others).query(points)[0], dtype=np.float64)
 
 
-def _second_nearest(points: FloatArray) -> FloatArray:
-    """Return the distance of each point to the nearest one but itself."""
-    return np.asarray(cKDTree(points).query(points, k=2)[0][:, 1], dtype=np.float64)
+def _nearest_other(points: FloatArray, group: NDArray[np.bool_]) -> FloatArray:
+    """Return the distance of each point to the nearest of a group but itself; at most 1."""
+    distance = _nearest(points, points[group])
+    if group.sum() > 1:
+        distance[group] = cKDTree(points[group]).query(points[group], k=2)[0][:, 1]
+    else:
+        distance[group] = 1.0
+    return np.minimum(distance, 1.0)
 
 
-def _features(odds: FloatArray, to_failing: FloatArray, to_safe: FloatArray) -> FloatArray:
-    """Return what the correction sees of each case, (m, 3)."""
-    logs = np.log(np.column_stack([to_failing, to_safe]) + SOFTENING)
-    return np.column_stack([odds, logs])
+def _lowered(
+    probability: FloatArray, distances: list[FloatArray], typical_width: float
+) -> FloatArray:
+    """Return P(fail) with what a closed bracket of safe cases says against it.
+
+    `distances` are those to the nearest failure and to the nearest safe case on either side.
+    """
+    to_failing, before, behind = distances
+    width = before + behind
+    closed = to_failing > np.maximum(before, behind)
+    return np.where(closed, probability * width / (width + typical_width), probability)
 
 
-def _correction(margin: Margin, history: LevelHistory) -> Any:
-    """Return the regression that corrects the log odds, or None while there is too little."""
-    from sklearn.linear_model import LogisticRegression
+def _sharpened(probability: FloatArray, sharpness: float) -> FloatArray:
+    """Return the probabilities with their log odds multiplied (Platt, 1999, without offset)."""
+    for_it, against_it = probability**sharpness, (1.0 - probability) ** sharpness
+    return np.asarray(for_it / (for_it + against_it), dtype=np.float64)
 
-    failed, points = history.failed, history.points
-    if min(failed.sum(), (~failed).sum()) < CALIBRATE_FROM:
-        return None
-    to_failing, to_safe = _nearest(points, points[failed]), _nearest(points, points[~failed])
-    # A case is not its own neighbour.
-    to_failing[failed] = _second_nearest(points[failed])
-    to_safe[~failed] = _second_nearest(points[~failed])
-    return LogisticRegression().fit(_features(margin.left_out(), to_failing, to_safe), failed)
+
+def _log_likelihood(probability: FloatArray, failed: NDArray[np.bool_]) -> float:
+    p = np.clip(probability, SURE, 1.0 - SURE)
+    return float(np.log(np.where(failed, p, 1.0 - p)).sum())

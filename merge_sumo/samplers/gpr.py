@@ -11,21 +11,29 @@ from scipy.linalg import solve_triangular
 from merge_sumo.case import FloatArray
 from merge_sumo.samplers.allocation import last_failure_share, softmax_shares
 from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, uniform_points
+from merge_sumo.samplers.ground import Ground
+from merge_sumo.samplers.surrogate import most_telling
 from merge_sumo.score import FAILURE_SCORE
 
-QUERIES: Final = 2000
+QUERIES: Final = 4000
 """p, the uniform queries among which a batch is chosen."""
-EPSILON0: Final = 0.3
+EPSILON0: Final = 0.1
 ALPHA: Final = 0.95
 """epsilon = EPSILON0 ALPHA^(i-1) is the share of exploring picks in batch i."""
-Z_EXPLOIT: Final = (2.0, 1.0)
+Z_EXPLOIT: Final = (4.0, 1.0)
 Z_EXPLORE: Final = (1.0, 2.0)
 """Powers (z1, z2) and (z3, z4) of the predicted badness and of its variance."""
+COVERED: Final = 0.8
+"""Share of a pick's ball that counts as covered for the later picks of the batch."""
+FLOOR: Final = 1e-3
+"""What a query is worth even where all is covered."""
 XI: Final = 3.0
 """Greediness of the shares of the levels."""
-NOISE: Final = 1e-4
+NOISE: Final = 1e-2
 """Variance of the observation noise, in units of lambda^2: P has a jump, which a smooth
 surrogate can only take as noise."""
+MAX_LEARNED: Final = 600
+"""Cases that the process learns from; what bounds the time per batch in a long campaign."""
 LENGTH_BOUNDS: Final = (0.05, 5.0)
 """Bounds of the kernel's length scales in the unit cube. Below the FMC's radius a surrogate
 explains a jump by forgetting its neighbours."""
@@ -37,15 +45,18 @@ class GprSampler(LevelwiseSampler):
     The surrogate learns the badness -P / 500, because the powers of q = mu^z1 Var^z2 need
     positive numbers: P itself is never positive. Within a batch the picks are made one after the
     other, and the variance is conditioned on the earlier ones (it does not depend on their
-    results), so that a batch is spread out instead of piled up on one maximum.
+    results), so that a batch is spread out instead of piled up on one maximum. A query is worth
+    only the share of its ball (radius rho of the FMC) that no failure and no pick covers yet.
+
+    What the choices are worth is printed by `python tools/bench_samplers.py --ablate`.
     """
 
     def allocate(self, n: int) -> dict[int, int]:
         """Return equal shares first, then shares by the softmax of the last failure shares."""
         outcomes = self.told()
-        told = {level: sum(o.case.level == level for o in outcomes) for level in self.pool.levels}
+        proposed = {level: self.proposed(level) for level in self.pool.levels}
         shares = {level: last_failure_share(outcomes, level) for level in self.pool.levels}
-        return softmax_shares(shares, told, n, XI)
+        return softmax_shares(shares, proposed, n, XI)
 
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
@@ -68,6 +79,8 @@ class _Posterior:
 
     def __init__(self, history: LevelHistory, queries: FloatArray) -> None:
         self._queries = queries
+        failures = history.points[history.failed]
+        history = most_telling(history, MAX_LEARNED)
         process = _fit(history)
         self._kernel = process.kernel_
         cross = self._kernel(history.points, queries)
@@ -77,14 +90,19 @@ class _Posterior:
         self._badness = badness + 1e-6
         self._variance = self._kernel.diag(queries) - np.square(self._explained).sum(axis=0)
         self._taken = np.zeros(len(queries), dtype=bool)
+        self._ground = Ground(queries.shape[1])
+        self._ground.cover(self._ground.balls(failures), 1.0)
+        self._balls = self._ground.balls(queries)
 
     def pick(self, z_badness: float, z_variance: float) -> int:
-        """Take the query that maximises badness^z variance^z, and condition on it."""
+        """Take the query that maximises badness^z variance^z new, and condition on it."""
         variance = np.maximum(self._variance, 1e-12)
         quality = z_badness * np.log(self._badness) + z_variance * np.log(variance)
+        quality += np.log(self._ground.new(self._balls) + FLOOR)
         quality[self._taken] = -np.inf
         best = int(np.argmax(quality))
         self._taken[best] = True
+        self._ground.cover(self._balls[best], COVERED)
         covariance = self._kernel(self._queries[[best]], self._queries)[0]
         covariance -= self._explained[:, best] @ self._explained
         step = covariance / np.sqrt(variance[best] + NOISE)
@@ -108,3 +126,8 @@ def _fit(history: LevelHistory) -> Any:
         # A length scale at its bound is expected where P hardly depends on a coordinate.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return process.fit(history.points, history.score / FAILURE_SCORE)
+
+
+def predicted_score(history: LevelHistory, points: FloatArray) -> FloatArray:
+    """Return the score P that the surrogate predicts at points, (m, d), as (m,)."""
+    return np.asarray(FAILURE_SCORE * _fit(history).predict(points), dtype=np.float64)

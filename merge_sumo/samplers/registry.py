@@ -20,7 +20,6 @@ SAMPLERS: Final[dict[str, type[Sampler]]] = {
     "gpr": GprSampler,
     "coverage": CoverageSampler,
 }
-DEFAULT_SAMPLER: Final = "gpr"
 
 
 def make_sampler(name: str, pool: Pool, seed: int) -> Sampler:

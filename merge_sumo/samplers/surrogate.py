@@ -1,102 +1,166 @@
-"""The Gaussian process of `coverage`: a margin that is learned, and what it says of failing."""
+"""The Gaussian process of `coverage`: a margin that is learned, and what it says of failing.
+
+The kernel is var * prod_j k_j(|z_j - z'_j| / l_j) in coordinates z = Q^T x. The rotation Q turns
+the first axis along the mean slope of the margin: who goes first changes across a slanted curve,
+and a process that may be short across it and long along it needs fewer cases. k_j is Matern 3/2;
+a process that is `rough` has Matern 1/2 along the first axis, where the margin may jump.
+"""
 
 from __future__ import annotations
 
-import warnings
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from merge_sumo.case import FloatArray
+from merge_sumo.samplers.base import LevelHistory
 
 LEARN_FROM: Final = 150
-"""Cases from which the parameters of the kernel are learned, spread evenly over the history."""
-NOISE: Final = 1e-4
+"""Cases from which the parameters of the kernel are learned at most, and SPACING apart."""
+SPACING: Final = 0.02
+"""Cases that close on both sides of a jump would make the whole field look rough."""
+NOISE: Final = 1e-3
 """Variance of the observation noise: it keeps matrices with close cases invertible."""
-LENGTH_BOUNDS: Final = (0.05, 5.0)
-TINY: Final = 1e-5
-"""Probabilities nearer to 0 or 1 than this are not told apart."""
+LOG_PRIOR_VARIANCE: Final = (np.log(4.0), 1.5)
+LOG_PRIOR_LENGTH: Final = (np.log(0.4), 1.0)
+"""Mean and standard deviation of the logarithms of the parameters before anything is known."""
+VARIANCE_BOUNDS: Final = (1e-2, 1e3)
+LENGTH_BOUNDS: Final = (0.03, 10.0)
+CLIPPED: Final = 2.0
+"""Margins are clipped at this for the slope, which is sought near the failures."""
+ITERATIONS: Final = 25
 
 
 class Margin:
-    """A Gaussian process (Matern 3/2) on a margin of which an interval means failure."""
+    """A Gaussian process on a margin of which an interval means failure."""
 
-    def __init__(self, points: FloatArray, values: FloatArray, low: float, high: float) -> None:
+    def __init__(
+        self, points: FloatArray, values: FloatArray, low: float, high: float, *, rough: bool
+    ) -> None:
         """Learn `values`, (N,), at `points`, (N, d); between `low` and `high` a case fails."""
         self._interval = low, high
-        self._points = points
-        self._kernel = _learn_kernel(points, values)
-        gram = self._kernel(points) + NOISE * np.eye(len(points))
+        self._rough = rough
+        self.rotation = _rotation(points, values)
+        self._values = values
+        self._points = points @ self.rotation
+        some = spaced(points, SPACING, LEARN_FROM)
+        self._variance, self._lengths = _learn_kernel(self._points[some], values[some], rough)
+        gram = self._covariance(self._points) + NOISE * np.eye(len(points))
         self._factor = cholesky(gram, lower=True)
         self._alpha = cho_solve((self._factor, True), values)
-        self._values = values
 
     def left_out(self) -> FloatArray:
-        """Return for each case, (N,), the log odds of failing as seen by all the others.
+        """Return for each case, (N,), its probability of failing as seen by all the others.
 
         Leave-one-out predictions in closed form: Rasmussen and Williams (2006), eq. (5.12).
         """
         inverse = solve_triangular(self._factor, np.eye(len(self._factor)), lower=True)
         precision = np.square(inverse).sum(axis=0)
-        return self._log_odds(self._values - self._alpha / precision, 1.0 / precision)
+        return self._probability(self._values - self._alpha / precision, 1.0 / precision)
 
-    def at(self, queries: FloatArray) -> Queries:
-        """Return the posterior at queries, (m, d)."""
-        return Queries(self, queries)
+    def at(self, queries: FloatArray) -> FloatArray:
+        """Return the probability of failing at queries, (m, d)."""
+        cross = self._covariance(queries @ self.rotation)
+        explained = solve_triangular(self._factor, cross, lower=True)
+        variance = self._variance - np.square(explained).sum(axis=0)
+        return self._probability(cross.T @ self._alpha, variance)
 
-    def _log_odds(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
+    def _covariance(self, others: FloatArray) -> FloatArray:
+        correlation, _ = _correlation(self._points, others, self._lengths, self._rough)
+        return self._variance * correlation
+
+    def _probability(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
         low, high = self._interval
         deviation = np.sqrt(np.maximum(variance, 1e-12))
-        p = ndtr((high - mean) / deviation) - ndtr((low - mean) / deviation)
-        p = np.clip(p, TINY, 1.0 - TINY)
-        return np.asarray(np.log(p / (1.0 - p)), dtype=np.float64)
+        return np.asarray(
+            ndtr((high - mean) / deviation) - ndtr((low - mean) / deviation), dtype=np.float64
+        )
 
 
-class Queries:
-    """The posterior of a margin at queries, that can be conditioned on queries to be run."""
-
-    def __init__(self, margin: Margin, queries: FloatArray) -> None:
-        """Predict at `queries`, (m, d)."""
-        self._margin = margin
-        self._queries = queries
-        cross = margin._kernel(margin._points, queries)
-        self._explained = solve_triangular(margin._factor, cross, lower=True)
-        self._mean = cross.T @ margin._alpha
-        self._variance = margin._kernel.diag(queries) - np.square(self._explained).sum(axis=0)
-        self._steps = np.empty((0, len(queries)))
-
-    def log_odds(self) -> FloatArray:
-        """Return the log odds of failing, (m,)."""
-        return self._margin._log_odds(self._mean, self._variance)
-
-    def run(self, query: int) -> None:
-        """Take a query as run with the result that is expected: the mean stays where it is."""
-        covariance = self._margin._kernel(self._queries[[query]], self._queries)[0]
-        covariance -= self._explained[:, query] @ self._explained
-        covariance -= self._steps[:, query] @ self._steps
-        step = covariance / np.sqrt(max(self._variance[query], 0.0) + NOISE)
-        self._steps = np.vstack([self._steps, step])
-        self._variance = self._variance - np.square(step)
+def spaced(points: FloatArray, spacing: float, most: int) -> NDArray[np.int64]:
+    """Return the places of at most `most` points, the first ones that lie `spacing` apart."""
+    tree = cKDTree(points)
+    free = np.ones(len(points), dtype=bool)
+    kept: list[int] = []
+    for place in range(len(points)):
+        if free[place] and len(kept) < most:
+            kept.append(place)
+            free[tree.query_ball_point(points[place], spacing)] = False
+    return np.array(kept, dtype=np.int64)
 
 
-def _learn_kernel(points: FloatArray, values: FloatArray) -> Any:
-    """Return the kernel with the parameters of maximum likelihood."""
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import ConstantKernel, Matern
-
-    lengths = np.full(points.shape[1], 0.5)
-    kernel = ConstantKernel(10.0, (1e-2, 1e3)) * Matern(lengths, LENGTH_BOUNDS, nu=1.5)
-    some = evenly(len(points), LEARN_FROM)
-    with warnings.catch_warnings():
-        # A length scale at its bound is expected where the margin jumps or is flat.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        process = GaussianProcessRegressor(kernel, alpha=NOISE).fit(points[some], values[some])
-    return process.kernel_
+def most_telling(history: LevelHistory, most: int) -> LevelHistory:
+    """Return at most `most` cases: half of them the worst ones, half spread over the rest."""
+    if len(history.points) <= most:
+        return history
+    order = np.argsort(history.score, kind="stable")
+    half = most // 2
+    rest = np.sort(order[half:])
+    evenly = np.linspace(0, len(rest) - 1, half).round().astype(np.int64)
+    return history.take(np.sort(np.concatenate([order[:half], rest[evenly]])))
 
 
-def evenly(n: int, most: int) -> Any:
-    """Return at most `most` of the places 0 to n - 1, evenly spread."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
+def _rotation(points: FloatArray, values: FloatArray) -> FloatArray:
+    """Return an orthonormal matrix, (d, d), whose first column is the mean slope of the values."""
+    dims = points.shape[1]
+    centred = points - points.mean(axis=0)
+    clipped = np.clip(values, -CLIPPED, CLIPPED)
+    gram = centred.T @ centred + 1e-3 * len(points) * np.eye(dims)
+    slope = np.linalg.solve(gram, centred.T @ (clipped - clipped.mean()))
+    steepness = float(np.linalg.norm(slope))
+    if steepness < 1e-9:
+        return np.eye(dims)
+    axes, _ = np.linalg.qr(np.column_stack([slope / steepness, np.eye(dims)]))
+    return np.asarray(axes[:, :dims], dtype=np.float64)
+
+
+def _correlation(
+    points: FloatArray, others: FloatArray, lengths: FloatArray, rough: bool
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the correlations, (n, m), and for each coordinate the scaled distances, (n, m)."""
+    roots = np.where(rough & (np.arange(len(lengths)) == 0), 1.0, np.sqrt(3.0))
+    scaled = [
+        factor * np.abs(points[:, axis, None] - others[None, :, axis])
+        for axis, factor in enumerate((roots / lengths).tolist())
+    ]
+    correlation = np.exp(-np.sum(scaled, axis=0))
+    for distance in scaled[rough:]:
+        correlation *= 1.0 + distance
+    return correlation, scaled
+
+
+def _learn_kernel(points: FloatArray, values: FloatArray, rough: bool) -> tuple[float, FloatArray]:
+    """Return variance and lengths, (d,), of the largest posterior density."""
+    n, dims = points.shape
+    priors = np.array([LOG_PRIOR_VARIANCE, *[LOG_PRIOR_LENGTH] * dims])
+    bounds = np.log([VARIANCE_BOUNDS, *[LENGTH_BOUNDS] * dims])
+
+    def loss(logs: FloatArray) -> tuple[float, FloatArray]:
+        """Rasmussen and Williams (2006), eq. (2.30) and (5.9), with the prior."""
+        correlation, scaled = _correlation(points, points, np.exp(logs[1:]), rough)
+        covariance = np.exp(logs[0]) * correlation
+        factor = cholesky(covariance + NOISE * np.eye(n), lower=True)
+        alpha = cho_solve((factor, True), values)
+        weights = (cho_solve((factor, True), np.eye(n)) - np.outer(alpha, alpha)) * covariance
+        # d log k_j / d log l_j: u of Matern 1/2, u^2 / (1 + u) of Matern 3/2.
+        steep = [u if rough and axis == 0 else u * u / (1.0 + u) for axis, u in enumerate(scaled)]
+        slopes = [weights.sum(), *((weights * slope).sum() for slope in steep)]
+        off = (logs - priors[:, 0]) / priors[:, 1]
+        value = 0.5 * (values @ alpha + off @ off) + np.log(np.diag(factor)).sum()
+        return float(value), 0.5 * np.array(slopes) + off / priors[:, 1]
+
+    found = minimize(
+        loss,
+        priors[:, 0],
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": ITERATIONS},
+    )
+    parameters = np.exp(found.x)
+    return float(parameters[0]), np.asarray(parameters[1:], dtype=np.float64)

@@ -7,7 +7,7 @@ import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from lxml import etree
 
@@ -66,9 +66,22 @@ class Net:
         """Read and check the net at `path`, or the shipped one."""
         self.path = path or default_net_path()
         try:
-            self._bytes = self.path.read_bytes()
+            content = self.path.read_bytes()
         except OSError as error:
             raise UserError(f"cannot read the net {self.path}: {error.strerror}") from error
+        self._parse(content)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel to another process or machine as path and bytes."""
+        return Net.__new__, (Net,), (self.path, self._bytes)
+
+    def __setstate__(self, state: tuple[Path, bytes]) -> None:
+        """Arrive: no file is read."""
+        self.path, content = state
+        self._parse(content)
+
+    def _parse(self, content: bytes) -> None:
+        self._bytes = content
         parser = etree.XMLParser(
             resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
         )
@@ -120,6 +133,14 @@ class Net:
             lane, name = (self.ramp, RAMP) if on_ramp else (self.main_in, MAIN_IN)
             position = lane.length_m + x_m
         return f"{name}_0", position, *lane.point(position), lane.angle_deg
+
+    def lane_shapes(self) -> list[list[tuple[float, float]]]:
+        """Return the centre lines of all lanes as points (x, y) in metres."""
+        lines = []
+        for lane in self._root.iterfind("edge/lane"):
+            points = (point.split(",") for point in lane.get("shape", "").split())
+            lines.append([(float(x), float(y)) for x, y, *_ in points])
+        return lines
 
     def replicate(self, corridors: int) -> bytes:
         """Return a net of `corridors` copies, `CORRIDOR_SPACING_M` apart, ids suffixed ".k"."""

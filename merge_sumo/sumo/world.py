@@ -6,6 +6,9 @@ SUMO holds the state: positions and speeds are read back from it after every ste
     x(t+1) = x(t) + v(t) dt,    v(t+1) = v(t) + a(t) dt,
 
 is had by stepping at v(t) and then telling SUMO that the speed now is v(t+1).
+
+Where SUMO itself drives the VUTs, its car-following model and its junction logic decide v(t+1) from
+the state at t. SUMO then moves by v(t+1) instead of v(t), so the VUT is put where eq. (4) has it.
 """
 
 from __future__ import annotations
@@ -13,12 +16,13 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
+from lxml import etree
 
 from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
@@ -35,6 +39,9 @@ PARKING_M: Final = 182.0
 """Distance to M at which the vehicles of an idle corridor stand."""
 MAX_SPEED_MPS: Final = 200.0
 """Above what a POV can reach by the timeout, so that SUMO never caps a commanded speed."""
+
+VUT_TYPE: Final = "vut"
+"""Id of the vType of VUTs that SUMO drives."""
 
 SUMO_OPTIONS: Final = (
     *("--step-length", str(DT_S)),
@@ -64,12 +71,22 @@ class World:
 
     _open = False
 
-    def __init__(self, corridors: int = 32, net: Net | None = None) -> None:
-        """Start SUMO; raises `UserError` when it cannot start, or when a world is open already."""
+    def __init__(
+        self,
+        corridors: int = 32,
+        net: Net | None = None,
+        vut_type: Mapping[str, str] | None = None,
+    ) -> None:
+        """Start SUMO; raises `UserError` when it cannot start, or when a world is open already.
+
+        `vut_type` are attributes of a SUMO vType: with them SUMO's own models decide on the speed
+        of the VUTs, and `wanted_v_mps` tells what they want.
+        """
         if World._open:
             raise UserError("libsumo holds one simulation per process: close the other World first")
         self.corridors = corridors
         self.net = net or Net()
+        self.vut_type = vut_type
         self._libsumo = load_libsumo()
         self.x_m: FloatArray = np.empty((2, corridors))
         self.v_mps: FloatArray = np.empty((2, corridors))
@@ -91,15 +108,19 @@ class World:
         with tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder:
             net_file = Path(folder) / "corridors.net.xml"
             net_file.write_bytes(self.net.replicate(self.corridors))
+            types_file = Path(folder) / "types.add.xml"
+            types_file.write_bytes(_types(self.vut_type))
             messages = Path(folder) / "messages"
+            files = ("--net-file", str(net_file), "--additional-files", str(types_file))
             try:
                 with _standard_error_into(messages):
-                    libsumo.start(["sumo", "--net-file", str(net_file), *SUMO_OPTIONS])
+                    libsumo.start(["sumo", *files, *SUMO_OPTIONS])
             except libsumo.TraCIException as error:
                 said = messages.read_text(encoding="utf-8", errors="replace").split("\n")[0]
                 reason = said.removeprefix("Error: ") or error
                 raise UserError(f"SUMO cannot load the net {self.net.path}: {reason}") from error
         vehicle = libsumo.vehicle
+        self._add, self._remove = vehicle.add, vehicle.remove
         self._ids = [f"{who}.{k}" for who in ("pov", "vut") for k in range(self.corridors)]
         try:
             vtype = "DEFAULT_VEHTYPE"
@@ -109,7 +130,7 @@ class World:
                 k = index % self.corridors
                 edge = RAMP if index >= self.corridors else MAIN_IN
                 libsumo.route.add(f"route.{name}", [f"{edge}.{k}", f"{MAIN_OUT}.{k}"])
-                vehicle.add(name, f"route.{name}", departLane="0", departPos="10", departSpeed="0")
+                self._enter(name, vtype)
             libsumo.simulation.step()
             for name in self._ids:
                 vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
@@ -120,11 +141,23 @@ class World:
             raise UserError(f"SUMO cannot use the net {self.net.path}: {error}") from error
         # Bound once: attribute look-ups cost as much as the calls themselves.
         self._step_simulation = libsumo.simulation.step
-        self._move_to = vehicle.moveTo
+        self._move_to, self._set_lane_change_mode = vehicle.moveTo, vehicle.setLaneChangeMode
         self._set_speed, self._set_previous_speed = _raw(libsumo, "setSpeed", "setPreviousSpeed")
         self._get_position, self._get_speed = _raw(libsumo, "getLanePosition", "getSpeed")
+        self._commanded = len(self._ids) if self.vut_type is None else self.corridors
+        """How many of `_ids` hold the speed that they are told."""
         World._open = True
         self.read()
+
+    def _enter(self, name: str, vtype: str) -> None:
+        self._add(
+            name,
+            f"route.{name}",
+            typeID=vtype,
+            departLane="0",
+            departPos="10",
+            departSpeed="0",
+        )
 
     def place(
         self, corridor: int, x_pov_m: float, v_pov_mps: float, x_vut_m: float, v_vut_mps: float
@@ -136,9 +169,17 @@ class World:
         ):
             name = self._ids[row * self.corridors + corridor]
             to_m = float(self._before_m[row, corridor]) if x < 0.0 else 0.0
+            driven_by_sumo = row == VUT and self.vut_type is not None
+            if driven_by_sumo:
+                # A new vehicle: some of SUMO's models remember how they drove.
+                self._remove(name)
+                self._enter(name, VUT_TYPE)
             self._move_to(name, f"{edge if x < 0.0 else MAIN_OUT}.{corridor}_0", to_m + x)
             self._set_previous_speed(name, v, 0.0)
-            self._set_speed(name, v)
+            if driven_by_sumo:
+                self._set_lane_change_mode(name, 0)
+            else:
+                self._set_speed(name, v)
             self._to_m[row, corridor] = to_m
             self._position_m[row, corridor] = position = self._get_position(name)
             self.x_m[row, corridor] = position - to_m
@@ -153,20 +194,56 @@ class World:
 
         `a_mps2` has shape (2, corridors). Speeds do not fall below 0. Raises `SimulationError`.
         """
-        v_next = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
+        self.advance()
+        self.command(a_mps2)
+
+    def advance(self) -> None:
+        """Let SUMO make its step; `x_m` and `v_mps` stay those before it until `command`.
+
+        Raises `SimulationError`.
+        """
         try:
             self._step_simulation()
-            # A vehicle that keeps its speed needs no command: SUMO holds the last one.
+        except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
+            raise SimulationError(str(error)) from error
+
+    def wanted_v_mps(self) -> FloatArray:
+        """Return the speeds that SUMO's own models chose for the VUTs in its step, (corridors,)."""
+        names = self._ids[self.corridors :]
+        return np.fromiter(map(self._get_speed, names), float, len(names))
+
+    def command(self, a_mps2: FloatArray) -> None:
+        """Set the speeds that follow from accelerations, (2, corridors), and read the state.
+
+        Comes after `advance`; the two are one step. Raises `SimulationError`.
+        """
+        v_next = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
+        # A vehicle that keeps its speed needs no command: SUMO holds the last one.
+        changed = v_next != self.v_mps
+        try:
+            if self.vut_type is not None:
+                self._put_vuts(self.x_m[VUT] + self.v_mps[VUT] * DT_S)
+                changed[VUT] = True
             speeds, accelerations = v_next.ravel().tolist(), a_mps2.ravel().tolist()
             ids, set_previous_speed = self._ids, self._set_previous_speed
-            set_speed = self._set_speed
-            for index in np.flatnonzero(v_next != self.v_mps).tolist():
+            set_speed, commanded = self._set_speed, self._commanded
+            for index in np.flatnonzero(changed).tolist():
                 name, speed = ids[index], speeds[index]
                 set_previous_speed(name, speed, accelerations[index])
-                set_speed(name, speed)
+                if index < commanded:
+                    set_speed(name, speed)
             self.read()
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
+
+    def _put_vuts(self, x_m: FloatArray) -> None:
+        """Put the VUTs at lane coordinates, (corridors,)."""
+        names = self._ids[self.corridors :]
+        for k, (name, x) in enumerate(zip(names, x_m.tolist(), strict=True)):
+            if x < 0.0:
+                self._move_to(name, f"{RAMP}.{k}_0", self.net.ramp.length_m + x)
+            else:
+                self._move_to(name, f"{MAIN_OUT}.{k}_0", x)
 
     def read(self) -> None:
         """Read positions and speeds of all vehicles from SUMO into `x_m` and `v_mps`."""
@@ -196,6 +273,14 @@ class World:
     def __exit__(self, *_: object) -> None:
         """Close the world."""
         self.close()
+
+
+def _types(vut_type: Mapping[str, str] | None) -> bytes:
+    """Return the additional file with the vType of VUTs that SUMO drives, if there is one."""
+    root = etree.Element("additional")
+    if vut_type is not None:
+        etree.SubElement(root, "vType", {"id": VUT_TYPE, **vut_type})
+    return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
 
 
 @contextmanager

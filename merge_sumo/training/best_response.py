@@ -11,6 +11,7 @@ All returns are sums of the reward over the game, from starts of the pool.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -22,12 +23,11 @@ from merge_sumo.drivers.levelk import (
     DECISION_STEPS,
     LEVEL0_GAP_FEATURE,
     QNetwork,
-    features,
 )
 from merge_sumo.scenario import DT_S, MAX_STEPS, V_VUT0_MPS, X_VUT0_M
+from merge_sumo.training.game import MAX_DECISIONS, Game, IntArray, inputs_of
 from merge_sumo.training.reward import (
     RewardWeights,
-    pov_reward,
     pov_step,
     safety,
     vut_end,
@@ -191,104 +191,61 @@ def _arrivals(weights: RewardWeights) -> tuple[FloatArray, FloatArray, FloatArra
     return steps, x, v_end, reward
 
 
+@dataclass(frozen=True, slots=True)
+class BestGames:
+    """What a search found from n states: the best returns, (n,), and the actions that lead there.
+
+    `plans` has shape (n, MAX_DECISIONS): places in ACTIONS_MPS2, -1 behind the end of the game.
+    """
+
+    returns: FloatArray
+    plans: IntArray
+
+
 def beam_search(
-    role: str,
-    x_pov0_m: FloatArray,
-    v_pov0_mps: FloatArray,
-    svo_rad: FloatArray,
-    agent: QNetwork,
-    opponent: QNetwork,
-    weights: RewardWeights,
-    width: int = 64,
-) -> FloatArray:
-    """Return the best return, (n,), that a beam search finds against a learned opponent.
+    game: Game, state: FloatArray, svo_rad: FloatArray, agent: QNetwork, width: int = 64
+) -> BestGames:
+    """Return the best games that a beam search finds from states, (n, 4), of a game.
 
     Every state of the beam is continued by all actions. Of the results, half of the beam goes to
     those with the best reward so far plus the agent's own estimate of the rest, and half to the
     best of each class of predicted gap at M, so that the agent's errors cannot hide an answer.
     """
-    starts = range(0, len(x_pov0_m), _CHUNK)
-    chunks = [slice(start, start + _CHUNK) for start in starts]
-    beams = [
-        _beam_chunk(role, x_pov0_m[c], v_pov0_mps[c], svo_rad[c], agent, opponent, weights, width)
-        for c in chunks
-    ]
-    return np.concatenate([np.empty(0), *beams])
+    chunks = [slice(start, start + _CHUNK) for start in range(0, len(state), _CHUNK)]
+    found = [_beam_chunk(game, state[c], svo_rad[c], agent, width) for c in chunks]
+    return BestGames(
+        np.concatenate([np.empty(0), *(f.returns for f in found)]),
+        np.concatenate([np.empty((0, MAX_DECISIONS), np.int64), *(f.plans for f in found)]),
+    )
 
 
 def _beam_chunk(
-    role: str,
-    x0: FloatArray,
-    v0: FloatArray,
-    svo_rad: FloatArray,
-    agent: QNetwork,
-    opponent: QNetwork,
-    weights: RewardWeights,
-    width: int,
-) -> FloatArray:
-    cases = np.arange(len(x0))
-    state = np.stack([x0, v0, np.full(len(x0), X_VUT0_M), np.full(len(x0), V_VUT0_MPS)], axis=1)
-    so_far = np.zeros(len(x0))
-    best = np.full(len(x0), -np.inf)
-    for _ in range(0, MAX_STEPS, DECISION_STEPS):
-        answer = _greedy(opponent, state, svo_rad[cases])
-        n = len(ACTIONS_MPS2)
-        a_agent = np.tile(ACTIONS_MPS2, len(state))
-        a_other = np.repeat(answer, n)
-        cases, so_far = np.repeat(cases, n), np.repeat(so_far, n)
-        state = np.repeat(state, n, axis=0)
-        state, reward, over = _advance(role, state, a_agent, a_other, svo_rad[cases], weights)
+    game: Game, state: FloatArray, svo_rad: FloatArray, agent: QNetwork, width: int
+) -> BestGames:
+    n, actions = len(state), len(ACTIONS_MPS2)
+    cases, so_far = np.arange(n), np.zeros(n)
+    plan = np.full((n, MAX_DECISIONS), -1)
+    best, best_plan = np.full(n, -np.inf), plan.copy()
+    for decision in range(MAX_DECISIONS):
+        action = np.tile(np.arange(actions), len(state))
+        cases, so_far = np.repeat(cases, actions), np.repeat(so_far, actions)
+        plan = np.repeat(plan, actions, axis=0)
+        plan[:, decision] = action
+        state = np.repeat(state, actions, axis=0)
+        state, reward, over = game.advance(state, svo_rad[cases], ACTIONS_MPS2[action])
         so_far = so_far + reward
-        np.maximum.at(best, cases[over], so_far[over])
-        cases, state, so_far = cases[~over], state[~over], so_far[~over]
+        ended = np.flatnonzero(over)
+        # In rising order, so that the best of a case is written last.
+        ended = ended[np.argsort(so_far[ended], kind="stable")]
+        ended = ended[so_far[ended] > best[cases[ended]]]
+        best[cases[ended]], best_plan[cases[ended]] = so_far[ended], plan[ended]
         # Nothing that goes on can win more than the reward of a full gap.
-        alive = so_far + weights.gap > best[cases]
-        cases, state, so_far = cases[alive], state[alive], so_far[alive]
-        if not cases.size:
+        alive = np.flatnonzero(~over & (so_far + game.weights.gap > best[cases]))
+        if not alive.size:
             break
-        keep = _prune(cases, state, so_far, svo_rad, agent, width)
-        cases, state, so_far = cases[keep], state[keep], so_far[keep]
-    return best
-
-
-def _columns(state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    return state[:, 0], state[:, 1], state[:, 2], state[:, 3]
-
-
-def _greedy(network: QNetwork, state: FloatArray, svo_rad: FloatArray) -> FloatArray:
-    inputs = features(*_columns(state), svo_rad if network.sees_svo else None)
-    picked: FloatArray = ACTIONS_MPS2[network.values(inputs).argmax(axis=1)]
-    return picked
-
-
-def _advance(
-    role: str,
-    state: FloatArray,
-    a_agent: FloatArray,
-    a_other: FloatArray,
-    svo_rad: FloatArray,
-    weights: RewardWeights,
-) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Play one decision by eq. (4); return states, the agent's reward, and what is over."""
-    x_pov, v_pov, x_vut, v_vut = state.T.copy()
-    a_pov, a_vut = (a_agent, a_other) if role == "pov" else (a_other, a_agent)
-    safe, pov_ego, vut_ego = np.zeros((3, len(state)))
-    over = np.zeros(len(state), dtype=bool)
-    for _ in range(DECISION_STEPS):
-        live = ~over
-        pov_ego += live * pov_step(v_pov, a_pov, weights)
-        vut_ego += live * vut_step(v_vut, a_vut, weights)
-        x_pov = np.where(live, x_pov + v_pov * DT_S, x_pov)
-        x_vut = np.where(live, x_vut + v_vut * DT_S, x_vut)
-        v_pov = np.where(live, np.maximum(v_pov + a_pov * DT_S, 0.0), v_pov)
-        v_vut = np.where(live, np.maximum(v_vut + a_vut * DT_S, 0.0), v_vut)
-        arrived = live & (x_vut >= 0.0)
-        safe += arrived * safety(x_pov - x_vut, v_pov - v_vut, weights)
-        vut_ego += arrived * vut_end(v_vut, weights)
-        over |= arrived
-    of_pov = role == "pov"
-    reward = pov_reward(safe, pov_ego, vut_ego, svo_rad) if of_pov else safe + vut_ego
-    return np.stack([x_pov, v_pov, x_vut, v_vut], axis=1), reward, over
+        alive = alive[_prune(cases[alive], state[alive], so_far[alive], svo_rad, agent, width)]
+        cases, state, so_far, plan = cases[alive], state[alive], so_far[alive], plan[alive]
+    return BestGames(best, best_plan)
 
 
 def _prune(
@@ -300,9 +257,9 @@ def _prune(
     width: int,
 ) -> np.ndarray:
     """Return the indices of at most `width` states per case that stay in the beam."""
-    inputs = features(*_columns(state), svo_rad[cases] if agent.sees_svo else None)
+    inputs = inputs_of(agent, state, svo_rad[cases])
     # The networks rate with squashed returns; only the order matters here.
-    promise = so_far + agent.values(inputs).max(axis=1)
+    promise = so_far + agent.values_at_once(inputs).max(axis=1)
     gap_class = np.clip(np.rint(inputs[:, LEVEL0_GAP_FEATURE] * 8.0), -8, 8)
     rows = np.arange(len(cases))
 

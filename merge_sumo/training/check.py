@@ -11,16 +11,18 @@ import numpy as np
 from merge_sumo.case import SVO, Case, FloatArray, from_unit
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
-from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
+from merge_sumo.drivers.levelk import ACTIONS_MPS2, LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.rollout import rollout
-from merge_sumo.scenario import DX_CRASH_M
+from merge_sumo.scenario import DX_CRASH_M, LEVEL0_A_MPS2, LEVEL0_V_MPS, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import (
     beam_search,
     best_response_pov1,
     best_response_vut1,
 )
+from merge_sumo.training.env import pool_starts
+from merge_sumo.training.game import Game, IntArray, greedy
 from merge_sumo.training.reward import (
     RewardWeights,
     pov_reward,
@@ -129,41 +131,102 @@ def check_policy(
     count: int = CHECK_CASES,
 ) -> PolicyCheck:
     """Return how near a network is to its best response over `count` cases of the pool."""
-    weights = weights or RewardWeights()
-    network, opponent = load_network(name, folder), opponents(name, folder)
+    opponent = opponents(name, folder)
+    return check_network(
+        name,
+        load_network(name, folder),
+        opponent if isinstance(opponent, QNetwork) else None,
+        weights or RewardWeights(),
+        count,
+    )
+
+
+def check_network(
+    name: str, network: QNetwork, opponent: QNetwork | None, weights: RewardWeights, count: int
+) -> PolicyCheck:
+    """Return how near a network is to its best response; `opponent` is None for level 0."""
     cases = check_cases(name, count)
-    x0 = np.array([case.x_pov0_m for case in cases])
-    v0 = np.array([case.v_pov0_mps for case in cases])
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
     is_pov = name.startswith("pov")
+    level0 = Level0Pov if is_pov else Level0Vut
+    other = opponent or (Level0Vut if is_pov else Level0Pov)
 
     def returns(driver: type[Driver] | QNetwork) -> tuple[FloatArray, np.ndarray]:
-        pair = (driver, opponent) if is_pov else (opponent, driver)
+        pair = (driver, other) if is_pov else (other, driver)
         got = returns_of(play(cases, *pair), weights)
         if is_pov:
             return pov_reward(got.safe, got.pov_ego, got.vut_ego, svo_rad), got.collided
         return got.safe + got.vut_ego, got.collided
 
     reached, collided = returns(network)
-    level0, _ = returns(Level0Pov if is_pov else Level0Vut)
-    if name == "pov1":
-        best = best_response_pov1(x0, v0, weights)
-    elif name == "vut1":
-        best = best_response_vut1(x0, v0, weights)
-    else:
-        assert isinstance(opponent, QNetwork)  # noqa: S101 (level 2 faces level 1)
-        best = beam_search(name[:3], x0, v0, svo_rad, network, opponent, weights)
-        # The driver's own sequence is one that a search may find.
+    unmoved, _ = returns(level0)
+    best = best_returns(name, network, opponent, weights, cases, svo_rad)
+    if opponent is not None:
+        # The driver's own games are some that a search may find.
         best = np.maximum(best, reached)
-    gain = float((best - level0).mean())
+    gain = float((best - unmoved).mean())
     regret = (best - reached) / gain
     return PolicyCheck(
         cases=count,
         mean_return=float(reached.mean()),
         mean_best=float(best.mean()),
-        mean_level0=float(level0.mean()),
+        mean_level0=float(unmoved.mean()),
         mean_regret=float(regret.mean()),
         p99_regret=float(np.quantile(regret, 0.99)),
         collisions=int(collided.sum()),
         avoidable_collisions=int((collided & (best > -weights.crash / 2)).sum()),
     )
+
+
+def best_returns(
+    name: str,
+    network: QNetwork,
+    opponent: QNetwork | None,
+    weights: RewardWeights,
+    cases: list[Case],
+    svo_rad: FloatArray,
+) -> FloatArray:
+    """Return what the best response to an opponent would have, (n,): see `best_response`."""
+    x0 = np.array([case.x_pov0_m for case in cases])
+    v0 = np.array([case.v_pov0_mps for case in cases])
+    if opponent is None:
+        exact = best_response_pov1 if name == "pov1" else best_response_vut1
+        return exact(x0, v0, weights)
+    n = len(cases)
+    game = Game("pov" if name == "pov2" else "vut", opponent, weights)
+    start = np.stack([x0, v0, np.full(n, X_VUT0_M), np.full(n, V_VUT0_MPS)], axis=1)
+    searched = beam_search(game, start, svo_rad, network).returns
+    played_out = game.play(start, svo_rad, game.improved(greedy(network)))
+    return np.maximum(searched, played_out)
+
+
+class QuickRegret:
+    """A lower bound of the mean regret that is quick enough to be watched while training.
+
+    The best response is replaced by the network's own policy with every action played out before
+    it is chosen, from some starts of the pool.
+    """
+
+    def __init__(self, game: Game, *, sees_svo: bool, starts: int = 100) -> None:
+        """Draw the starts."""
+        rng = np.random.default_rng(CHECK_SEED + 1)
+        self._game = game
+        self._start = pool_starts(starts, rng)
+        self._svo_rad = rng.uniform(SVO.low, SVO.high, starts) * sees_svo
+        still = ACTIONS_MPS2.tolist().index(0.0)
+        along = ACTIONS_MPS2.tolist().index(LEVEL0_A_MPS2)
+
+        def level0(state: FloatArray, _: FloatArray) -> IntArray:
+            if game.role == "pov":
+                return np.full(len(state), still)
+            return np.where(state[:, 3] < LEVEL0_V_MPS, along, still)
+
+        self._level0 = game.play(self._start, self._svo_rad, level0)
+
+    def __call__(self, network: QNetwork) -> float:
+        """Return the bound for a network, as a share of the mean gain over level-0 behaviour."""
+        policy = greedy(network)
+        reached = self._game.play(self._start, self._svo_rad, policy)
+        improved = self._game.play(self._start, self._svo_rad, self._game.improved(policy))
+        best = np.maximum(reached, improved)
+        return float((best - reached).mean() / (best - self._level0).mean())

@@ -25,14 +25,14 @@ from torch import Tensor, nn
 from merge_sumo.case import SVO, FloatArray
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, QNetwork, features
 from merge_sumo.training.env import MergeGame, exploring_starts
+from merge_sumo.training.game import MAX_DECISIONS
 
 SQUASH_BELOW: Final = -2.0
-MAX_DECISIONS: Final = 60
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TrainingSettings:
-    """What `train` does; the defaults train a network in a few minutes on one core.
+class DdqnSettings:
+    """What `train` does.
 
     Attributes:
         transitions: size of the replay; every transition is kept.
@@ -54,8 +54,8 @@ class TrainingSettings:
         last_midway: share of games that begin mid-way from then on.
     """
 
-    transitions: int = 600_000
-    updates: int = 60_000
+    transitions: int = 400_000
+    updates: int = 40_000
     collecting: float = 0.6
     warm_up: int = 20_000
     batch: int = 512
@@ -71,7 +71,7 @@ class TrainingSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class TrainingProgress:
+class DdqnProgress:
     """Where training is: told after every thousand updates."""
 
     updates: int
@@ -134,19 +134,19 @@ class Replay:
 def train(
     game: MergeGame,
     seed: int,
-    settings: TrainingSettings | None = None,
+    settings: DdqnSettings | None = None,
     *,
     sees_svo: bool = False,
-    on_progress: Callable[[TrainingProgress], None] | None = None,
+    on_progress: Callable[[DdqnProgress], None] | None = None,
 ) -> QNetwork:
     """Train the agent of a game and return its network; same seed, same weights."""
-    s = settings or TrainingSettings()
+    s = settings or DdqnSettings()
     # One thread: the result must not depend on the number of cores.
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     inputs = FEATURES + SVO_FEATURES * sees_svo
-    online, target = _network(inputs, s.width), _network(inputs, s.width)
+    online, target = make_network(inputs, s.width), make_network(inputs, s.width)
     target.load_state_dict(online.state_dict())
     optimiser = torch.optim.Adam(online.parameters(), lr=s.learning_rate, fused=True)
     replay = Replay(s.transitions)
@@ -177,16 +177,16 @@ def train(
             if on_progress and update % 1000 == 0:
                 mean_return, crash_share = collector.recent()
                 on_progress(
-                    TrainingProgress(
+                    DdqnProgress(
                         update,
                         replay.filled,
                         float(loss.detach()),
                         mean_return,
                         crash_share,
-                        _export(target),
+                        export(target),
                     )
                 )
-    return _export(target)
+    return export(target)
 
 
 class _Collector:
@@ -284,7 +284,8 @@ def _svo_columns(svo_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0
 
 
-def _network(inputs: int, width: int) -> nn.Sequential:
+def make_network(inputs: int, width: int) -> nn.Sequential:
+    """Return a network with two hidden layers, at random."""
     return nn.Sequential(
         nn.Linear(inputs, width),
         nn.ReLU(),
@@ -294,7 +295,8 @@ def _network(inputs: int, width: int) -> nn.Sequential:
     )
 
 
-def _export(network: nn.Sequential) -> QNetwork:
+def export(network: nn.Sequential) -> QNetwork:
+    """Return a torch network as one that acts in numpy."""
     linear = [layer for layer in network if isinstance(layer, nn.Linear)]
     return QNetwork(
         [
@@ -302,3 +304,15 @@ def _export(network: nn.Sequential) -> QNetwork:
             for layer in linear
         ]
     )
+
+
+def as_torch(network: QNetwork) -> nn.Sequential:
+    """Return a network as one that torch trains, in float32; the inverse of `export`."""
+    width, inputs = network.layers[0][0].shape
+    model = make_network(inputs, width)
+    linear = [layer for layer in model if isinstance(layer, nn.Linear)]
+    with torch.no_grad():
+        for layer, (weight, bias) in zip(linear, network.layers, strict=True):
+            layer.weight.copy_(torch.from_numpy(weight))
+            layer.bias.copy_(torch.from_numpy(bias))
+    return model

@@ -29,6 +29,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario import MAX_STEPS, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.world import POV, VUT, World
+from merge_sumo.training.game import Role
 from merge_sumo.training.reward import (
     RewardWeights,
     pov_reward,
@@ -38,7 +39,6 @@ from merge_sumo.training.reward import (
     vut_step,
 )
 
-Role = Literal["pov", "vut"]
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])
 

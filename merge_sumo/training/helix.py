@@ -1,24 +1,33 @@
-"""The double helix: each level-k driver is trained against level k-1 (Wang et al., Fig. 2b)."""
+"""The double helix: each level-k driver is trained against level k-1 (Wang et al., Fig. 2b).
+
+The two networks of a level do not depend on each other: they are trained beside each other, in a
+process each. A network is first trained by DDQN in SUMO (`ddqn`), then refined (`refine`).
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import queue
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
 
 from safetensors.numpy import save
 
-from merge_sumo.drivers.levelk import QNetwork
-from merge_sumo.drivers.policies import MANIFEST, NETWORKS, load_driver, read_manifest
+from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
+from merge_sumo.drivers.policies import MANIFEST, NETWORKS, load_network, read_manifest
 from merge_sumo.errors import UserError
-from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_policy
-from merge_sumo.training.ddqn import TrainingProgress, TrainingSettings, train
-from merge_sumo.training.env import MergeGame, Role, make_opponent
+from merge_sumo.training.check import CHECK_CASES, PolicyCheck, QuickRegret, check_network
+from merge_sumo.training.ddqn import DdqnProgress, DdqnSettings, train
+from merge_sumo.training.env import MergeGame, make_opponent
+from merge_sumo.training.game import Game, Role
+from merge_sumo.training.refine import RefineProgress, RefineSettings, refine
 from merge_sumo.training.reward import RewardWeights
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
@@ -28,25 +37,58 @@ OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "vut2": ("vut", "pov1"),
 }
 """Role and opponent of each network, in the order of the helix."""
-# What level 2 gains over level 0 is small, because level 1 makes room for it: so precision.
-_LEVEL_2: Final = TrainingSettings(
-    updates=140_000,
-    transitions=1_000_000,
-    collecting=0.7,
-    last_exploration=0.05,
-    last_midway=0.15,
-)
-SETTINGS: Final = {
-    "pov1": TrainingSettings(),
-    "vut1": TrainingSettings(),
-    "pov2": _LEVEL_2,
-    "vut2": _LEVEL_2,
-}
+PAIRS: Final[tuple[tuple[str, ...], ...]] = (NETWORKS[:2], NETWORKS[2:])
+"""The networks of a level, which do not depend on each other."""
 GAMES: Final = 64
 """Corridors in which transitions are collected."""
+REGRET_EVERY: Final = 5
+"""The regret is told with every fifth report of DDQN: it costs a second."""
 
-OnProgress = Callable[[str, TrainingProgress, int], None]
-"""Told the network, where its training is, and how many updates there will be."""
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingSettings:
+    """How a network is trained, and in how many cases it is checked."""
+
+    ddqn: DdqnSettings = field(default_factory=DdqnSettings)
+    refine: RefineSettings = field(default_factory=RefineSettings)
+    check_cases: int = CHECK_CASES
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingProgress:
+    """Where the training of a network is: a line of its log.
+
+    Attributes:
+        network: its name.
+        stage: "ddqn" or "refine".
+        done: updates or rounds done in this stage.
+        total: updates or rounds of this stage.
+        loss: of DDQN's fit, or the mean cost of a choice.
+        mean_return: of the games played lately, from exploring starts.
+        crash_share: share of collisions among them; None while refining.
+        regret: a lower bound, `check.QuickRegret`; None where it was not measured.
+    """
+
+    network: str
+    stage: str
+    done: int
+    total: int
+    loss: float
+    mean_return: float
+    crash_share: float | None
+    regret: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """What a process needs to train a network."""
+
+    name: str
+    role: Role
+    opponent: QNetwork | None
+    weights: RewardWeights
+    seed: int
+    settings: TrainingSettings
 
 
 def train_library(
@@ -56,55 +98,44 @@ def train_library(
     weights: RewardWeights | None = None,
     settings: TrainingSettings | None = None,
     *,
-    check_count: int = CHECK_CASES,
-    on_progress: OnProgress | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
     on_done: Callable[[str, PolicyCheck | None], None] | None = None,
 ) -> None:
     """Train networks into a folder, in the order of the helix; finished ones are kept.
 
     A network that the folder's manifest already has with the same seed, weights, settings and
-    opponent is not trained again, so an interrupted training goes on where it stood. Next to each
-    network lies a log, `<name>.training.jsonl`. Raises `UserError` when an opponent is missing, the
-    folder has such a network of another plan, or the folder cannot be written.
+    opponent is not trained again, so an interrupted training goes on with what is not finished.
+    Next to each network lies a log, `<name>.training.jsonl`. Raises `UserError` when an opponent
+    is missing, the folder has such a network of another plan, or the folder cannot be written.
     """
-    weights = weights or RewardWeights()
+    weights, settings = weights or RewardWeights(), settings or TrainingSettings()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror}") from error
-    for name in (name for name in NETWORKS if name in names):
-        chosen = settings or SETTINGS[name]
-        plan = _plan(folder, name, seed, weights, chosen)
-        known = read_manifest(folder).get(name, {})
-        if {key: known.get(key) for key in plan} == plan:
-            if on_done is not None:
-                on_done(name, None)
-            continue
-        if known:
-            raise UserError(
-                f"{folder} has a {name} of another seed, opponent or setting: choose another "
-                "folder with --out, or remove it first"
-            )
-        network, seconds = _train_one(folder, name, seed, weights, chosen, on_progress)
-        content = save(
-            {
-                f"{i}.{part}": tensor.astype("float32")
-                for i, layer in enumerate(network.layers)
-                for part, tensor in zip(("weight", "bias"), layer, strict=True)
-            }
-        )
-        entry = {
-            **plan,
-            "sha256": hashlib.sha256(content).hexdigest(),
-            "training_s": round(seconds, 1),
-            "versions": {package: version(package) for package in ("torch", "numpy", "libsumo")},
+    for pair in PAIRS:
+        plans = {
+            name: _plan(folder, name, seed, weights, settings) for name in pair if name in names
         }
-        (folder / f"{name}.safetensors").write_bytes(content)
-        _write_entry(folder, name, entry)
-        checked = check_policy(name, folder, weights, check_count)
-        _write_entry(folder, name, {**entry, "check": asdict(checked)})
-        if on_done is not None:
-            on_done(name, checked)
+        tasks = []
+        for name, plan in plans.items():
+            known = read_manifest(folder).get(name, {})
+            if {key: known.get(key) for key in plan} != plan:
+                if known:
+                    raise UserError(
+                        f"{folder} has a {name} of another seed, opponent or setting: choose "
+                        "another folder with --out, or remove it first"
+                    )
+                role, opponent = OPPONENTS[name]
+                network = None if opponent == "level0" else load_network(opponent, folder)
+                tasks.append(_Task(name, role, network, weights, seed, settings))
+            elif on_done is not None:
+                on_done(name, None)
+        for trained, network, check, seconds in _train_beside(folder, tasks, on_progress):
+            entry = {**plans[trained], "training_s": round(seconds, 1)}
+            _keep(folder, trained, network, entry, check)
+            if on_done is not None:
+                on_done(trained, check)
 
 
 def _plan(
@@ -129,39 +160,108 @@ def _plan(
     }
 
 
-def _train_one(
-    folder: Path,
-    name: str,
-    seed: int,
-    weights: RewardWeights,
-    settings: TrainingSettings,
-    on_progress: OnProgress | None,
-) -> tuple[QNetwork, float]:
-    role, opponent_name = OPPONENTS[name]
-    if opponent_name == "level0":
-        opponent = make_opponent(role, opponent_name, GAMES)
-    else:
-        opponent = load_driver(opponent_name, GAMES, folder)
-    started = time.perf_counter()
-    game = MergeGame(role, opponent, weights)
+_Trained = tuple[str, QNetwork, PolicyCheck, float]
+"""Name, network, how near it is to its best response, and the seconds that training took."""
+
+
+def _train_beside(
+    folder: Path, tasks: list[_Task], on_progress: Callable[[TrainingProgress], None] | None
+) -> list[_Trained]:
+    """Train networks beside each other; write their logs as they go."""
+    if not tasks:
+        return []
+    context = get_context("spawn")
+    told = context.Queue()
+    logs = {
+        t.name: (folder / f"{t.name}.training.jsonl").open("w", encoding="utf-8") for t in tasks
+    }
     try:
-        with (folder / f"{name}.training.jsonl").open("w", encoding="utf-8") as log:
+        # Spawned, because libsumo's simulation must not be forked.
+        with ProcessPoolExecutor(len(tasks), context, _report_into, (told,)) as pool:
+            results = [pool.submit(_train_one, task) for task in tasks]
+            running: set[Future[_Trained]] = set(results)
+            while running:
+                running = wait(running, timeout=0.2).not_done
+                while True:
+                    try:
+                        now = told.get_nowait()
+                    except queue.Empty:
+                        break
+                    logs[now.network].write(json.dumps(asdict(now)) + "\n")
+                    logs[now.network].flush()
+                    if on_progress is not None:
+                        on_progress(now)
+            return [result.result() for result in results]
+    finally:
+        for log in logs.values():
+            log.close()
 
-            def progress(now: TrainingProgress) -> None:
-                values = asdict(now)
-                del values["network"]
-                log.write(json.dumps(values) + "\n")
-                log.flush()
-                if on_progress is not None:
-                    on_progress(name, now, settings.updates)
 
-            network = train(game, seed, settings, sees_svo=name == "pov2", on_progress=progress)
+_told: Any = None
+"""Where a training process reports to."""
+
+
+def _report_into(told: Any) -> None:
+    global _told  # noqa: PLW0603 (one process, one queue)
+    _told = told
+
+
+def _train_one(task: _Task) -> _Trained:
+    """Train a network by DDQN in SUMO, refine it, check it in SUMO."""
+    sees_svo = task.name == "pov2"
+    played_out = Game(task.role, task.opponent, task.weights)
+    regret = QuickRegret(played_out, sees_svo=sees_svo)
+    ddqn, refinement = task.settings.ddqn, task.settings.refine
+
+    def covering(now: DdqnProgress) -> None:
+        measured = now.updates % (1000 * REGRET_EVERY) == 0
+        bound = regret(now.network) if measured else None
+        told = (now.updates, ddqn.updates, now.loss, now.mean_return, now.crash_share, bound)
+        _told.put(TrainingProgress(task.name, "ddqn", *told))
+
+    def refining(now: RefineProgress) -> None:
+        told = (now.round, refinement.rounds, now.cost, now.mean_return, None, regret(now.network))
+        _told.put(TrainingProgress(task.name, "refine", *told))
+
+    started = time.perf_counter()
+    if task.opponent is None:
+        opponent = make_opponent(task.role, "level0", GAMES)
+    else:
+        opponent = LevelKDriver(GAMES, task.opponent)
+    game = MergeGame(task.role, opponent, task.weights)
+    try:
+        network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=covering)
     finally:
         game.close()
-    return network, time.perf_counter() - started
+    network = refine(played_out, network, task.seed, refinement, refining)
+    seconds = time.perf_counter() - started
+    check = check_network(
+        task.name, network, task.opponent, task.weights, task.settings.check_cases
+    )
+    return task.name, network, check, seconds
 
 
-def _write_entry(folder: Path, name: str, entry: dict[str, Any]) -> None:
-    networks = {**read_manifest(folder), name: entry}
-    text = json.dumps({"networks": {n: networks[n] for n in NETWORKS if n in networks}}, indent=2)
+def _keep(
+    folder: Path, name: str, network: QNetwork, entry: dict[str, Any], check: PolicyCheck
+) -> None:
+    """Write a network, then its entry in the manifest."""
+    content = save(
+        {
+            f"{i}.{part}": tensor.astype("float32")
+            for i, layer in enumerate(network.layers)
+            for part, tensor in zip(("weight", "bias"), layer, strict=True)
+        }
+    )
+    (folder / f"{name}.safetensors").write_bytes(content)
+    packages = ("torch", "numpy", "libsumo")
+    known = {
+        **read_manifest(folder),
+        name: {
+            **entry,
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "versions": {package: version(package) for package in packages},
+            "check": asdict(check),
+        },
+    }
+    text = json.dumps({"networks": {n: known[n] for n in NETWORKS if n in known}}, indent=2)
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,194 @@
+"""merge-sumo from Python: run a campaign or open one, and look at it in a notebook.
+
+import merge_sumo as ms
+
+run = ms.campaign("design2", cases=400, seed=1)
+run.failures        # rows for pandas.DataFrame(run.failures); a table in a notebook
+run.report()        # path of the HTML report
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import datetime
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.conductor import (
+    DEFAULT_BATCH,
+    DEFAULT_CASES,
+    CampaignSettings,
+    OnCase,
+    parse_levels,
+    run_campaign,
+)
+from merge_sumo.errors import UserError
+from merge_sumo.journal import SETTINGS, Run, failures
+from merge_sumo.samplers import DEFAULT_SAMPLER
+from merge_sumo.scenario import DEADLINE_S, V_VUT0_MPS
+from merge_sumo.score import Outcome
+from merge_sumo.summary import Summary, summarise
+from merge_sumo.sumo.net import Net
+from merge_sumo.trajectory import Trajectory
+from merge_sumo.workers import open_workers
+
+MOST_ROWS: Final = 20
+"""Rows that a notebook shows of a table."""
+IN_A_NOTEBOOK: Final = (
+    *("index", "level", "x_pov0_m", "v_pov0_mps", "svo_rad", "end"),
+    *("score", "dx_m", "dv_mps", "avoidable"),
+)
+"""Columns that it shows; the rows hold all of `outcomes.jsonl`."""
+
+
+class Table(list[dict[str, Any]]):
+    """Rows of cases, as in `outcomes.jsonl`: a list that `pandas.DataFrame` takes as it is."""
+
+    def __init__(self, outcomes: Iterable[Outcome]) -> None:
+        """Take the rows of outcomes, in their order."""
+        super().__init__(outcome.to_record() for outcome in outcomes)
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{name}</th>" for name in IN_A_NOTEBOOK)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{_cell(row[name])}</td>" for name in IN_A_NOTEBOOK) + "</tr>"
+            for row in self[:MOST_ROWS]
+        )
+        more = f"<p>{len(self) - MOST_ROWS} more rows</p>" if len(self) > MOST_ROWS else ""
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}"
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    return escape(f"{value:.2f}" if isinstance(value, float) else str(value))
+
+
+class CampaignRun:
+    """A campaign that was run, as it lies in its folder."""
+
+    def __init__(self, folder: Path | str) -> None:
+        """Open the folder of a campaign; `UserError` when it is none."""
+        self._run = Run(Path(folder))
+        if not isinstance(self._run.settings.get("levels"), list):
+            raise UserError(f"{Path(folder) / SETTINGS} is no campaign's: it has no levels")
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the campaign."""
+        return self._run.folder
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What `campaign.json` holds."""
+        return self._run.settings
+
+    @property
+    def cases(self) -> Table:
+        """All cases, in the order in which they were chosen."""
+        return Table(self._run.outcomes)
+
+    @property
+    def failures(self) -> Table:
+        """The failing cases, the worst first."""
+        return Table(failures(self._run.outcomes))
+
+    @cached_property
+    def summary(self) -> Summary:
+        """Cases, failures, regions and failure mode coverage by POV level."""
+        return summarise(self._run.outcomes, self.settings["levels"])
+
+    def trajectory(self, index: int) -> Trajectory:
+        """Return the motion of a case; `UserError` when there is none."""
+        return self._run.trajectory(index)
+
+    def report(self) -> Path:
+        """Write the HTML report and return its path."""
+        from merge_sumo.report import write_report
+
+        return write_report(self._run)
+
+    def __repr__(self) -> str:
+        """Return folder and result in a line."""
+        found = self.summary
+        return f"<campaign {self.folder}: {found.failures} failures in {found.cases} cases>"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{level}</td><td>{found.cases}</td><td>{found.failures}</td>"
+            f"<td>{found.regions}</td><td>{found.fmc:.4f}</td></tr>"
+            for level, found in self.summary.levels.items()
+        )
+        title = escape(f"{self.settings.get('vut')}: {self.summary.failures} failures in ")
+        return (
+            f"<p><b>{title}{self.summary.cases} cases</b><br>{escape(str(self.folder))}</p>"
+            "<table><thead><tr><th>POV level</th><th>cases</th><th>failures</th><th>regions</th>"
+            f"<th>FMC</th></tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+
+def campaign(
+    vut: str,
+    *,
+    level: int | str = "all",
+    sampler: str = DEFAULT_SAMPLER,
+    cases: int = DEFAULT_CASES,
+    batch: int | None = None,
+    seed: int = 0,
+    v_vut0_mps: float = V_VUT0_MPS,
+    vut_command: str | None = None,
+    deadline_s: float = DEADLINE_S,
+    stop_after_converged: float | None = None,
+    workers: int = 1,
+    out: Path | str | None = None,
+    net: Path | str | None = None,
+    on_case: OnCase | None = None,
+) -> CampaignRun:
+    """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
+
+    Args:
+        vut: vehicle under test, as after `--vut`.
+        level: POV level 0, 1 or 2, or "all".
+        sampler: who chooses the cases.
+        cases: number of cases.
+        batch: cases per batch; 40, or all if fewer, when left out.
+        seed: same seed, same outcomes.
+        v_vut0_mps: initial speed of the VUT.
+        vut_command: command that starts the controller of `vut="traci"`.
+        deadline_s: time that a VUT may take for a step before it is a VUT_ERROR.
+        stop_after_converged: stop early when less than this share of new coverage is expected.
+        workers: processes that run cases; the outcomes are the same.
+        out: new folder to write; `runs/<vut>-<date>` when left out.
+        net: SUMO net to use instead of the shipped one.
+        on_case: told of every case as it ends.
+
+    Raises `UserError` for values that make no campaign, or when the folder exists.
+    """
+    settings = CampaignSettings(
+        vut=vut,
+        levels=parse_levels(str(level)),
+        sampler=sampler,
+        cases=cases,
+        batch=min(DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
+        seed=seed,
+        v_vut0_mps=v_vut0_mps,
+        stop_after_converged=stop_after_converged,
+        vut_command=vut_command,
+        deadline_s=deadline_s,
+    )
+    name = "".join(letter if letter.isalnum() or letter in "._" else "-" for letter in vut)
+    default = Path("runs") / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    folder = default if out is None else Path(out)
+    road = Net(None if net is None else Path(net))
+    with open_workers(settings.vut_factory.workers(workers)) as there:
+        run_campaign(settings, folder, road, on_case, workers=there)
+    run = CampaignRun(folder)
+    run.report()
+    return run
+
+
+def open_run(folder: Path | str) -> CampaignRun:
+    """Open the folder of a campaign; `UserError` when it is none."""
+    return CampaignRun(folder)

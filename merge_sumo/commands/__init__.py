@@ -1,0 +1,1 @@
+"""The commands, one file per family: each parses, calls one function, and prints."""

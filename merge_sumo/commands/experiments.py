@@ -1,0 +1,303 @@
+"""Commands that measure: truth, compare, reproduce, probability."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from merge_sumo.commands.shared import DaskOption, JsonOption, NetOption, RunArgument, app, say
+from merge_sumo.errors import UserError
+
+if TYPE_CHECKING:
+    from merge_sumo.experiments import Comparison, Quartiles, Truth
+    from merge_sumo.workers import Workers
+
+
+@app.command()
+def truth(
+    vut: Annotated[str, typer.Option(help="Vehicle under test.")],
+    level: Annotated[str, typer.Option(help="POV level: 0, 1 or 2.")],
+    cases: Annotated[
+        int | None, typer.Option(help="Uniform cases.  [default: 10000, at level 2 20000]")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
+    workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
+    dask: DaskOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the ground truth of a VUT at a level, by uniform cases on all cores.
+
+    It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of everything
+    that it depends on.
+
+    Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
+    """
+    from merge_sumo import experiments
+    from merge_sumo.conductor import one_level
+    from merge_sumo.drivers.vut import vut_factory
+    from merge_sumo.fmc import fmc, regions
+    from merge_sumo.workers import open_workers
+
+    chosen = one_level(level)
+    with open_workers(vut_factory(vut).workers(workers), dask) as there:
+        found = _truth(vut, chosen, cases, seed, there)
+    labels = regions(found.failures).tolist()
+    sizes = [labels.count(label) for label in range(max(labels, default=-1) + 1)]
+    result = {
+        "vut": vut,
+        "level": chosen,
+        "cases": len(found.score),
+        "failures": len(found.failures),
+        "fmc": fmc(found.failures),
+        "region_sizes": sizes,
+        "real_regions": len(found.real_regions()),
+    }
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    typer.echo(
+        f"{vut} at level {chosen}: {result['failures']} failures in {result['cases']} cases, "
+        f"FMC {result['fmc']:.4f}, {result['real_regions']} regions with at least "
+        f"{experiments.REAL_REGION:.0%} of the failures"
+    )
+
+
+@app.command()
+def compare(
+    vut: Annotated[str, typer.Option(help="Vehicle under test.")],
+    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2 or all.")],
+    samplers: Annotated[
+        str, typer.Option(help="Names, separated by commas.")
+    ] = "uniform,annealing,subset,gpr,coverage",
+    seeds: Annotated[int, typer.Option(help="Runs of each sampler.")] = 10,
+    cases: Annotated[int, typer.Option(help="Cases of each run.")] = 400,
+    batch: Annotated[int, typer.Option(help="Cases per batch.")] = 20,
+    truth_cases: Annotated[
+        int | None, typer.Option(help="Cases of the truth.  [default: 10000, at level 2 20000]")
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="New file for FMC against cases: .png, .svg or .html.", metavar="FILE"),
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
+    dask: DaskOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare samplers with each other and with the ground truth, over several seeds.
+
+    With all levels, each run shares its cases out over them, and coverage is summed over them.
+
+    Example:  merge-sumo compare --vut design1 --level 0 --samplers uniform,gpr --seeds 3
+    """
+    from merge_sumo import experiments, figures
+    from merge_sumo.conductor import CampaignSettings, parse_levels
+    from merge_sumo.drivers.vut import vut_factory
+    from merge_sumo.fmc import fmc
+    from merge_sumo.progress import Counter
+    from merge_sumo.workers import open_workers
+
+    levels = parse_levels(level)
+    names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
+    for name in names:
+        CampaignSettings(vut=vut, levels=levels, sampler=name, cases=cases, batch=batch)
+    if seeds < 1:
+        raise UserError(f"--seeds is {seeds}: it must be 1 or more")
+    if figure is not None:
+        figures.check_figure(figure)
+    title = f"{vut} v level {'/'.join(map(str, levels))}"
+    with (
+        open_workers(vut_factory(vut).workers(workers), dask) as there,
+        Counter(title, len(names) * seeds, "runs") as counter,
+    ):
+        truths = {level: _truth(vut, level, truth_cases, 0, there) for level in levels}
+        searches = experiments.search(
+            vut,
+            levels,
+            names,
+            seeds=seeds,
+            cases=cases,
+            batch=batch,
+            workers=there,
+            on_search=lambda name, _: counter.ended(1, name),
+        )
+    compared = {name: experiments.compare(found, truths) for name, found in searches.items()}
+    truth_fmc = sum(fmc(found.failures) for found in truths.values())
+    of_oracle = experiments.oracle(truths, cases, batch)
+    if figure is not None:
+        picture = figures.coverage_curves(f"{title}, {seeds} seeds", compared, truth_fmc, of_oracle)
+        figures.save(picture, figure)
+    if as_json:
+        by_name = {name: asdict(result) for name, result in compared.items()}
+        oracle_by_batch = [of_oracle[n] for n in compared[names[0]].cases_by_batch]
+        result = {"truth_fmc": truth_fmc, "oracle_fmc_by_batch": oracle_by_batch, **by_name}
+        typer.echo(json.dumps(result, allow_nan=False))
+        return
+    failures = sum(len(found.failures) for found in truths.values())
+    real = sum(len(found.real_regions()) for found in truths.values())
+    typer.echo(f"truth: FMC {truth_fmc:.4f}, {failures} failures, {real} regions")
+    typer.echo(f"oracle: FMC {of_oracle[cases]:.4f} with {cases} cases")
+    _print_comparisons(compared)
+    if figure is not None:
+        typer.echo(f"figure: {figure}")
+
+
+def _print_comparisons(compared: dict[str, Comparison]) -> None:
+    """Print a line per sampler: medians, with the quartiles in brackets."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, caption="medians [quartiles]", caption_justify="left")
+    table.add_column("sampler")
+    for heading in ("FMC / truth", "FMC", "failures", "regions", "to 50 %", "to 90 %", "sampler s"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, found in compared.items():
+        table.add_row(
+            name,
+            _spread(found.fmc_over_truth_median, found.fmc_over_truth_quartiles, ".3f"),
+            _spread(found.fmc_median, found.fmc_quartiles, ".4f"),
+            _spread(found.failures_median, found.failures_quartiles, ".0f"),
+            _spread(found.regions_found_median, found.regions_found_quartiles, ".1f"),
+            _spread(found.cases_to_50_percent_median, found.cases_to_50_percent_quartiles, ".0f"),
+            _spread(found.cases_to_90_percent_median, found.cases_to_90_percent_quartiles, ".0f"),
+            f"{found.sampler_s_median:.2f}",
+        )
+    # As wide as it is: a line of a table that is read by a program must not be broken.
+    Console(width=200, highlight=False, soft_wrap=True).print(table)
+
+
+def _spread(median: float | None, quartiles: Quartiles, form: str) -> str:
+    median_text, low, high = (
+        "-" if value is None else f"{value:{form}}" for value in (median, *quartiles)
+    )
+    return f"{median_text} [{low}, {high}]"
+
+
+@app.command()
+def reproduce(
+    seeds: Annotated[
+        int | None, typer.Option(help="Runs of each sampler.  [default: 10; with --quick 2]")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder to write.  [default: runs/reproduce-DATE]")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few and short runs and a small truth: a first look.")
+    ] = False,
+    workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
+    dask: DaskOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Reproduce the paper: Table II and every figure of its results, beside the paper's numbers.
+
+    Writes table2.md, table2.json, the figures as PNG, and index.html that shows it all.
+
+    Example:  merge-sumo reproduce --seeds 10 --out reproduction
+    """
+    from merge_sumo import reproduce as paper
+    from merge_sumo.progress import Bars
+    from merge_sumo.workers import open_workers
+
+    if seeds is None:
+        seeds = 2 if quick else 10
+    scale = paper.quick(seeds) if quick else paper.Scale(seeds=seeds)
+    folder = out or Path("runs") / f"reproduce-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    with open_workers(workers, dask) as there, Bars() as bars:
+
+        def show(title: str, done: int, total: int, unit: str) -> None:
+            elapsed_s = bars.elapsed_s(title)
+            rate = f"{done / elapsed_s:.3g}" if elapsed_s > 0.0 else "-"
+            bars.show(title, done, total, f"{rate} {unit}/s")
+
+        index = paper.reproduce(folder, scale, workers=there, on_run=show)
+    if as_json:
+        typer.echo((folder / paper.TABLE_JSON).read_text(encoding="utf-8").strip())
+        say(f"all of it: {index}")
+        return
+    typer.echo((folder / paper.TABLE_MARKDOWN).read_text(encoding="utf-8"), nl=False)
+    typer.echo(f"all of it: {index}")
+
+
+@app.command()
+def probability(
+    run: RunArgument,
+    cases: Annotated[int, typer.Option(help="Fresh cases to run.")] = 4000,
+    distribution: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="JSON: how often cases occur.  [default: uniform]"),
+    ] = None,
+    confidence: Annotated[
+        float, typer.Option(help="Chance that the interval holds the probability.")
+    ] = 0.95,
+    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="New file to write.  [default: RUN/probability.json]"),
+    ] = None,
+    net: NetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate how likely a VUT is to fail, with an interval that is valid.
+
+    The cases of the campaign were chosen to fail: they only say where fresh cases are worth most.
+    These are drawn independently, run in SUMO, and weighted; the interval is by betting, and holds
+    for any number of cases.
+
+    Example:  merge-sumo probability runs/design2 --cases 4000
+    """
+    from merge_sumo import probability as estimates
+    from merge_sumo.journal import Run
+    from merge_sumo.progress import Counter
+    from merge_sumo.sumo.net import Net
+
+    campaign = Run(run)
+    target = out or run / estimates.RESULT
+    with Counter("fresh cases", cases, "cases") as counter:
+        found = estimates.failure_probability(
+            campaign,
+            target,
+            cases=cases,
+            distribution=distribution,
+            confidence=confidence,
+            seed=seed,
+            net=Net(net),
+            on_case=lambda _: counter.ended(1),
+        )
+    if as_json:
+        typer.echo(json.dumps({**asdict(found), "file": str(target)}, allow_nan=False))
+        return
+    how = "under the stated distribution" if distribution else "under uniform cases"
+    typer.echo(
+        f"P(fail) {how}: {found.probability:.3g}, {100.0 * confidence:g} % interval "
+        f"[{found.low:.3g}, {found.high:.3g}] ({found.failures} failures in {cases} fresh cases)"
+    )
+    if found.without_verdict:
+        typer.echo(
+            f"  {found.without_verdict} cases without a verdict: safe for the lower end, failures "
+            "for the upper end"
+        )
+    arm = found.uniform_arm
+    typer.echo(
+        f"  for comparison, the {arm.cases} plain cases among them alone: {arm.failures} failures, "
+        f"[{arm.low:.3g}, {arm.high:.3g}]"
+    )
+    typer.echo(f"written: {target}")
+
+
+def _truth(vut: str, level: int, cases: int | None, seed: int, workers: Workers) -> Truth:
+    from merge_sumo import experiments
+    from merge_sumo.drivers.vut import vut_factory
+    from merge_sumo.progress import Counter
+
+    vut_factory(vut)
+    total = experiments.TRUTH_CASES[level] if cases is None else cases
+    if total < 1:
+        raise UserError(f"--cases is {total}: it must be 1 or more")
+    with Counter(f"truth of {vut} at level {level}", total, "cases") as counter:
+        return experiments.ground_truth(
+            vut, level, total, seed, workers=workers, on_cases=counter.ended
+        )

@@ -1,0 +1,173 @@
+"""Commands on the folder of a campaign: export, replay, report, compare-runs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from merge_sumo.commands.shared import JsonOption, NetOption, RunArgument, app
+from merge_sumo.errors import UserError
+
+if TYPE_CHECKING:
+    from merge_sumo.comparison import RunComparison
+
+EXPORTS: Final = "exports"
+
+
+class Format(StrEnum):
+    """What `export` writes."""
+
+    SUMO = "sumo"
+    OPENSCENARIO = "openscenario"
+    CSV = "csv"
+    PARQUET = "parquet"
+
+
+@app.command()
+def export(
+    run: RunArgument,
+    case: Annotated[
+        list[int] | None,
+        typer.Argument(help="Indices of cases in outcomes.jsonl; csv, parquet: all if left out."),
+    ] = None,
+    file_format: Annotated[
+        Format,
+        typer.Option(
+            "--format",
+            help="sumo: folders that sumo-gui replays. openscenario: folders with OpenSCENARIO "
+            "and OpenDRIVE. csv, parquet: one table of motion.",
+        ),
+    ] = Format.SUMO,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder.  [default: RUN/scenarios, else RUN/exports]")
+    ] = None,
+    net: NetOption = None,
+) -> None:
+    """Write cases of a campaign for SUMO, for other simulators, or as a table.
+
+    Example:  merge-sumo export runs/design2 17 42
+    """
+    from merge_sumo import exports
+    from merge_sumo.conductor import SCENARIOS
+    from merge_sumo.journal import Run
+    from merge_sumo.sumo.net import Net
+
+    loaded = Run(run)
+    if file_format in (Format.CSV, Format.PARQUET):
+        indices = case or [outcome.index for outcome in loaded.outcomes]
+        typer.echo(exports.write_table(loaded, indices, out or run / EXPORTS, file_format.value))
+        return
+    if not case:
+        raise UserError(f"--format {file_format} needs the indices of cases")
+    to_sumo = file_format is Format.SUMO
+    target = out or run / (SCENARIOS if to_sumo else EXPORTS)
+    write = exports.write_sumo if to_sumo else exports.write_openscenario
+    for path in exports.write_folders(loaded, case, target, write, Net(net)):
+        typer.echo(path)
+
+
+@app.command()
+def replay(
+    folder: Annotated[Path, typer.Argument(help="A scenario folder.")],
+    gui: Annotated[bool, typer.Option("--gui", help="Open it in sumo-gui.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Replay a scenario in SUMO and check every position and speed against its record.
+
+    Says "identical" (exit code 0) or "diverged at t = ..." (exit code 1).
+
+    Example:  merge-sumo replay scenarios/stalemate --gui
+    """
+    from merge_sumo.sumo import replay as replayer
+
+    if gui:
+        raise typer.Exit(replayer.open_gui(folder))
+    result = replayer.replay(folder)
+    identical = result.diverged_at_s is None
+    if as_json:
+        typer.echo(json.dumps({"identical": identical, **asdict(result)}))
+    elif identical:
+        typer.echo(f"identical: {result.rows} rows of x, y, position and speed")
+    else:
+        typer.echo(f"diverged at t = {result.diverged_at_s:.1f} s: {result.detail}")
+    raise typer.Exit(0 if identical else 1)
+
+
+@app.command()
+def report(run: RunArgument) -> None:
+    """Write the report of a campaign again and print its path.
+
+    Example:  merge-sumo report runs/design2
+    """
+    from merge_sumo.journal import Run
+    from merge_sumo.report import write_report
+
+    typer.echo(write_report(Run(run)))
+
+
+@app.command("compare-runs")
+def compare_runs(
+    a: Annotated[Path, typer.Argument(help="Folder of the campaign before.")],
+    b: Annotated[Path, typer.Argument(help="Folder of the campaign after.")],
+    tolerance: Annotated[
+        float, typer.Option(help="Growth of FMC at a level that is still no regression.")
+    ] = 0.0,
+    rerun: Annotated[
+        bool,
+        typer.Option("--rerun/--no-rerun", help="Run the failures of each with the other's VUT."),
+    ] = True,
+    net: NetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare two VUTs, or two versions of one: what got fixed, and what broke.
+
+    The failures of each campaign are run again with the other's VUT. Exit code 1 when the failure
+    mode coverage (FMC) of B exceeds that of A by more than the tolerance at some level.
+
+    Example:  merge-sumo compare-runs runs/design1 runs/design2 --tolerance 0.005
+    """
+    from merge_sumo import comparison
+    from merge_sumo.journal import Run
+    from merge_sumo.sumo.net import Net
+
+    if not tolerance >= 0.0:
+        raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
+    runs = Run(a), Run(b)
+    compared = comparison.compare_runs(*runs, rerun=rerun, net=Net(net))
+    worse = compared.is_worse(tolerance)
+    if as_json:
+        typer.echo(json.dumps({**asdict(compared), "tolerance": tolerance, "worse": worse}))
+    else:
+        for name, loaded in zip("AB", runs, strict=True):
+            typer.echo(f"{name}: {loaded.folder} ({loaded.settings.get('vut')})")
+        _print_comparison(compared, {"A": a, "B": b})
+        than = f"by more than {tolerance:g} in FMC at some level"
+        typer.echo(f"B is worse than A {than}" if worse else f"B is not worse than A {than}")
+    raise typer.Exit(1 if worse else 0)
+
+
+def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
+    typer.echo(
+        f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "
+        "cases: fixed, broke, both fail, not run again, no verdict"
+    )
+    for level, found in compared.levels.items():
+        counts = [
+            found.changes[name]
+            for name in ("fixed", "broke", "both fail", "not run again", "no verdict")
+        ]
+        typer.echo(
+            f"{level:<6} {found.fmc_a:8.4f} {found.fmc_b:8.4f} {found.fmc_fixed:8.4f} "
+            f"{found.fmc_broke:8.4f}   {', '.join(map(str, counts))}"
+        )
+    typer.echo(f"evidence: {compared.evidence}")
+    first = compared.look_first()
+    if first:
+        typer.echo("look first at:")
+    for case in first:
+        typer.echo(f"  {case.change}: merge-sumo export {folders[case.run]} {case.index}")

@@ -1,0 +1,50 @@
+"""What the commands share: the application, common options, and talking to a person."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    help="""Find where a merging controller fails against drivers who react to it.
+
+    A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO while a primary other
+    vehicle (POV) on the mainline interacts with it. A sampler chooses the test cases; failures
+    are collisions at the merge point, and failure mode coverage (FMC) says how much of the
+    failing region was found.
+
+    Start with:  merge-sumo campaign --vut design2
+    """,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+NetOption = Annotated[
+    Path | None, typer.Option(help="SUMO net to use instead of the shipped US-23 ramp.")
+]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print the result as one JSON object on standard output.")
+]
+DaskOption = Annotated[
+    str | None,
+    typer.Option(help="Address of a Dask scheduler whose workers run the cases: tcp://HOST:PORT."),
+]
+VutCommandOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Command that starts the controller of --vut traci; {port} stands for the port."
+    ),
+]
+DeadlineOption = Annotated[
+    float, typer.Option(help="Seconds that a VUT may take for a step before it is a VUT_ERROR.")
+]
+RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
+
+
+def say(text: str) -> None:
+    """Print a line for a person, on standard error: standard output is for results."""
+    typer.echo(text, err=True)

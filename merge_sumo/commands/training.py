@@ -1,0 +1,92 @@
+"""Commands on the learned drivers: train."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from merge_sumo.commands.shared import JsonOption, app
+from merge_sumo.errors import UserError
+
+if TYPE_CHECKING:
+    pass
+
+
+@app.command()
+def train(
+    only: Annotated[
+        list[str] | None, typer.Option(help="Network to train: pov1, vut1, pov2 or vut2.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same weights.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder.  [default: the policies in use]")
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Train nothing: measure regret of what is there.")
+    ] = False,
+    cases: Annotated[int, typer.Option(help="Random cases of a check.")] = 300,
+    as_json: JsonOption = False,
+) -> None:
+    """Train the learned drivers in SUMO, level by level, and measure their regret.
+
+    The regret is what a driver loses to its best response, as a share of what that gains over
+    level-0 behaviour. An interrupted training goes on with what is not finished.
+
+    Example:  merge-sumo train --out my-policies --seed 1
+    """
+    from merge_sumo.drivers.policies import NETWORKS, read_manifest
+    from merge_sumo.resources import resource
+
+    folder = out or resource("policies")
+    unknown = set(only or ()) - set(NETWORKS)
+    if unknown:
+        raise UserError(f"there is no network {unknown.pop()!r}: choose {', '.join(NETWORKS)}")
+    names = tuple(name for name in NETWORKS if name in (only or NETWORKS))
+    _need_training_packages()
+    if not check:
+        _train(folder, names, seed)
+    manifest = read_manifest(folder)
+    missing = [name for name in names if name not in manifest]
+    if missing:
+        raise UserError(f"{folder} has no {missing[0]}: run `merge-sumo train` to make it")
+    if check:
+        from merge_sumo.training.check import check_policy
+
+        checks = {name: asdict(check_policy(name, folder, count=cases)) for name in names}
+    else:
+        checks = {name: manifest[name]["check"] for name in names}
+    if as_json:
+        typer.echo(json.dumps(checks))
+        return
+    typer.echo(
+        "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0"
+    )
+    for name, found in checks.items():
+        typer.echo(
+            f"{name:<7}  {found['mean_regret']:11.2%}  {found['p99_regret']:10.2%}  "
+            f"{found['collisions']:10d}  {found['avoidable_collisions']:9d}  "
+            f"{found['mean_return']:11.3f}  {found['mean_best']:.3f}  {found['mean_level0']:.3f}"
+        )
+
+
+def _need_training_packages() -> None:
+    from importlib.util import find_spec
+
+    for package in ("torch", "gymnasium"):
+        if find_spec(package) is None:
+            raise UserError(
+                f"training needs {package}, which is not installed: run "
+                "`pip install 'merge-sumo[train]'`"
+            )
+
+
+def _train(folder: Path, names: tuple[str, ...], seed: int) -> None:
+    from merge_sumo.progress import TrainingBars
+    from merge_sumo.training.helix import train_library
+
+    with TrainingBars() as bars:
+        train_library(folder, names, seed, on_progress=bars.progressed, on_done=bars.done)

@@ -1,0 +1,86 @@
+"""Commands on VUTs that a user brings: vuts, check-vut, and the export of policies."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from merge_sumo.commands.shared import DeadlineOption, JsonOption, VutCommandOption, app
+from merge_sumo.scenario import DEADLINE_S
+
+policies = typer.Typer(help="The learned drivers as files for others.", no_args_is_help=True)
+app.add_typer(policies, name="policies")
+
+
+@app.command()
+def vuts(as_json: JsonOption = False) -> None:
+    """List the vehicles that can be tested: by name, and the kinds that you can bring.
+
+    Example:  merge-sumo vuts
+    """
+    from merge_sumo.drivers.vut import KINDS, PYTHON, built_in_vuts
+    from merge_sumo.drivers.vuts.python import installed_vuts
+
+    names = {"built in": list(built_in_vuts()), "installed": list(installed_vuts())}
+    kinds = [PYTHON, *KINDS.values()]
+    if as_json:
+        listed = [{"form": kind.form, "what": kind.what, "example": kind.example} for kind in kinds]
+        typer.echo(json.dumps({**names, "kinds": listed}))
+        return
+    for title, found in names.items():
+        if found:
+            typer.echo(f"{title}: {', '.join(found)}")
+    for kind in kinds:
+        typer.echo(f"{kind.form}\n    {kind.what}\n    {kind.example}")
+
+
+@app.command("check-vut")
+def check_vut(
+    vut: Annotated[str, typer.Argument(help="What you would write after --vut.")],
+    vut_command: VutCommandOption = None,
+    deadline: DeadlineOption = DEADLINE_S,
+    as_json: JsonOption = False,
+) -> None:
+    """Let a VUT drive a few cases and say what is wrong with it, and what a step of it costs.
+
+    Says "nothing wrong" (exit code 0), or what is wrong in sentences (exit code 1).
+
+    Example:  merge-sumo check-vut design1
+    """
+    from merge_sumo import vut_check
+    from merge_sumo.drivers.vut import vut_factory
+    from merge_sumo.drivers.vuts.base import VutOptions
+
+    options = VutOptions(command=vut_command, deadline_s=deadline)
+    found = vut_check.check_vut(vut_factory(vut, options))
+    if as_json:
+        typer.echo(json.dumps({"vut": vut, "ok": not found.problems, **asdict(found)}))
+    else:
+        for sentence in found.problems or ["nothing wrong"]:
+            typer.echo(sentence)
+        for sentence in found.notes:
+            typer.echo(f"note: {sentence}")
+        typer.echo(
+            f"a step costs {found.us_per_step_median:.0f} us (median), "
+            f"{found.us_per_step_worst:.0f} us at worst"
+        )
+    raise typer.Exit(1 if found.problems else 0)
+
+
+@policies.command("export")
+def export_policy(
+    name: Annotated[str, typer.Argument(help="pov1, vut1, pov2 or vut2.")],
+    out: Annotated[Path, typer.Option(help="ONNX file to write.")],
+) -> None:
+    """Write a learned driver as an ONNX network, from the state to the action values.
+
+    Example:  merge-sumo policies export vut1 --out vut1.onnx
+    """
+    from merge_sumo.drivers.onnx_export import export_onnx
+
+    export_onnx(name, out)
+    typer.echo(out)

@@ -1,0 +1,94 @@
+"""When a search may stop by itself: nothing new is expected, and nothing new was found lately.
+
+Only a sampler that can say what it expects of its next batch can be asked. What it expects is what
+its surrogate knows: a region of failures that no case has come near is in no expectation. So the
+rule saves cases; it proves nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Final, Protocol, runtime_checkable
+
+import numpy as np
+
+from merge_sumo.case import dimensions, to_unit
+from merge_sumo.errors import UserError
+from merge_sumo.fmc import fmc
+from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.score import Outcome
+
+PATIENCE: Final = 3
+"""Batches in a row after which little must be expected: one may be luck."""
+
+
+@runtime_checkable
+class Foresighted(Protocol):
+    """A sampler that says what it expects."""
+
+    def expected_gain(self, n: int) -> float:
+        """Return the expected new coverage of the next `n` cases as a share of that so far."""
+
+
+class StoppingRule:
+    """Ends a search when, after each of the last `PATIENCE` batches, little more was expected.
+
+    Little is less than `share` of the coverage found so far, per batch. The batches that ran must
+    bear it out: on average they added less than that, too. While no failure is known, the search
+    goes on. A pure function of the outcomes, so that a resumed campaign ends where it would have
+    ended; what was expected after a batch is worked out once and kept.
+    """
+
+    def __init__(self, share: float, batch: int, fresh: Callable[[], Sampler]) -> None:
+        """Stop below `share`; `fresh` makes a sampler that was told nothing.
+
+        Raises `UserError` for a share that is no share, or a sampler that expects nothing.
+        """
+        if not 0.0 < share < 1.0:
+            raise UserError(
+                f"--stop-after-converged is {share}: choose a share between 0 and 1, say 0.01"
+            )
+        if not isinstance(fresh(), Foresighted):
+            able = [name for name, kind in SAMPLERS.items() if issubclass(kind, Foresighted)]
+            raise UserError(
+                "--stop-after-converged needs a sampler that says what it expects of its next "
+                f"batch: choose --sampler {' or '.join(able)}"
+            )
+        self._share, self._batch, self._fresh = share, batch, fresh
+        self._expected: dict[int, float] = {}
+
+    def __call__(self, outcomes: Sequence[Outcome]) -> bool:
+        """Return whether the search is over after these outcomes, which have a verdict."""
+        last = max((outcome.batch for outcome in outcomes), default=-1)
+        if last + 1 <= PATIENCE:
+            return False
+        expected = (self.expected(outcomes, last - ago) for ago in range(PATIENCE))
+        return all(gain < self._share for gain in expected) and (
+            gained(outcomes, last - PATIENCE) < PATIENCE * self._share
+        )
+
+    def expected(self, outcomes: Sequence[Outcome], batch: int) -> float:
+        """Return the gain that was expected after a batch, as a share of the coverage by then."""
+        if batch not in self._expected:
+            sampler = self._fresh()
+            sampler.tell(outcome for outcome in outcomes if outcome.batch <= batch)
+            assert isinstance(sampler, Foresighted), "checked at the start"  # noqa: S101
+            self._expected[batch] = sampler.expected_gain(self._batch)
+        return self._expected[batch]
+
+
+def gained(outcomes: Sequence[Outcome], batch: int) -> float:
+    """Return the coverage found after a batch as a share of that found up to it."""
+    before = covered_balls([outcome for outcome in outcomes if outcome.batch <= batch])
+    return covered_balls(outcomes) / before - 1.0 if before > 0.0 else math.inf
+
+
+def covered_balls(outcomes: Sequence[Outcome]) -> float:
+    """Return the coverage of all levels in balls: volumes of 2 and 3 dimensions do not compare."""
+    balls = 0.0
+    for level in {outcome.case.level for outcome in outcomes}:
+        failing = to_unit((o.case for o in outcomes if o.failed and o.case.level == level), level)
+        balls += fmc(failing) / fmc(np.zeros((1, len(dimensions(level)))))
+    return balls

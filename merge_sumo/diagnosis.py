@@ -1,0 +1,281 @@
+"""What went wrong in a failure, in words: who yielded when, which kind it was, and where it lies.
+
+Yielding is measured against level-0 behaviour, which gives way to nobody: a POV that keeps its
+speed, a VUT that accelerates by 1 m/s2 up to 28 m/s. A vehicle has yielded once it is `CEDED_MPS`
+slower than that profile; it began to yield when it last left the profile before that. So what a
+network jitters by is not taken for a decision, and a vehicle that brakes and then catches up again
+before it is 1 m/s behind has not yielded.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.case import Case, FloatArray
+from merge_sumo.scenario import DT_S, LEVEL0_A_MPS2, LEVEL0_V_MPS, MAX_STEPS
+from merge_sumo.score import Measures, Outcome
+from merge_sumo.trajectory import End, Trajectory
+
+CEDED_MPS: Final = 1.0
+"""A vehicle that is this much slower than its level-0 profile has yielded."""
+ROUNDING_MPS: Final = 1e-6
+
+
+class Kind(StrEnum):
+    """Kinds of collision; `MEANING` says what they mean. Every collision is of exactly one."""
+
+    STALEMATE = "stalemate"
+    SQUEEZE = "squeeze"
+    FORCED_MERGE = "forced merge"
+    LATE_BRAKE = "late brake"
+    WEAK_BRAKE = "weak brake"
+
+
+MEANING: Final[dict[Kind, str]] = {
+    Kind.STALEMATE: "both yield, and meet",
+    Kind.SQUEEZE: "neither yields",
+    Kind.FORCED_MERGE: "only the POV yields, and not enough for the VUT that goes on",
+    Kind.LATE_BRAKE: "only the VUT yields, and begins when there is no way out any more",
+    Kind.WEAK_BRAKE: "only the VUT yields, begins in time, and does not yield enough",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """Who yielded in an episode and, of a collision, which kind it was.
+
+    Attributes:
+        vut_yields_s: when the VUT began to yield; None if it did not.
+        pov_yields_s: when the POV began to yield; None if it did not.
+        kind: of a collision; None for every other end.
+    """
+
+    vut_yields_s: float | None
+    pov_yields_s: float | None
+    kind: Kind | None
+
+    @property
+    def first_to_yield(self) -> str | None:
+        """Return "POV", "VUT" or "both" (in the same step); None when nobody yielded."""
+        vut, pov = self.vut_yields_s, self.pov_yields_s
+        if vut is None or pov is None:
+            return "POV" if pov is not None else "VUT" if vut is not None else None
+        return "both" if vut == pov else "VUT" if vut < pov else "POV"
+
+
+def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
+    """Return who yielded in an episode and which kind of failure it was."""
+    time_s = np.arange(len(trajectory.motion)) * DT_S
+    v_vut, v_pov = trajectory.v_vut_mps, trajectory.v_pov_mps
+    cruise_mps = max(float(v_vut[0]), LEVEL0_V_MPS)
+    vut = _yields_s(np.minimum(v_vut[0] + LEVEL0_A_MPS2 * time_s, cruise_mps) - v_vut)
+    pov = _yields_s(v_pov[0] - v_pov)
+    kind = None
+    if measures.end is End.COLLISION:
+        kind = _kind(vut, pov, measures.last_avoidable_s)
+    return Diagnosis(vut, pov, kind)
+
+
+def _yields_s(behind_mps: FloatArray) -> float | None:
+    """Return when a vehicle began to yield that is `behind_mps`, (T + 1,), its level-0 profile."""
+    ceded = np.flatnonzero(behind_mps >= CEDED_MPS - ROUNDING_MPS)
+    if not ceded.size:
+        return None
+    on_profile = np.flatnonzero(behind_mps[: ceded[0]] <= ROUNDING_MPS)
+    return round(float(on_profile[-1]) * DT_S, 1)
+
+
+def _kind(vut_s: float | None, pov_s: float | None, way_out_until_s: float | None) -> Kind:
+    if vut_s is None:
+        return Kind.SQUEEZE if pov_s is None else Kind.FORCED_MERGE
+    if pov_s is not None:
+        return Kind.STALEMATE
+    late = way_out_until_s is None or vut_s > way_out_until_s
+    return Kind.LATE_BRAKE if late else Kind.WEAK_BRAKE
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """What a sentence says of a case: a coordinate of the pool, or the time it makes for.
+
+    Attributes:
+        name: as it is written.
+        unit: of the value.
+        decimals: with which it is written.
+        value: gives it for a case.
+    """
+
+    name: str
+    unit: str
+    decimals: int
+    value: Callable[[Case], float]
+
+
+X_FEATURE: Final = Feature("x_POV0", "m", 0, lambda case: case.x_pov0_m)
+V_FEATURE: Final = Feature("v_POV0", "m/s", 1, lambda case: case.v_pov0_mps)
+DUE_FEATURE: Final = Feature(
+    "POV due at M (at constant speed)",
+    "s",
+    2,
+    lambda case: -case.x_pov0_m / case.v_pov0_mps if case.v_pov0_mps > 0.0 else MAX_STEPS * DT_S,
+)
+"""Failures lie in bands along which the POV would reach M at the same time."""
+SVO_FEATURE: Final = Feature("psi", "rad", 2, lambda case: case.svo_rad or 0.0)
+
+
+def features(level: int) -> tuple[Feature, ...]:
+    """Return what sentences on a level speak of."""
+    common = (DUE_FEATURE, V_FEATURE, X_FEATURE)
+    return (*common, SVO_FEATURE) if level == 2 else common
+
+
+MOST_BOXES: Final = 10
+"""Leaves of the decision tree of a level."""
+FEWEST_FAILURES: Final = 3
+"""Failures that make a region worth a sentence; of fewer, the cases speak for themselves."""
+
+
+Bounds = tuple[tuple[Feature, float | None, float | None], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FailureBox:
+    """A region of the pool where at least half of the cases that ran failed.
+
+    Attributes:
+        level: POV level.
+        bounds: (feature, low, high), rounded as it is written; None where nothing bounds it.
+        cases: cases of the run inside, by the bounds as written.
+        failures: failures among them.
+        kinds: kinds of these failures, the most frequent first.
+    """
+
+    level: int
+    bounds: Bounds
+    cases: int
+    failures: int
+    kinds: tuple[tuple[Kind, int], ...]
+
+    @property
+    def where(self) -> str:
+        """Return the bounds in words."""
+        parts = [words for bounds in self.bounds if (words := _in_words(*bounds))]
+        return " and ".join(parts) or "anywhere"
+
+    @property
+    def what(self) -> str:
+        """Return the kinds of failure in words."""
+        if len(self.kinds) == 1:
+            return f"{self.kinds[0][0]}: {MEANING[self.kinds[0][0]]}"
+        return ", ".join(f"{count} {kind}" for kind, count in self.kinds)
+
+    @property
+    def sentence(self) -> str:
+        """Return the box as a sentence."""
+        text = f"POV level {self.level}, {self.where}: {self.failures} of {self.cases} cases fail"
+        return f"{text} ({self.what})." if self.kinds else f"{text}."
+
+
+def failure_boxes(
+    outcomes: Sequence[Outcome], level: int, kinds: Mapping[int, Kind]
+) -> list[FailureBox]:
+    """Return where a level's failures lie, as boxes of the pool, those with most failures first.
+
+    A small decision tree (scikit-learn, Gini, balanced classes) tells failing cases from the
+    others; its leaves with at least as many failures as other cases are the boxes, joined where
+    siblings are. The shares are of cases that a sampler chose: they are no probabilities.
+
+    Args:
+        outcomes: outcomes of a run, of any level.
+        level: POV level.
+        kinds: kind of failure by index of the case, as far as known.
+    """
+    from sklearn.tree import DecisionTreeClassifier
+
+    told = [o for o in outcomes if o.case.level == level and o.measures.score is not None]
+    failed = np.array([o.failed for o in told], dtype=bool)
+    if failed.sum() < FEWEST_FAILURES:
+        return []
+    told_of = features(level)
+    places = np.array([[feature.value(o.case) for feature in told_of] for o in told])
+    tree = DecisionTreeClassifier(
+        max_leaf_nodes=MOST_BOXES,
+        min_samples_leaf=FEWEST_FAILURES,
+        class_weight="balanced",
+        random_state=0,
+    ).fit(places, failed)
+    leaf = tree.apply(places)
+    failing = {node for node in set(leaf.tolist()) if failed[leaf == node].mean() >= 0.5}
+    boxes = [
+        _box(level, _rounded(told_of, low, high), told, kinds)
+        for low, high in _leaf_boxes(tree.tree_, failing, len(told_of))
+    ]
+    boxes = [box for box in boxes if box.failures >= FEWEST_FAILURES]
+    return sorted(boxes, key=lambda box: -box.failures)
+
+
+def _leaf_boxes(tree: Any, failing: set[int], dims: int) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield the lower and upper bounds, (d,), of the failing leaves; siblings that fail are one."""
+
+    def all_fail(node: int) -> bool:
+        if tree.children_left[node] < 0:
+            return node in failing
+        return all_fail(tree.children_left[node]) and all_fail(tree.children_right[node])
+
+    def walk(
+        node: int, low: FloatArray, high: FloatArray
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        if all_fail(node):
+            yield low, high
+        elif tree.children_left[node] >= 0:
+            dim, at = tree.feature[node], tree.threshold[node]
+            below, above = high.copy(), low.copy()
+            below[dim], above[dim] = at, at
+            yield from walk(tree.children_left[node], low, below)
+            yield from walk(tree.children_right[node], above, high)
+
+    yield from walk(0, np.full(dims, -np.inf), np.full(dims, np.inf))
+
+
+def _rounded(told_of: Sequence[Feature], low: FloatArray, high: FloatArray) -> Bounds:
+    def written(feature: Feature, value: float) -> float | None:
+        return round(value, feature.decimals) if np.isfinite(value) else None
+
+    return tuple(
+        (feature, written(feature, a), written(feature, b))
+        for feature, a, b in zip(told_of, low.tolist(), high.tolist(), strict=True)
+    )
+
+
+def _box(
+    level: int, bounds: Bounds, told: Sequence[Outcome], kinds: Mapping[int, Kind]
+) -> FailureBox:
+    inside = [o for o in told if _inside(o, bounds)]
+    failures = [o for o in inside if o.failed]
+    found = Counter(kinds[o.index] for o in failures if o.index in kinds)
+    return FailureBox(level, bounds, len(inside), len(failures), tuple(found.most_common()))
+
+
+def _inside(outcome: Outcome, bounds: Bounds) -> bool:
+    return all(
+        (low is None or feature.value(outcome.case) >= low)
+        and (high is None or feature.value(outcome.case) <= high)
+        for feature, low, high in bounds
+    )
+
+
+def _in_words(feature: Feature, low: float | None, high: float | None) -> str:
+    name, unit, decimals = feature.name, feature.unit, feature.decimals
+    if low is not None and high is not None:
+        return f"{name} between {low:.{decimals}f} and {high:.{decimals}f} {unit}"
+    if low is not None:
+        return f"{name} above {low:.{decimals}f} {unit}"
+    if high is not None:
+        return f"{name} below {high:.{decimals}f} {unit}"
+    return ""

@@ -1,0 +1,239 @@
+"""What all kinds of VUT share: what they see, the deadline, and one controller per corridor."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import threading
+import traceback
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from types import FrameType
+from typing import Any, Final, NamedTuple, Self, TextIO
+
+import numpy as np
+
+from merge_sumo.case import Case, FloatArray
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import DEADLINE_S, DT_S, X_VUT0_M
+from merge_sumo.sumo.world import World
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VutOptions:
+    """How a VUT is hosted; `UserError` for values that make no sense.
+
+    Attributes:
+        command: command line of a controller that is a program of its own, else None.
+        deadline_s: time for one step, and for one reset.
+        connect_s: time for a program to start and connect.
+    """
+
+    command: str | None = None
+    deadline_s: float = DEADLINE_S
+    connect_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        """Check the times."""
+        if not (math.isfinite(self.deadline_s) and self.deadline_s > 0.0):
+            raise UserError(f"--deadline is {self.deadline_s}: give seconds, more than 0")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Vut:
+    """A VUT that is ready to be made.
+
+    Attributes:
+        make: makes the driver for a number of corridors in a world.
+        max_corridors: corridors that one driver can serve; None for any number.
+        max_workers: processes that can each have such a driver at a time; None for any number.
+        vut_type: attributes of the SUMO vType with which SUMO itself drives; None if it does not.
+        file: the file that it was loaded from; None where there is none.
+    """
+
+    make: Callable[[int, World | None], Driver]
+    max_corridors: int | None = None
+    max_workers: int | None = None
+    vut_type: Mapping[str, str] | None = None
+    file: Path | None = None
+
+
+class Seen(NamedTuple):
+    """What a VUT sees at a step: time and state, and nothing about who drives the POV.
+
+    Attributes:
+        t_s: time since the episode began.
+        x_pov_m: distance of the POV's front bumper to M along its lane, negative before M.
+        v_pov_mps: speed of the POV.
+        x_vut_m: distance of the VUT's front bumper to M along its lane, negative before M.
+        v_vut_mps: speed of the VUT.
+    """
+
+    t_s: float
+    x_pov_m: float
+    v_pov_mps: float
+    x_vut_m: float
+    v_vut_mps: float
+
+
+def seen_at_start(case: Case) -> Seen:
+    """Return what a VUT sees as an episode begins; level and orientation of the POV are hidden."""
+    return Seen(0.0, case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps)
+
+
+class TooLate(BaseException):
+    """A call ran into its deadline. Not an Exception, so that a VUT does not catch it by habit."""
+
+
+@dataclass(slots=True)
+class Watch:
+    """Ends calls to a VUT that take longer than the deadline, and keeps standard output ours.
+
+    While it is entered, a timer rings in the main thread and interrupts a call that is too late.
+    It cannot interrupt native code, nor work in another thread or where there is no such timer
+    (Windows): there a call that is too late is found out when it returns.
+    """
+
+    deadline_s: float
+    _since_s: float = math.inf
+    _stdout: TextIO | None = None
+    _restore: Callable[[], None] | None = field(default=None, repr=False)
+
+    def __enter__(self) -> Self:
+        """Start the timer; what the VUT prints goes to standard error."""
+        self._stdout, sys.stdout = sys.stdout, sys.stderr
+        if hasattr(signal, "setitimer") and (threading.current_thread() is threading.main_thread()):
+            handler = signal.signal(signal.SIGALRM, self._ring)
+            timer = signal.setitimer(signal.ITIMER_REAL, self.deadline_s, self.deadline_s / 10)
+
+            def restore() -> None:
+                signal.setitimer(signal.ITIMER_REAL, *timer)
+                signal.signal(signal.SIGALRM, handler)
+
+            self._restore = restore
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the timer."""
+        if self._restore is not None:
+            self._restore()
+            self._restore = None
+        if self._stdout is not None:
+            sys.stdout = self._stdout
+
+    def _ring(self, _signal: int, _frame: FrameType | None) -> None:
+        if perf_counter() - self._since_s > self.deadline_s:
+            raise TooLate
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return function(*arguments); `TooLate` when that takes too long."""
+        self._since_s = start = perf_counter()
+        try:
+            answer = function(*arguments)
+        finally:
+            self._since_s = math.inf
+        if perf_counter() - start > self.deadline_s:
+            raise TooLate
+        return answer
+
+    def reason(self, error: BaseException) -> str:
+        """Return what a call did wrong, with the place where it happened."""
+        if isinstance(error, TooLate):
+            return f"took longer than the deadline of {self.deadline_s:g} s"
+        place = ""
+        frames = traceback.extract_tb(error.__traceback__)
+        if frames and frames[-1].filename != __file__:
+            place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"
+        return f"{type(error).__name__}: {error}{place}"
+
+
+WRONGS: Final = (Exception, SystemExit, TooLate)
+"""What a call to a VUT may raise, and that is then its fault."""
+
+
+class PerCorridor(Driver):
+    """Asks a controller of its own in each corridor, so that corridors share no state.
+
+    What a controller does wrong is the reason of its corridor alone; it is then made anew.
+    """
+
+    def __init__(self, corridors: int, deadline_s: float) -> None:
+        """Prepare for a number of corridors; a subclass makes the controllers."""
+        super().__init__(corridors)
+        self._watch = Watch(deadline_s)
+        self._reasons: list[str | None] = [None] * corridors
+        self._renew_first = [False] * corridors
+
+    @abstractmethod
+    def renew(self, corridor: int) -> None:
+        """Make the controller of a corridor anew."""
+
+    @abstractmethod
+    def reset(self, corridor: int, seen: Seen) -> None:
+        """Tell the controller of a corridor that an episode begins."""
+
+    @abstractmethod
+    def answer(self, corridor: int, seen: Seen) -> float:
+        """Return the acceleration in one corridor, m/s2; raises what the controller raises."""
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Reset the controller of a corridor; an error is kept as the reason of its answer."""
+        self._reasons[corridor] = None
+        try:
+            with self._watch as watch:
+                if self._renew_first[corridor]:
+                    watch.call(self.renew, corridor)
+                    self._renew_first[corridor] = False
+                watch.call(self.reset, corridor, seen_at_start(case))
+        except WRONGS as error:
+            self._fault(corridor, f"reset: {self._watch.reason(error)}")
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the answers of the controllers; NaN where there is a reason."""
+        answers = [0.0] * self.corridors
+        columns = (scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps)
+        states = zip(scene.step.tolist(), *(column.tolist() for column in columns), strict=True)
+        with self._watch as watch:
+            for k, (active, (step, *state)) in enumerate(
+                zip(scene.active.tolist(), states, strict=True)
+            ):
+                if not active:
+                    continue
+                if self._reasons[k] is not None:
+                    answers[k] = math.nan
+                    continue
+                try:
+                    seen = Seen(round(step * DT_S, 1), *state)
+                    answers[k] = as_number(watch.call(self.answer, k, seen))
+                except WRONGS as error:
+                    self._fault(k, watch.reason(error))
+                    answers[k] = math.nan
+        return np.array(answers)
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what the controller of a corridor did wrong."""
+        return self._reasons[corridor]
+
+    def _fault(self, corridor: int, reason: str) -> None:
+        self._reasons[corridor] = reason
+        self._renew_first[corridor] = True
+
+
+class WrongAnswerError(Exception):
+    """A VUT answered something that is no acceleration."""
+
+
+def as_number(answer: Any) -> float:
+    """Return an answer as a float; raises `WrongAnswerError` for what is not one real number."""
+    if type(answer) is float:
+        return answer
+    if isinstance(answer, (int, float, np.integer, np.floating)) and not isinstance(answer, bool):
+        return float(answer)
+    if isinstance(answer, np.ndarray) and answer.shape == () and answer.dtype.kind in "fiu":
+        return float(answer)
+    raise WrongAnswerError(f"answered {answer!r:.60} ({type(answer).__name__}) instead of a number")

@@ -1,0 +1,119 @@
+"""A VUT as an ONNX network: the state goes in, an acceleration or action values come out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.drivers.base import Driver
+from merge_sumo.drivers.levelk import ACTIONS_MPS2
+from merge_sumo.drivers.vuts.base import PerCorridor, Seen, Vut, VutOptions
+from merge_sumo.drivers.vuts.options import split_options
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import DT_S
+from merge_sumo.sumo.world import World
+
+PERIOD: Final = "decision_period_s"
+"""Metadata of a network, or option: it decides this often and holds its acceleration."""
+STATE: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
+"""The columns of a network's one input, (1, 4)."""
+_DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+
+
+def onnx_vut(argument: str, options: VutOptions) -> Vut:
+    """Return the VUT of `onnx:FILE?decision_period_s=...`; `UserError` for one that cannot be."""
+    spec = f"onnx:{argument}"
+    file, given = split_options(argument, spec)
+    unknown = set(given) - {PERIOD}
+    if unknown:
+        raise UserError(f"--vut {spec}: there is no option {unknown.pop()!r}, only {PERIOD}")
+    network = Network(Path(file), given.get(PERIOD))
+
+    def make(corridors: int, _world: World | None) -> Driver:
+        return OnnxVut(corridors, network, options.deadline_s)
+
+    return Vut(make=make, file=Path(file))
+
+
+class Network:
+    """A checked network; `UserError` when the file is missing or is no such network."""
+
+    def __init__(self, path: Path, period_s: str | None) -> None:
+        """Load the file with one thread, so that answers do not depend on the machine's cores."""
+        try:
+            import onnxruntime as ort
+        except ImportError as error:
+            raise UserError(
+                "an ONNX network needs onnxruntime: run `pip install 'merge-sumo[onnx]'`"
+            ) from error
+        if not path.is_file():
+            raise UserError(f"there is no ONNX file {path}")
+        settings = ort.SessionOptions()
+        settings.intra_op_num_threads = settings.inter_op_num_threads = 1
+        settings.log_severity_level = 4
+        try:
+            self._session: Any = ort.InferenceSession(
+                str(path), settings, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # onnxruntime has a class of its own for every failure
+            raise UserError(f"{path} is no ONNX network that can be run: {error}") from error
+        inputs = self._session.get_inputs()
+        if len(inputs) != 1 or inputs[0].type not in _DTYPES or list(inputs[0].shape)[-1:] != [4]:
+            said = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+            raise UserError(
+                f"{path} has the inputs {said}: a VUT has one of floats, (1, 4), with "
+                f"{', '.join(STATE)}"
+            )
+        self._input, self._dtype = inputs[0].name, _DTYPES[inputs[0].type]
+        outputs = self.run((0.0, 0.0, 0.0, 0.0))
+        if outputs.size not in (1, len(ACTIONS_MPS2)):
+            raise UserError(
+                f"{path} gives {outputs.size} numbers: a VUT gives one acceleration, or "
+                f"{len(ACTIONS_MPS2)} values of the actions -4 to +2 m/s2"
+            )
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        text = period_s or metadata.get(PERIOD) or str(DT_S)
+        try:
+            self.period_steps = round(float(text) / DT_S)
+        except (ValueError, OverflowError):
+            self.period_steps = 0
+        if self.period_steps < 1:
+            raise UserError(f"{path}: {PERIOD} is {text!r}: give seconds, {DT_S} or more")
+
+    def run(self, state: tuple[float, ...]) -> np.ndarray[Any, Any]:
+        """Return the flat output for one state."""
+        fed = np.array([state], dtype=self._dtype)
+        return np.asarray(self._session.run(None, {self._input: fed})[0]).ravel()
+
+    def acceleration_mps2(self, state: tuple[float, ...]) -> float:
+        """Return the acceleration, or that of the highest action value."""
+        output = self.run(state)
+        if output.size == 1:
+            return float(output[0])
+        if not np.isfinite(output).all():
+            return float("nan")
+        return float(ACTIONS_MPS2[int(output.argmax())])
+
+
+class OnnxVut(PerCorridor):
+    """Asks the network when a decision is due, corridor by corridor, and holds in between."""
+
+    def __init__(self, corridors: int, network: Network, deadline_s: float) -> None:
+        """Take the network; it remembers nothing, so one serves all corridors."""
+        super().__init__(corridors, deadline_s)
+        self._network = network
+        self._held = [0.0] * corridors
+
+    def renew(self, corridor: int) -> None:
+        """Do nothing."""
+
+    def reset(self, corridor: int, seen: Seen) -> None:
+        """Do nothing: the first step is a decision."""
+
+    def answer(self, corridor: int, seen: Seen) -> float:
+        """Return the held acceleration, decided anew where a decision is due."""
+        if round(seen.t_s / DT_S) % self._network.period_steps == 0:
+            self._held[corridor] = self._network.acceleration_mps2(seen[1:])
+        return self._held[corridor]

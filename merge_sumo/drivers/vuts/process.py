@@ -1,0 +1,92 @@
+"""A controller that is a program of its own: started, watched and stopped."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import tempfile
+from contextlib import suppress
+from typing import IO, Final
+
+from merge_sumo.errors import UserError
+
+PORT_FIELD: Final = "{port}"
+PORT_VARIABLE: Final = "MERGE_SUMO_PORT"
+GRACE_S: Final = 2.0
+"""Time that a program has to end by itself before it is killed."""
+TAIL_BYTES: Final = 2000
+
+
+def split_command(command: str) -> list[str]:
+    """Return the arguments of a command line; `UserError` when its program is not there."""
+    try:
+        arguments = shlex.split(command)
+    except ValueError as error:
+        raise UserError(f"--vut-command cannot be read: {error}") from error
+    if not arguments or shutil.which(arguments[0]) is None:
+        raise UserError(
+            f"--vut-command {command!r}: there is no program {(arguments or [''])[0]!r}; write it "
+            "as you would in a terminal"
+        )
+    return arguments
+
+
+class Program:
+    """A running program in a process group of its own; what it prints goes to a nameless file."""
+
+    def __init__(self, arguments: list[str], port: int) -> None:
+        """Start it, told the port as `{port}` in its arguments and by the environment."""
+        self._output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed in `stop`)
+        try:
+            self._process = subprocess.Popen(
+                [argument.replace(PORT_FIELD, str(port)) for argument in arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=self._output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, PORT_VARIABLE: str(port)},
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._output.close()
+            raise UserError(f"--vut-command cannot be started: {error.strerror}") from error
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    def ended(self, patience_s: float) -> str:
+        """Return how it ended and the last line that it printed; "" when it still runs."""
+        try:
+            code = self._process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            return ""
+        how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        size = self._output.seek(0, os.SEEK_END)
+        self._output.seek(max(size - TAIL_BYTES, 0))
+        lines = self._output.read().decode("utf-8", errors="replace").strip().splitlines()
+        return f"the controller {how}" + (f": {lines[-1]:.200}" if lines else "")
+
+    def stop(self, grace_s: float = GRACE_S) -> None:
+        """End the program and what it started; it may end by itself for a while first."""
+        try:
+            self._process.wait(grace_s)
+        except subprocess.TimeoutExpired:
+            self._signal(signal.SIGTERM)
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(GRACE_S)
+        finally:
+            # The group, because a program may have started others that are left.
+            self._signal(signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
+            self._process.wait()
+            self._output.close()
+
+    def _signal(self, number: int) -> None:
+        with suppress(ProcessLookupError, PermissionError):  # nobody may be left
+            if hasattr(os, "killpg"):
+                os.killpg(self._process.pid, number)
+            else:
+                self._process.send_signal(number)

@@ -1,0 +1,207 @@
+"""Cases of a campaign for others: SUMO folders, OpenSCENARIO with OpenDRIVE, tables of motion.
+
+Nothing here loads libsumo. Parquet is written by polars and not by pyarrow: libsumo is linked with
+an Arrow of its own and warns wherever a pyarrow is installed.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.conductor import case_name, export_case
+from merge_sumo.errors import UserError
+from merge_sumo.journal import Run
+from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.opendrive import write_opendrive
+
+TABLE: Final = "trajectories"
+COLUMNS: Final = (
+    *("case", "level", "time_s", "x_pov_m", "v_pov_mps", "a_pov_mps2"),
+    *("x_vut_m", "v_vut_mps", "a_vut_mps2"),
+)
+ROAD: Final = "us23.xodr"
+_EPOCH: Final = datetime(2000, 1, 1)
+MINOR_VERSION: Final = 2
+"""OpenSCENARIO 1.2."""
+CAR_M: Final = {"length": 5.0, "width": 1.8, "height": 1.5}
+"""The car of the replay folders; it plays no part in a verdict."""
+WHEEL_M: Final = 0.7
+
+WriteCase = Callable[[Run, int, Path, Net], Path]
+"""Writes a case of a run into a new folder; returns the path of the file to open."""
+
+
+def write_folders(
+    run: Run, indices: Sequence[int], target: Path, write: WriteCase, net: Net
+) -> Iterator[Path]:
+    """Write cases as folders below `target`, and yield the file to open of each.
+
+    Raises `UserError`, before anything is written, when a case or a folder is not as it should be.
+    """
+    folders = {index: target / case_name(index) for index in indices}
+    for index, folder in folders.items():
+        run.outcome(index)
+        if folder.exists():
+            raise UserError(f"{folder} exists: choose another folder with --out")
+    for index, folder in folders.items():
+        yield write(run, index, folder, net)
+
+
+def write_sumo(run: Run, index: int, folder: Path, net: Net) -> Path:
+    """Write a case as a folder that sumo-gui replays."""
+    return export_case(run, index, folder, net)
+
+
+def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str) -> Path:
+    """Write the motion of cases as one table, "csv" or "parquet", one row a step; return its path.
+
+    Raises `UserError` when the file exists, a case has no trajectory, or polars is missing.
+    """
+    path = folder / f"{TABLE}.{file_format}"
+    if path.exists():
+        raise UserError(f"{path} exists: choose another folder with --out")
+    if file_format == "parquet":
+        polars = _need("polars")
+    rows = _rows(run, indices)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if file_format == "parquet":
+            polars.DataFrame(rows, schema=list(COLUMNS), orient="row").write_parquet(path)
+        else:
+            with path.open("x", newline="", encoding="utf-8") as file:
+                writer = csv.writer(file)
+                writer.writerow(COLUMNS)
+                writer.writerows(rows)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    return path
+
+
+def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float, ...]]:
+    rows: list[tuple[float, ...]] = []
+    for index in indices:
+        trajectory = run.trajectory(index)
+        level = trajectory.case.level
+        for step, motion in enumerate(trajectory.motion.tolist()):
+            rows.append((index, level, round(step * DT_S, 1), *motion))
+    return rows
+
+
+def write_openscenario(run: Run, index: int, folder: Path, net: Net) -> Path:
+    """Write a case as OpenSCENARIO, with both cars on their recorded trajectories, and OpenDRIVE.
+
+    The reference point of each car is its front bumper, as in the record: x, y and heading are
+    those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
+    folder exists or the package scenariogeneration is missing.
+    """
+    xosc = _need("scenariogeneration").xosc
+    trajectory, name = run.trajectory(index), case_name(index)
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError as error:
+        raise UserError(f"{folder} exists: choose another folder or remove it first") from error
+    except OSError as error:
+        raise UserError(f"cannot write {folder}: {error.strerror}") from error
+    write_opendrive(net, folder / ROAD)
+    entities, init = xosc.Entities(), xosc.Init()
+    act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
+    for who, column, on_ramp in (("pov", 0, False), ("vut", 3, True)):
+        entities.add_scenario_object(who, _car(xosc, who))
+        places = [
+            _place(xosc, net, x_m, on_ramp=on_ramp) for x_m in trajectory.motion[:, column].tolist()
+        ]
+        init.add_init_action(who, xosc.TeleportAction(places[0]))
+        init.add_init_action(who, _speed(xosc, float(trajectory.motion[0, column + 1])))
+        act.add_maneuver_group(_follow(xosc, who, places))
+    story = xosc.Story(name)
+    story.add_act(act)
+    board = xosc.StoryBoard(init, _at_time(xosc, "end", trajectory.t_end_s))
+    board.add_story(story)
+    scenario = xosc.Scenario(
+        f"{run.settings.get('vut')}, {name}",
+        "merge-sumo",
+        xosc.ParameterDeclarations(),
+        entities,
+        board,
+        xosc.RoadNetwork(ROAD),
+        xosc.Catalog(),
+        osc_minor_version=MINOR_VERSION,
+        # A fixed date: the same case gives the same bytes.
+        creation_date=_EPOCH,
+    )
+    path = folder / f"{name}.xosc"
+    scenario.write_xml(str(path))
+    return path
+
+
+def _need(package: str) -> Any:
+    """Import a package of the extra "export"; `UserError` when it is missing."""
+    from importlib import import_module
+
+    try:
+        module = import_module(package)
+        if package == "scenariogeneration":
+            import_module(f"{package}.xosc")
+    except ImportError as error:
+        raise UserError(
+            f"this format needs {package}: run `pip install 'merge-sumo[export]'`"
+        ) from error
+    return module
+
+
+def _place(xosc: Any, net: Net, x_m: float, *, on_ramp: bool) -> Any:
+    _, _, x, y, angle_deg = net.lane_point(x_m, on_ramp=on_ramp)
+    # SUMO's angles run clockwise from north, OpenSCENARIO's the other way round from east.
+    heading = math.remainder(math.radians(90.0 - angle_deg), 2.0 * math.pi)
+    return xosc.WorldPosition(round(x, 9), round(y, 9), 0.0, round(heading, 9))
+
+
+def _follow(xosc: Any, who: str, places: Sequence[Any]) -> Any:
+    times = np.round(np.arange(len(places)) * DT_S, 1).tolist()
+    track = xosc.Trajectory(f"{who} recorded", closed=False)
+    track.add_shape(xosc.Polyline(times, list(places)))
+    action = xosc.FollowTrajectoryAction(
+        track,
+        xosc.FollowingMode.position,
+        reference_domain=xosc.ReferenceContext.absolute,
+        scale=1.0,
+        offset=0.0,
+    )
+    event = xosc.Event(f"{who} event", xosc.Priority.override)
+    event.add_trigger(_at_time(xosc, f"{who} start", 0.0))
+    event.add_action(f"{who} follows", action)
+    maneuver = xosc.Maneuver(f"{who} maneuver")
+    maneuver.add_event(event)
+    group = xosc.ManeuverGroup(f"{who} group")
+    group.add_actor(who)
+    group.add_maneuver(maneuver)
+    return group
+
+
+def _at_time(xosc: Any, name: str, time_s: float) -> Any:
+    condition = xosc.SimulationTimeCondition(time_s, xosc.Rule.greaterOrEqual)
+    point = "stop" if name == "end" else "start"
+    return xosc.ValueTrigger(name, 0, xosc.ConditionEdge.none, condition, point)
+
+
+def _speed(xosc: Any, v_mps: float) -> Any:
+    at_once = xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0.0)
+    return xosc.AbsoluteSpeedAction(v_mps, at_once)
+
+
+def _car(xosc: Any, who: str) -> Any:
+    length, width, height = CAR_M["length"], CAR_M["width"], CAR_M["height"]
+    box = xosc.BoundingBox(width, length, height, -length / 2.0, 0.0, height / 2.0)
+    front = xosc.Axle(0.5, WHEEL_M, width - 0.2, -0.2 * length, WHEEL_M / 2.0)
+    rear = xosc.Axle(0.0, WHEEL_M, width - 0.2, -0.8 * length, WHEEL_M / 2.0)
+    return xosc.Vehicle(
+        who, xosc.VehicleCategory.car, box, front, rear, 70.0, A_MAX_MPS2, -A_MIN_MPS2
+    )

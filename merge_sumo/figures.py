@@ -1,0 +1,385 @@
+"""Pictures of experiments, drawn by matplotlib (the extra `plot`) without a screen.
+
+One colour per sampler in all pictures, and one per level of the POV; all of them are told apart
+with any kind of colour vision (Okabe and Ito, 2008).
+"""
+
+from __future__ import annotations
+
+import html
+import importlib
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from merge_sumo.case import Dimension, FloatArray, dimensions
+from merge_sumo.errors import UserError
+from merge_sumo.experiments import Comparison
+from merge_sumo.fmc import RADIUS
+from merge_sumo.score import FAILURE_SCORE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS: Final = {
+    "truth": "#000000",
+    "uniform": "#8a8a8a",
+    "annealing": "#E69F00",
+    "subset": "#009E73",
+    "gpr": "#0072B2",
+    "coverage": "#D55E00",
+}
+OTHER_COLOUR: Final = "#7B3294"
+LEVEL_COLOURS: Final = {0: "#000000", 1: "#CC79A7", 2: "#56B4E9"}
+LEVEL_MARKERS: Final = {0: "o", 1: "s", 2: "^"}
+SAFE_COLOUR: Final = "#c4c9cf"
+DPI: Final = 150
+KINDS: Final = (".png", ".svg", ".html")
+SYMBOLS: Final = {
+    "x_pov0_m": "$x_{POV}^0$ (m)",
+    "v_pov0_mps": "$v_{POV}^0$ (m/s)",
+    "svo_rad": "$\\psi$ (rad)",
+}
+"""Coordinates of a case as the paper writes them: start and speed of the POV, and its SVO."""
+STYLE: Final[Any] = {
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": False,
+    "legend.frameon": False,
+    "svg.hashsalt": "merge-sumo",
+    "svg.fonttype": "path",
+    "mathtext.default": "regular",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Cases at one level in the unit cube, (n, d), which of them failed, (n,), and their FMC."""
+
+    points: FloatArray
+    failed: Any
+    fmc: float
+
+
+def check_figure(path: Path) -> None:
+    """Raise `UserError` where a figure cannot be drawn to `path`, before anything is run for it."""
+    if path.suffix not in KINDS:
+        raise UserError(f"--figure is {path}: end it in {', '.join(KINDS[:-1])} or {KINDS[-1]}")
+    if path.exists():
+        raise UserError(f"{path} exists: choose another file with --figure")
+    if not path.parent.is_dir():
+        raise UserError(f"--figure is {path}: there is no folder {path.parent}")
+    require_matplotlib()
+
+
+def require_matplotlib() -> None:
+    """Raise `UserError` where matplotlib is not installed."""
+    try:
+        importlib.import_module("matplotlib")
+    except ImportError as error:
+        raise UserError("figures need matplotlib: pip install 'merge-sumo[plot]'") from error
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, SVG or a page that needs no network, by the end of the file's name.
+
+    Raises `UserError` when the file cannot be written.
+    """
+    try:
+        if path.suffix == ".html":
+            with io.StringIO() as file:
+                _write(figure, file, "svg")
+                svg = file.getvalue()
+            title = html.escape(figure.get_suptitle())
+            page = f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{title}'
+            path.write_text(f"{page}</title>\n{svg[svg.index('<svg') :]}", encoding="utf-8")
+        else:
+            _write(figure, path, path.suffix[1:])
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _write(figure: Figure, file: Any, kind: str) -> None:
+    import matplotlib
+
+    # No date: the same numbers give the same file.
+    metadata = {"Date": None} if kind == "svg" else {"Software": None}
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(file, format=kind, dpi=DPI, metadata=metadata)
+
+
+@contextmanager
+def _drawing(width: float, height: float) -> Iterator[Figure]:
+    """Give an empty figure of a size in inches, and our style while it is drawn."""
+    require_matplotlib()
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        yield Figure(figsize=(width, height), layout="constrained", facecolor="white")
+
+
+def colour(name: str) -> str:
+    """Return the colour of a sampler, or of the truth."""
+    return COLOURS.get(name, OTHER_COLOUR)
+
+
+def coverage_curves(
+    title: str,
+    compared: Mapping[str, Comparison],
+    truth_fmc: float,
+    oracle: Mapping[int, float],
+) -> Figure:
+    """Draw FMC against cases: a median with its quartile band per sampler, truth and oracle.
+
+    Args:
+        title: what is compared.
+        compared: each sampler, all with the same batches.
+        truth_fmc: FMC of the truth.
+        oracle: FMC of the oracle after numbers of cases.
+    """
+    with _drawing(7.5, 4.6) as figure:
+        figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
+        axes = figure.subplots()
+        ends = []
+        for name, result in compared.items():
+            cases = [0, *result.cases_by_batch]
+            low, high = ([0.0, *band] for band in result.fmc_by_batch_quartiles)
+            axes.fill_between(cases, low, high, color=colour(name), alpha=0.18, linewidth=0)
+            axes.plot(cases, [0.0, *result.fmc_by_batch_median], color=colour(name), lw=2)
+            ends.append((result.fmc_by_batch_median[-1], name, colour(name)))
+            axes.set_xlim(0, cases[-1])
+        known = list(oracle)
+        axes.plot(known, list(oracle.values()), color="black", lw=1.2, ls=(0, (4, 2)), zorder=1)
+        axes.axhline(truth_fmc, color="black", lw=1.2)
+        ends += [(truth_fmc, "truth", "black"), (oracle[known[-1]], "oracle", "black")]
+        axes.set_ylim(0.0)
+        axes.set_xlabel("cases")
+        axes.set_ylabel("failure mode coverage (FMC)")
+        _label_ends(axes, ends)
+    return figure
+
+
+def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
+    """Write each name at the right end of its line, moved up where it would lie on another."""
+    low, high = axes.get_ylim()
+    step = 0.055 * (high - low)
+    place = -np.inf
+    for y, name, ink in sorted(ends):
+        place = max(y, place + step)
+        axes.annotate(
+            name,
+            xy=(1.0, y),
+            xytext=(1.03, place),
+            xycoords=("axes fraction", "data"),
+            textcoords=("axes fraction", "data"),
+            color=ink,
+            va="center",
+            arrowprops={"arrowstyle": "-", "color": ink, "lw": 0.6, "shrinkA": 1, "shrinkB": 0},
+        )
+
+
+def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
+    """Draw where cases were run and where they failed, a panel per sampler, in the pool's units.
+
+    The pale discs around failures are what FMC counts. At level 2 the panels are boxes.
+    """
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    solid = level == 2
+    with _drawing(3.6 * columns, (3.5 if solid else 3.1) * rows + 0.4) as figure:
+        figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
+        for place, (name, panel) in enumerate(panels.items(), start=1):
+            kind = {"projection": "3d"} if solid else {}
+            axes: Any = figure.add_subplot(rows, columns, place, **kind)
+            (_box if solid else _map)(axes, panel, level, colour(name))
+            if not solid:
+                axes.label_outer()
+            say = axes.text2D if solid else axes.text
+            found = f"{int(np.sum(panel.failed))} of {len(panel.points)} fail"
+            line: Any = {"transform": axes.transAxes, "va": "bottom"}
+            say(0.0, 1.02, name, color=colour(name), fontweight="bold", fontsize=11, **line)
+            say(1.0, 1.02, f"{found}, FMC {panel.fmc:.4f}", ha="right", fontsize=8.5, **line)
+    return figure
+
+
+def _physical(points: FloatArray, level: int) -> FloatArray:
+    """Return points of the unit cube, (n, d), in the pool's units."""
+    dims = dimensions(level)
+    low = np.array([d.low for d in dims])
+    high = np.array([d.high for d in dims])
+    return np.asarray(low + points * (high - low), dtype=np.float64)
+
+
+def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
+    from matplotlib.collections import EllipseCollection
+
+    x, v = dimensions(level)
+    failing = _physical(panel.points[panel.failed], level)
+    safe = _physical(panel.points[~panel.failed], level)
+    size = 3.0 if len(panel.points) > 2000 else 8.0
+    dots: Any = {"linewidths": 0, "rasterized": True}
+    axes.scatter(safe[:, 0], safe[:, 1], s=size / 2, color=SAFE_COLOUR, **dots)
+    balls = EllipseCollection(
+        [2 * RADIUS * (x.high - x.low)],
+        [2 * RADIUS * (v.high - v.low)],
+        [0.0],
+        units="xy",
+        offsets=failing,
+        offset_transform=axes.transData,
+        facecolor=_pale(ink),
+        linewidths=0,
+    )
+    axes.add_collection(balls)
+    axes.scatter(failing[:, 0], failing[:, 1], s=size, color=ink, **dots)
+    _pool_axes(axes, x, v)
+
+
+def _pale(ink: str) -> tuple[float, ...]:
+    """Return a colour mixed with white, so that discs on discs stay one colour."""
+    from matplotlib.colors import to_rgb
+
+    return tuple(0.22 * part + 0.78 for part in to_rgb(ink))
+
+
+def _pool_axes(axes: Axes, x: Dimension, y: Dimension) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axes.set_xlim(x.low, x.high)
+    axes.set_ylim(y.low, y.high)
+    axes.set_xlabel(SYMBOLS[x.field])
+    axes.set_ylabel(SYMBOLS[y.field])
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+
+
+def _box(axes: Any, panel: Panel, level: int, ink: str) -> None:
+    failing = _physical(panel.points[panel.failed], level)
+    safe = _physical(panel.points[~panel.failed], level)
+    few = len(panel.points) <= 2000
+    dots: Any = {"linewidths": 0, "depthshade": False}
+    if few:
+        axes.scatter(*safe.T, s=3, color=SAFE_COLOUR, alpha=0.7, **dots)
+    # The shadows on the floor say where in x and v a failure floats.
+    floor = np.full(len(failing), dimensions(level)[2].low)
+    axes.scatter(failing[:, 0], failing[:, 1], floor, s=8, color=_pale(ink), **dots)
+    axes.scatter(*failing.T, s=14 if few else 7, color=ink, **dots)
+    for side, d in zip("xyz", dimensions(level), strict=True):
+        getattr(axes, f"set_{side}lim")(d.low, d.high)
+        getattr(axes, f"set_{side}label")(SYMBOLS[d.field])
+        axis = getattr(axes, f"{side}axis")
+        axis.set_pane_color((0.97, 0.97, 0.98, 1.0))
+        axis.line.set_color("#57606a")
+        axis._axinfo["grid"].update(color="#dfe3e8", linewidth=0.6)
+    axes.locator_params(nbins=4)
+    axes.view_init(elev=22, azim=-60)
+    axes.set_box_aspect(None, zoom=0.86)
+    axes.tick_params(labelsize=7, pad=0)
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A surrogate after a number of batches.
+
+    Attributes:
+        predicted: P on a regular grid, (n, n), rows along v_POV0, columns along x_POV0.
+        learned: the cases that it has learned from.
+    """
+
+    predicted: FloatArray
+    learned: Panel
+
+
+def surfaces(title: str, by_batch: Mapping[int, Surface], level: int, truth: FloatArray) -> Figure:
+    """Draw the surrogate's score P after some batches, with the failures of the truth, (m, 2)."""
+    x, v = dimensions(level)
+    steps = np.linspace(2.0 * FAILURE_SCORE, 0.0, 21)
+    failures = _physical(truth, level)
+    with _drawing(8.6, 6.6) as figure:
+        figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
+        rows, columns = -(-len(by_batch) // 2), min(len(by_batch), 2)
+        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        for unused in grid.flat[len(by_batch) :]:
+            unused.set_visible(False)
+        for axes, (batch, surface) in zip(grid.flat, by_batch.items(), strict=False):
+            n = len(surface.predicted)
+            across, up = np.linspace(x.low, x.high, n), np.linspace(v.low, v.high, n)
+            filled = axes.contourf(
+                across,
+                up,
+                np.minimum(surface.predicted, 0.0),
+                steps,
+                cmap="cividis",
+                extend="min",
+            )
+            line: Any = {"colors": "white", "linewidths": 1.6, "linestyles": "solid"}
+            if surface.predicted.min() < FAILURE_SCORE < surface.predicted.max():
+                axes.contour(across, up, surface.predicted, [FAILURE_SCORE], **line)
+            axes.scatter(
+                failures[:, 0], failures[:, 1], s=2, color="#D55E00", linewidths=0, alpha=0.5
+            )
+            run = _physical(surface.learned.points, level)
+            axes.scatter(
+                run[:, 0], run[:, 1], s=9, color="white", edgecolors="black", linewidths=0.5
+            )
+            axes.set_title(f"after batch {batch}: {len(run)} cases")
+            _pool_axes(axes, x, v)
+            axes.label_outer()
+        bar = figure.colorbar(filled, ax=grid, shrink=0.85, ticks=steps[::5])
+        bar.set_label(f"predicted score P (white line: {FAILURE_SCORE:.0f}, a failure)")
+    return figure
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """How a sampler went on over batches at each level, one row per seed, (seeds, batches).
+
+    Attributes:
+        cases: cases at the level in each batch.
+        score: mean score P of them; NaN where there was none.
+    """
+
+    cases: Mapping[int, FloatArray]
+    score: Mapping[int, FloatArray]
+
+
+def allocation(title: str, by_sampler: Mapping[str, Levels]) -> Figure:
+    """Draw cases per level and mean score per level over the batches: median and quartile band."""
+    with _drawing(4.6 * len(by_sampler), 6.4) as figure:
+        figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
+        grid = figure.subplots(2, len(by_sampler), sharex=True, sharey="row", squeeze=False)
+        for column, (name, levels) in enumerate(by_sampler.items()):
+            for axes, rows in zip(grid[:, column], (levels.cases, levels.score), strict=True):
+                for level, values in rows.items():
+                    _band(axes, values, level)
+            grid[0, column].set_title(name, color=colour(name))
+            grid[1, column].set_xlabel("batch")
+        grid[0, 0].set_ylim(0)
+        grid[0, 0].set_ylabel("cases of the batch")
+        grid[1, 0].set_ylabel("mean score P of the batch")
+        grid[0, 0].legend(loc="upper left", title="POV level", ncols=3)
+    return figure
+
+
+def _band(axes: Axes, values: FloatArray, level: int) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    batches = np.arange(1, values.shape[1] + 1)
+    # A batch in which no seed has a case at this level has no mean score: there is a gap.
+    some = ~np.isnan(values).all(axis=0)
+    parts = np.full((3, len(batches)), np.nan)
+    parts[:, some] = np.nanquantile(values[:, some], [0.25, 0.5, 0.75], axis=0)
+    ink = LEVEL_COLOURS[level]
+    axes.fill_between(batches, parts[0], parts[2], color=ink, alpha=0.18, linewidth=0)
+    axes.plot(batches, parts[1], color=ink, marker=LEVEL_MARKERS[level], ms=4, label=str(level))
+    axes.set_xlim(1, max(len(batches), 2))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))

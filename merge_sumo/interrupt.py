@@ -1,0 +1,60 @@
+"""SIGINT and SIGTERM: the first finishes what is running, the second stops at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+from types import FrameType
+from typing import Any, Final, Self
+
+SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+STDERR: Final = 2
+
+
+class Stopped(BaseException):
+    """A signal asked to stop. Not an `Exception`: no VUT that swallows errors swallows this."""
+
+    def __init__(self, number: int) -> None:
+        """Take the number of the signal."""
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code by the convention of shells: 130 for SIGINT, 143 for SIGTERM."""
+        return 128 + self.number
+
+
+class Interrupt:
+    """Within `with`, signals are noted; to be used in the main thread.
+
+    `check` raises `Stopped` after the first signal; the second raises it wherever the program is.
+    """
+
+    def __init__(self, note: str) -> None:
+        """`note` is what a person is told at the first signal."""
+        self._note = f"\n{note}\n".encode()
+        self._number: int | None = None
+        self._before: list[Any] = []
+
+    def check(self) -> None:
+        """Raise `Stopped` when a signal has come."""
+        if self._number is not None:
+            raise Stopped(self._number)
+
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        if self._number is not None:
+            raise Stopped(number)
+        self._number = number
+        # Not print: the signal may have come in the middle of one.
+        os.write(STDERR, self._note)
+
+    def __enter__(self) -> Self:
+        """Take over the signals."""
+        self._before = [signal.signal(number, self._handle) for number in SIGNALS]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Give the signals back."""
+        for number, handler in zip(SIGNALS, self._before, strict=True):
+            signal.signal(number, handler)

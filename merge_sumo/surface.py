@@ -1,0 +1,74 @@
+"""What a surrogate says of the cases that a campaign did not run.
+
+The surrogate is that of the sampler `coverage`, learned afresh from the outcomes of a run,
+whichever sampler chose its cases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.case import FloatArray, Pool, dimensions
+from merge_sumo.fmc import fmc
+from merge_sumo.samplers.coverage import learn_chance
+from merge_sumo.samplers.uniform import UniformSampler
+from merge_sumo.score import Outcome
+
+FEWEST_FAILURES: Final = 5
+"""Failures at a level from which a surrogate has something to say of others."""
+PLAUSIBLE: Final = 0.1
+"""Chance to fail from which a place counts for `plausible_fmc`."""
+POOL_POINTS: Final = {2: 10_000, 3: 20_000}
+"""Uniform points by dimension: as many as the cases of a ground truth."""
+PART: Final = 4000
+"""Points asked at a time, so that memory does not grow with their number."""
+
+
+class Surface:
+    """The surrogate of one level of a run."""
+
+    def __init__(
+        self, level: int, failing: FloatArray, chance: Callable[[FloatArray], FloatArray]
+    ) -> None:
+        """Use a learned chance to fail and the points, (n, d), of the failures found."""
+        self._dims = len(dimensions(level))
+        self._failing = failing
+        self._chance = chance
+
+    def chance(self, points: FloatArray) -> FloatArray:
+        """Return the chance that cases at points, (n, d), of the unit cube fail: (n,)."""
+        from threadpoolctl import threadpool_limits
+
+        parts = np.array_split(points, len(points) // PART + 1)
+        # One thread: a report is the same whatever the number of cores.
+        with threadpool_limits(1):
+            return np.concatenate([self._chance(part) for part in parts])
+
+    def plausible_fmc(self) -> float:
+        """Return the coverage if all places failed that the surrogate does not exclude.
+
+        As many uniform points as a ground truth has cases, those with a chance of at least
+        `PLAUSIBLE`, together with the failures found. No confidence bound: a region of which the
+        surrogate knows nothing is not in it.
+        """
+        points = np.random.default_rng(0).random((POOL_POINTS[self._dims], self._dims))
+        plausible = points[self.chance(points) >= PLAUSIBLE]
+        return fmc(np.concatenate([self._failing, plausible]))
+
+
+def learn_surface(outcomes: Sequence[Outcome], level: int) -> Surface | None:
+    """Return the surrogate of a level, or None where too few cases failed to learn from."""
+    from threadpoolctl import threadpool_limits
+
+    sampler = UniformSampler(Pool(levels=(level,)), seed=0)
+    sampler.tell(outcome for outcome in outcomes if outcome.case.level == level)
+    history = sampler.history(level)
+    failing = history.points[history.failed]
+    if len(failing) < FEWEST_FAILURES:
+        return None
+    with threadpool_limits(1):
+        chance = learn_chance(history)
+    return None if chance is None else Surface(level, failing, chance)

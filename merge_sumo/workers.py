@@ -1,0 +1,309 @@
+"""Where work is done: in this process, in worker processes, or on a cluster.
+
+What is above submits chunks of its items to a standard `concurrent.futures.Executor` and never
+sees which one. A worker that dies takes nothing with it: its chunks run again.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+import multiprocessing
+import multiprocessing.util
+import os
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
+from concurrent.futures.process import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final, Generic, Self, TypeVar
+
+from merge_sumo.errors import UserError
+
+MAX_CHUNK: Final = 500
+"""Items that a worker takes at a time; what bounds its memory."""
+RECYCLE_AFTER: Final = 200
+"""Chunks after which a worker process is replaced by a new one: a VUT may leak memory."""
+MAX_DEATHS: Final = 2
+"""An item that ends so many workers on its own is not tried again."""
+DASK_TIMEOUT_S: Final = 30.0
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class Workers:
+    """Runs functions on chunks of items through an executor; to be closed, or used in `with`.
+
+    A chunk whose worker dies runs again, alone and then item by item, so that the one item that
+    ends its worker each time is found; after `MAX_DEATHS` it is given up, and only that one.
+    """
+
+    def __init__(
+        self,
+        open_executor: Callable[[], Executor],
+        count: int,
+        *,
+        died: tuple[type[Exception], ...] = (BrokenExecutor,),
+        recycle_after: int | None = None,
+        on_close: Callable[[], None] | None = None,
+    ) -> None:
+        """Open an executor with `count` workers.
+
+        `died` is what a future raises when its worker is dead. The executor is closed and opened
+        anew after a death, and after `recycle_after` chunks per worker.
+        """
+        self.count = count
+        self._open = open_executor
+        self._died = died
+        self._recycle_after = recycle_after
+        self._on_close = on_close
+        self._executor = open_executor()
+        self._submitted = 0
+        self._broken = False
+        self._left: list[Future[Any]] = []
+
+    def run(
+        self,
+        function: Callable[[Sequence[T]], Sequence[R]],
+        items: Sequence[T],
+        lost: Callable[[T], R],
+        *,
+        chunk: int | None = None,
+    ) -> Iterator[tuple[int, R]]:
+        """Yield (place in `items`, result) as chunks end.
+
+        Args:
+            function: gives one result for each item of a chunk. It goes to other processes, so it
+                is found by its name there, and it must be safe to run twice.
+            items: what to work on.
+            lost: gives the result of an item that ended its worker `MAX_DEATHS` times.
+            chunk: items in a chunk; by default as many as give every worker one chunk, up to
+                `MAX_CHUNK`.
+
+        Raises what `function` raises, and `UserError` when the executor goes away.
+        """
+        size = chunk or max(1, min(MAX_CHUNK, math.ceil(len(items) / self.count)))
+        starts = range(0, len(items), size)
+        waiting = deque(_Chunk(first, items[first : first + size]) for first in starts)
+        suspects: deque[_Chunk[T]] = deque()
+        running: dict[Future[Sequence[R]], _Chunk[T]] = {}
+        try:
+            while waiting or suspects or running:
+                # Suspects run one at a time, so that a death is theirs.
+                source, most = (suspects, 1) if suspects else (waiting, 2 * self.count)
+                alone = source is suspects and not running
+                while source and len(running) < most and self._ready(running):
+                    next_chunk = source.popleft()
+                    running[self._submit(function, next_chunk.items)] = next_chunk
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    ended = running.pop(future)
+                    try:
+                        yield from enumerate(future.result(), start=ended.first)
+                    except self._died:
+                        self._broken = True
+                        yield from ended.died(alone, suspects, lost)
+                    except CancelledError as error:  # we cancel only what nobody waits for
+                        raise UserError("the workers went away: look after the cluster") from error
+        finally:
+            self._left = [future for future in running if not future.cancel()]
+
+    def _ready(self, running: dict[Future[Any], Any]) -> bool:
+        """Return whether the executor takes work; reopen it where that is due and possible."""
+        most = math.inf if self._recycle_after is None else self._recycle_after * self.count
+        if self._submitted < most and not self._broken:
+            return True
+        if running:
+            return False
+        self._executor.shutdown(wait=True)
+        self._executor = self._open()
+        self._submitted, self._broken = 0, False
+        return True
+
+    def _submit(self, function: Callable[..., R], *arguments: Any) -> Future[R]:
+        self._submitted += 1
+        try:
+            return self._executor.submit(function, *arguments)
+        except self._died as error:
+            # It broke between two submissions: as if it had broken a moment later.
+            future: Future[R] = Future()
+            future.set_exception(error)
+            return future
+
+    def __enter__(self) -> Self:
+        """Return the workers."""
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        """Close the executor; only where work was left behind does it hear of an exception."""
+        left_behind = any(not future.done() for future in self._left)
+        try:
+            self._executor.__exit__(*(exception if left_behind else (None, None, None)))
+        finally:
+            if self._on_close is not None:
+                self._on_close()
+
+
+@dataclass(slots=True)
+class _Chunk(Generic[T]):
+    """Items that go to a worker together, and how many workers they ended on their own."""
+
+    first: int
+    items: Sequence[T]
+    deaths: int = 0
+
+    def died(
+        self, alone: bool, suspects: deque[_Chunk[T]], lost: Callable[[T], R]
+    ) -> Iterator[tuple[int, R]]:
+        """Take note of a death: try again, item by item where it was surely ours, or give up."""
+        self.deaths += alone
+        if len(self.items) > 1 and self.deaths:
+            for k in range(len(self.items)):
+                suspects.append(_Chunk(self.first + k, self.items[k : k + 1]))
+        elif self.deaths < MAX_DEATHS:
+            suspects.append(self)
+        else:
+            yield self.first, lost(self.items[0])
+
+
+def workers_or_cores(workers: int | None) -> int:
+    """Return the number of workers: as asked, or one for each core."""
+    if workers is not None and workers < 1:
+        raise UserError(f"--workers is {workers}: it must be 1 or more")
+    return workers or os.cpu_count() or 1
+
+
+def open_workers(workers: int | None = None, dask: str | None = None) -> Workers:
+    """Return the workers of a cluster at the address `dask`, or else local ones.
+
+    One local worker is this process itself; more are processes of their own. None is one a core.
+    """
+    if dask is not None:
+        return dask_workers(dask)
+    count = workers_or_cores(workers)
+    if count == 1:
+        return Workers(InProcess, 1)
+    return Workers(lambda: LocalProcesses(count), count, recycle_after=RECYCLE_AFTER)
+
+
+def dask_workers(address: str) -> Workers:
+    """Return the workers of a running Dask cluster; `UserError` when there are none."""
+    try:
+        from distributed import Client, KilledWorker
+    except ModuleNotFoundError as error:
+        raise UserError("--dask needs Dask: run `pip install merge-sumo[dask]`") from error
+    try:
+        client = Client(address, timeout=DASK_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError, ImportError) as error:
+        raise UserError(f"--dask: there is no scheduler at {address}: {error}") from error
+    count = len(client.scheduler_info(n_workers=-1)["workers"])
+    if count == 0:
+        client.close()
+        raise UserError(f"--dask: the scheduler at {address} has no workers: start `dask worker`")
+    return Workers(
+        lambda: client.get_executor(pure=False),
+        count,
+        died=(KilledWorker,),
+        on_close=client.close,
+    )
+
+
+class InProcess(Executor):
+    """An executor of one worker: the process that calls it."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run at once; the future is done."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:  # a future holds whatever was raised
+            future.set_exception(error)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let go what the worker kept."""
+        end_worker()
+
+
+class LocalProcesses(ProcessPoolExecutor):
+    """Worker processes that leave Ctrl-C to their parent and do not outlive it.
+
+    They are spawned, because libsumo's simulation must not be forked.
+    """
+
+    def __init__(self, workers: int) -> None:
+        """Prepare for a number of workers; they start with the first task."""
+        super().__init__(workers, multiprocessing.get_context("spawn"), _begin_worker)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit; workers that are started here, now or later, never see SIGINT."""
+        with _sigint_blocked():
+            return super().submit(fn, *args, **kwargs)
+
+    def __exit__(self, *exception: Any) -> bool | None:
+        """Wait for the workers; when the program is to end at once, end them too."""
+        if exception[0] is not None and not issubclass(exception[0], Exception):
+            for process in list((self._processes or {}).values()):
+                process.kill()
+        return super().__exit__(*exception)
+
+
+_endings: list[Callable[[], None]] = []
+
+
+def when_worker_ends(ending: Callable[[], None]) -> None:
+    """Have something called when the work of this process as a worker is over."""
+    if ending not in _endings:
+        _endings.append(ending)
+    atexit.unregister(end_worker)  # not to be registered twice
+    atexit.register(end_worker)
+
+
+def end_worker() -> None:
+    """Let go what this process kept from one chunk to the next."""
+    while _endings:
+        _endings.pop()()
+
+
+def _begin_worker() -> None:
+    """Set up a worker process."""
+    from threadpoolctl import threadpool_limits
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    # Processes of multiprocessing end without atexit.
+    multiprocessing.util.Finalize(None, end_worker, exitpriority=100)
+    # As many threads as workers keep all cores busy.
+    threadpool_limits(1)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is gone, even if that was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextmanager
+def _sigint_blocked() -> Iterator[None]:
+    """Block SIGINT in this thread, and in the threads and processes that it starts."""
+    if sys.platform == "win32":
+        yield
+        return
+    before: Iterable[Any] = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,83 @@
+"""A campaign made by hand, without SUMO: simple drivers, all levels, failures, and one error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from merge_sumo.case import Case, from_unit
+from merge_sumo.conductor import versions
+from merge_sumo.journal import Journal, Run
+from merge_sumo.scenario import A_MIN_MPS2, DT_S, X_VUT0_M
+from merge_sumo.score import Outcome, measure
+from merge_sumo.trajectory import End, Trajectory
+
+BATCH = 20
+
+
+def drive(case: Case, error: str | None = None) -> Trajectory:
+    """Return an episode: the POV brakes a little at level 1 and 2, the VUT coasts from 3 s."""
+    rows = []
+    x_pov, v_pov, x_vut, v_vut = case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps
+    step = 0
+    while x_vut < 0.0:
+        a_pov = -0.5 if case.level and 2.0 < step * DT_S < 5.0 + (case.svo_rad or 0.0) else 0.0
+        a_vut = 1.0 if step * DT_S < 3.0 else max(A_MIN_MPS2, -v_vut / DT_S) * 0.05
+        rows.append((x_pov, v_pov, a_pov, x_vut, v_vut, a_vut))
+        x_pov, x_vut = x_pov + v_pov * DT_S, x_vut + v_vut * DT_S
+        v_pov, v_vut = v_pov + a_pov * DT_S, v_vut + a_vut * DT_S
+        step += 1
+    rows.append((x_pov, v_pov, 0.0, x_vut, v_vut, 0.0))
+    end = End.MERGED if error is None else End.VUT_ERROR
+    return Trajectory(case, np.array(rows), end, error)
+
+
+def cases_of(level: int, count: int) -> list[Case]:
+    """Return cases, half of them near the place where both arrive together."""
+    rng = np.random.default_rng([7, level])
+    points = rng.random((count, 3 if level == 2 else 2))
+    cases = from_unit(points, level)
+    meets = {0: 8.9, 1: 8.8, 2: 8.7}[level]
+    near = [
+        Case(
+            level=level,
+            x_pov0_m=max(-340.0, -meets * case.v_pov0_mps + float(rng.normal(0.0, 6.0))),
+            v_pov0_mps=case.v_pov0_mps,
+            svo_rad=case.svo_rad,
+        )
+        for case in cases[::2]
+    ]
+    return cases[1::2] + near
+
+
+def write_run(
+    folder: Path,
+    per_level: int = 60,
+    levels: tuple[int, ...] = (0, 1, 2),
+    error: str | None = "answered nan",
+    **settings: Any,
+) -> Run:
+    """Write a campaign of `per_level` cases at each level and return it; the last case errs."""
+    by_level = [cases_of(level, per_level) for level in levels]
+    cases = [case for group in zip(*by_level, strict=True) for case in group]
+    record = {
+        "vut": "handmade",
+        "levels": list(levels),
+        "sampler": "uniform",
+        "cases": len(cases),
+        "batch": BATCH,
+        "seed": 1,
+        "v_vut0_mps": 18.0,
+        "versions": versions(),
+        **settings,
+    }
+    journal = Journal.create(folder, record)
+    for batch, first in enumerate(range(0, len(cases), BATCH)):
+        ran = []
+        for index, case in enumerate(cases[first : first + BATCH], start=first):
+            trajectory = drive(case, error if index == len(cases) - 1 else None)
+            ran.append((Outcome(index, batch, case, measure(trajectory)), trajectory))
+        journal.append(ran)
+    return Run(folder)

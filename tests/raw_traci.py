@@ -1,0 +1,142 @@
+"""A TraCI client of a few lines that can misbehave; as a program: raw_traci.py PORT [MISDEED].
+
+It knows three commands of the protocol, so that it starts at once and can be wrong on purpose.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import struct
+import sys
+import time
+from contextlib import suppress
+
+STEP, CLOSE, GET_VEHICLE, SET_VEHICLE = 0x02, 0x7F, 0xA4, 0xC4
+SPEED = 0x40
+
+
+def text(value: str) -> bytes:
+    return struct.pack("!i", len(value)) + value.encode()
+
+
+def command(identifier: int, payload: bytes = b"") -> bytes:
+    return struct.pack("!BiB", 0, len(payload) + 6, identifier) + payload
+
+
+class GoneError(Exception):
+    """The server closed the connection."""
+
+
+class Client:
+    def __init__(self, port: int, patience_s: float = 10.0) -> None:
+        until = time.monotonic() + patience_s
+        while True:
+            try:
+                self.socket = socket.create_connection(("127.0.0.1", port), timeout=patience_s)
+                break
+            except OSError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.02)
+
+    def send(self, *commands: bytes) -> None:
+        content = b"".join(commands)
+        try:
+            self.socket.sendall(struct.pack("!i", len(content) + 4) + content)
+        except OSError as error:
+            raise GoneError from error
+
+    def read(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count:
+            try:
+                part = self.socket.recv(count - len(data))
+            except OSError as error:
+                raise GoneError from error
+            if not part:
+                raise GoneError
+            data += part
+        return data
+
+    def ask(self, *commands: bytes) -> bytes:
+        self.send(*commands)
+        return self.read(struct.unpack("!i", self.read(4))[0] - 4)
+
+    def step(self, target_s: float = 0.0) -> None:
+        self.ask(command(STEP, struct.pack("!d", target_s)))
+
+    def speed(self, vehicle: str = "vut") -> float | None:
+        """Return the speed of a vehicle, or None when it is not there."""
+        answer = self.ask(command(GET_VEHICLE, bytes((SPEED,)) + text(vehicle)))
+        return struct.unpack("!d", answer[-8:])[0] if answer[2] == 0 else None
+
+    def set_speed(self, value: float, vehicle: str = "vut") -> bytes:
+        typed = struct.pack("!Bd", 0x0B, value)
+        return self.ask(command(SET_VEHICLE, bytes((SPEED,)) + text(vehicle) + typed))
+
+    def drive(self, steps: int) -> None:
+        """Make steps on the level-0 profile."""
+        for _ in range(steps):
+            self.step()
+            v = self.speed()
+            if v is not None:
+                self.set_speed(min(v + 0.1, max(v, 28.0)))
+
+
+def nonsense(client: Client, rng: random.Random) -> bytes:
+    """Return a message of the right length whose content was mutated."""
+    content = bytearray(command(SET_VEHICLE, bytes((SPEED,)) + text("vut") + b"\x0b" + b"\0" * 8))
+    for _ in range(rng.randint(1, 6)):
+        content[rng.randrange(len(content))] = rng.randrange(256)
+    return struct.pack("!i", len(content) + 4) + bytes(content)
+
+
+MISDEEDS = {
+    "nan": lambda c, r: (c.set_speed(float("nan")), c.step()),
+    "infinite": lambda c, r: (c.set_speed(float("inf")), c.step()),
+    "huge": lambda c, r: (c.set_speed(1e300), c.step()),
+    "wrong type": lambda c, r: c.ask(
+        command(SET_VEHICLE, bytes((SPEED,)) + text("vut") + b"\x0c" + text("fast"))
+    ),
+    "closes": lambda c, r: c.socket.close(),
+    "says goodbye": lambda c, r: (c.ask(command(CLOSE)), c.socket.close()),
+    "stalls": lambda c, r: c.read(1),
+    "half a message": lambda c, r: (c.socket.sendall(b"\0\0\0\x20\x05"), c.read(1)),
+    "half a message and closes": lambda c, r: (c.socket.sendall(b"\0\0\0\x20"), c.socket.close()),
+    "half a length": lambda c, r: (c.socket.sendall(b"\0\0"), c.socket.close()),
+    "garbage": lambda c, r: (c.socket.sendall(r.randbytes(r.randint(4, 200))), c.read(1)),
+    "a huge message": lambda c, r: (c.socket.sendall(b"\x7f\xff\xff\xff"), c.read(1)),
+    "an empty message": lambda c, r: (c.socket.sendall(b"\0\0\0\x04"), c.read(1)),
+    "a mutated message": lambda c, r: (c.socket.sendall(nonsense(c, r)), c.read(1)),
+    "steps to nan": lambda c, r: c.step(float("nan")),
+    "never reads": lambda c, r: [c.send(command(STEP, bytes(8))) for _ in range(100_000)],
+}
+"""What a client may do wrong in an episode."""
+ENDS = {
+    "exits": lambda c, r: sys.exit(0),
+    "crashes": lambda c, r: 1 / 0,
+    "is killed": lambda c, r: os.kill(os.getpid(), signal.SIGKILL),
+    "hangs": lambda c, r: time.sleep(600),
+    "will not be stopped": lambda c, r: (
+        signal.signal(signal.SIGTERM, signal.SIG_IGN),
+        time.sleep(600),
+    ),
+}
+"""What a program may do wrong besides."""
+
+
+def main(port: int, misdeed: str | None = None) -> None:
+    client = Client(port)
+    if misdeed is None:
+        while True:
+            client.drive(1)
+    client.drive(4)
+    (MISDEEDS | ENDS)[misdeed](client, random.Random(0))  # noqa: S311
+
+
+if __name__ == "__main__":
+    with suppress(GoneError):
+        main(int(sys.argv[1]), *sys.argv[2:])

@@ -1,0 +1,116 @@
+"""merge-sumo from Python."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas
+import pytest
+from handmade import write_run
+from lxml import html
+
+import merge_sumo as ms
+from merge_sumo.summary import summarise
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return write_run(tmp_path_factory.mktemp("api") / "run", vut="<b>x</b>")
+
+
+@pytest.fixture
+def opened(made) -> ms.CampaignRun:
+    return ms.open_run(made.folder)
+
+
+class TestARun:
+    def test_gives_its_failures_to_pandas_as_they_are(self, opened, made):
+        frame = pandas.DataFrame(opened.failures)
+        assert len(frame) == summarise(made.outcomes, (0, 1, 2)).failures
+        assert frame["score"].is_monotonic_increasing
+        assert (frame["score"] < -500).all()
+
+    def test_gives_the_rows_of_its_file(self, opened, made):
+        lines = (made.folder / "outcomes.jsonl").read_text().splitlines()
+        assert list(opened.cases) == [json.loads(line) for line in lines]
+
+    def test_writes_its_report(self, opened, made):
+        path = opened.report()
+        assert path == made.folder / "report.html"
+        assert path.is_file()
+
+    def test_gives_a_trajectory(self, opened, made):
+        assert (opened.trajectory(3).motion == made.trajectory(3).motion).all()
+
+    @pytest.mark.parametrize("of", [lambda run: run, lambda run: run.failures])
+    def test_shows_itself_as_a_table_and_its_names_as_text(self, opened, of):
+        root = html.fragment_fromstring(of(opened)._repr_html_(), create_parent="div")
+        assert len(root.xpath(".//tr")) > 3
+        assert root.xpath(".//b/b") == []
+
+    def test_shows_at_most_20_rows_and_says_how_many_there_are(self, opened):
+        shown = opened.cases._repr_html_()
+        assert shown.count("<tr>") == 21
+        assert "160 more rows" in shown
+
+    def test_has_a_line_for_a_terminal(self, opened, made):
+        assert repr(opened).startswith(f"<campaign {made.folder}: ")
+
+    def test_of_a_folder_that_is_none_is_refused(self, tmp_path):
+        with pytest.raises(ms.UserError, match="not a campaign"):
+            ms.open_run(tmp_path)
+
+
+class TestACampaign:
+    def test_is_the_one_of_the_command_line(self, tmp_path, run):
+        seen = []
+        again = ms.campaign(
+            "design1", level=0, cases=60, batch=20, seed=1, out=tmp_path / "r", on_case=seen.append
+        )
+        assert len(seen) == 60
+        first, second = (folder / "outcomes.jsonl" for folder in (run.folder, again.folder))
+        assert first.read_bytes() == second.read_bytes()
+        assert (again.folder / "report.html").is_file()
+
+    def test_goes_into_a_folder_named_after_the_vut(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        made = ms.campaign("level0", level=0, cases=2)
+        assert made.folder.parts[0] == "runs"
+        assert made.folder.name.startswith("level0-")
+
+    def test_with_values_that_make_none_is_refused(self, tmp_path):
+        with pytest.raises(ms.UserError, match="--cases"):
+            ms.campaign("level0", level=0, cases=0, out=tmp_path / "r")
+        assert not (tmp_path / "r").exists()
+
+
+def test_the_import_costs_nothing():
+    script = "import sys, merge_sumo as ms; dir(ms); print('numpy' in sys.modules, len(ms.__all__))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["False", "4"]
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="nothing_like_it"):
+        _ = ms.nothing_like_it
+
+
+def test_the_example_of_the_readme_runs(tmp_path, monkeypatch):
+    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    _, section = readme.split("## Python", 1)
+    code = section.split("```python", 1)[1].split("```", 1)[0]
+    assert "cases=400" in code
+    monkeypatch.chdir(tmp_path)
+    script = tmp_path / "example.py"
+    script.write_text(code.replace("cases=400", "cases=40"), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert (folder / "report.html").is_file()

@@ -1,0 +1,224 @@
+"""The report in a real browser: Debian's Chromium without a window."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from conftest import require
+from handmade import write_run
+
+from merge_sumo import report
+from merge_sumo.journal import Run, failures
+
+EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    program = shutil.which("chromium") or shutil.which("google-chrome")
+    require(program is not None, "chromium is not on the PATH")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        # No sandbox: CI runs as root, and the page is our own.
+        opened = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    run = write_run(tmp_path_factory.mktemp("browser") / "run")
+    report.write_report(run)
+    return run
+
+
+@contextmanager
+def shown(browser, file: Path, **options) -> Iterator:
+    """Open a file; afterwards, fail if the page had anything to complain about."""
+    complaints: list[str] = []
+    context = browser.new_context(**{"viewport": {"width": 1280, "height": 900}, **options})
+    page = context.new_page()
+    page.set_default_timeout(60_000)
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("dialog", lambda dialog: complaints.append(f"dialog {dialog.message}"))
+    page.on(
+        "request",
+        lambda request: (
+            request.url.startswith(("file:", "data:")) or complaints.append(request.url)
+        ),
+    )
+    try:
+        page.goto(file.as_uri())
+        yield page
+    finally:
+        context.close()
+    assert complaints == []
+
+
+@pytest.fixture
+def page(browser, made):
+    with shown(browser, made.folder / report.REPORT) as opened:
+        yield opened
+
+
+def chosen(page) -> int:
+    """Return the index of the case that is shown."""
+    return int(page.inner_text("#case-title").split()[1])
+
+
+def marks(page, kind: str) -> int:
+    return page.locator(f".map[data-level='2'] {kind}").count()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"viewport": {"width": 1280, "height": 900}},
+        {"viewport": {"width": 380, "height": 800}},
+        {"color_scheme": "dark"},
+    ],
+    ids=["wide", "narrow", "dark"],
+)
+def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options):
+    with shown(browser, made.folder / report.REPORT, **options) as page:
+        assert page.locator(".map .mark.fail").count() == len(failures(made.outcomes))
+        width = page.evaluate("document.documentElement.scrollWidth")
+        assert width <= page.viewport_size["width"]
+
+
+def test_it_starts_with_the_worst_case(page, made):
+    assert chosen(page) == failures(made.outcomes)[0].index
+    assert "Collision" in page.inner_text("#case-words")
+
+
+def test_the_slider_shows_the_cases_near_a_psi(page, made):
+    page.locator("#psi").fill("0.2")
+    assert "0.20 rad" in page.inner_text("#psi-value")
+    all_of_level = sum(o.case.level == 2 for o in made.outcomes)
+    near = sum(o.case.level == 2 and abs(o.case.svo_rad - 0.2) <= 0.1 for o in made.outcomes)
+    assert marks(page, ".mark.faint") == all_of_level - near
+    page.locator("#psi").focus()
+    page.keyboard.press("ArrowRight")
+    assert "0.21 rad" in page.inner_text("#psi-value")
+    page.locator("#psi-all").check()
+    assert marks(page, ".mark.faint") == 0
+
+
+def test_a_click_on_a_case_shows_it(page, made):
+    mark = page.locator(".map[data-level='0'] .mark.fail").last
+    mark.scroll_into_view_if_needed()
+    box = mark.bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    outcome = made.outcome(chosen(page))
+    assert outcome.failed
+    assert outcome.case.level == 0
+    assert f"x_POV0 \u2212{-outcome.case.x_pov0_m:.1f} m" in page.inner_text("#case-title")
+    command = page.inner_text("#command")
+    name = f"case-{outcome.index:05d}"
+    assert command == (
+        f"merge-sumo export {made.folder} {outcome.index} && "
+        f"merge-sumo replay {made.folder / 'scenarios' / name} --gui"
+    )
+
+
+def test_arrow_keys_move_through_the_lists(page, made):
+    worst = [o.index for o in failures(made.outcomes)]
+    page.locator(".list button").first.focus()
+    for expected in (worst[1], worst[2]):
+        page.keyboard.press("ArrowDown")
+        assert chosen(page) == expected
+    page.keyboard.press("ArrowUp")
+    assert chosen(page) == worst[1]
+
+
+def test_arrow_keys_move_over_a_map(page, made):
+    page.locator(".map[data-level='0'] > svg").focus()
+    page.keyboard.press("ArrowLeft")
+    start = made.outcome(chosen(page))
+    assert start.case.level == 0
+    page.keyboard.press("ArrowLeft")
+    left = made.outcome(chosen(page))
+    assert left.case.x_pov0_m < start.case.x_pov0_m
+    page.keyboard.press("ArrowUp")
+    assert made.outcome(chosen(page)).case.v_pov0_mps > left.case.v_pov0_mps
+
+
+def test_the_animation_plays_pauses_and_is_scrubbed(page, made):
+    last = len(made.trajectory(chosen(page)).motion) - 1
+    assert page.input_value("#time") == str(last), "a failure is shown as it ended"
+    page.locator("#time").fill("0")
+    assert page.inner_text("#time-value") == "0.0 s"
+    before = page.locator("#road").get_attribute("viewBox")
+    page.locator("#play").focus()
+    page.keyboard.press("Enter")
+    assert page.locator("#play").get_attribute("aria-label") == "Pause"
+    for _ in range(600):
+        if int(page.input_value("#time")) > 3:
+            break
+        page.wait_for_timeout(50)
+    assert int(page.input_value("#time")) > 3
+    page.keyboard.press("Enter")
+    assert page.locator("#play").get_attribute("aria-label") == "Play"
+    assert page.locator("#road").get_attribute("viewBox") != before
+    page.locator("#time").focus()
+    page.keyboard.press("End")
+    assert page.input_value("#time") == str(last)
+
+
+def test_the_command_is_copied(browser, made):
+    with shown(
+        browser, made.folder / report.REPORT, permissions=["clipboard-read", "clipboard-write"]
+    ) as page:
+        page.locator("#copy").click()
+        page.locator("#copy:text('Copied')").wait_for()
+        assert page.evaluate("navigator.clipboard.readText()") == page.inner_text("#command")
+
+
+def test_what_is_drawn_is_where_the_case_is(page, made):
+    outcome = failures(made.outcomes)[0]
+    mark = page.locator(f"[data-case='{outcome.index}'].mark")
+    frame = page.locator(f".map[data-level='{outcome.case.level}'] .frame").bounding_box()
+    box = mark.bounding_box()
+    x = (box["x"] + box["width"] / 2 - frame["x"]) / frame["width"]
+    y = 1.0 - (box["y"] + box["height"] / 2 - frame["y"]) / frame["height"]
+    assert x == pytest.approx((outcome.case.x_pov0_m + 340.0) / 160.0, abs=0.01)
+    assert y == pytest.approx((outcome.case.v_pov0_mps - 25.0) / 10.0, abs=0.01)
+
+
+def test_print_leaves_out_what_cannot_be_pressed(page):
+    page.emulate_media(media="print")
+    assert not page.locator("#play").is_visible()
+    assert page.locator(".map .mark.fail").first.is_visible()
+
+
+def test_nothing_from_outside_runs(browser, tmp_path):
+    run = write_run(tmp_path / "run", per_level=10, vut=EVIL, error=EVIL)
+    report.write_report(run)
+    with shown(browser, run.folder / report.REPORT) as page:
+        assert page.inner_text("h1") == EVIL
+        page.locator(".list button").last.click()
+        assert EVIL in page.inner_text("#case-words")
+
+
+def test_a_long_campaign_opens_too(browser, made, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "SHOWN", 50)
+    file = tmp_path / "long.html"
+    file.write_text(report.report_page(made), encoding="utf-8")
+    with shown(browser, file) as page:
+        assert page.locator(".map .mark").count() == 50
+        assert page.locator(".map .count").count() > 20
+
+
+def test_a_campaign_without_cases_opens_too(browser, made, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(made.folder, folder)
+    (folder / "outcomes.jsonl").write_bytes(b"")
+    report.write_report(Run(folder))
+    with shown(browser, folder / report.REPORT) as page:
+        assert "No case has run" in page.inner_text(".verdict")

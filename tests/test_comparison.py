@@ -1,0 +1,153 @@
+"""Two campaigns side by side: what got fixed, what broke, and how that is known."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.comparison import Change, LevelChange, RunComparison, compare_runs
+from merge_sumo.conductor import CampaignSettings, run_campaign
+from merge_sumo.errors import UserError
+from merge_sumo.journal import Run, failures
+
+
+@pytest.fixture(scope="module")
+def fixed(tmp_path_factory) -> Run:
+    """Return a campaign of a VUT that does not fail at level 0: design2."""
+    settings = CampaignSettings(vut="design2", levels=(0,), cases=60, batch=20, seed=1)
+    return run_campaign(settings, tmp_path_factory.mktemp("fixed") / "run")
+
+
+@pytest.fixture(scope="module")
+def other_seed(tmp_path_factory) -> Run:
+    settings = CampaignSettings(vut="design1", levels=(0,), cases=60, batch=20, seed=2)
+    return run_campaign(settings, tmp_path_factory.mktemp("other") / "run")
+
+
+def changed(folder, run, **settings) -> Run:
+    """Return a copy of a run with other settings."""
+    folder.mkdir()
+    for name in ("outcomes.jsonl", "campaign.json"):
+        (folder / name).write_bytes((run.folder / name).read_bytes())
+    record = {**run.settings, **settings}
+    (folder / "campaign.json").write_text(json.dumps(record))
+    return Run(folder)
+
+
+class TestFromABadVutToAGoodOne:
+    def test_everything_is_fixed(self, run, fixed):
+        compared = compare_runs(run, fixed)
+        found = compared.levels[0]
+        count = len(failures(run.outcomes))
+        assert found.changes[Change.FIXED] == count == len(compared.cases)
+        assert found.fmc_b == found.fmc_broke == 0.0
+        assert found.fmc_a == found.fmc_fixed > 0.0
+        assert not compared.is_worse(0.0)
+        assert compared.look_first() == []
+
+    def test_and_back_everything_broke(self, run, fixed):
+        compared = compare_runs(fixed, run)
+        found = compared.levels[0]
+        assert found.changes[Change.BROKE] == len(failures(run.outcomes))
+        assert found.fmc_a == found.fmc_fixed == 0.0
+        assert found.fmc_b == found.fmc_broke > 0.0
+        assert compared.is_worse(0.0)
+        assert not compared.is_worse(found.fmc_b + 0.01)
+        worst = failures(run.outcomes)[0]
+        assert compared.look_first()[0].index == worst.index
+
+
+class TestTheSameVut:
+    def test_with_another_seed_is_not_worse(self, run, other_seed):
+        compared = compare_runs(run, other_seed)
+        found = compared.levels[0]
+        assert found.changes[Change.BOTH_FAIL] == len(compared.cases) > 5
+        assert found.fmc_a == found.fmc_b
+        assert found.fmc_fixed == found.fmc_broke == 0.0
+        assert not compared.is_worse(0.0)
+
+    def test_that_does_not_do_again_what_it_did_is_not_believed(self, tmp_path, run, other_seed):
+        # The record says design2, as if the design had been changed under its name since.
+        before = changed(tmp_path / "before", run, vut="design2")
+        compared = compare_runs(before, other_seed)
+        assert compared.levels[0].changes[Change.NOT_RUN_AGAIN] == len(
+            failures(other_seed.outcomes)
+        )
+        assert "does not do again" in compared.evidence
+        assert compared.look_first()[0].change is Change.NOT_RUN_AGAIN
+
+
+class TestRecordsOnly:
+    def test_run_nothing_again(self, run, other_seed, monkeypatch):
+        monkeypatch.setattr("merge_sumo.comparison.ProvingGround", None)
+        compared = compare_runs(run, other_seed, rerun=False)
+        found = compared.levels[0]
+        assert found.changes[Change.NOT_RUN_AGAIN] == len(compared.cases)
+        # Union and differences of the balls.
+        assert found.fmc_a + found.fmc_broke == pytest.approx(found.fmc_b + found.fmc_fixed)
+
+
+class TestWorse:
+    @pytest.mark.parametrize(
+        ("fmc_b", "tolerance", "worse"),
+        [(0.1, 0.0, False), (0.11, 0.0, True), (0.11, 0.02, False), (0.09, 0.0, False)],
+    )
+    def test_is_a_growth_beyond_the_tolerance(self, fmc_b, tolerance, worse):
+        compared = RunComparison({0: LevelChange(0.1, fmc_b, 0.0, 0.0, {})}, [], "")
+        assert compared.is_worse(tolerance) is worse
+
+    def test_at_one_level_is_not_made_good_at_another(self):
+        levels = {0: LevelChange(0.5, 0.0, 0.0, 0.0, {}), 1: LevelChange(0.1, 0.2, 0.0, 0.0, {})}
+        assert RunComparison(levels, [], "").is_worse(0.05)
+
+
+class TestRefused:
+    def test_without_a_common_level(self, tmp_path, run):
+        with pytest.raises(UserError, match="no POV level in common"):
+            compare_runs(run, changed(tmp_path / "b", run, levels=[1]))
+
+    def test_with_another_initial_speed(self, tmp_path, run):
+        with pytest.raises(UserError, match="--v-vut0"):
+            compare_runs(run, changed(tmp_path / "b", run, v_vut0_mps=10.0))
+
+    def test_on_another_net_unless_only_records_count(self, tmp_path, run):
+        other = changed(tmp_path / "b", run, net_sha256="0")
+        with pytest.raises(UserError, match="--no-rerun"):
+            compare_runs(run, other)
+        assert compare_runs(run, other, rerun=False)
+
+
+class TestTheCommand:
+    def test_exits_with_1_when_b_is_worse(self, run, fixed):
+        worse = CliRunner().invoke(cli.app, ["compare-runs", str(fixed.folder), str(run.folder)])
+        assert worse.exit_code == 1
+        assert "look first at:" in worse.output
+        assert f"broke: merge-sumo export {run.folder} {failures(run.outcomes)[0].index}" in (
+            worse.output
+        )
+        better = CliRunner().invoke(cli.app, ["compare-runs", str(run.folder), str(fixed.folder)])
+        assert better.exit_code == 0
+        assert "B is not worse than A" in better.output
+
+    def test_prints_one_json_object(self, run, fixed):
+        said = CliRunner().invoke(
+            cli.app,
+            ["compare-runs", str(fixed.folder), str(run.folder), "--json", "--tolerance", "9"],
+        )
+        assert said.exit_code == 0
+        found = json.loads(said.stdout)
+        assert found["worse"] is False
+        assert found["levels"]["0"]["fmc_b"] > 0.0
+        assert {case["change"] for case in found["cases"]} == {"broke"}
+
+    def test_refuses_a_negative_tolerance(self, run, fixed):
+        for tolerance in (-1.0, math.nan):
+            said = CliRunner().invoke(
+                cli.app,
+                ["compare-runs", str(run.folder), str(fixed.folder), "--tolerance", str(tolerance)],
+            )
+            assert isinstance(said.exception, UserError)

@@ -1,0 +1,64 @@
+"""Every example in --help runs as it stands, with a small budget in the place of its own."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.conductor import CampaignSettings, run_campaign
+
+ROOT = Path(__file__).resolve().parent.parent
+SMALL = {"--cases": "40", "--seeds": "1"}
+MORE = {"compare": ["--cases", "40", "--truth-cases", "300"]}
+ELSEWHERE = {"train", "reproduce"}
+"""These take minutes: tests/test_training.py and the README's commands run them small."""
+
+
+def examples() -> list[str]:
+    found = []
+    command = typer.main.get_command(cli.app)
+    waiting = [command]
+    while waiting:
+        one = waiting.pop()
+        waiting += getattr(one, "commands", {}).values()
+        for line in (one.help or "").splitlines():
+            if line.strip().startswith("Example:"):
+                found.append(line.split("Example:")[1].strip())
+    return sorted(found)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """Return a folder with what the examples name: two campaigns, and the shipped scenarios."""
+    folder = tmp_path_factory.mktemp("examples")
+    for vut in ("design1", "design2"):
+        settings = CampaignSettings(vut=vut, levels=(0,), cases=60, batch=20, seed=1)
+        run_campaign(settings, folder / "runs" / vut)
+    shutil.copytree(ROOT / "scenarios" / "stalemate", folder / "scenarios" / "stalemate")
+    return folder
+
+
+def test_there_are_examples_of_every_command():
+    assert len(examples()) >= 13
+
+
+@pytest.mark.parametrize("example", [e for e in examples() if e.split()[1] not in ELSEWHERE])
+def test_runs(example, place, monkeypatch, tmp_path):
+    monkeypatch.chdir(place)
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
+    words = [word for word in shlex.split(example) if word != "--gui"]
+    assert words.pop(0) == "merge-sumo"
+    for place_of, word in enumerate(words[:-1]):
+        if word in SMALL:
+            words[place_of + 1] = SMALL[word]
+    if "--batch" not in words:
+        words += MORE.get(words[0], [])
+    done = CliRunner().invoke(cli.app, words)
+    failed = words[0] == "compare-runs" and done.exit_code == 1  # its way to say "worse"
+    assert done.exit_code == 0 or failed, done.output

@@ -1,0 +1,242 @@
+"""What the report says, what it holds, and what it lets in."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import shutil
+
+import numpy as np
+import pytest
+from handmade import write_run
+from lxml import html
+
+from merge_sumo import report
+from merge_sumo.case import dimensions, to_unit
+from merge_sumo.experiments import Truth
+from merge_sumo.fmc import fmc
+from merge_sumo.journal import Run, failures
+from merge_sumo.report import SPEED_UNIT_MPS, report_page, verdict, write_report
+from merge_sumo.scenario import DT_S, X_VUT0_M
+from merge_sumo.summary import summarise
+from merge_sumo.sumo.net import Net
+from merge_sumo.surface import learn_surface
+
+EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    return write_run(tmp_path_factory.mktemp("made") / "run")
+
+
+@pytest.fixture(scope="module")
+def page(made) -> str:
+    return report_page(made)
+
+
+def data_of(page: str) -> dict:
+    (element,) = html.fromstring(page).xpath("//script[@id='data']")
+    return json.loads(element.text)
+
+
+def text_of(page: str) -> str:
+    root = html.fromstring(page)
+    for element in root.xpath("//script | //style"):
+        element.drop_tree()
+    return " ".join(root.text_content().split())
+
+
+class TestThePage:
+    def test_says_the_result_first(self, made, page):
+        found = len(failures(made.outcomes))
+        assert found > 10
+        text = text_of(page)
+        assert f"handmade: {found} failures in 180 cases" in text
+        assert f"{found} failures in 180 cases" in text
+        assert text.index("Collides in") < text.index("Failure mode coverage")
+
+    def test_loads_nothing_and_runs_nothing_but_its_own_script(self, page):
+        root = html.fromstring(page)
+        assert "//" not in "".join(root.xpath("//@href | //@src"))
+        assert "http:" not in page
+        assert "https:" not in page
+        (policy,) = root.xpath("//meta[@http-equiv='Content-Security-Policy']/@content")
+        assert policy.startswith("default-src 'none'")
+        for name in ("style", "script"):
+            (source,) = root.xpath(f"//{name}[not(@type)]")
+            digest = hashlib.sha256(source.text.encode()).digest()
+            assert f"'sha256-{base64.b64encode(digest).decode()}'" in policy
+        assert root.xpath("//@style") == []
+
+    def test_is_small(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=267)
+        assert len(run.outcomes) > 800
+        assert write_report(run).stat().st_size < 1e6
+
+    def test_is_the_same_when_written_again(self, made, page):
+        assert report_page(Run(made.folder)) == page
+
+    def test_shows_what_comes_from_outside_as_text(self, tmp_path):
+        run = write_run(tmp_path / "run", vut=EVIL, error=EVIL, sampler=EVIL)
+        page = report_page(run)
+        root = html.fromstring(page)
+        assert len(root.xpath("//script")) == 2
+        assert root.xpath("//img | //@onerror") == []
+        (title,) = root.xpath("//h1")
+        assert title.text == EVIL
+        assert data_of(page)["errors"][str(len(run.outcomes) - 1)] == EVIL
+
+    def test_quotes_a_folder_with_a_space(self, tmp_path):
+        run = write_run(tmp_path / "a run", per_level=10)
+        assert data_of(report_page(run))["export"].endswith(" '" + str(tmp_path / "a run") + "'")
+
+    def test_gives_the_replay_of_a_case_that_is_exported(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=10)
+        folder = run.folder / "scenarios" / "case-00003"
+        folder.mkdir(parents=True)
+        assert data_of(report_page(run))["commands"] == {"3": f"merge-sumo replay {folder} --gui"}
+
+    def test_lists_the_worst_and_the_nearest_misses(self, made, page):
+        root = html.fromstring(page)
+        listed = [int(n) for n in root.xpath("//button/@data-case")]
+        assert listed[:10] == [o.index for o in failures(made.outcomes)[:10]]
+        near = [made.outcome(index) for index in listed[10:20]]
+        assert not any(o.failed for o in near)
+        scores = [o.measures.score for o in near]
+        assert scores == sorted(scores)
+        assert scores[-1] <= min(
+            o.measures.score
+            for o in made.outcomes
+            if o.measures.score is not None and not o.failed and o not in near
+        )
+        assert listed[20:] == [179], "the case that ended with an error"
+
+    def test_says_when_a_campaign_was_interrupted(self, made, tmp_path):
+        assert "interrupted" not in text_of(report_page(made))
+        assert "interrupted" in text_of(report_page(write_run(tmp_path / "run", 10, cases=999)))
+
+    def test_goes_without_trajectories_that_are_lost(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=10)
+        shutil.rmtree(run.folder / "trajectories")
+        data = data_of(report_page(Run(run.folder)))
+        assert set(data["cases"]["rows"]) == {0}
+
+
+class TestTheMotion:
+    def test_follows_from_the_speeds_to_within_2_cm(self, made, page):
+        data = data_of(page)
+        packed = np.frombuffer(base64.b64decode(data["speeds"]), dtype="<u2").reshape(-1, 2)
+        for i, index in enumerate(data["cases"]["index"]):
+            first, rows = data["cases"]["offset"][i], data["cases"]["rows"][i]
+            motion = made.trajectory(index).motion
+            assert rows == len(motion)
+            speeds = packed[first : first + rows] * SPEED_UNIT_MPS
+            assert np.abs(speeds - motion[:, (1, 4)]).max() <= SPEED_UNIT_MPS / 2
+            moved = np.cumsum(speeds * DT_S, axis=0)[:-1]
+            assert np.abs(data["cases"]["x"][i] + moved[:, 0] - motion[1:, 0]).max() < 0.02
+            assert np.abs(X_VUT0_M + moved[:, 1] - motion[1:, 3]).max() < 0.02
+
+
+class TestALongCampaign:
+    def test_shows_some_cases_and_counts_the_others(self, made, monkeypatch):
+        monkeypatch.setattr(report, "SHOWN", 50)
+        page = report_page(made)
+        data = data_of(page)
+        assert len(data["cases"]["index"]) == 50
+        counted = sum(
+            sum(grid[name]) for grid in data["counts"].values() for name in ("safe", "failing")
+        )
+        assert counted == len(made.outcomes) - 50
+        assert f"how many of the {counted} further cases" in text_of(page)
+        root = html.fromstring(page)
+        shown = set(data["cases"]["index"])
+        assert {int(n) for n in root.xpath("//button/@data-case")} <= shown
+
+    def test_with_many_failures_has_fewer_points_of_coverage(self, made, monkeypatch):
+        monkeypatch.setattr(report, "MOST_BALLS", 60)
+        for level in data_of(report_page(made))["search"]["levels"]:
+            known = [value for value in level["fmc"] if value is not None]
+            assert 1 <= len(known) < len(level["fmc"])
+            assert level["fmc"][-1] is not None
+            # A volume in three dimensions may fall by its rounding.
+            assert (np.diff(known) > -1e-4).all()
+
+    def test_is_drawn_in_groups_of_batches(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(report, "MOST_STEPS", 4)
+        run = write_run(tmp_path / "run", per_level=60)
+        search = data_of(report_page(run))["search"]
+        assert search["batch"] == [0, 3, 6]
+        assert sum(sum(level["cases"]) for level in search["levels"]) == 180
+        for level in search["levels"]:
+            found = summarise(run.outcomes, (level["level"],)).levels[level["level"]]
+            assert level["fmc"][-1] == pytest.approx(found.fmc, abs=1e-5)
+
+
+class TestTheTruth:
+    @pytest.fixture
+    def cached(self, monkeypatch):
+        """Keep a truth where the left half of each pool fails."""
+
+        def truth(vut: str, level: int) -> Truth:
+            points = np.random.default_rng(1).random((2000, len(dimensions(level))))
+            return Truth(points, np.where(points[:, 0] < 0.5, -900.0, -10.0))
+
+        monkeypatch.setattr(report, "cached_truth", truth)
+        return truth
+
+    def test_is_drawn_where_it_is_cached(self, tmp_path, cached):
+        run = write_run(tmp_path / "run", per_level=10, net_sha256=Net().sha256)
+        page = report_page(run)
+        grid = data_of(page)["truth"]["0"]
+        values = np.frombuffer(base64.b64decode(grid["data"]), dtype=np.uint8)
+        values = values.reshape(grid["ny"], grid["nx"])
+        assert (values[:, :46] == 255).all()
+        assert (values[:, -46:] == 0).all()
+        assert f"{fmc(cached('handmade', 0).failures):.4f}" in text_of(page)
+
+    @pytest.mark.parametrize(
+        "settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}, {"v_vut0_mps": 10.0}]
+    )
+    def test_of_something_else_is_not(self, tmp_path, cached, settings):
+        run = write_run(tmp_path / "run", per_level=10, **{"net_sha256": Net().sha256, **settings})
+        assert set(data_of(report_page(run))["truth"].values()) == {None}
+
+
+class TestTheSurrogate:
+    def test_gives_failures_a_higher_chance_than_other_cases(self, made):
+        for level in (0, 1):
+            surface = learn_surface(made.outcomes, level)
+            told = [o for o in made.outcomes if o.case.level == level and o.measures.score]
+            chance = surface.chance(to_unit([o.case for o in told], level))
+            failed = np.array([o.failed for o in told])
+            assert chance[failed].min() > np.median(chance[~failed])
+            assert chance[failed].mean() > 0.5
+            assert chance[~failed].mean() < 0.1
+
+    def test_finds_at_least_plausible_what_was_found(self, made):
+        for level, found in summarise(made.outcomes, (0, 1, 2)).levels.items():
+            surface = learn_surface(made.outcomes, level)
+            assert surface.plausible_fmc() >= found.fmc - 1e-3
+
+    def test_is_not_made_of_too_few_failures(self, made):
+        few = [o for o in made.outcomes if not o.failed] + failures(made.outcomes)[:4]
+        assert all(learn_surface(few, level) is None for level in (0, 1, 2))
+
+
+class TestTheVerdict:
+    def test_of_no_failure_is_no_proof(self, made):
+        safe = [o for o in made.outcomes if not o.failed]
+        text = verdict(summarise(safe, (0, 1, 2)), [], {})
+        assert text.startswith(f"No collision in {len(safe)} cases. That is no proof")
+        assert text.endswith("1 case ended with an error and without a verdict.")
+
+    def test_of_nothing_says_so(self):
+        assert verdict(summarise([], (0,)), [], {}) == "No case has run."
+
+    def test_names_levels_that_fail_and_levels_that_do_not(self, made):
+        some = [o for o in made.outcomes if o.case.level == 0 or not o.failed]
+        text = verdict(summarise(some, (0, 1, 2)), failures(some), {})
+        assert "cases at POV level 0" in text
+        assert "never at level 1 and 2." in text

@@ -1,0 +1,87 @@
+"""A VUT as an FMU of FMI 2.0 and 3.0, compiled here from C."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from build_fmu import NAMES, build_fmu, compiler
+from conftest import require
+from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+
+from merge_sumo.errors import UserError
+from merge_sumo.trajectory import End
+
+pytest.importorskip("fmpy")
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory):
+    """Return a function that builds an FMU: its version, names, and what it does wrong."""
+    require(compiler() is not None, "gcc is not on the PATH")
+    folder = tmp_path_factory.mktemp("fmu")
+
+    def build(version="2.0", names=NAMES, fault="") -> Path:
+        return build_fmu(folder / f"{len(list(folder.iterdir()))}.fmu", version, names, fault)
+
+    return build
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_an_fmu_drives_like_the_same_law_in_python_and_leaves_nothing(
+    unit, tmp_path, monkeypatch, version
+):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    cases = cases_of(30)
+    by_fmu = run_cases(factory(f"fmu:{unit(version)}"), cases)
+    in_process = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_fmu, in_process, strict=True):
+        assert one.error is None
+        assert np.array_equal(one.motion, other.motion)
+    assert list(scratch.iterdir()) == []
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_names_of_variables_can_be_mapped(unit, version):
+    path = unit(version, ("PovPos", "PovSpeed", "x_vut_m", "Speed", "Cmd"))
+    spec = f"fmu:{path}?v_vut_mps=Speed&v_pov_mps=PovSpeed&acceleration_mps2=Cmd"
+    (trajectory,) = run_cases(factory(spec), cases_of(1))
+    assert trajectory.error is None
+    assert (trajectory.a_vut_mps2[:-1] == 1.0).all()
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [("return 3;", "failed with status 3"), ("u->v[4] = NAN; return 0;", "nan")],
+)
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_what_an_fmu_does_wrong_is_the_outcome_of_its_own_case(unit, version, fault, reason):
+    cases = cases_of(12)
+    trajectories = run_cases(factory(f"fmu:{unit(version, fault=fault)}"), cases)
+    for case, trajectory in zip(cases, trajectories, strict=True):
+        if case.v_pov0_mps > 30.0:
+            assert trajectory.end is End.VUT_ERROR
+            assert reason in trajectory.error
+        else:
+            assert trajectory.end is End.MERGED
+
+
+def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
+    (tmp_path / "text.fmu").write_text("no unit")
+    good, other = unit(), unit(names=("a", "b", "c", "d", "e"))
+    for spec, said in {
+        tmp_path / "nothing.fmu": "there is no FMU",
+        tmp_path / "text.fmu": "is no readable FMU",
+        other: "has none of the inputs",
+        f"{other}?v_vut_mps=d": "has no variable 'acceleration_mps2'; it has a, b, c, d, e",
+        f"{good}?v_vut_mps=wrong": "has no variable 'wrong'",
+        f"{good}?speed=v": "there is no variable 'speed' to name",
+    }.items():
+        with pytest.raises(UserError, match=r"fmu|FMU") as refused:
+            factory(f"fmu:{spec}")
+        assert said in str(refused.value)

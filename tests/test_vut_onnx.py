@@ -1,0 +1,110 @@
+"""A VUT as an ONNX network, and the export of the shipped ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from vut_contract import cases_of, factory, run_cases
+
+from merge_sumo.case import from_unit
+from merge_sumo.drivers.levelk import features
+from merge_sumo.drivers.onnx_export import export_onnx
+from merge_sumo.drivers.policies import NETWORKS, load_network
+from merge_sumo.errors import UserError
+from merge_sumo.trajectory import End
+
+onnx = pytest.importorskip("onnx")
+ort = pytest.importorskip("onnxruntime")
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("onnx")
+    for name in NETWORKS:
+        export_onnx(name, folder / f"{name}.onnx")
+    return folder
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_an_exported_policy_gives_the_values_of_the_policy(exported, name):
+    rng = np.random.default_rng(0)
+    state = rng.uniform((-340, 0, -182, 0), (100, 40, 0, 40), (300, 4))
+    svo = rng.uniform(0.0, 1.57, 300)
+    network = load_network(name)
+    fed = {"state": state} | ({"svo_rad": svo[:, None]} if network.sees_svo else {})
+    (values,) = ort.InferenceSession(exported / f"{name}.onnx").run(None, fed)
+    expected = network.values(features(*state.T, svo if network.sees_svo else None))
+    assert values == pytest.approx(expected, abs=1e-12)
+
+
+def test_an_exported_policy_as_vut_drives_like_the_built_in_one(exported):
+    cases = from_unit(np.random.default_rng(1).random((40, 3)), level=2)
+    by_onnx, built_in = (
+        run_cases(factory(vut), cases) for vut in (f"onnx:{exported / 'vut1.onnx'}", "level1")
+    )
+    for one, other in zip(by_onnx, built_in, strict=True):
+        assert np.array_equal(one.motion, other.motion)
+
+
+def network(path, *, answer, dtype=None, width=4):
+    """Write a network that answers numbers whatever it sees, times its first input's 0."""
+    helper, proto = onnx.helper, onnx.TensorProto
+    kind = proto.FLOAT if dtype == np.float32 else proto.DOUBLE
+    weight = np.zeros((width, len(answer)), dtype=dtype or np.float64)
+    bias = np.array(answer, dtype=weight.dtype)
+    graph = helper.make_graph(
+        [
+            helper.make_node("MatMul", ["in", "w"], ["m"]),
+            helper.make_node("Add", ["m", "b"], ["out"]),
+        ],
+        "g",
+        [helper.make_tensor_value_info("in", kind, [1, width])],
+        [helper.make_tensor_value_info("out", kind, [1, len(answer)])],
+        [onnx.numpy_helper.from_array(v, n) for v, n in ((weight, "w"), (bias, "b"))],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_one_number_is_an_acceleration_and_seven_are_values_of_actions(tmp_path, dtype):
+    one = network(tmp_path / "one.onnx", answer=[0.5], dtype=dtype)
+    seven = network(tmp_path / "seven.onnx", answer=[0, 0, 0, 0, 0, 3, 1], dtype=dtype)
+    for path, expected in ((one, 0.5), (seven, 1.0)):
+        (trajectory,) = run_cases(factory(f"onnx:{path}"), cases_of(1))
+        assert (trajectory.a_vut_mps2[:-1] == expected).all()
+
+
+@pytest.mark.parametrize("answer", [[np.nan], [np.inf], [0, 0, 0, 0, np.nan, 0, 0]])
+def test_an_answer_that_is_no_number_is_a_vut_error(tmp_path, answer):
+    path = network(tmp_path / "bad.onnx", answer=answer)
+    assert run_cases(factory(f"onnx:{path}"), cases_of(1))[0].end is End.VUT_ERROR
+
+
+def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
+    (tmp_path / "text.onnx").write_text("no network")
+    network(tmp_path / "wide.onnx", answer=[0.0], width=5)
+    network(tmp_path / "two.onnx", answer=[0.0, 1.0])
+    good = network(tmp_path / "good.onnx", answer=[0.0])
+    for spec, said in {
+        tmp_path / "nothing.onnx": "there is no ONNX file",
+        tmp_path / "text.onnx": "is no ONNX network that can be run",
+        tmp_path / "wide.onnx": "a VUT has one of floats",
+        tmp_path / "two.onnx": "gives 2 numbers",
+        f"{good}?decision_period_s=0": "decision_period_s is '0'",
+        f"{good}?decision_period_s=often": "decision_period_s is 'often'",
+        f"{good}?period=1": "there is no option 'period'",
+    }.items():
+        with pytest.raises(UserError, match=r"onnx|ONNX") as refused:
+            factory(f"onnx:{spec}")
+        assert said in str(refused.value)
+
+
+def test_an_export_overwrites_nothing_and_knows_its_policies(exported, tmp_path):
+    with pytest.raises(UserError, match="exists: choose another file"):
+        export_onnx("vut1", exported / "vut1.onnx")
+    with pytest.raises(UserError, match="there is no policy 'vut9'"):
+        export_onnx("vut9", tmp_path / "x.onnx")
+    with pytest.raises(UserError, match="cannot write"):
+        export_onnx("vut1", tmp_path / "no-folder" / "x.onnx")

@@ -1,0 +1,681 @@
+"""A controller behind TraCI: what it sees, what it may do, and what it may do wrong."""
+
+from __future__ import annotations
+
+import gc
+import random
+import re
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import traci
+from conftest import require
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from raw_traci import MISDEEDS, Client, GoneError
+from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+
+from merge_sumo.case import Case
+from merge_sumo.conductor import CampaignSettings, run_campaign
+from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.vuts import traci_protocol as tp
+from merge_sumo.drivers.vuts.base import Seen, VutOptions
+from merge_sumo.drivers.vuts.traci import TraciVut
+from merge_sumo.drivers.vuts.traci_session import Session
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.world import World
+from merge_sumo.trajectory import End
+
+TESTS = Path(__file__).parent
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
+README = (TESTS.parent / "README.md").read_text(encoding="utf-8")
+(CONTROLLER,) = re.findall(r"```python\n(import sys, traci.*?)```", README, flags=re.DOTALL)
+"""The README's controller; its law is that of level 0."""
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+class Played:
+    """Episodes of eq. (4) with a client in a thread: speeds, clipped or not, and reasons."""
+
+    def __init__(self, client, episodes=1, steps=30, deadline_s=5.0, port=None):
+        self.port = port or free_port()
+        self.result = self.error = None
+        self.speeds, self.accelerations, self.reasons = [], [], []
+        thread = threading.Thread(target=self._client, args=(client,))
+        thread.start()
+        options = VutOptions(deadline_s=deadline_s, connect_s=10.0)
+        vut = TraciVut(1, Net(), self.port, None, options)
+        try:
+            for _ in range(episodes):
+                self._episode(vut, steps)
+        finally:
+            vut.close()
+            thread.join()
+        if self.error is not None:
+            raise self.error
+
+    def _client(self, client):
+        try:
+            self.result = client(self.port)
+        except (Exception, SystemExit) as error:
+            self.error = error
+
+    def _episode(self, vut, steps):
+        vut.begin(0, CASE)
+        x_pov, v_pov, x, v = -250.0, 30.0, -182.0, 18.0
+        for step in range(steps):
+            columns = (np.array([value]) for value in (x_pov, v_pov, x, v))
+            a = vut.act(Scene(np.array([True]), np.array([step]), *columns))[0]
+            if not np.isfinite(a):
+                self.reasons.append(vut.reason(0))
+                return
+            self.accelerations.append(a)
+            a = min(max(a, A_MIN_MPS2), A_MAX_MPS2)
+            x_pov, x, v = x_pov + v_pov * DT_S, x + v * DT_S, max(v + a * DT_S, 0.0)
+            self.speeds.append(v)
+        self.reasons.append(None)
+
+
+def stock(function):
+    """Return a client that speaks by the stock package: a function of its connection."""
+
+    def client(port):
+        connection = traci.connect(port, numRetries=200, waitBetweenRetries=0.02)
+        try:
+            return function(connection)
+        finally:
+            connection.close()
+
+    return client
+
+
+class TestAStockClient:
+    def test_sees_vehicles_depart_and_arrive_episode_after_episode_while_time_runs_on(self):
+        def drive(c):
+            seen = [(c.simulation.getTime(), c.vehicle.getIDList(), c.vehicle.getIDCount())]
+            while c.simulation.getMinExpectedNumber() > 0:
+                c.simulationStep()
+                seen.append(
+                    (
+                        c.simulation.getTime(),
+                        c.vehicle.getIDList(),
+                        c.simulation.getDepartedIDList(),
+                        c.simulation.getArrivedIDList(),
+                    )
+                )
+            return seen
+
+        first, *others = Played(stock(drive), episodes=2, steps=3).result
+        assert first == (0.0, (), 0)
+        both, none = ("pov", "vut"), ()
+        episode = [(both, both, none), (both, none, none), (both, none, none), (none, none, both)]
+        assert [(ids, departed, arrived) for _, ids, departed, arrived in others] == episode * 2
+        assert [round(time_s, 6) for time_s, *_ in others] == [
+            round(0.1 * (i + 1), 6) for i in range(8)
+        ]
+
+    def test_reads_both_vehicles(self):
+        def read(c):
+            c.simulationStep()
+            c.simulationStep()
+            v = c.vehicle
+            ramp = c.lane.getLength("ramp_0")
+            return {
+                "speeds": (v.getSpeed("pov"), v.getSpeed("vut")),
+                "x_vut": v.getLanePosition("vut") - ramp,
+                "x_pov": v.getLanePosition("pov") - c.lane.getLength("main_in_0"),
+                "lanes": (v.getLaneID("pov"), v.getLaneID("vut"), v.getRoadID("vut")),
+                "route": (v.getRoute("vut"), v.getRouteIndex("vut"), v.getRouteID("vut")),
+                "type": (v.getTypeID("vut"), v.getVehicleClass("vut"), v.getLength("vut")),
+                "distance": np.hypot(*v.getPosition("vut")),
+                "height": v.getPosition3D("vut")[2],
+                "lane": (v.getLaneIndex("vut"), v.getLateralLanePosition("vut")),
+                "limits": (v.getAccel("vut"), v.getDecel("vut"), v.getMaxSpeed("vut")),
+                "acceleration": v.getAcceleration("vut"),
+                "colour": v.getColor("vut"),
+                "leader": v.getLeader("vut", 100.0),
+                "junction": c.junction.getPosition("M"),
+                "on lane": c.lane.getLastStepVehicleIDs("ramp_0"),
+                "lanes of the net": c.lane.getIDList(),
+                "shape": c.lane.getShape("main_out_0")[0],
+                "times": (c.simulation.getTime(), c.simulation.getDeltaT()),
+                "version": c.getVersion(),
+                "gui": c.hasGUI(),
+                "angle": v.getAngle("pov"),
+            }
+
+        seen = Played(stock(read), steps=2).result
+        assert seen["speeds"] == (30.0, 18.0)
+        assert seen["x_vut"] == pytest.approx(-180.2, abs=1e-9)
+        assert seen["x_pov"] == pytest.approx(-247.0, abs=1e-9)
+        assert seen["lanes"] == ("main_in_0", "ramp_0", "ramp")
+        assert seen["route"] == (("ramp", "main_out"), 0, "route.vut")
+        assert seen["type"] == ("vut", "passenger", 5.0)
+        assert seen["distance"] == pytest.approx(180.2, abs=1e-6)
+        assert seen["height"] == 0.0
+        assert seen["lane"] == (0, 0.0)
+        assert seen["limits"] == (2.0, 4.0, 45.0)
+        assert seen["acceleration"] == 0.0
+        assert seen["colour"] == (26, 89, 230, 255)
+        assert seen["leader"] is None
+        assert seen["junction"] == (0.0, 0.0)
+        assert seen["on lane"] == ("vut",)
+        assert seen["lanes of the net"] == ("main_in_0", "ramp_0", "main_out_0")
+        assert seen["shape"] == pytest.approx((0.0, 0.0), abs=1e-6)
+        assert seen["times"] == (0.2, 0.1)
+        assert seen["version"][0] == traci.constants.TRACI_VERSION
+        assert "1.28.0" in seen["version"][1]
+        assert seen["gui"] is False
+        assert seen["angle"] == pytest.approx(90.0, abs=1e-6)
+
+    def test_holds_the_speed_it_set_until_it_sets_another_or_lets_go(self):
+        def drive(c):
+            c.simulationStep()
+            c.vehicle.setSpeedMode("vut", 0)
+            c.vehicle.setSpeed("vut", 18.3)
+            c.simulationStep(c.simulation.getTime() + 0.35)
+            c.vehicle.setSpeed("vut", 18.1)
+            c.simulationStep()
+            c.vehicle.setSpeed("vut", -1)
+            c.simulationStep()
+
+        played = Played(stock(drive), steps=6)
+        # Clipped to 2 m/s2 by who moves the vehicle; the wish itself is 3 m/s2.
+        assert played.accelerations[:2] == pytest.approx([3.0, 1.0])
+        assert played.speeds == pytest.approx([18.2, 18.3, 18.3, 18.3, 18.1, 18.1])
+
+    def test_that_steps_to_a_time_of_the_past_makes_no_step(self):
+        def drive(c):
+            c.simulationStep()
+            c.simulationStep()
+            before = c.simulation.getTime()
+            c.simulationStep(0.05)
+            return before, c.simulation.getTime()
+
+        before, after = Played(stock(drive), steps=3).result
+        assert before == after == 0.2
+
+    def test_that_steps_far_ahead_is_told_who_came_and_went(self):
+        def drive(c):
+            c.simulationStep(0.75)
+            return (
+                c.simulation.getTime(),
+                c.simulation.getDepartedIDList(),
+                c.simulation.getArrivedIDList(),
+            )
+
+        time_s, departed, arrived = Played(stock(drive), episodes=2, steps=4).result
+        assert time_s == pytest.approx(0.8)
+        assert departed == ("pov", "vut", "pov", "vut")
+        assert arrived == ("pov", "vut")
+
+    def test_subscribes_to_a_vehicle_to_the_simulation_and_to_what_is_around(self):
+        speed, time_id = traci.constants.VAR_SPEED, traci.constants.VAR_TIME
+        leader, domain = traci.constants.VAR_LEADER, traci.constants.CMD_GET_VEHICLE_VARIABLE
+
+        def drive(c):
+            c.simulation.subscribe([time_id, traci.constants.VAR_DEPARTED_VEHICLES_IDS])
+            c.simulationStep()
+            seen = [c.simulation.getSubscriptionResults()]
+            c.vehicle.subscribe("vut", [speed])
+            c.vehicle.subscribe("pov", [leader], parameters={leader: ("d", 50.0)})
+            c.vehicle.subscribeContext("vut", domain, 1000.0, [speed])
+            seen.append(c.vehicle.getSubscriptionResults("vut"))
+            c.vehicle.setSpeed("vut", 18.1)
+            c.simulationStep()
+            seen.append(dict(c.vehicle.getAllSubscriptionResults()))
+            seen.append(c.vehicle.getContextSubscriptionResults("vut"))
+            c.vehicle.subscribeContext("vut", domain, 1.0, [speed])
+            seen.append(set(c.vehicle.getContextSubscriptionResults("vut")))
+            c.vehicle.unsubscribe("vut")
+            c.simulationStep()
+            seen.append(dict(c.vehicle.getSubscriptionResults("vut")))
+            for _ in range(2):  # the road is empty, then the vehicles are new
+                c.simulationStep()
+                seen.append(dict(c.vehicle.getAllSubscriptionResults()))
+            return seen
+
+        seen = Played(stock(drive), episodes=2, steps=3).result
+        assert seen[0] == {
+            time_id: 0.1,
+            traci.constants.VAR_DEPARTED_VEHICLES_IDS: ("pov", "vut"),
+        }
+        assert seen[1] == {speed: 18.0}
+        assert seen[2]["vut"] == {speed: pytest.approx(18.1)}
+        assert "pov" in seen[2]
+        assert seen[3] == {"pov": {speed: 30.0}, "vut": {speed: pytest.approx(18.1)}}
+        assert seen[4] >= {"vut"}
+        assert seen[5] == {}
+        assert seen[6] == seen[7] == {}
+
+    def test_is_refused_what_is_not_its_own_and_goes_on(self):
+        def refused(call, *arguments):
+            with pytest.raises(traci.TraCIException) as error:
+                call(*arguments)
+            return str(error.value)
+
+        def drive(c):
+            said = [refused(c.vehicle.getSpeed, "vut")]
+            c.simulationStep()
+            said += [
+                refused(c.vehicle.setSpeed, "pov", 10.0),
+                refused(c.vehicle.slowDown, "pov", 10.0, 2.0),
+                refused(c.vehicle.setSpeed, "nobody", 10.0),
+                refused(c.vehicle.moveTo, "vut", "main_out_0", 5.0),
+                refused(c.vehicle.setPreviousSpeed, "vut", 50.0),
+                refused(c.vehicle.getCO2Emission, "vut"),
+                refused(c.lane.getLength, "lane_0"),
+                refused(c.vehicle.subscribe, "nobody", [0x40]),
+                refused(c.load, ["-c", "x.sumocfg"]),
+                refused(c.trafficlight.getIDList),
+            ]
+            c.vehicle.setSpeed("vut", 18.1)
+            c.simulationStep()
+            return said
+
+        played = Played(stock(drive), steps=1)
+        said = played.result
+        assert played.speeds == pytest.approx([18.1])
+        assert said[0] == "Vehicle 'vut' is not known."
+        assert "'pov' is not the controller's" in said[1]
+        assert "'pov' is not the controller's" in said[2]
+        assert "'nobody' is not known" in said[3]
+        assert "does not carry out" in said[4]
+        assert "does not carry out" in said[5]
+        assert "does not know variable" in said[6]
+        assert "'lane_0' is not known" in said[7]
+        assert "'nobody' is not known" in said[8]
+        assert all("has no command" in text for text in said[9:])
+
+    def test_may_close_when_the_vehicle_has_arrived_and_another_come(self):
+        def once(c):
+            c.simulationStep()
+            while "vut" in c.vehicle.getIDList():
+                c.vehicle.setSpeed("vut", 18.1)
+                c.simulationStep()
+
+        def client(port):
+            stock(once)(port)
+            stock(once)(port)
+
+        assert Played(client, episodes=2, steps=5).reasons == [None, None]
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "steps"),
+    [
+        ("setSpeed", (18.15,), 3),
+        ("slowDown", (17.0, 0.5), 5),
+        ("slowDown", (19.0, 1.0), 10),
+        ("slowDown", (17.95, 0.0), 1),
+        ("setAcceleration", (1.0, 0.6), 6),
+        ("setAcceleration", (-3.0, 0.1), 1),
+    ],
+)
+def test_the_speeds_that_follow_from_a_command_are_those_of_sumo(command, arguments, steps):
+    with World(1) as world:
+        world.place(0, -300.0, 30.0, -182.0, 18.0)
+        vehicle = world._libsumo.vehicle
+        vehicle.setSpeed("vut.0", -1.0)
+        getattr(vehicle, command)("vut.0", *arguments)
+        expected = []
+        for _ in range(steps):
+            world.advance()
+            expected.append(vehicle.getSpeed("vut.0"))
+
+    def drive(c):
+        c.simulationStep()
+        getattr(c.vehicle, command)("vut", *arguments)
+        c.simulationStep(c.simulation.getTime() + steps * DT_S + 0.05)
+
+    assert Played(stock(drive), steps=steps).speeds == pytest.approx(expected, abs=1e-9)
+
+
+def measures_of(folder: Path) -> list[dict]:
+    from merge_sumo.journal import Run
+
+    return [outcome.to_record() for outcome in Run(folder).outcomes]
+
+
+def assert_same_to_1e9(one: list[dict], other: list[dict]) -> None:
+    assert len(one) == len(other)
+    for a, b in zip(one, other, strict=True):
+        assert a.keys() == b.keys()
+        for name, value in a.items():
+            if isinstance(value, float):
+                assert b[name] == pytest.approx(value, abs=1e-9, rel=0), name
+            else:
+                assert b[name] == value, name
+
+
+@pytest.mark.parametrize("count", [40, pytest.param(400, marks=pytest.mark.long)])
+def test_the_same_law_by_traci_and_in_process_gives_the_same_measures(tmp_path, count):
+    (tmp_path / "controller.py").write_text(CONTROLLER)
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    command = f"{sys.executable} {tmp_path / 'controller.py'} {{port}}"
+    shared = {"levels": (0,), "sampler": "uniform", "cases": count, "batch": 20, "seed": 4}
+    by_traci = CampaignSettings(vut="traci", vut_command=command, **shared)
+    in_process = CampaignSettings(vut=f"{tmp_path / 'law.py'}:Level0", **shared)
+    run_campaign(by_traci, tmp_path / "traci")
+    run_campaign(in_process, tmp_path / "python")
+    found = measures_of(tmp_path / "traci")
+    assert_same_to_1e9(found, measures_of(tmp_path / "python"))
+    assert sum(m["end"] == "COLLISION" for m in found) > 0
+
+
+CPP = r"""
+#include <libsumo/libtraci.h>
+#include <algorithm>
+#include <cstdlib>
+#include <iostream>
+using namespace libtraci;
+int main(int, char** argv) {
+    Simulation::init(std::atoi(argv[1]), 100, "localhost");
+    while (Simulation::getMinExpectedNumber() > 0) {
+        Simulation::step();
+        for (const std::string& id : Simulation::getDepartedIDList()) {
+            if (id == "vut") {
+                Vehicle::subscribe("vut", {libsumo::VAR_SPEED, libsumo::VAR_LANEPOSITION});
+                Vehicle::subscribeContext("vut", libsumo::CMD_GET_VEHICLE_VARIABLE, 300,
+                                          {libsumo::VAR_SPEED, libsumo::VAR_POSITION});
+            }
+        }
+        const auto ids = Vehicle::getIDList();
+        if (std::find(ids.begin(), ids.end(), "vut") == ids.end()) continue;
+        const double v = Vehicle::getSpeed("vut");
+        const double a = std::min(std::max((28.0 - v) / 0.1, 0.0), 1.0);
+        Vehicle::setSpeed("vut", v + a * 0.1);
+        try {
+            Vehicle::setSpeed("pov", 5.0);
+            return 7;
+        } catch (const libsumo::TraCIException&) {
+        }
+    }
+    Simulation::close();
+    return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def cpp_client(tmp_path_factory) -> Path:
+    """Return a controller in C++, built on the libtraci of SUMO's wheel."""
+    import sumo
+
+    compiler, home = shutil.which("g++"), Path(sumo.SUMO_HOME)
+    require(compiler is not None, "g++ is not on the PATH")
+    folder = tmp_path_factory.mktemp("cpp")
+    (folder / "client.cpp").write_text(CPP)
+    (library,) = home.glob("lib*/libtracicpp.so")
+    subprocess.run(
+        [
+            *(compiler, "-std=c++17", "-O1", str(folder / "client.cpp")),
+            *("-I", str(home / "include"), "-o", str(folder / "client"), str(library)),
+            f"-Wl,-rpath,{library.parent}",
+        ],
+        check=True,
+    )
+    return folder / "client"
+
+
+def test_a_controller_in_cpp_on_libtraci_drives_like_the_same_law_in_process(cpp_client, tmp_path):
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    cases = cases_of(20)
+    by_cpp = run_cases(factory("traci", command=f"{cpp_client} {{port}}"), cases)
+    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_cpp, by_python, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+
+
+def test_traci_start_with_our_port_connects_to_us_and_not_to_the_sumo_it_starts(tmp_path):
+    program = tmp_path / "starts.py"
+    head = 'import sys, traci\ntraci.start(["sumo", "-n", "no.net.xml"], port=int(sys.argv[1]))'
+    program.write_text(CONTROLLER.replace("import sys, traci\ntraci.init(int(sys.argv[1]))", head))
+    trajectories = run_cases(
+        factory("traci", command=f"{sys.executable} {program} {{port}}"), cases_of(2)
+    )
+    assert [t.error for t in trajectories] == [None, None]
+
+
+def descriptors() -> int:
+    gc.collect()
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def children() -> set[str]:
+    """Return the running processes whose command names our test client."""
+    found = set()
+    for status in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if b"raw_traci.py" in status.read_bytes():
+                found.add(status.parent.name)
+        except OSError:
+            continue
+    return found
+
+
+def program(misdeed: str) -> str:
+    return f"{sys.executable} {TESTS / 'raw_traci.py'} {{port}} '{misdeed}'"
+
+
+@pytest.mark.parametrize(
+    ("misdeed", "reason"),
+    [
+        ("exits", "the controller closed the connection; the controller ended with exit code 0"),
+        ("crashes", "ended with exit code 1: ZeroDivisionError: division by zero"),
+        ("is killed", "the controller was ended by signal 9"),
+        ("hangs", "the controller made no step within the deadline of 0.5 s"),
+        ("will not be stopped", "made no step within the deadline of 0.5 s"),
+        ("says goodbye", "the controller closed the connection during the episode"),
+        ("half a message", "sent half a message and no more within the deadline of 0.5 s"),
+        ("a huge message", "bytes that are no TraCI: a message of 2147483647 bytes was announced"),
+        ("wrong type", "a speed was commanded by 'fast'"),
+        ("nan", "asked for an acceleration of nan"),
+    ],
+)
+def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(misdeed, reason):
+    before = descriptors()
+    vut = factory("traci", command=program(misdeed), deadline_s=0.5)
+    start = time.perf_counter()
+    trajectories = run_cases(vut, cases_of(2))
+    assert time.perf_counter() - start < 60.0
+    for trajectory in trajectories:
+        assert trajectory.end is End.VUT_ERROR
+        assert reason in trajectory.error
+        assert len(trajectory.motion) == 4
+    assert descriptors() <= before
+    assert children() == set()
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("no-such-program {port}", "there is no program 'no-such-program'"),
+        ("'unclosed", "--vut-command cannot be read"),
+        ("", "there is no program"),
+        (f"{sys.executable} -c 'raise SystemExit(3)'", "ended with exit code 3 (before it"),
+    ],
+)
+def test_a_command_that_cannot_work_is_refused_in_a_sentence(command, said):
+    with pytest.raises(UserError, match=r"controller|--vut-command") as refused:
+        run_cases(factory("traci", command=command), cases_of(1))
+    assert said in str(refused.value)
+
+
+def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):
+    for port in ("0", "70000", "x"):
+        with pytest.raises(UserError, match="the port is a number"):
+            factory(f"traci:{port}")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1:{port}"):
+            run_cases(factory(f"traci:{port}"), cases_of(1))
+    with pytest.raises(UserError, match=r"no TraCI client connected .* in 0.2 s"):
+        run_cases(factory(f"traci:{free_port()}", connect_s=0.2), cases_of(1))
+    assert "waiting up to 0.2 s for a TraCI client on 127.0.0.1:" in capfd.readouterr().err
+
+
+def test_the_server_listens_on_the_loopback_interface_only():
+    def client(port):
+        raw = Client(port)
+        inodes = Path("/proc/net/tcp").read_text().splitlines()[1:]
+        listening = [line.split() for line in inodes if line.split()[3] == "0A"]
+        raw.drive(2)
+        return [local for _, local, *_ in listening if local.endswith(f":{port:04X}")]
+
+    played = Played(client, steps=1)
+    assert played.result == [f"0100007F:{played.port:04X}"]
+
+
+class Monkey:
+    """Connects again and again, drives for a while, and does something wrong."""
+
+    def __init__(self, port: int, seed: int, deadline_s: float) -> None:
+        self.port, self.rng, self.deadline_s = port, random.Random(seed), deadline_s  # noqa: S311
+        self.done: list[str] = []
+        self.stopped = False
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def run(self) -> None:
+        while not self.stopped:
+            try:
+                client = Client(self.port, 1.0)
+            except OSError:
+                continue
+            with client.socket:
+                try:
+                    client.drive(self.rng.randint(0, 60))
+                    misdeed = self.rng.choice(sorted(MISDEEDS))
+                    self.done.append(misdeed)
+                    MISDEEDS[misdeed](client, self.rng)
+                except (GoneError, OSError, struct.error):
+                    continue
+
+    def stop(self) -> None:
+        self.stopped = True
+        self.thread.join()
+
+
+@pytest.mark.parametrize("count", [50, pytest.param(1000, marks=pytest.mark.long)])
+def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count):
+    before, port, deadline_s = descriptors(), free_port(), 0.2
+    monkey = Monkey(port, count, deadline_s)
+    cases, misdeeds, ran = cases_of(200, seed=9), 0, 0
+    try:
+        while misdeeds < count:
+            vut = factory(f"traci:{port}", deadline_s=deadline_s, connect_s=5.0)
+            start = time.perf_counter()
+            trajectories = run_cases(vut, cases[: min(len(cases), count - misdeeds)])
+            # A case costs one deadline at most, besides its steps and a connection.
+            assert time.perf_counter() - start < len(trajectories) * (deadline_s + 2.0)
+            for trajectory in trajectories:
+                assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
+                assert trajectory.error != ""
+            ran += len(trajectories)
+            misdeeds += sum(t.end is End.VUT_ERROR for t in trajectories)
+    finally:
+        monkey.stop()
+    assert len(set(monkey.done)) > min(count, len(MISDEEDS)) // 2
+    assert descriptors() <= before
+
+
+def reference_commands() -> list[bytes]:
+    """Return contents of messages that the stock package sends."""
+    sent: list[bytes] = []
+    kept = traci.connection.Connection.__new__(traci.connection.Connection)
+    for form, values in (("d", (3.0,)), ("tdd", (2, 1.0, 2.0)), ("s", ("a",)), ("i", (5,))):
+        payload = bytes((0x40,)) + tp.raw_string("vut") + kept._pack(form, *values)
+        sent.append(tp.command(bytes((0xC4,)) + payload))
+    sent.append(tp.command(bytes((0x02,)) + struct.pack("!d", 0.0)))
+    sent.append(
+        tp.command(bytes((0xD4,)) + struct.pack("!dd", 0, 9) + tp.raw_string("vut") + b"\1@")
+    )
+    context = tp.raw_string("vut") + b"\xa4" + struct.pack("!d", 50.0) + b"\1@"
+    sent.append(tp.command(bytes((0x84,)) + struct.pack("!dd", 0, 9) + context))
+    sent.append(tp.command(b"\xa4\x68" + tp.raw_string("vut") + tp.double(9.0)))
+    return sent
+
+
+class TestTheProtocol:
+    @settings(max_examples=300, deadline=None)
+    @given(st.binary(max_size=200))
+    def test_bytes_of_any_kind_are_commands_or_a_protocol_error(self, data):
+        self.handle_all(data)
+
+    @settings(max_examples=500, deadline=None)
+    @given(st.data())
+    def test_a_mutated_message_is_answered_refused_or_a_protocol_error(self, data):
+        content = bytearray(b"".join(data.draw(st.lists(st.sampled_from(reference_commands())))))
+        for _ in range(data.draw(st.integers(0, 5))):
+            if content:
+                content[data.draw(st.integers(0, len(content) - 1))] = data.draw(
+                    st.integers(0, 255)
+                )
+        self.handle_all(bytes(content)[: data.draw(st.integers(0, 400))])
+
+    def handle_all(self, data: bytes) -> None:
+        session = Session(NET)
+        session.show(Seen(0.0, -250.0, 30.0, -182.0, 18.0))
+        try:
+            commands = tp.commands_of(data)
+        except tp.ProtocolError:
+            return
+        for command in commands:
+            try:
+                answer = session.handle(command)
+            except tp.ProtocolError:
+                continue
+            # Status first, and nothing that is not a command of a stated length.
+            first, *_ = tp.commands_of(answer)
+            assert first.identifier == command.identifier
+            assert answer[0] > 0, "clients read the length of a status as one byte"
+        session.results()
+        session.acceleration_mps2()
+
+    @given(st.binary(min_size=4, max_size=4))
+    def test_a_length_is_one_that_can_be_or_a_protocol_error(self, head):
+        announced = int.from_bytes(head, signed=True)
+        if 4 <= announced <= tp.MAX_MESSAGE_BYTES + 4:
+            assert tp.message_length(head) == announced - 4
+        else:
+            with pytest.raises(tp.ProtocolError, match=f"{announced} bytes was announced"):
+                tp.message_length(head)
+
+    @given(
+        st.recursive(
+            st.floats(allow_nan=False) | st.integers(-(2**31), 2**31 - 1) | st.text(max_size=20),
+            lambda inner: st.tuples(inner, inner),
+            max_leaves=3,
+        )
+    )
+    def test_typed_values_are_read_as_they_were_written(self, value):
+        def written(v):
+            if isinstance(v, tuple):
+                return tp.compound(*map(written, v))
+            forms = {float: tp.double, int: tp.integer, str: tp.string}
+            return forms[type(v)](v)
+
+        assert tp.Reader(written(value)).typed() == value
+
+    def test_compounds_that_are_nested_without_end_are_a_protocol_error(self):
+        with pytest.raises(tp.ProtocolError, match="nested too deeply"):
+            tp.Reader(b"\x0f\0\0\0\1" * 50).typed()
+
+
+NET = Net()

@@ -1,0 +1,36 @@
+"""What the tests of all kinds of VUT share: cases, and running them in a real SUMO world."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from merge_sumo.case import Case, from_unit
+from merge_sumo.conductor import ProvingGround
+from merge_sumo.drivers.vut import VutFactory, vut_factory
+from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.trajectory import Trajectory
+
+LEVEL0_CLASS = """
+class Level0:
+    def act(self, seen):
+        return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
+"""
+
+
+def cases_of(count: int, seed: int = 0) -> list[Case]:
+    return from_unit(np.random.default_rng(seed).random((count, 2)), level=0)
+
+
+def factory(spec: object, **options: object) -> VutFactory:
+    return vut_factory(str(spec), VutOptions(**options))
+
+
+def run_cases(vut: VutFactory, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
+    """Return what became of every case, in order; every case must come back exactly once."""
+    found: dict[int, Trajectory] = {}
+    with ProvingGround(vut, corridors) as ground:
+        for index, trajectory in ground.run(cases):
+            assert index not in found
+            found[index] = trajectory
+    assert sorted(found) == list(range(len(cases)))
+    return [found[index] for index in range(len(cases))]

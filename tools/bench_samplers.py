@@ -1,0 +1,169 @@
+"""How near the samplers come to the ground truth, and what they cost.
+
+    python tools/bench_samplers.py --vut design1 --level 0 --seeds 10
+    python tools/bench_samplers.py --vut design1 --level 0 --seeds 10 --ablate
+    python tools/bench_samplers.py --time
+
+The first prints medians of FMC / truth after 100, 200 and 400 cases in batches of 20; the second
+does so for `gpr` with one of its choices changed at a time; the third prints the seconds that a
+sampler takes for a batch after N cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from merge_sumo.case import Case, Pool, to_unit
+from merge_sumo.conductor import GroundPlan, Ran, conduct, run_cases
+from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.experiments import Truth, ground_truth
+from merge_sumo.fmc import RADIUS, fmc
+from merge_sumo.samplers import gpr
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.score import Measures, Outcome
+from merge_sumo.sumo.net import Net
+from merge_sumo.trajectory import End
+
+CASES, BATCH = 400, 20
+SHOWN = (100, 200, 400)
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "noise 1e-4": {"NOISE": 1e-4},
+    "noise 1e-3": {"NOISE": 1e-3},
+    "z1 = 2": {"Z_EXPLOIT": (2.0, 1.0)},
+    "z1 = 8": {"Z_EXPLOIT": (8.0, 1.0)},
+    "epsilon0 = .3": {"EPSILON0": 0.3},
+    "alpha = .91": {"ALPHA": 0.91},
+    "p = 1000": {"QUERIES": 1000},
+    "lengths from .02": {"LENGTH_BOUNDS": (0.02, 5.0)},
+    "covered balls not discounted": {"FLOOR": 1e9},
+}
+"""Of `gpr`: what each choice is worth is the difference to the first line."""
+
+
+@contextmanager
+def changed(constants: dict[str, Any]) -> Iterator[None]:
+    """Give constants of `gpr` other values for a while."""
+    before = {name: getattr(gpr, name) for name in constants}
+    try:
+        for name, value in constants.items():
+            setattr(gpr, name, value)
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(gpr, name, value)
+
+
+def search(
+    name: str, level: int, seed: int, plan: GroundPlan, truth: Truth
+) -> tuple[list[float], int, float]:
+    """Return FMC / truth at SHOWN, the real regions found, and the seconds of the sampler."""
+    sampler = make_sampler(name, Pool(levels=(level,)), seed)
+    seconds = 0.0
+    ask = sampler.ask
+
+    def timed(n: int) -> Any:
+        nonlocal seconds
+        start = time.process_time()
+        cases = ask(n)
+        seconds += time.process_time() - start
+        return cases
+
+    def run(cases: Sequence[Case]) -> Iterable[tuple[int, Ran]]:
+        return enumerate(run_cases(plan, cases))
+
+    sampler.ask = timed  # type: ignore[method-assign]
+    found: list[Any] = []
+    curve = {}
+    for number, ran in enumerate(conduct(sampler, run, CASES, BATCH), start=1):
+        found += [outcome.case for outcome, _ in ran if outcome.failed]
+        curve[number * BATCH] = fmc(to_unit(found, level))
+    points, whole = to_unit(found, level), fmc(truth.failures)
+    regions = sum(
+        bool((np.linalg.norm(points[:, None] - region, axis=2) <= RADIUS).any())
+        for region in truth.real_regions()
+    )
+    return [curve[n] / whole if whole else math.nan for n in SHOWN], regions, seconds
+
+
+def bench(name: str, level: int, seeds: int, plan: GroundPlan, truth: Truth) -> str:
+    """Return a line of medians over the seeds."""
+    runs = [search(name, level, seed, plan, truth) for seed in range(seeds)]
+    shares = np.median([run[0] for run in runs], axis=0)
+    lowest = min(run[0][-1] for run in runs)
+    whole = sum(run[1] == len(truth.real_regions()) for run in runs)
+    seconds = float(np.median([run[2] for run in runs]))
+    columns = " ".join(f"{share:7.2f}" for share in [*shares, lowest])
+    return f"{columns}   {whole:2d} of {seeds:2d}   {seconds:6.1f}"
+
+
+def outcome(index: int, case: Any) -> Outcome:
+    """Return an outcome in closed form: a slanted band of failures."""
+    x, v = to_unit([case], case.level)[0, :2].tolist()
+    dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7)
+    overlap_m = 6.0 - abs(dx_m)
+    score = -560.0 - 75.0 * overlap_m if overlap_m > 0 else -450.0 * math.exp(overlap_m / 15.0)
+    end = End.COLLISION if overlap_m > 0 else End.MERGED
+    nothing = dict.fromkeys(Measures.__dataclass_fields__)
+    measures = Measures(**{**nothing, "end": end, "score": score, "dx_m": dx_m})
+    return Outcome(index, index // BATCH, case, measures)
+
+
+def print_times(names: list[str]) -> None:
+    """Print the seconds of one core for a batch after N cases at level 2."""
+    sizes = (100, 200, 400, 1000, 2000, 5000)
+    print(f"{'seconds for a batch after N =':30s}" + " ".join(f"{n:7d}" for n in sizes))
+    cases = make_sampler("uniform", Pool(levels=(2,)), 0).ask(sizes[-1])
+    outcomes = [outcome(index, case) for index, case in enumerate(cases)]
+    for name in names:
+        seconds = []
+        for size in sizes:
+            sampler = make_sampler(name, Pool(levels=(2,)), 0)
+            sampler.tell(outcomes[:size])
+            start = time.process_time()
+            sampler.ask(BATCH)
+            seconds.append(time.process_time() - start)
+        print(f"{name:30s}" + " ".join(f"{s:7.2f}" for s in seconds), flush=True)
+
+
+def main() -> None:
+    """Parse the command line and print the table that it asks for."""
+    parser = argparse.ArgumentParser(description="What samplers find, and what they cost.")
+    parser.add_argument("--vut", default="design1")
+    parser.add_argument("--level", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--samplers", default=",".join(SAMPLERS))
+    parser.add_argument("--ablate", action="store_true", help="change the choices of gpr")
+    parser.add_argument("--time", action="store_true", help="time batches up to N = 5,000")
+    options = parser.parse_args()
+    names = options.samplers.split(",")
+    if options.time:
+        print_times(names)
+        return
+    truth = ground_truth(options.vut, options.level)
+    print(f"{options.vut}, level {options.level}, FMC of the truth {fmc(truth.failures):.4f}")
+    heads = [*(f"N={n}" for n in SHOWN), "lowest"]
+    print(
+        f"{'FMC / truth':30s}" + " ".join(f"{h:>7s}" for h in heads) + "   all regions   sampler s"
+    )
+    plan = GroundPlan(vut=vut_factory(options.vut), corridors=BATCH, net=Net())
+    if options.ablate:
+        for label, constants in ABLATIONS.items():
+            with changed(constants):
+                line = bench("gpr", options.level, options.seeds, plan, truth)
+            print(f"{label:30s}{line}", flush=True)
+    else:
+        for name in names:
+            line = bench(name, options.level, options.seeds, plan, truth)
+            print(f"{name:30s}{line}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""Measure how cost and memory grow with the number of cases: `python tools/bench_scale.py`.
+
+    truth     uniform cases of the rule-based VUT against the level-0 POV through the workers that
+              `truth` uses: cases per second and the largest memory of a worker process
+    workers   the same cases on one worker process and on two, in turns, beside a loop that only
+              computes, on one process and on two: what the machine itself can give
+    samplers  seconds that each sampler takes for a batch, after a history of that many cases
+    files     reading `outcomes.jsonl`, FMC and regions of its failures, the report
+
+Everything is measured in one run; `--most 1000000` goes on to a million uniform cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from merge_sumo.case import FloatArray, Pool, from_unit, to_unit
+from merge_sumo.conductor import MAX_CORRIDORS, CampaignSettings, GroundPlan, run_campaign
+from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.experiments import _scores
+from merge_sumo.fmc import fmc, regions
+from merge_sumo.journal import OUTCOMES, Run, failures, read_outcomes, to_line
+from merge_sumo.report import write_report
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.score import Outcome
+from merge_sumo.sumo.net import Net
+from merge_sumo.workers import LocalProcesses, Workers
+
+VUT = "design1"
+ROUNDS = 5
+PAIR_CASES = 2000
+BATCH = 20
+
+
+def memory_mb() -> float:
+    """Return the largest resident memory that this process has had, in MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def scores_and_memory(plan: GroundPlan, points: Sequence[FloatArray]) -> list[tuple[Any, ...]]:
+    """Run cases of level 0 as `truth` does; say which process did and how large it is."""
+    return [(score, os.getpid(), memory_mb()) for score in _scores(plan, 0, points)]
+
+
+def compute(seconds: Sequence[float]) -> list[int]:
+    """Compute for some seconds; return how often for each."""
+    counts = []
+    for limit in seconds:
+        count, end = 0, time.perf_counter() + limit
+        while time.perf_counter() < end:
+            sum(range(1000))
+            count += 1
+        counts.append(count)
+    return counts
+
+
+def never(item: Any) -> Any:
+    """Stop: no worker may die in a benchmark."""
+    raise RuntimeError(f"a worker died at {item}")
+
+
+def local(count: int) -> Workers:
+    """Return worker processes that are never replaced, so that a leak would show."""
+    return Workers(partial(LocalProcesses, count), count)
+
+
+def truth(most: int) -> Iterator[dict[str, float]]:
+    """Yield cost and memory for 100, 1,000, ... cases, all in the same worker process."""
+    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=Net())
+    rng = np.random.default_rng(0)
+    with local(1) as workers:
+        list(workers.run(partial(scores_and_memory, plan), list(rng.random((32, 2))), never))
+        cases = 100
+        while cases <= most:
+            points: Any = rng.random((cases, 2))
+            start, memory = time.perf_counter(), 0.0
+            for _, (_, _, now) in workers.run(partial(scores_and_memory, plan), points, never):
+                memory = max(memory, now)
+            spent = time.perf_counter() - start
+            yield {
+                "cases": cases,
+                "cases_per_s": cases / spent,
+                "worker_mb": memory,
+                "this_process_mb": memory_mb(),
+            }
+            cases *= 10
+
+
+def two_workers() -> dict[str, list[float]]:
+    """Return the rates on two workers over those on one, round by round."""
+    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=Net())
+    points: Any = np.random.default_rng(1).random((PAIR_CASES, 2))
+    found: dict[str, list[float]] = {"cases": [], "computing": [], "cases_per_s_on_one": []}
+    with local(1) as one, local(2) as two:
+
+        def seconds(workers: Workers) -> float:
+            start = time.perf_counter()
+            list(workers.run(partial(scores_and_memory, plan), points, never, chunk=250))
+            return time.perf_counter() - start
+
+        def rate(workers: Workers, count: int) -> float:
+            counts = dict(workers.run(compute, [1.0] * count, never, chunk=1))
+            return float(sum(counts.values()))
+
+        seconds(one), seconds(two)
+        for _ in range(ROUNDS):
+            alone = seconds(one)
+            found["cases"].append(alone / seconds(two))
+            found["cases_per_s_on_one"].append(PAIR_CASES / alone)
+            found["computing"].append(rate(two, 2) / rate(one, 1))
+    return found
+
+
+def history_of(count: int, seen: Sequence[Outcome]) -> list[Outcome]:
+    """Return a history of that many outcomes: new places for what was measured once."""
+    rng = np.random.default_rng(2)
+    cases = from_unit(rng.random((count, 2)), 0)
+    outcomes = []
+    for index, case in enumerate(cases):
+        outcome = replace(seen[index % len(seen)], index=index, batch=index // BATCH, case=case)
+        outcomes.append(outcome)
+    return outcomes
+
+
+def sampler_s(name: str, history: Sequence[Outcome]) -> float:
+    """Return the seconds for one batch after a history."""
+    sampler = make_sampler(name, Pool(levels=(0,)), 0)
+    sampler.tell(history)
+    return timed(partial(sampler.ask, BATCH))
+
+
+def timed(function: Callable[[], object]) -> float:
+    """Return the seconds that a function takes."""
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def files(count: int, seen: Sequence[Outcome], folder: Path) -> dict[str, float]:
+    """Return the seconds for what is done with a finished campaign of that many cases."""
+    outcomes = history_of(count, seen)
+    text = "".join(map(to_line, outcomes)).encode()
+    run = Run(folder)
+    run.outcomes = outcomes
+    points = to_unit((outcome.case for outcome in failures(outcomes)), 0)
+    found = {
+        "cases": float(count),
+        "failures": float(len(points)),
+        "file_mb": len(text) / 1e6,
+        "read_s": timed(lambda: read_outcomes(text, OUTCOMES)),
+        "fmc_s": timed(lambda: fmc(points)),
+        "regions_s": timed(lambda: regions(points)),
+        "report_s": timed(lambda: write_report(run)),
+    }
+    found["report_mb"] = (folder / "report.html").stat().st_size / 1e6
+    return found
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--most", type=int, default=100_000, help="uniform cases of the largest run"
+    )
+    parser.add_argument("--history", type=int, default=10_000, help="longest history of a sampler")
+    parser.add_argument("--outcomes", type=int, default=1_000_000, help="outcomes of a report")
+    parser.add_argument("--json", action="store_true")
+    chosen = parser.parse_args()
+
+    def tell(text: str) -> None:
+        if not chosen.json:
+            print(text, flush=True)
+
+    result: dict[str, Any] = {"truth": [], "samplers": {}, "files": []}
+    for row in truth(chosen.most):
+        result["truth"].append(row)
+        tell(
+            f"truth: {row['cases']:9,.0f} cases at {row['cases_per_s']:6.0f} cases/s, worker at "
+            f"most {row['worker_mb']:.0f} MB, this process {row['this_process_mb']:.0f} MB"
+        )
+    result["workers"] = two_workers()
+    for name, values in result["workers"].items():
+        median = statistics.median(values)
+        tell(f"workers: {name}: {median:.2f} [{min(values):.2f}, {max(values):.2f}]")
+    with tempfile.TemporaryDirectory() as scratch:
+        settings = CampaignSettings(vut=VUT, levels=(0,), sampler="uniform", cases=400, batch=400)
+        run = run_campaign(settings, Path(scratch) / "run")
+        count = 100
+        while count <= chosen.history:
+            history = history_of(count, run.outcomes)
+            spent = {name: sampler_s(name, history) for name in SAMPLERS}
+            result["samplers"][count] = spent
+            rates = ", ".join(f"{name} {seconds:.3f}" for name, seconds in spent.items())
+            tell(f"samplers: seconds for a batch of {BATCH} after {count:,} cases: {rates}")
+            count *= 10
+        count = 10_000
+        while count <= chosen.outcomes:
+            row = files(count, run.outcomes, run.folder)
+            result["files"].append(row)
+            tell("files: " + ", ".join(f"{name} {value:.3g}" for name, value in row.items()))
+            count *= 10
+    if chosen.json:
+        print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

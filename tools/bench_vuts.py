@@ -1,0 +1,213 @@
+"""Measure what a step of each kind of VUT costs, in one run: `python tools/bench_vuts.py`.
+
+    python   an object with act(seen), in one corridor and per corridor of 32
+    traci    a client of the stock `traci` package in a process of its own: an id list, four
+             getters, setSpeed and a step; and one that subscribes to what it sees
+    peer     the same client with SUMO's own TraCI server for two clients, where the other client
+             moves the POV: what hosting a controller costs without our server
+    fmu      a level-0 FMU of FMI 2.0, compiled here, in one corridor
+    onnx     the exported vut1, deciding at every step, in one corridor
+
+Rounds take turns over the kinds; the figures are medians in microseconds, with the range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import numpy as np
+import traci
+from build_fmu import build_fmu
+
+from merge_sumo.case import Case
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.onnx_export import export_onnx
+from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.scenario import DT_S
+from merge_sumo.sumo.binding import sumo_program
+from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net
+from merge_sumo.sumo.world import SUMO_OPTIONS
+
+STEPS = 80
+"""Of an episode."""
+CASE = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0)
+LAW = """
+class Vut:
+    def act(self, seen):
+        return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
+"""
+CLIENT = """
+import sys, traci
+traci.init(int(sys.argv[1]), numRetries=200)
+if len(sys.argv) > 2:
+    traci.setOrder(int(sys.argv[2]))
+vehicle = traci.vehicle
+try:
+    while traci.simulation.getMinExpectedNumber() > 0 or len(sys.argv) > 2:
+        traci.simulationStep()
+        if "vut" in vehicle.getIDList():
+            gap = vehicle.getLanePosition("pov") - vehicle.getLanePosition("vut")
+            closing = vehicle.getSpeed("pov")
+            v = vehicle.getSpeed("vut")
+            vehicle.setSpeed("vut", v + 0.1 * min(max((28.0 - v) / 0.1, 0.0), 1.0))
+    traci.close()
+except traci.FatalTraCIError:
+    pass
+"""
+SUBSCRIBER = """
+import sys, traci
+import traci.constants as tc
+traci.init(int(sys.argv[1]), numRetries=200)
+vehicle = traci.vehicle
+try:
+    while True:
+        traci.simulationStep()
+        seen = vehicle.getSubscriptionResults("vut")
+        if not seen:
+            if "vut" in vehicle.getIDList():
+                for name in ("pov", "vut"):
+                    vehicle.subscribe(name, (tc.VAR_LANEPOSITION, tc.VAR_SPEED))
+                seen = vehicle.getSubscriptionResults("vut")
+            else:
+                continue
+        v = seen[tc.VAR_SPEED]
+        vehicle.setSpeed("vut", v + 0.1 * min(max((28.0 - v) / 0.1, 0.0), 1.0))
+except traci.FatalTraCIError:
+    pass
+"""
+
+
+def us_per_step(driver: Driver, episodes: int) -> float:
+    """Return microseconds per step and corridor of a driver that moves by its own answers."""
+    k = driver.corridors
+    active, spent = np.ones(k, dtype=bool), 0.0
+    for _ in range(episodes):
+        for corridor in range(k):
+            driver.begin(corridor, CASE)
+        x_pov, v_pov = np.full(k, CASE.x_pov0_m), np.full(k, CASE.v_pov0_mps)
+        x, v = np.full(k, -182.0), np.full(k, CASE.v_vut0_mps)
+        for step in range(STEPS):
+            scene = Scene(active, np.full(k, step), x_pov, v_pov, x, v)
+            start = time.perf_counter()
+            a = driver.act(scene)
+            if step:  # the first step of a client includes its turn to a new episode
+                spent += time.perf_counter() - start
+            if not np.isfinite(a).all():
+                raise RuntimeError(driver.reason(0))
+            x_pov, x, v = x_pov + v_pov * DT_S, x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
+    return spent / (episodes * (STEPS - 1) * k) * 1e6
+
+
+def us_of_peer(client: Path, folder: Path, episodes: int) -> float:
+    """Return microseconds per step with SUMO's own server for two clients."""
+    net_file = folder / "peer.net.xml"
+    net = Net()
+    net_file.write_bytes(net.text)
+    port = traci.main.getFreeSocketPort()
+    options = ["--net-file", str(net_file), "--remote-port", str(port), "--num-clients", "2"]
+    server = subprocess.Popen([sumo_program("sumo"), *options, *SUMO_OPTIONS])
+    other = subprocess.Popen(
+        [sys.executable, str(client), str(port), "2"], stdout=subprocess.DEVNULL
+    )
+    try:
+        with redirect_stdout(sys.stderr):  # it prints every attempt
+            host = traci.connect(port, numRetries=200, waitBetweenRetries=0.2)
+        host.setOrder(1)
+        vehicle, spent = host.vehicle, 0.0
+        starts = {"pov": (MAIN_IN, net.main_in.length_m), "vut": (RAMP, net.ramp.length_m)}
+        for name, (edge, _) in starts.items():
+            host.route.add(name, [edge, MAIN_OUT])
+            vehicle.add(name, name, departPos="10", departSpeed="0")
+        host.simulationStep()
+        for name in starts:
+            vehicle.setSpeedMode(name, 32)
+        for _ in range(episodes):
+            x_and_v = {"pov": (-300.0, 30.0), "vut": (-182.0, 18.0)}
+            for name, (edge, length_m) in starts.items():
+                x_m, v_mps = x_and_v[name]
+                vehicle.moveTo(name, f"{edge}_0", length_m + x_m)
+                vehicle.setPreviousSpeed(name, v_mps, 0.0)
+                vehicle.setSpeed(name, v_mps)
+            for _ in range(STEPS - 1):
+                start = time.perf_counter()
+                host.simulationStep()
+                for name in starts:
+                    vehicle.getLanePosition(name)
+                    vehicle.getSpeed(name)
+                vehicle.setSpeed("pov", 30.0)
+                spent += time.perf_counter() - start
+        return spent / (episodes * (STEPS - 1)) * 1e6
+    finally:
+        for process in (other, server):
+            process.kill()  # SUMO would wait for its clients
+            process.wait()
+
+
+def main() -> None:
+    """Print a table, or with --json one object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--episodes", type=int, default=20, help="episodes per round and kind")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "law.py").write_text(LAW)
+        (folder / "client.py").write_text(CLIENT)
+        (folder / "subscriber.py").write_text(SUBSCRIBER)
+        export_onnx("vut1", folder / "vut1.onnx")
+        build_fmu(folder / "level0.fmu")
+        command = shlex.join([sys.executable, str(folder / "client.py"), "{port}"])
+        with_command = VutOptions(command=command)
+        subscribing = VutOptions(command=command.replace("client.py", "subscriber.py"))
+
+        def driver(spec: str, corridors: int = 1, given: VutOptions | None = None) -> Driver:
+            return vut_factory(spec, given)(corridors)
+
+        drivers = {
+            "python": driver(f"{folder / 'law.py'}:Vut"),
+            "python, 32 corridors": driver(f"{folder / 'law.py'}:Vut", 32),
+            "traci": driver("traci", given=with_command),
+            "traci, subscribing": driver("traci", given=subscribing),
+            "fmu": driver(f"fmu:{folder / 'level0.fmu'}"),
+            "onnx": driver(f"onnx:{folder / 'vut1.onnx'}?decision_period_s=0.1"),
+        }
+        measured: dict[str, Callable[[], float]] = {
+            kind: lambda d=d: us_per_step(d, options.episodes)  # type: ignore[misc]
+            for kind, d in drivers.items()
+        }
+        measured["peer"] = lambda: us_of_peer(folder / "client.py", folder, options.episodes)
+        found: dict[str, list[float]] = {kind: [] for kind in measured}
+        try:
+            for _ in range(options.rounds):
+                for kind, run in measured.items():
+                    found[kind].append(run())
+        finally:
+            for made in drivers.values():
+                made.close()
+    ratios = [a / b for a, b in zip(found["traci"], found["peer"], strict=True)]
+    if options.json:
+        medians = {kind: statistics.median(us) for kind, us in found.items()}
+        print(json.dumps({"us_per_step": medians, "traci_to_peer": statistics.median(ratios)}))
+        return
+    for kind, us in found.items():
+        print(f"{kind:22} {statistics.median(us):8.1f} us a step [{min(us):.1f}, {max(us):.1f}]")
+    print(
+        f"traci costs {statistics.median(ratios):.2f} times the peer "
+        f"[{min(ratios):.2f}, {max(ratios):.2f}]"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""Kill campaigns and resume them: `python tools/kill_campaigns.py --kills 100`.
+
+Every campaign is killed once (SIGKILL), at a place drawn from a seed, and resumed; then its
+outcomes must be those of a campaign that nobody disturbed, byte for byte. The places take turns:
+
+    moment  any time between the start and the end of the campaign
+    sync    between a write and its sync to the disk, of any file of the journal
+    torn    in the middle of a write, of any file of the journal
+    worker  a worker process, at any time; the campaign itself goes on
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from merge_sumo import journal
+from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
+from merge_sumo.journal import OUTCOMES, SETTINGS
+from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.workers import open_workers
+
+PLACES = ("moment", "sync", "torn", "worker")
+SAMPLERS = ("gpr", "coverage")
+CASES, BATCH = 60, 12
+WRITES = 1 + 2 * CASES // BATCH
+"""Files that the journal writes: settings, then trajectories and outcomes of every batch."""
+SYNCS = 3 + 3 * CASES // BATCH
+"""Of settings and two folders, then of trajectories, their folder and outcomes of every batch."""
+PATIENCE_S = 600.0
+
+
+def settings_of(sampler: str) -> CampaignSettings:
+    """Return a campaign in which every batch depends on those before it."""
+    return CampaignSettings(
+        vut="design1", levels=(0, 1), sampler=sampler, cases=CASES, batch=BATCH, seed=1
+    )
+
+
+def forked(work: Callable[[], object]) -> int:
+    """Start work in a process of its own, without importing everything again."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            work()
+            os._exit(0)
+        except BaseException as error:
+            print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
+            os._exit(1)
+    return pid
+
+
+def ended(pid: int) -> int:
+    """Wait for a process and return its exit code, negative for a signal."""
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def kill_me() -> None:
+    """End this process at once."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def kill_at_sync(nth: int) -> None:
+    """Have this process killed between its nth write and the sync of it."""
+    fsync, count = os.fsync, 0
+
+    def counting(file: Any) -> None:
+        nonlocal count
+        count += 1
+        if count == nth:
+            kill_me()
+        fsync(file)
+
+    os.fsync = counting  # type: ignore[assignment]
+
+
+def kill_at_write(nth: int, share: float) -> None:
+    """Have this process killed when a share of its nth write is done."""
+    write_all, count = journal._write_all, 0
+
+    def counting(file: FileIO, content: bytes) -> None:
+        nonlocal count
+        count += 1
+        if count == nth:
+            file.write(content[: int(share * len(content))])
+            kill_me()
+        write_all(file, content)
+
+    journal._write_all = counting
+
+
+def workers_of(pid: int) -> list[int]:
+    """Return the worker processes of a process."""
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    found = [int(child) for child in children.read_text().split()] if children.exists() else []
+    return [
+        child for child in found if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
+    ]
+
+
+def disturb(
+    folder: Path, sampler: str, place: str, rng: np.random.Generator, whole_s: float
+) -> int:
+    """Run a campaign, kill at a place, and return how it ended."""
+    settings = settings_of(sampler)
+
+    def campaign() -> None:
+        if place == "sync":
+            kill_at_sync(int(rng.integers(1, SYNCS + 1)))
+        if place == "torn":
+            kill_at_write(int(rng.integers(1, WRITES + 1)), float(rng.random()))
+        with open_workers(2 if place == "worker" else 1) as workers:
+            run_campaign(settings, folder, workers=workers)
+
+    pid = forked(campaign)
+    if place == "moment":
+        time.sleep(float(rng.random()) * whole_s)
+        os.kill(pid, signal.SIGKILL)
+    if place == "worker":
+        start = time.monotonic()
+        while not (workers := workers_of(pid)) and time.monotonic() - start < PATIENCE_S:
+            time.sleep(0.01)
+        # While they are starting, or while they are at work.
+        at_work = rng.random() < 0.7
+        while at_work and not folder.exists() and time.monotonic() - start < PATIENCE_S:
+            time.sleep(0.01)
+        time.sleep(float(rng.random()) * whole_s / 2.0)
+        workers = workers_of(pid) or workers
+        try:
+            os.kill(int(rng.choice(workers)), signal.SIGKILL)
+        except ProcessLookupError:
+            print("the campaign was over", file=sys.stderr)
+    return ended(pid)
+
+
+def main() -> None:
+    """Kill and resume, and exit with 1 unless all outcomes are the same."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    load_libsumo()
+    same = 0
+    with tempfile.TemporaryDirectory() as scratch:
+        expected, whole_s = {}, 0.0
+        for sampler in SAMPLERS:
+            folder = Path(scratch) / sampler
+            start = time.monotonic()
+            if ended(forked(partial(run_campaign, settings_of(sampler), folder))) != 0:
+                sys.exit("a campaign that nobody disturbed failed")
+            whole_s = max(whole_s, time.monotonic() - start)
+            expected[sampler] = (folder / OUTCOMES).read_bytes()
+        for kill in range(chosen.kills):
+            rng = np.random.default_rng([chosen.seed, kill])
+            place, sampler = PLACES[kill % len(PLACES)], SAMPLERS[kill // len(PLACES) % 2]
+            folder = Path(scratch) / f"run-{kill}"
+            code = disturb(folder, sampler, place, rng, whole_s)
+            there = (folder / SETTINGS).is_file()
+            lines = (folder / OUTCOMES).read_bytes().count(b"\n") if there else 0
+            again: Callable[[Path], object] = (
+                resume_campaign if there else partial(run_campaign, settings_of(sampler))
+            )
+            resumed = ended(forked(partial(again, folder)))
+            equal = resumed == 0 and (folder / OUTCOMES).read_bytes() == expected[sampler]
+            same += equal
+            state = f"after {lines} outcomes" if there else "before there was a folder"
+            print(
+                f"{kill + 1:4d} {place:7s} {sampler:9s} exit {code:3d} {state}, resumed: "
+                f"{'the same' if equal else 'NOT THE SAME'}",
+                flush=True,
+            )
+    print(f"the same outcomes.jsonl after {same} of {chosen.kills} kills")
+    sys.exit(0 if same == chosen.kills else 1)
+
+
+if __name__ == "__main__":
+    main()
