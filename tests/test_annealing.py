@@ -1,4 +1,4 @@
-"""Simulated annealing: one chain per level that ends up at one minimum."""
+"""Simulated annealing: chains that end up at one minimum each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from merge_sumo.case import Pool
-from merge_sumo.samplers.annealing import AnnealingSampler
+from merge_sumo.samplers.annealing import CHAINS, AnnealingSampler
 from merge_sumo.samplers.base import LevelHistory, reflect
 
 FloatArray = np.ndarray
@@ -16,7 +16,7 @@ def two_valleys(points: FloatArray) -> FloatArray:
     """Return a score with two equal minima, far apart."""
     left = np.square(points - [0.2, 0.3]).sum(axis=1)
     right = np.square(points - [0.8, 0.7]).sum(axis=1)
-    return -900.0 * np.exp(-np.minimum(left, right) / 0.02)
+    return -900.0 * np.exp(-np.minimum(left, right) / 0.05)
 
 
 def history_of(points: FloatArray, score: FloatArray, batch: FloatArray) -> LevelHistory:
@@ -35,14 +35,20 @@ def anneal(seed: int, batches: int, n: int = 20) -> LevelHistory:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_ends_up_around_one_of_two_minima(seed):
+@pytest.mark.parametrize("chain", range(CHAINS))
+def test_each_chain_ends_up_around_one_of_two_minima(seed, chain):
     history = anneal(seed, batches=20)
-    last = history.points[-60:]
+    last = history.points[-60:][chain::CHAINS]
     to_left = np.linalg.norm(last - [0.2, 0.3], axis=1) < 0.2
     to_right = np.linalg.norm(last - [0.8, 0.7], axis=1) < 0.2
     assert max(to_left.mean(), to_right.mean()) == 1.0
     assert history.failed[:20].mean() < 0.3, "the start must not be there already"
     assert history.failed[-60:].mean() > 0.8
+
+
+def test_a_batch_of_one_still_moves():
+    points = anneal(0, batches=5, n=1).points
+    assert len(np.unique(points, axis=0)) == 5
 
 
 def test_begins_with_a_uniform_batch():

@@ -1,7 +1,7 @@
 """Simulated annealing, a baseline of the paper (Dixon and Szego, 1978; Kirkpatrick et al., 1983).
 
-One chain looks for the lowest score and cools down as batches come in, so its cases end up around
-one minimum: it is an optimiser, not a search for all regions of failures.
+Chains look for the lowest score and cool down as batches come in, so their cases end up around
+one minimum each: it is an optimiser, not a search for all regions of failures.
 """
 
 from __future__ import annotations
@@ -10,10 +10,13 @@ import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.case import FloatArray
 from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, reflect, uniform_points
 
+CHAINS: Final = 2
+"""Chains per level: a single one may spend the whole budget around a minimum of no failures."""
 TEMPERATURE0: Final = 200.0
 """Of the first move, in units of the score: a rise by it is accepted with probability 1/e."""
 COOLING: Final = 0.8
@@ -26,36 +29,41 @@ STEP_MIN: Final = 0.02
 
 
 class AnnealingSampler(LevelwiseSampler):
-    """One chain per level; a batch holds independent moves from where the chain stands.
+    """Chains that take turns; a batch holds independent moves from where each chain stands.
 
-    The chain is replayed from the history. What decides on a move is drawn anew from the seed
+    The chains are replayed from the history. What decides on a move is drawn anew from the seed
     and the batch, so that it is the same whenever it is replayed.
     """
 
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Return `n` moves, (n, d), of the chain; a uniform batch before it stands anywhere."""
+        """Return `n` moves, (n, d), of the chains; a uniform batch before they stand anywhere."""
         if not len(history.points):
             return uniform_points(n, level, rng)
-        current = self._replay(history, level)
+        standing = self._replay(history, level)
         cooled = len(np.unique(history.batch)) - 1
         step = max(STEP0 * STEP_SHRINK**cooled, STEP_MIN)
-        here = history.points[current]
-        return reflect(here + step * rng.standard_normal((n, len(here))))
+        here = history.points[standing[np.arange(n) % len(standing)]]
+        return reflect(here + step * rng.standard_normal(here.shape))
 
-    def _replay(self, history: LevelHistory, level: int) -> int:
-        """Return the place in the history of the case where the chain stands."""
+    def _replay(self, history: LevelHistory, level: int) -> NDArray[np.int64]:
+        """Return the places in the history of the cases where the chains stand, (chains,).
+
+        The k-th move of a batch belongs to chain k modulo their number.
+        """
         batches = np.unique(history.batch)
         first = np.flatnonzero(history.batch == batches[0])
-        current = int(first[np.argmin(history.score[first])])
+        turns = [first[chain::CHAINS] for chain in range(min(CHAINS, len(first)))]
+        standing = np.array([turn[np.argmin(history.score[turn])] for turn in turns])
         for cooled, batch in enumerate(batches[1:].tolist()):
             temperature = TEMPERATURE0 * COOLING**cooled
             moves = np.flatnonzero(history.batch == batch)
             luck = self.batch_rng(level, batch).random(len(moves))
-            for move, chance in zip(moves.tolist(), luck.tolist(), strict=True):
-                rise = float(history.score[move] - history.score[current])
+            turn = (np.arange(len(moves)) % len(standing)).tolist()
+            for chain, move, chance in zip(turn, moves.tolist(), luck.tolist(), strict=True):
+                rise = float(history.score[move] - history.score[standing[chain]])
                 # Metropolis et al. (1953): downhill always, uphill sometimes.
                 if rise <= 0.0 or chance < math.exp(-rise / temperature):
-                    current = move
-        return current
+                    standing[chain] = move
+        return standing
