@@ -11,10 +11,21 @@ import pytest
 from merge_sumo.case import Case, Pool, to_unit
 from merge_sumo.fmc import RADIUS, fmc
 from merge_sumo.samplers.base import LevelHistory, Sampler
-from merge_sumo.samplers.coverage import CoverageSampler, _trust, margin_of
+from merge_sumo.samplers.coverage import (
+    CALIBRATION,
+    NEAREST,
+    PATIENCE,
+    CoverageSampler,
+    _as_if,
+    _calibrated,
+    _limit,
+    _Search,
+    _trust,
+    margin_of,
+)
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.samplers.surrogate import Margin
+from merge_sumo.samplers.surrogate import Branches, Margin
 from merge_sumo.score import Measures, Outcome
 from merge_sumo.trajectory import End
 
@@ -136,6 +147,112 @@ def test_learns_from_a_bounded_number_of_cases_in_a_long_campaign():
     sampler.tell(outcome(i, i // 40, case, blind=False) for i, case in enumerate(cases))
     points = to_unit(sampler.ask(10), 0)
     assert points.shape == (10, 2)
+
+
+class TestTheBranches:
+    """A margin that comes up to `top` on the left of 0.5, and jumps to 3 on the right of it."""
+
+    @staticmethod
+    def chance(top: float) -> np.ndarray:
+        rng = np.random.default_rng(3)
+        points = rng.random((80, 2))
+        x = points[:, 0]
+        points = points[(x < 0.5) | (x > 0.54)]
+        x = points[:, 0]
+        values = np.where(x < 0.5, top - 8.0 * (0.5 - x), 3.0)
+        branches = Branches(points, values, Margin(points, values, -1.0, 1.0, rough=False))
+        left_out = branches.left_out()
+        assert left_out.shape == (len(points),)
+        assert left_out[x > 0.8].max() < 0.05
+        return branches.at(np.array([[0.47, 0.5], [0.2, 0.5], [0.9, 0.5]]))
+
+    def test_expect_no_failure_where_the_margin_jumps_over_it(self):
+        assert self.chance(top=-3.0).max() < 0.1
+
+    def test_expect_failures_where_one_side_comes_down_to_them_before_the_jump(self):
+        near, *far = self.chance(top=-0.3)
+        assert near > 0.7
+        assert max(far) < 0.05
+
+    def test_a_smooth_process_alone_is_taken_in_by_the_jump(self):
+        points = np.random.default_rng(3).random((80, 2))
+        points = points[np.abs(points[:, 0] - 0.5) > 0.04]
+        values = np.where(points[:, 0] < 0.5, -3.0, 3.0)
+        smooth = Margin(points, values, -1.0, 1.0, rough=False)
+        here = np.array([[0.5, 0.5]])
+        assert smooth.at(here)[0] > 3.0 * Branches(points, values, smooth).at(here)[0]
+
+
+class TestTheCalibration:
+    @staticmethod
+    def evidence(n: int) -> np.ndarray:
+        rng = np.random.default_rng(8)
+        return np.column_stack([rng.normal(0.0, 2.0, n), np.ones(n), rng.normal(size=(n, 2))])
+
+    def test_finds_the_weights_that_the_outcomes_were_drawn_with(self):
+        evidence, true = self.evidence(20_000), np.array([1.5, -1.0, 0.2, -0.3])
+        luck = np.random.default_rng(9).random(len(evidence))
+        failed = luck < 1.0 / (1.0 + np.exp(-evidence @ true))
+        assert _calibrated(evidence, failed)[0] == pytest.approx(true, abs=0.08)
+
+    @pytest.mark.parametrize("n", [1, 3])
+    def test_stays_near_what_it_believed_before_while_it_has_seen_little(self, n):
+        weights, _ = _calibrated(self.evidence(n), np.zeros(n, dtype=bool))
+        assert (np.abs(weights - CALIBRATION[0]) < 2.0 * CALIBRATION[1]).all()
+
+    def test_does_not_run_away_where_failures_are_perfectly_foretold(self):
+        evidence = self.evidence(400)
+        evidence[:, 0] *= 20.0
+        weights, posterior = _calibrated(evidence, evidence[:, 0] > 0.0)
+        assert np.isfinite(posterior)
+        assert np.abs(weights).max() < 5.0
+
+
+class TestWhatIsAimedAt:
+    """Where failures are rare, the nearest cases stand in for them."""
+
+    @staticmethod
+    def history(n: int, failures: int, *, blind: bool = False) -> LevelHistory:
+        rng = np.random.default_rng(6)
+        gap_m = rng.permutation(np.arange(n) + 10.0) * rng.choice([-1.0, 1.0], n)
+        gap_m[:failures] = 1.0
+        score = np.where(np.abs(gap_m) < 6.0, -600.0, -450.0 * np.exp((6.0 - np.abs(gap_m)) / 15))
+        failed = score < -500.0
+        gap_m = np.full(n, np.nan) if blind else gap_m
+        return LevelHistory(rng.random((n, 2)), score, failed, gap_m, np.arange(n) // 20)
+
+    @pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
+    def test_are_the_nearest_cases_where_nothing_failed(self, blind):
+        history = self.history(PATIENCE, 0, blind=blind)
+        near = _as_if(history, _limit(history)).failed
+        assert near.sum() == NEAREST
+        assert set(np.flatnonzero(near)) == set(np.argsort(history.score)[:NEAREST])
+
+    def test_are_failures_alone_once_enough_are_known(self):
+        assert _limit(self.history(PATIENCE, NEAREST)) is None
+
+    def test_are_failures_alone_in_the_first_batches(self):
+        assert _limit(self.history(PATIENCE - 1, 0)) is None
+
+    def test_a_gap_at_the_limit_has_a_margin_of_one(self):
+        history = self.history(PATIENCE, 0)
+        values, low, high = margin_of(history, 12.0)
+        at_limit = np.abs(history.dx_m) == 12.0
+        assert np.abs(values[at_limit]) == pytest.approx([high])
+        assert low == -high
+
+
+def test_looks_where_cases_come_near_but_counts_on_failures_alone():
+    rng = np.random.default_rng(2)
+    points = rng.random((2 * PATIENCE, 2))
+    gap_m = 8.0 + 60.0 * points[:, 0]
+    score = -450.0 * np.exp((6.0 - gap_m) / 15.0)
+    nothing, batch = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=np.int64)
+    history = LevelHistory(points, score, nothing, gap_m, batch)
+    assert _limit(history) is not None
+    proposal = _Search(history, 0, rng, 20).batch(20)
+    assert np.median(proposal.points[:, 0]) < 0.1
+    assert proposal.gain.sum() < 2.0
 
 
 class TestTheTrust:

@@ -37,12 +37,16 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "as it is": {},
     "noise 1e-4": {"NOISE": 1e-4},
     "noise 1e-3": {"NOISE": 1e-3},
+    "noise 3e-2": {"NOISE": 3e-2},
     "z1 = 2": {"Z_EXPLOIT": (2.0, 1.0)},
     "z1 = 8": {"Z_EXPLOIT": (8.0, 1.0)},
+    "epsilon0 = .1": {"EPSILON0": 0.1},
     "epsilon0 = .3": {"EPSILON0": 0.3},
     "alpha = .91": {"ALPHA": 0.91},
     "p = 1000": {"QUERIES": 1000},
+    "p = 16000": {"QUERIES": 16_000},
     "lengths from .02": {"LENGTH_BOUNDS": (0.02, 5.0)},
+    "lengths from .1": {"LENGTH_BOUNDS": (0.1, 5.0)},
     "covered balls not discounted": {"FLOOR": 1e9},
 }
 """Of `gpr`: what each choice is worth is the difference to the first line."""

@@ -42,7 +42,7 @@ def _case(level: int, x_pov0_m: float, v_pov0_mps: float, svo_rad: float | None 
 EXAMPLES = {
     "pov-yields": Example("level0", _case(1, -273.0, 33.0)),
     "vut-waits": Example("level1", _case(2, -273.0, 33.0, 0.6)),
-    "stalemate": Example("design2", _case(2, -297.5, 34.5, 0.6)),
+    "stalemate": Example("design2", _case(2, -294.5, 34.125, 0.6)),
     "no-reaction": Example("design1", _case(0, -269.0, 31.0)),
 }
 

@@ -2,31 +2,39 @@
 
 A case is worth P(fail) times the share of its ball (radius rho of the FMC) that is not covered
 yet. Failing means that the signed gap dx at M is within 6 m, so failures lie where the gap changes
-its sign: where another car goes first. Gaussian processes learn the gap; a VUT that gives no
-trajectory has its score learned instead. A process believes that the gap passes through 0 between
-a safe case on either side, but often it jumps, and then no test between them ever fails. So the
-odds of a case that is bracketed, the nearest safe case on either side being nearer than any
-failure, are lowered by h / (h + w): h is the width of the bracket, w the typical width of what
-fails, which is learned. Together that bisects the curve where the order of merging flips, gives
-up where it is a jump, and goes on along it where it is a strip of failures.
+its sign: where another car goes first. There the gap often jumps, and no test between the two
+sides ever fails. Three experts give P(fail) from the cases so far:
+
+- a smooth process on the gap, and a rough one, which believe that it passes through 0;
+- a process for the gap of either side, and who goes first: the gap may come down to a failure on
+  one side and jump to the other from there, or jump over the failures.
+
+A VUT that gives no trajectory has its score learned instead, by the first two. Every expert is
+judged by how well it foretold each case from all the others. Two things that no process knows are
+learned with it. First, the odds of a case that is bracketed, the nearest safe case on either side
+being nearer than any failure, are lowered by h / (h + w): h is the width of the bracket, w the
+typical width of what fails. That bisects the curve where the order of merging flips, gives up
+where it is a jump, and goes on along it where it is a strip of failures. Then a logistic
+regression corrects the odds by the distances to the nearest failure and to that curve.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import expit, log_expit, logit
 
 from merge_sumo.case import Case, FloatArray, dimensions, from_unit
 from merge_sumo.fmc import RADIUS
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import LevelHistory, Sampler, uniform_points
 from merge_sumo.samplers.ground import Ground
-from merge_sumo.samplers.surrogate import Margin, most_telling
+from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
 from merge_sumo.scenario import DX_CRASH_M
 from merge_sumo.score import FAILURE_SCORE
 
@@ -49,13 +57,23 @@ NO_GAP_M: Final = 200.0
 """Gap of a VUT that never arrives: the POV goes first, as far ahead as one can be."""
 MAX_LEARNED: Final = 1000
 """Cases that a process learns from; what bounds the time per batch in a long campaign."""
+BRANCH_FROM: Final = 4
+"""Cases on either side that it takes to learn the gap of each side by itself."""
+NEAR: Final = 0.005
+"""Distances below this are not told apart."""
+CALIBRATION: Final = (np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, 1.0, 0.3, 0.3]))
+"""Mean and standard deviation, before anything is known, of the weights by which the log odds, 1,
+and the log distances to the nearest failure and to the curve add up to calibrated log odds."""
+NEWTON_STEPS: Final = 6
 WIDTHS: Final = np.geomspace(0.001, 0.5, 25)
-SHARPNESSES: Final = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
-"""Factors of the log odds that are tried: how sure of themselves the processes should be."""
 LOG_PRIOR_WIDTH: Final = (np.log(0.02), 1.5)
 """Widths w that are tried, and mean and standard deviation of log w before anything is known."""
 SURE: Final = 1e-3
-"""Probabilities nearer to 0 or 1 than this are not told apart."""
+"""Probabilities nearer to 0 or 1 than this are not told apart, nor are weights of evidence."""
+NEAREST: Final = 3
+"""Failures that it takes to aim at failures alone, and else how many cases stand in for them."""
+PATIENCE: Final = 60
+"""Cases that are run before anything stands in for failures."""
 JUDGED_FROM: Final = 3
 """Failures, and safe cases, that it takes to tell somebody else P(fail)."""
 FORETOLD: Final = 100
@@ -135,25 +153,33 @@ class CoverageSampler(Sampler):
 
 
 class _Belief:
-    """P(fail) at a level, from its history."""
+    """P(fail) at a level, from its history; `limit` is below what a case fails (`_limit`)."""
 
-    def __init__(self, history: LevelHistory) -> None:
+    def __init__(self, history: LevelHistory, limit: float | None = None) -> None:
+        if limit is not None:
+            history = _as_if(history, limit)
         learned = most_telling(history, MAX_LEARNED)
-        values, low, high = margin_of(learned)
-        self._margins = [
-            Margin(learned.points, values, low, high, rough=rough) for rough in (False, True)
-        ]
         self._groups = _groups(history)
         self._history = history
-        self.rotation = self._margins[0].rotation
+        values, low, high = margin_of(learned, limit)
+        smooth, rough = (
+            Margin(learned.points, values, low, high, rough=rough) for rough in (False, True)
+        )
+        self.rotation = smooth.rotation
+        self._experts: list[Margin | Branches] = [smooth, rough]
+        positive = int((values >= 0.0).sum())
+        if _has_gaps(history) and min(positive, len(values) - positive) >= BRANCH_FROM:
+            self._experts.append(Branches(learned.points, values, smooth))
         self._judge(learned)
 
     def of(self, cases: FloatArray) -> FloatArray:
         """Return P(fail) of cases, (m, d)."""
         distances = [_nearest(cases, self._history.points[group]) for group in self._groups]
-        odds = [margin.at(cases) for margin in self._margins]
-        mean = np.average(odds, axis=0, weights=self._weights)
-        return _sharpened(_lowered(mean, distances, self._width), self._sharpness)
+        chances = [
+            expit(_evidence(_lowered(expert.at(cases), distances, width), distances) @ calibration)
+            for expert, (width, calibration) in zip(self._experts, self._judged, strict=True)
+        ]
+        return np.asarray(np.average(chances, axis=0, weights=self._weights), dtype=np.float64)
 
     def between(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Return `n` places, (n, d), or none, between safe cases on either side, most in narrow
@@ -176,22 +202,22 @@ class _Belief:
         return np.asarray(first[chosen] * (1.0 - part) + second[chosen] * part, dtype=np.float64)
 
     def _judge(self, learned: LevelHistory) -> None:
-        """Weigh the processes and learn the width w by how well they foretold each case."""
-        failed = learned.failed
+        """Weigh the experts, and learn width and calibration, by how each foretold each case."""
         distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
-        odds = [margin.left_out() for margin in self._margins]
         log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
-        scores = np.empty((len(odds), len(WIDTHS), len(SHARPNESSES)))
-        for i, p in enumerate(odds):
-            for j, width in enumerate(WIDTHS.tolist()):
-                lowered = _lowered(p, distances, width)
-                for k, sharpness in enumerate(SHARPNESSES):
-                    likelihood = _log_likelihood(_sharpened(lowered, sharpness), failed)
-                    scores[i, j, k] = likelihood + log_prior[j] - 0.5 * np.log(sharpness) ** 2
-        best = scores.max(axis=(1, 2))
-        self._weights = np.exp(best - best.max())
-        _, width_at, sharpness_at = np.unravel_index(np.argmax(scores), scores.shape)
-        self._width, self._sharpness = float(WIDTHS[width_at]), SHARPNESSES[int(sharpness_at)]
+        self._judged: list[tuple[float, FloatArray]] = []
+        best = []
+        for expert in self._experts:
+            chance = expert.left_out()
+            found = []
+            for width, prior in zip(WIDTHS.tolist(), log_prior.tolist(), strict=True):
+                evidence = _evidence(_lowered(chance, distances, width), distances)
+                calibration, posterior = _calibrated(evidence, learned.failed)
+                found.append((posterior + prior, width, calibration))
+            posterior, width, calibration = max(found, key=lambda one: one[0])
+            self._judged.append((width, calibration))
+            best.append(posterior)
+        self._weights = np.exp(np.array(best) - max(best))
 
 
 class _Search:
@@ -201,26 +227,32 @@ class _Search:
         failing = history.points[history.failed]
         self._ground = Ground(failing.shape[1])
         self._ground.cover(self._ground.balls(failing), 1.0)
-        belief = _Belief(history)
-        trust = _trust(history)
+        limit, trust = _limit(history), _trust(history)
+        belief = _Belief(history, limit)
+
+        def trusted(of: _Belief, cases: FloatArray) -> FloatArray:
+            return of.of(cases) * trust[_far(cases, failing)]
+
         candidates = _candidates(history, belief, level, rng, n)
-        probability = belief.of(candidates) * trust[_far(candidates, failing)]
+        probability = trusted(belief, candidates)
         worth = probability * self._ground.new(self._ground.balls(candidates))
         best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
         refined = _around(best, REFINED_QUERIES, REFINED_REACH, rng)
         candidates = np.concatenate([candidates, refined])
-        probability = np.concatenate(
-            [probability, belief.of(refined) * trust[_far(refined, failing)]]
-        )
+        probability = np.concatenate([probability, trusted(belief, refined)])
         worth = probability * (self._ground.new(self._ground.balls(candidates)) + EVEN_IF_COVERED)
         kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
-        self._candidates, self._probability = candidates[kept], probability[kept]
+        self._candidates, self._aim = candidates[kept], probability[kept]
+        self._probability = (
+            self._aim if limit is None else trusted(_Belief(history), self._candidates)
+        )
 
     def batch(self, n: int) -> Proposal:
         """Return the greedy batch of `n` cases.
 
         Most of the ball of a pick counts as covered for the later ones: if the pick fails, it is
-        covered, and if it does not, picks near it would mostly have been as wrong.
+        covered, and if it does not, picks near it would mostly have been as wrong. What is aimed
+        at may be a near miss, but only a failure is a gain.
         """
         balls = self._ground.balls(self._candidates)
         picks: list[int] = []
@@ -228,12 +260,12 @@ class _Search:
         free = np.ones(len(balls), dtype=bool)
         for _ in range(n):
             new = self._ground.new(balls)
-            worth = np.where(free, self._probability * (new + EVEN_IF_COVERED), -1.0)
+            worth = np.where(free, self._aim * (new + EVEN_IF_COVERED), -1.0)
             best = int(np.argmax(worth))
             free[best] = False
             picks.append(best)
             gains.append(float(self._probability[best] * new[best]))
-            self._ground.cover(balls[best], max(PICKED, float(self._probability[best])))
+            self._ground.cover(balls[best], max(PICKED, float(self._aim[best])))
         return Proposal(self._candidates[picks], np.array(gains))
 
 
@@ -270,16 +302,43 @@ def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | 
     return _Belief(history).of
 
 
-def margin_of(history: LevelHistory) -> tuple[FloatArray, float, float]:
+def margin_of(history: LevelHistory, limit: float | None = None) -> tuple[FloatArray, float, float]:
     """Return what is learned, (N,), and the interval of it that means failure.
 
-    The signed gap in units of 6 m, compressed like a logarithm where it is large: a gap of 100 m
-    says little more about failures than one of 50 m. Without gaps, the score in units of lambda.
+    The signed gap in units of the limit (6 m), compressed like a logarithm where it is large: a
+    gap of 100 m says little more about failures than one of 50 m. Without gaps, the score in
+    units of the limit (lambda).
     """
-    if np.isnan(history.dx_m).all():
-        return np.minimum(history.score / FAILURE_SCORE - 1.0, 1.0), 0.0, np.inf
-    gap = np.nan_to_num(history.dx_m, nan=NO_GAP_M) / DX_CRASH_M
+    if not _has_gaps(history):
+        return np.minimum(history.score / (limit or FAILURE_SCORE) - 1.0, 1.0), 0.0, np.inf
+    gap = np.nan_to_num(history.dx_m, nan=NO_GAP_M) / (limit or DX_CRASH_M)
     return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
+
+
+def _limit(history: LevelHistory) -> float | None:
+    """Return the gap, in m, or the score that is aimed at; None for that of a failure.
+
+    Where failures are rare, the cases that came nearest show the way, as in subset simulation.
+    """
+    if history.failed.sum() >= NEAREST or len(history.score) < PATIENCE:
+        return None
+    nearness = _gap_m(history) if _has_gaps(history) else history.score
+    return float(np.partition(nearness, NEAREST - 1)[NEAREST - 1])
+
+
+def _as_if(history: LevelHistory, limit: float) -> LevelHistory:
+    """Return the history as if all cases up to a limit had failed."""
+    nearness = _gap_m(history) if _has_gaps(history) else history.score
+    return replace(history, failed=nearness <= limit)
+
+
+def _gap_m(history: LevelHistory) -> FloatArray:
+    return np.abs(np.nan_to_num(history.dx_m, nan=NO_GAP_M))
+
+
+def _has_gaps(history: LevelHistory) -> bool:
+    """Return whether the VUT gives trajectories."""
+    return not np.isnan(history.dx_m).all()
 
 
 def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
@@ -288,7 +347,7 @@ def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
     The side is who goes first; without a trajectory a safe case is on both.
     """
     safe = ~history.failed
-    if np.isnan(history.dx_m).all():
+    if not _has_gaps(history):
         return [history.failed, safe, safe]
     pov_first = np.nan_to_num(history.dx_m, nan=NO_GAP_M) >= 0.0
     return [history.failed, safe & ~pov_first, safe & pov_first]
@@ -365,12 +424,36 @@ def _lowered(
     return np.where(closed, probability * width / (width + typical_width), probability)
 
 
-def _sharpened(probability: FloatArray, sharpness: float) -> FloatArray:
-    """Return the probabilities with their log odds multiplied (Platt, 1999, without offset)."""
-    for_it, against_it = probability**sharpness, (1.0 - probability) ** sharpness
-    return np.asarray(for_it / (for_it + against_it), dtype=np.float64)
+def _evidence(chance: FloatArray, distances: list[FloatArray]) -> FloatArray:
+    """Return what speaks for and against failures, (m, 4): see CALIBRATION."""
+    to_failing, before, behind = distances
+    odds = logit(np.clip(chance, SURE, 1.0 - SURE))
+    to_curve = np.maximum(before, behind)
+    near = [np.log((distance + NEAR) / (RADIUS + NEAR)) for distance in (to_failing, to_curve)]
+    return np.column_stack([odds, np.ones(len(chance)), *near])
 
 
-def _log_likelihood(probability: FloatArray, failed: NDArray[np.bool_]) -> float:
-    p = np.clip(probability, SURE, 1.0 - SURE)
-    return float(np.log(np.where(failed, p, 1.0 - p)).sum())
+def _calibrated(evidence: FloatArray, failed: NDArray[np.bool_]) -> tuple[FloatArray, float]:
+    """Return the weights of the evidence, (4,), that foretell best, and their log posterior.
+
+    Logistic regression by Newton's method; a step that makes it worse is halved.
+    """
+    mean, deviation = CALIBRATION
+    signs = np.where(failed, 1.0, -1.0)
+
+    def posterior(weights: FloatArray) -> float:
+        prior = -0.5 * np.square((weights - mean) / deviation).sum()
+        return float(log_expit(signs * (evidence @ weights)).sum() + prior)
+
+    weights, best = mean, posterior(mean)
+    for _ in range(NEWTON_STEPS):
+        chance = expit(evidence @ weights)
+        slope = evidence.T @ (failed - chance) - (weights - mean) / deviation**2
+        spread = (evidence.T * (chance * (1.0 - chance))) @ evidence + np.diag(deviation**-2.0)
+        step = np.linalg.solve(spread, slope)
+        while (reached := posterior(weights + step)) < best and np.abs(step).max() > SURE:
+            step = 0.5 * step
+        if reached <= best:
+            break
+        weights, best = weights + step, reached
+    return weights, best

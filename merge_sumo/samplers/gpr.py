@@ -17,14 +17,12 @@ from merge_sumo.score import FAILURE_SCORE
 
 QUERIES: Final = 4000
 """p, the uniform queries among which a batch is chosen."""
-EPSILON0: Final = 0.1
+EPSILON0: Final = 0.05
 ALPHA: Final = 0.95
 """epsilon = EPSILON0 ALPHA^(i-1) is the share of exploring picks in batch i."""
 Z_EXPLOIT: Final = (4.0, 1.0)
 Z_EXPLORE: Final = (1.0, 2.0)
 """Powers (z1, z2) and (z3, z4) of the predicted badness and of its variance."""
-COVERED: Final = 0.8
-"""Share of a pick's ball that counts as covered for the later picks of the batch."""
 FLOOR: Final = 1e-3
 """What a query is worth even where all is covered."""
 XI: Final = 3.0
@@ -34,8 +32,8 @@ NOISE: Final = 1e-2
 surrogate can only take as noise."""
 MAX_LEARNED: Final = 600
 """Cases that the process learns from; what bounds the time per batch in a long campaign."""
-LENGTH_BOUNDS: Final = (0.05, 5.0)
-"""Bounds of the kernel's length scales in the unit cube. Below the FMC's radius a surrogate
+LENGTH_BOUNDS: Final = (0.035, 5.0)
+"""Bounds of the kernel's length scales in the unit cube. Far below the FMC's radius a surrogate
 explains a jump by forgetting its neighbours."""
 
 
@@ -102,7 +100,7 @@ class _Posterior:
         quality[self._taken] = -np.inf
         best = int(np.argmax(quality))
         self._taken[best] = True
-        self._ground.cover(self._balls[best], COVERED)
+        self._ground.cover(self._balls[best], 1.0)
         covariance = self._kernel(self._queries[[best]], self._queries)[0]
         covariance -= self._explained[:, best] @ self._explained
         step = covariance / np.sqrt(variance[best] + NOISE)

@@ -1,4 +1,4 @@
-"""The Gaussian process of `coverage`: a margin that is learned, and what it says of failing.
+"""The Gaussian processes of `coverage`: what a margin that is learned says of failing.
 
 The kernel is var * prod_j k_j(|z_j - z'_j| / l_j) in coordinates z = Q^T x. The rotation Q turns
 the first axis along the mean slope of the margin: who goes first changes across a slanted curve,
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
-from scipy.special import ndtr
+from scipy.special import log_ndtr, ndtr
 
 from merge_sumo.case import FloatArray
 from merge_sumo.samplers.base import LevelHistory
@@ -31,55 +31,136 @@ LOG_PRIOR_LENGTH: Final = (np.log(0.4), 1.0)
 """Mean and standard deviation of the logarithms of the parameters before anything is known."""
 VARIANCE_BOUNDS: Final = (1e-2, 1e3)
 LENGTH_BOUNDS: Final = (0.03, 10.0)
+TREND: Final = 4.0
+"""Prior variance of the plane to which a branch goes back."""
 CLIPPED: Final = 2.0
 """Margins are clipped at this for the slope, which is sought near the failures."""
 ITERATIONS: Final = 25
 
 
+class Process:
+    """A Gaussian process on values; mean and variance at places that it has seen or not."""
+
+    def __init__(
+        self,
+        points: FloatArray,
+        values: FloatArray,
+        rotation: FloatArray,
+        *,
+        rough: bool = False,
+        trend: float = 0.0,
+    ) -> None:
+        """Learn `values`, (N,), at `points`, (N, d).
+
+        `trend` is the prior variance of a plane to which the process goes back far from all cases.
+        """
+        self._rotation, self._rough, self._trend = rotation, rough, trend
+        self._values = values
+        self._points = points @ rotation
+        some = spaced(points, SPACING, LEARN_FROM)
+        seen = self._points[some]
+        plane = trend * (1.0 + seen @ seen.T)
+        self._variance, self._lengths = _learn_kernel(seen, values[some], plane, rough)
+        gram = self._covariance(self._points) + NOISE * np.eye(len(points))
+        self._factor = cholesky(gram, lower=True)
+        self._alpha = cho_solve((self._factor, True), values)
+
+    def left_out(self) -> tuple[FloatArray, FloatArray]:
+        """Return mean and variance at each case, (N,), as seen by all the others.
+
+        Leave-one-out predictions in closed form: Rasmussen and Williams (2006), eq. (5.12).
+        """
+        inverse = solve_triangular(self._factor, np.eye(len(self._factor)), lower=True)
+        precision = np.square(inverse).sum(axis=0)
+        return self._values - self._alpha / precision, 1.0 / precision
+
+    def at(self, queries: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and variance at queries, (m, d), as (m,)."""
+        turned = queries @ self._rotation
+        cross = self._covariance(turned)
+        explained = solve_triangular(self._factor, cross, lower=True)
+        prior = self._variance + self._trend * (1.0 + np.square(turned).sum(axis=1))
+        return cross.T @ self._alpha, prior - np.square(explained).sum(axis=0)
+
+    def _covariance(self, others: FloatArray) -> FloatArray:
+        correlation, _ = _correlation(self._points, others, self._lengths, self._rough)
+        return self._variance * correlation + self._trend * (1.0 + self._points @ others.T)
+
+
 class Margin:
-    """A Gaussian process on a margin of which an interval means failure."""
+    """A process on a margin of which an interval means failure."""
 
     def __init__(
         self, points: FloatArray, values: FloatArray, low: float, high: float, *, rough: bool
     ) -> None:
         """Learn `values`, (N,), at `points`, (N, d); between `low` and `high` a case fails."""
         self._interval = low, high
-        self._rough = rough
         self.rotation = _rotation(points, values)
-        self._values = values
-        self._points = points @ self.rotation
-        some = spaced(points, SPACING, LEARN_FROM)
-        self._variance, self._lengths = _learn_kernel(self._points[some], values[some], rough)
-        gram = self._covariance(self._points) + NOISE * np.eye(len(points))
-        self._factor = cholesky(gram, lower=True)
-        self._alpha = cho_solve((self._factor, True), values)
+        self.process = Process(points, values, self.rotation, rough=rough)
 
     def left_out(self) -> FloatArray:
-        """Return for each case, (N,), its probability of failing as seen by all the others.
-
-        Leave-one-out predictions in closed form: Rasmussen and Williams (2006), eq. (5.12).
-        """
-        inverse = solve_triangular(self._factor, np.eye(len(self._factor)), lower=True)
-        precision = np.square(inverse).sum(axis=0)
-        return self._probability(self._values - self._alpha / precision, 1.0 / precision)
+        """Return for each case, (N,), its probability of failing as seen by all the others."""
+        return self._probability(*self.process.left_out())
 
     def at(self, queries: FloatArray) -> FloatArray:
         """Return the probability of failing at queries, (m, d)."""
-        cross = self._covariance(queries @ self.rotation)
-        explained = solve_triangular(self._factor, cross, lower=True)
-        variance = self._variance - np.square(explained).sum(axis=0)
-        return self._probability(cross.T @ self._alpha, variance)
-
-    def _covariance(self, others: FloatArray) -> FloatArray:
-        correlation, _ = _correlation(self._points, others, self._lengths, self._rough)
-        return self._variance * correlation
+        return self._probability(*self.process.at(queries))
 
     def _probability(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
         low, high = self._interval
-        deviation = np.sqrt(np.maximum(variance, 1e-12))
+        deviation = _deviation(variance)
         return np.asarray(
             ndtr((high - mean) / deviation) - ndtr((low - mean) / deviation), dtype=np.float64
         )
+
+
+class Branches:
+    """Two processes on the margin, one for each sign of it: the margin may jump in between.
+
+    A process over both signs tells which one a case has. There it fails where the size of the
+    margin, which the cases of this sign foretell, is below 1. So a failure is expected where a
+    branch comes down to the failing interval before the other one takes over, and none where the
+    margin jumps over it.
+    """
+
+    def __init__(self, points: FloatArray, values: FloatArray, both: Margin) -> None:
+        """Learn `values`, (N,), at `points`, (N, d), as `both` has: from -1 to 1 a case fails."""
+        self._points, self._positive, self._both = points, values >= 0.0, both.process
+        self._branches = [
+            Process(points[of], np.abs(values[of]), both.rotation, trend=TREND)
+            for of in (~self._positive, self._positive)
+        ]
+
+    def left_out(self) -> FloatArray:
+        """Return for each case, (N,), its probability of failing as seen by all the others."""
+        failing = []
+        for branch, of in zip(self._branches, (~self._positive, self._positive), strict=True):
+            chance = np.empty(len(self._points))
+            chance[of] = _below_one(*branch.left_out())
+            chance[~of] = _below_one(*branch.at(self._points[~of]))
+            failing.append(chance)
+        return self._mixed(failing, self._both.left_out())
+
+    def at(self, queries: FloatArray) -> FloatArray:
+        """Return the probability of failing at queries, (m, d)."""
+        failing = [_below_one(*branch.at(queries)) for branch in self._branches]
+        return self._mixed(failing, self._both.at(queries))
+
+    def _mixed(self, failing: list[FloatArray], sign: tuple[FloatArray, FloatArray]) -> FloatArray:
+        mean, variance = sign
+        positive = ndtr(mean / _deviation(variance))
+        return np.asarray((1.0 - positive) * failing[0] + positive * failing[1], dtype=np.float64)
+
+
+def _deviation(variance: FloatArray) -> FloatArray:
+    return np.sqrt(np.maximum(variance, 1e-12))
+
+
+def _below_one(mean: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return P(g < 1) of a normal g that is known to be positive."""
+    deviation = _deviation(variance)
+    above = log_ndtr((mean - 1.0) / deviation) - log_ndtr(mean / deviation)
+    return np.asarray(-np.expm1(above), dtype=np.float64)
 
 
 def spaced(points: FloatArray, spacing: float, most: int) -> NDArray[np.int64]:
@@ -134,9 +215,15 @@ def _correlation(
     return correlation, scaled
 
 
-def _learn_kernel(points: FloatArray, values: FloatArray, rough: bool) -> tuple[float, FloatArray]:
-    """Return variance and lengths, (d,), of the largest posterior density."""
+def _learn_kernel(
+    points: FloatArray, values: FloatArray, plane: FloatArray, rough: bool
+) -> tuple[float, FloatArray]:
+    """Return variance and lengths, (d,), of the largest posterior density.
+
+    `plane` is the covariance, (n, n), that is there besides.
+    """
     n, dims = points.shape
+    fixed = plane + NOISE * np.eye(n)
     priors = np.array([LOG_PRIOR_VARIANCE, *[LOG_PRIOR_LENGTH] * dims])
     bounds = np.log([VARIANCE_BOUNDS, *[LENGTH_BOUNDS] * dims])
 
@@ -144,7 +231,7 @@ def _learn_kernel(points: FloatArray, values: FloatArray, rough: bool) -> tuple[
         """Rasmussen and Williams (2006), eq. (2.30) and (5.9), with the prior."""
         correlation, scaled = _correlation(points, points, np.exp(logs[1:]), rough)
         covariance = np.exp(logs[0]) * correlation
-        factor = cholesky(covariance + NOISE * np.eye(n), lower=True)
+        factor = cholesky(covariance + fixed, lower=True)
         alpha = cho_solve((factor, True), values)
         weights = (cho_solve((factor, True), np.eye(n)) - np.outer(alpha, alpha)) * covariance
         # d log k_j / d log l_j: u of Matern 1/2, u^2 / (1 + u) of Matern 3/2.

@@ -54,6 +54,20 @@ class TrainingSettings:
     check_cases: int = CHECK_CASES
 
 
+LEVEL_SETTINGS: Final = {
+    1: TrainingSettings(),
+    2: TrainingSettings(
+        refine=RefineSettings(
+            rounds=26, starts=2_500, midway=0.05, searched=600, kept_rounds=8, learning_rate=4e-4
+        )
+    ),
+}
+"""Settings by the level of the driver. An opponent that reacts makes the game harder: level 2 takes
+more games, nearly all from the pool's own starts, and forgets what earlier policies were worth.
+Level 1 is not driven as far on purpose: the closer it is to its best response, the more corners its
+choices have, and the farther level 2 stays from its own."""
+
+
 @dataclass(frozen=True, slots=True)
 class TrainingProgress:
     """Where the training of a network is: a line of its log.
@@ -108,14 +122,15 @@ def train_library(
     Next to each network lies a log, `<name>.training.jsonl`. Raises `UserError` when an opponent
     is missing, the folder has such a network of another plan, or the folder cannot be written.
     """
-    weights, settings = weights or RewardWeights(), settings or TrainingSettings()
+    weights = weights or RewardWeights()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror}") from error
-    for pair in PAIRS:
+    for level, pair in enumerate(PAIRS, start=1):
+        of_level = settings or LEVEL_SETTINGS[level]
         plans = {
-            name: _plan(folder, name, seed, weights, settings) for name in pair if name in names
+            name: _plan(folder, name, seed, weights, of_level) for name in pair if name in names
         }
         tasks = []
         for name, plan in plans.items():
@@ -128,7 +143,7 @@ def train_library(
                     )
                 role, opponent = OPPONENTS[name]
                 network = None if opponent == "level0" else load_network(opponent, folder)
-                tasks.append(_Task(name, role, network, weights, seed, settings))
+                tasks.append(_Task(name, role, network, weights, seed, of_level))
             elif on_done is not None:
                 on_done(name, None)
         for trained, network, check, seconds in _train_beside(folder, tasks, on_progress):
