@@ -51,13 +51,13 @@ BEST: Final = 150
 REFINED_REACH: Final = 0.03
 SHORTLIST: Final = 2000
 """Candidates from which the batch is picked."""
-PICKED: Final = 0.6
+PICKED: Final = 0.8
 """Share of a pick's ball that counts as covered at least for the later picks of the batch."""
 NO_GAP_M: Final = 200.0
 """Gap of a VUT that never arrives: the POV goes first, as far ahead as one can be."""
 MAX_LEARNED: Final = 1000
 """Cases that a process learns from; what bounds the time per batch in a long campaign."""
-BRANCH_FROM: Final = 4
+BRANCH_FROM: Final = 20
 """Cases on either side that it takes to learn the gap of each side by itself."""
 NEAR: Final = 0.005
 """Distances below this are not told apart."""
@@ -72,7 +72,7 @@ SURE: Final = 1e-3
 """Probabilities nearer to 0 or 1 than this are not told apart, nor are weights of evidence."""
 NEAREST: Final = 3
 """Failures that it takes to aim at failures alone, and else how many cases stand in for them."""
-PATIENCE: Final = 60
+PATIENCE: Final = 40
 """Cases that are run before anything stands in for failures."""
 JUDGED_FROM: Final = 3
 """Failures, and safe cases, that it takes to tell somebody else P(fail)."""
@@ -141,11 +141,14 @@ class CoverageSampler(Sampler):
             return _Search(history, level, rng, n).batch(n)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
-        """Return how many cases each level gets: one each, the rest by the largest next gain."""
+        """Return how many cases each level gets: half of them evenly, the rest by the next gain.
+
+        A level whose failures are rare promises next to nothing until one of them is found.
+        """
         proposed = {level: self.proposed(level) for level in self.pool.levels}
         if min(len(self.told(level)) for level in self.pool.levels) < 2:
             return even_shares(proposed, n)
-        shares = even_shares(proposed, min(n, len(proposed)))
+        shares = even_shares(proposed, max(min(n, len(proposed)), n // 2))
         for _ in range(n - sum(shares.values())):
             best = max(shares, key=lambda level: proposals[level].gain[shares[level]])
             shares[best] += 1
