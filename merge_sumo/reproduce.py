@@ -344,6 +344,18 @@ def _markdown(table: Mapping[str, Result]) -> str:
             ours = result.compared[name].fmc_over_truth_median
             cells.append(f"{_or_dash(ours, '.2f')} ({_or_dash(share, '.2f')})")
         lines.append(f"| {name} / truth | " + " | ".join(cells) + " |")
+    for name in ADAPTIVE:
+        results = [(result, result.compared[name]) for result in table.values()]
+        early = max(len(results[0][1].cases_by_batch) // 4, 1) - 1
+        cases = results[0][1].cases_by_batch[early]
+        cells = [
+            _or_dash(
+                found.fmc_by_batch_median[early] / result.truth_fmc if result.truth_fmc else None,
+                ".2f",
+            )
+            for result, found in results
+        ]
+        lines.append(f"| {name} / truth after {cases} cases | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 

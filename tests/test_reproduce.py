@@ -59,6 +59,7 @@ class TestATinyReproduction:
             assert f"{ours:.4f}" in markdown
             assert f"{column['truth_fmc']:.4f} ({column['paper_fmc']['truth']:.4f})" in markdown
         assert "| gpr / truth |" in markdown
+        assert "| coverage / truth after " in markdown
 
     def test_says_how_far_it_is(self, tiny):
         _, said = tiny
