@@ -22,6 +22,8 @@ from merge_sumo.scenario import DT_S, LEVEL0_A_MPS2, LEVEL0_V_MPS, MAX_STEPS
 from merge_sumo.score import Measures, Outcome
 from merge_sumo.trajectory import End, Trajectory
 
+KEEPS_UP_MPS2: Final = 0.2
+"""A vehicle that falls back by no more than this keeps up with its level-0 profile."""
 CEDED_MPS: Final = 1.0
 """A vehicle that is this much slower than its level-0 profile has yielded."""
 ROUNDING_MPS: Final = 1e-6
@@ -60,14 +62,6 @@ class Diagnosis:
     pov_yields_s: float | None
     kind: Kind | None
 
-    @property
-    def first_to_yield(self) -> str | None:
-        """Return "POV", "VUT" or "both" (in the same step); None when nobody yielded."""
-        vut, pov = self.vut_yields_s, self.pov_yields_s
-        if vut is None or pov is None:
-            return "POV" if pov is not None else "VUT" if vut is not None else None
-        return "both" if vut == pov else "VUT" if vut < pov else "POV"
-
 
 def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
     """Return who yielded in an episode and which kind of failure it was."""
@@ -83,12 +77,16 @@ def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
 
 
 def _yields_s(behind_mps: FloatArray) -> float | None:
-    """Return when a vehicle began to yield that is `behind_mps`, (T + 1,), its level-0 profile."""
+    """Return when a vehicle began to yield that is `behind_mps`, (T + 1,), its level-0 profile.
+
+    That is when it last kept up with the profile; an actuator that lags is behind it all the time.
+    """
     ceded = np.flatnonzero(behind_mps >= CEDED_MPS - ROUNDING_MPS)
     if not ceded.size:
         return None
-    on_profile = np.flatnonzero(behind_mps[: ceded[0]] <= ROUNDING_MPS)
-    return round(float(on_profile[-1]) * DT_S, 1)
+    falls_back_mps = np.diff(behind_mps[: ceded[0] + 1])
+    keeps_up = np.flatnonzero(falls_back_mps <= KEEPS_UP_MPS2 * DT_S + ROUNDING_MPS)
+    return round(float(keeps_up[-1] + 1) * DT_S, 1) if keeps_up.size else 0.0
 
 
 def _kind(vut_s: float | None, pov_s: float | None, way_out_until_s: float | None) -> Kind:

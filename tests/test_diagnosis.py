@@ -57,24 +57,33 @@ COASTS = phases((2.0, 1.0), (6.0, 0.0))
 class TestWhoYields:
     def test_nobody_who_follows_the_level_0_profile(self):
         found = diagnosed(meeting(KEEP, LEVEL0))
-        assert (found.pov_yields_s, found.vut_yields_s, found.first_to_yield) == (None, None, None)
+        assert (found.pov_yields_s, found.vut_yields_s) == (None, None)
 
     def test_nobody_who_goes_faster_than_it(self):
         found = diagnosed(meeting(KEEP + 1.0, 2.0 * LEVEL0))
-        assert found.first_to_yield is None
+        assert (found.pov_yields_s, found.vut_yields_s) == (None, None)
 
     def test_a_pov_from_when_it_brakes(self):
         found = diagnosed(meeting(BRAKES, LEVEL0))
-        assert (found.pov_yields_s, found.first_to_yield) == (3.0, "POV")
+        assert (found.pov_yields_s, found.vut_yields_s) == (3.0, None)
 
     def test_a_vut_from_when_it_coasts(self):
         found = diagnosed(meeting(KEEP, COASTS))
-        assert (found.vut_yields_s, found.first_to_yield) == (2.0, "VUT")
+        assert (found.pov_yields_s, found.vut_yields_s) == (None, 2.0)
 
     def test_both_together(self):
         late = phases((2.0, 0.0), (6.0, -1.0))
         found = diagnosed(meeting(late, COASTS))
-        assert (found.first_to_yield, found.vut_yields_s) == ("both", found.pov_yields_s)
+        assert (found.pov_yields_s, found.vut_yields_s) == (2.0, 2.0)
+
+    def test_a_vut_that_lags_behind_its_commands_from_when_it_coasts(self):
+        lagging, command = [], 0.0
+        for wanted in COASTS:
+            command += (wanted - command) * 0.3
+            lagging.append(command)
+        assert diagnosed(meeting(KEEP, np.array(lagging))).vut_yields_s == pytest.approx(
+            2.0, abs=0.1
+        )
 
     def test_nobody_who_is_less_than_1_mps_behind(self):
         a_little = phases((3.0, 0.0), (0.9, -1.0), (4.1, 0.0))
