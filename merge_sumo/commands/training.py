@@ -21,7 +21,7 @@ def train(
     only: Annotated[
         list[str] | None, typer.Option(help="Network to train: pov1, vut1, pov2 or vut2.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same weights.")] = 0,
+    seed: Annotated[int, typer.Option(help="Same seed, same weights on one machine.")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder.  [default: the policies in use]")
     ] = None,

@@ -64,8 +64,8 @@ LEVEL_SETTINGS: Final = {
 }
 """Settings by the level of the driver. An opponent that reacts makes the game harder: level 2 takes
 more games, nearly all from the pool's own starts, and forgets what earlier policies were worth.
-Level 1 is not driven as far on purpose: the closer it is to its best response, the more corners its
-choices have, and the farther level 2 stays from its own."""
+Level 1 is not driven as far: where it was, level 2 stayed farther from its own best response
+(`policies/README.md`)."""
 
 
 @dataclass(frozen=True, slots=True)
