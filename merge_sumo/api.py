@@ -27,7 +27,7 @@ from merge_sumo.conductor import (
 from merge_sumo.errors import UserError
 from merge_sumo.journal import SETTINGS, Run, failures
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.scenario import DEADLINE_S, V_VUT0_MPS
+from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB, V_VUT0_MPS
 from merge_sumo.score import Outcome
 from merge_sumo.summary import Summary, summarise
 from merge_sumo.sumo.net import Net
@@ -140,6 +140,8 @@ def campaign(
     v_vut0_mps: float = V_VUT0_MPS,
     vut_command: str | None = None,
     deadline_s: float = DEADLINE_S,
+    vut_memory_gib: float = MEMORY_GIB,
+    in_process: bool = False,
     stop_after_converged: float | None = None,
     workers: int = 1,
     out: Path | str | None = None,
@@ -158,6 +160,8 @@ def campaign(
         v_vut0_mps: initial speed of the VUT.
         vut_command: command that starts the controller of `vut="traci"`.
         deadline_s: time that a VUT may take for a step before it is a VUT_ERROR.
+        vut_memory_gib: memory that the process of a VUT of your own may take.
+        in_process: run such a VUT in this process, where a debugger reaches it.
         stop_after_converged: stop early when less than this share of new coverage is expected.
         workers: processes that run cases; the outcomes are the same.
         out: new folder to write; `runs/<vut>-<date>` when left out.
@@ -177,6 +181,8 @@ def campaign(
         stop_after_converged=stop_after_converged,
         vut_command=vut_command,
         deadline_s=deadline_s,
+        vut_memory_gib=vut_memory_gib,
+        in_process=in_process,
     )
     name = "".join(letter if letter.isalnum() or letter in "._" else "-" for letter in vut)
     default = Path("runs") / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"

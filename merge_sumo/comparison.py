@@ -106,7 +106,9 @@ class RunComparison:
         return [case for case in self.cases if case.change in telling][:FIRST_LOOKS]
 
 
-def compare_runs(a: Run, b: Run, *, rerun: bool = True, net: Net | None = None) -> RunComparison:
+def compare_runs(
+    a: Run, b: Run, *, rerun: bool = True, net: Net | None = None, trust: bool = False
+) -> RunComparison:
     """Compare two campaigns level by level.
 
     Args:
@@ -114,6 +116,7 @@ def compare_runs(a: Run, b: Run, *, rerun: bool = True, net: Net | None = None) 
         b: campaign of the VUT after.
         rerun: run the failures of each with the VUT of the other.
         net: net for that; must be the one of the campaigns.
+        trust: run the controllers that the folders name although they may be a stranger's.
 
     Raises `UserError` where the campaigns have no level in common, differ in the initial speed of
     the VUT, or were run on another net than the one to run again on.
@@ -125,8 +128,8 @@ def compare_runs(a: Run, b: Run, *, rerun: bool = True, net: Net | None = None) 
     again_a = again_b = _Again({}, "was not run again")
     if rerun:
         net = _common_net(a, b, net or Net())
-        again_b = _run_again(b, failing_a, net)
-        again_a = _run_again(a, failing_b, net)
+        again_b = _run_again(b, failing_a, net, trust=trust)
+        again_a = _run_again(a, failing_b, net, trust=trust)
     cases = [
         ComparedCase(
             "A",
@@ -188,7 +191,7 @@ class _Again:
     how: str
 
 
-def _run_again(run: Run, failing: Sequence[Outcome], net: Net) -> _Again:
+def _run_again(run: Run, failing: Sequence[Outcome], net: Net, *, trust: bool) -> _Again:
     """Run a campaign's VUT on the other campaign's failures, if it is still the same VUT."""
     told = [o for o in run.outcomes if o.measures.score is not None]
     told = sorted(told, key=lambda o: (o.measures.score, o.index))[:CHECKED]
@@ -196,7 +199,7 @@ def _run_again(run: Run, failing: Sequence[Outcome], net: Net) -> _Again:
     if not failing:
         return _Again({}, "had nothing to run")
     measures: dict[int, Measures] = {}
-    vut = settings_of(run.folder, run.settings).vut_factory
+    vut = settings_of(run.folder, run.settings, trust=trust).vut_factory
     with ProvingGround(vut, min(MAX_CORRIDORS, len(cases)), net) as ground:
         for place, trajectory in ground.run(cases):
             measures[place] = measure(trajectory)

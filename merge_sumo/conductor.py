@@ -6,7 +6,7 @@ import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -19,20 +19,30 @@ from merge_sumo.case import Case, Pool
 from merge_sumo.convergence import StoppingRule
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.pov import PovLibrary, available_levels
-from merge_sumo.drivers.vut import VutFactory, vut_factory
+from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.drivers.vuts.files import Files, hashed, sha256_of
+from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.journal import SETTINGS, Journal, Run, failures
 from merge_sumo.rollout import rollout
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.scenario import DEADLINE_S, LEVELS, V_VUT0_MAX_MPS, V_VUT0_MPS, X_VUT0_M
+from merge_sumo.scenario import (
+    DEADLINE_S,
+    LEVELS,
+    MEMORY_GIB,
+    V_VUT0_MAX_MPS,
+    V_VUT0_MPS,
+    X_VUT0_M,
+)
 from merge_sumo.score import Measures, Outcome, measure
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.replay import CONFIG, write_scenario
 from merge_sumo.sumo.world import World
 from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.trust import SEAL, is_own, seal
 from merge_sumo.workers import MAX_DEATHS, Workers, open_workers, when_worker_ends
 
 DEFAULT_CASES: Final = 800
@@ -61,6 +71,8 @@ class CampaignSettings:
     stop_after_converged: float | None = None
     vut_command: str | None = None
     deadline_s: float = DEADLINE_S
+    vut_memory_gib: float = MEMORY_GIB
+    in_process: bool = False
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels."""
@@ -96,13 +108,22 @@ class CampaignSettings:
     @property
     def vut_factory(self) -> VutFactory:
         """What makes the VUT."""
-        options = VutOptions(command=self.vut_command, deadline_s=self.deadline_s)
+        options = VutOptions(
+            command=self.vut_command,
+            deadline_s=self.deadline_s,
+            memory_gib=self.vut_memory_gib,
+            in_process=self.in_process,
+        )
         return vut_factory(self.vut, options)
 
     @property
     def pool(self) -> Pool:
         """The cases to choose from."""
         return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps)
+
+
+_DEFAULTS: Final = {f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING}
+"""What the settings were in a campaign that does not record them."""
 
 
 def parse_levels(text: str) -> tuple[int, ...]:
@@ -188,7 +209,7 @@ class GroundPlan:
 
     def key(self) -> tuple[object, ...]:
         """Return what tells one plan from another."""
-        vut = self.vut.spec, self.vut.options, self.vut.sha256
+        vut = self.vut.spec, self.vut.options, self.vut.files
         return *vut, self.corridors, self.net.sha256, *self.software.items()
 
     def open(self) -> ProvingGround:
@@ -202,10 +223,11 @@ class GroundPlan:
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """What became of one case."""
+    """What became of one case, and the files that had decided on the VUT's answers by then."""
 
     measures: Measures
     trajectory: Trajectory
+    files: Files = field(default_factory=dict)
 
 
 _kept: tuple[tuple[object, ...], ProvingGround] | None = None
@@ -219,13 +241,12 @@ def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
     with _one_at_a_time:
         ground = _ground(plan)
         try:
-            ran: dict[int, Ran] = {}
-            for place, trajectory in ground.run(cases):
-                ran[place] = Ran(measure(trajectory), trajectory)
+            ran = dict(ground.run(cases))
+            files = hashed(ground.vut.files())
         except BaseException:
             _close_ground()  # it stands in the middle of episodes
             raise
-    return [ran[place] for place in range(len(cases))]
+    return [Ran(measure(ran[place]), ran[place], files) for place in range(len(cases))]
 
 
 def _ground(plan: GroundPlan) -> ProvingGround:
@@ -329,9 +350,11 @@ def run_campaign(
     """
     net = net or Net()
     with workers_or_here(workers) as there:
-        run = runs_on(there, _plan(settings, net))
-        with Journal.create(folder, record_of(settings, net)) as journal:
-            return _go_on(settings, net, journal, run, (), on_case, check)
+        run = runs_on(there, _plan(settings, net, folder))
+        record = record_of(settings, net)
+        sealed = {**record, SEAL: seal(record)}
+        with Journal.create(folder, sealed) as journal:
+            return _go_on(settings, sealed, net, journal, run, (), on_case, check)
 
 
 def resume_campaign(
@@ -344,6 +367,7 @@ def resume_campaign(
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
     warn: Callable[[str], None] = lambda _: None,
+    trust: bool = False,
 ) -> Run:
     """Go on with a campaign that was stopped, however it was; return it as `run_campaign` does.
 
@@ -360,14 +384,17 @@ def resume_campaign(
         workers: where cases run, by default in this process.
         check: called after every batch; may raise to stop there.
         warn: told in a sentence what was dropped.
+        trust: run the controller that the folder names although the folder may be a stranger's.
     """
     net = net or Net()
     journal, before, dropped = Journal.reopen(folder)
     with journal, workers_or_here(workers) as there:
-        recorded = {k: v for k, v in before.settings.items() if k != FORCED}
-        settings = settings_of(folder, {**before.settings, **(given or {})})
+        recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, SEAL)}
+        settings = settings_of(folder, before.settings, given, trust=trust)
         record = record_of(settings, net)
-        changes = differences(recorded, record)
+        # What was loaded while it ran must be the same, too, although it is not loaded yet.
+        record["vut_files"] = _files_again(recorded) | (record["vut_files"] or {}) or None
+        changes = differences(_DEFAULTS | recorded, record)
         if changes and not force:
             name, (was, now) = next(iter(changes.items()))
             raise UserError(
@@ -376,18 +403,28 @@ def resume_campaign(
             )
         if dropped:
             warn(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
-        run = runs_on(there, _plan(settings, net))
-        if changes:
+        run = runs_on(there, _plan(settings, net, folder))
+        record[SEAL] = seal(record)
+        if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
-            journal.rewrite_settings({**record, FORCED: [*_forced(before), forced]})
+            record[FORCED] = [*_forced(before), *([forced] if changes else [])]
+        if changes:
+            journal.rewrite_settings(record)
         if on_case is not None:
             for outcome in before.outcomes:
                 on_case(outcome)
-        return _go_on(settings, net, journal, run, before.outcomes, on_case, check)
+        return _go_on(settings, record, net, journal, run, before.outcomes, on_case, check)
+
+
+def _files_again(recorded: Mapping[str, Any]) -> Files:
+    """Return the files that a record names, as they are now."""
+    files = recorded.get("vut_files")
+    return {name: sha256_of(Path(name)) for name in files} if isinstance(files, dict) else {}
 
 
 def _go_on(
     settings: CampaignSettings,
+    record: dict[str, Any],
     net: Net,
     journal: Journal,
     run: RunCases,
@@ -397,8 +434,20 @@ def _go_on(
 ) -> Run:
     sampler = make_sampler(settings.sampler, settings.pool, settings.seed)
     stop = settings.stopping_rule()
-    for ran in conduct(sampler, run, settings.cases, settings.batch, on_case, history, stop):
+    files: Files = dict(record["vut_files"] or {})
+
+    def noting_files(cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
+        for place, done in run(cases):
+            for name, sha256 in done.files.items():
+                files.setdefault(name, sha256)
+            yield place, done
+
+    batches = conduct(sampler, noting_files, settings.cases, settings.batch, on_case, history, stop)
+    for ran in batches:
         journal.append(ran)
+        if len(files) > len(record["vut_files"] or {}):
+            record["vut_files"] = dict(files)
+            journal.rewrite_settings(record)
         check()
     done = Run(journal.folder)
     for outcome in failures(done.outcomes)[:EXPORTED_FAILURES]:
@@ -420,9 +469,11 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
         yield here
 
 
-def _plan(settings: CampaignSettings, net: Net) -> GroundPlan:
+def _plan(settings: CampaignSettings, net: Net, folder: Path) -> GroundPlan:
     return GroundPlan(
-        vut=settings.vut_factory, corridors=min(MAX_CORRIDORS, settings.batch), net=net
+        vut=settings.vut_factory.with_log(folder.resolve() / LOG),
+        corridors=min(MAX_CORRIDORS, settings.batch),
+        net=net,
     )
 
 
@@ -432,14 +483,33 @@ def record_of(settings: CampaignSettings, net: Net) -> dict[str, Any]:
     return {
         **asdict(settings),
         "versions": versions(),
-        "vut_sha256": settings.vut_factory.sha256,
+        "vut_files": settings.vut_factory.files or None,
         "net_sha256": net.sha256,
         "policies_sha256": policies,
     }
 
 
-def settings_of(folder: Path, record: Mapping[str, object]) -> CampaignSettings:
-    """Return the settings in a record; `UserError` where one is missing or something else."""
+def settings_of(
+    folder: Path,
+    recorded: Mapping[str, Any],
+    given: Mapping[str, object] | None = None,
+    *,
+    trust: bool = False,
+) -> CampaignSettings:
+    """Return the settings of a campaign, as its folder records them or as they are given anew.
+
+    They say whose code is run. Raises `UserError` where one is missing or something else, and where
+    the folder may be a stranger's and names a controller that nobody named here, unless we `trust`
+    it.
+    """
+    record = {**recorded, **(given or {})}
+    vut, command = record.get("vut"), record.get("vut_command")
+    named = ("vut" if command is None else "vut_command") in (given or {})
+    if not (trust or named or is_own(record)) and runs_code(str(vut), command):
+        raise UserError(
+            f"{folder} was not made here, and to go on is to run the controller that it names, "
+            f"{command or vut}: say --trust-vut if you trust it"
+        )
     hints = get_type_hints(CampaignSettings)
     values: dict[str, Any] = {}
     for spec in fields(CampaignSettings):

@@ -9,7 +9,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import accumulate
 from pathlib import Path
@@ -27,10 +27,12 @@ from merge_sumo.conductor import (
     workers_or_here,
 )
 from merge_sumo.drivers.policies import read_manifest
-from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
+from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
 from merge_sumo.fmc import RADIUS, fmc, regions
 from merge_sumo.journal import UNREADABLE_NPZ
+from merge_sumo.resources import cache_folder
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario import V_VUT0_MPS
@@ -87,7 +89,7 @@ OnCases = Callable[[int], None]
 
 
 def ground_truth(
-    vut: str,
+    vut: str | VutFactory,
     level: int,
     cases: int | None = None,
     seed: int = 0,
@@ -98,84 +100,107 @@ def ground_truth(
 ) -> Truth:
     """Return the ground truth of a VUT at a level, from the cache where it is there.
 
-    The cache's key is a hash of everything that the outcomes depend on: VUT, cases, seed, net,
-    policies, versions, and the sources that decide outcomes. Cases run on `workers`, by default in
-    this process.
+    The cache's key is a hash of what was asked for and of what is ours to know: VUT, cases, seed,
+    net, policies, versions, and the sources that decide outcomes. What the VUT itself loaded while
+    it drove is kept with the truth, and a truth is only used while those files are the same. Cases
+    run on `workers`, by default in this process.
     """
     count = cases or TRUTH_CASES[level]
     if count < 1:
         raise UserError(f"--cases is {count}: it must be 1 or more")
-    folder = cache or cache_folder()
-    path = folder / f"truth-{_key(vut=vut, level=level, cases=count, seed=seed)}.npz"
-    kept = _read_truth(path)
-    if kept is not None:
-        return kept
+    factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
+    kept = Kept(
+        factory.spec, level, count, seed, factory.options.command, factory.options.deadline_s
+    )
+    path = kept.path(cache)
+    found = read_truth(path, level, count)
+    if found is not None:
+        return found
     points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
     scores = np.full(count, np.nan)
-    plan = GroundPlan(vut=vut_factory(vut), corridors=MAX_CORRIDORS, net=Net())
+    files = dict(factory.files or {})
+    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=Net())
     with workers_or_here(workers) as there:
         rows = cast("Sequence[FloatArray]", points)
-        scored = there.run(partial(_scores, plan, level), rows, lambda _: np.nan)
-        for ended, (place, score) in enumerate(scored, start=1):
+        scored = there.run(partial(_scores, plan, level), rows, lambda _: (np.nan, {}))
+        for ended, (place, (score, loaded)) in enumerate(scored, start=1):
             scores[place] = score
+            for name, sha256 in loaded.items():
+                files.setdefault(name, sha256)
             if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
                 on_cases((ended - 1) % PROGRESS_CASES + 1)
     truth = Truth(points, scores)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         torn = path.with_suffix(f".{os.getpid()}.tmp")
         with torn.open("wb") as file:
-            np.savez(file, points=truth.points, score=truth.score)
+            np.savez(file, points=truth.points, score=truth.score, files=json.dumps(files))
         torn.replace(path)
     except OSError as error:
-        raise UserError(f"cannot write the cache {folder}: {error.strerror}") from error
+        raise UserError(f"cannot write the cache {path.parent}: {error.strerror}") from error
     return truth
 
 
-def cached_truth(vut: str, level: int, cache: Path | None = None) -> Truth | None:
-    """Return the ground truth with the default cases and seed if it is in the cache, else None."""
-    key = _key(vut=vut, level=level, cases=TRUTH_CASES[level], seed=0)
-    return _read_truth((cache or cache_folder()) / f"truth-{key}.npz")
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What a truth in the cache is of; nothing of the VUT is loaded to look for it."""
+
+    vut: str
+    level: int
+    cases: int
+    seed: int
+    command: str | None
+    deadline_s: float
+
+    def path(self, cache: Path | None = None) -> Path:
+        """Return the file of the cache that such a truth is in."""
+        package = Path(__file__).resolve().parent
+        sources = hashlib.sha256()
+        for part in DECIDES_OUTCOMES:
+            for source in sorted((package / part).rglob("*.py")) or [package / part]:
+                sources.update(source.read_bytes())
+        # The same name may be another file in another folder.
+        here = str(Path.cwd()) if runs_code(self.vut, self.command) else None
+        depends = {
+            **asdict(self),
+            "here": here,
+            "v_vut0_mps": V_VUT0_MPS,
+            "versions": versions(),
+            "sources": sources.hexdigest(),
+            "net": Net().sha256,
+            "policies": {name: entry["sha256"] for name, entry in read_manifest().items()},
+        }
+        key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
+        return (cache or cache_folder()) / f"truth-{key}.npz"
 
 
-def _read_truth(path: Path) -> Truth | None:
-    """Return what a file of the cache holds; None where there is none, or a torn one."""
+def read_truth(path: Path, level: int, cases: int) -> Truth | None:
+    """Return what a file of the cache holds.
+
+    None where there is none, or it is torn or something else, or a file that the VUT loaded is not
+    what it was.
+    """
     try:
         with np.load(path, allow_pickle=False) as data:
-            return Truth(data["points"], data["score"])
+            points, score = data["points"], data["score"]
+            files = json.loads(str(data["files"]))
     except UNREADABLE_NPZ:
         return None
+    fits = points.shape == (cases, len(dimensions(level))) and score.shape == (cases,)
+    numbers = points.dtype == score.dtype == np.float64
+    if not (fits and numbers and isinstance(files, dict)) or changed(files):
+        return None
+    inside = bool(((points >= 0.0) & (points <= 1.0)).all())
+    return Truth(points, score) if inside else None
 
 
-def cache_folder() -> Path:
-    """Return where ground truths are kept: MERGE_SUMO_CACHE, or the user's cache folder."""
-    named = os.environ.get("MERGE_SUMO_CACHE")
-    if named:
-        return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "merge-sumo"
-
-
-def _key(**what: Any) -> str:
-    package = Path(__file__).resolve().parent
-    sources = hashlib.sha256()
-    for part in DECIDES_OUTCOMES:
-        for source in sorted((package / part).rglob("*.py")) or [package / part]:
-            sources.update(source.read_bytes())
-    depends = {
-        **what,
-        "vut_sha256": vut_factory(what["vut"]).sha256,
-        "v_vut0_mps": V_VUT0_MPS,
-        "versions": versions(),
-        "sources": sources.hexdigest(),
-        "net": Net().sha256,
-        "policies": {name: entry["sha256"] for name, entry in read_manifest().items()},
-    }
-    return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
-
-
-def _scores(plan: GroundPlan, level: int, points: Sequence[FloatArray]) -> Sequence[float]:
+def _scores(
+    plan: GroundPlan, level: int, points: Sequence[FloatArray]
+) -> Sequence[tuple[float, Files]]:
     ran = run_cases(plan, from_unit(np.asarray(points), level))
-    return [np.nan if done.measures.score is None else done.measures.score for done in ran]
+    return [
+        (np.nan if done.measures.score is None else done.measures.score, done.files) for done in ran
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +301,7 @@ class Comparison:
 
 
 def search(
-    vut: str,
+    vut: str | VutFactory,
     levels: tuple[int, ...],
     samplers: Sequence[str],
     *,
@@ -291,7 +316,8 @@ def search(
     A search runs on one of the `workers`, by default in this process.
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
-    plan = GroundPlan(vut=vut_factory(vut), corridors=min(MAX_CORRIDORS, batch), net=Net())
+    factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
+    plan = GroundPlan(vut=factory, corridors=min(MAX_CORRIDORS, batch), net=Net())
     found: dict[int, Search] = {}
     with workers_or_here(workers) as there:
         for place, one in there.run(partial(_searches, plan), tasks, _lost_search, chunk=1):

@@ -458,12 +458,15 @@ def failure_probability(
     confidence: float = 0.95,
     seed: int = 0,
     net: Net | None = None,
+    trust: bool = False,
     on_case: OnCase | None = None,
 ) -> Estimate:
     """Estimate how likely the VUT of a campaign is to fail, with fresh cases in SUMO.
 
     Writes the estimate with all that decides it to `out`, and the fresh outcomes, each with its
     weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
+
+    The controller that a folder names runs only where the folder was made here, or with `trust`.
 
     Raises `UserError` for a distribution or numbers that make no sense, a run whose net or policies
     are not those of today, or files that exist or cannot be written.
@@ -475,7 +478,7 @@ def failure_probability(
     if seed < 0:
         raise UserError(f"--seed is {seed}: it must be 0 or more")
     net = net or Net()
-    settings = settings_of(run.folder, run.settings)
+    settings = settings_of(run.folder, run.settings, trust=trust)
     _same_system(run, record_of(settings, net))
     stated = read_distribution(distribution, settings.levels)
     lines = out.with_suffix(".jsonl")

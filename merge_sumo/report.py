@@ -25,10 +25,10 @@ from merge_sumo.case import SVO, V_POV0, X_POV0, FloatArray, dimensions, to_unit
 from merge_sumo.conductor import SCENARIOS, case_name, versions
 from merge_sumo.diagnosis import CEDED_MPS, MEANING, Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.errors import UserError
-from merge_sumo.experiments import TRUTH_CASES, Truth, cached_truth
+from merge_sumo.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.fmc import RADIUS, fmc
 from merge_sumo.journal import SETTINGS, Run, failures
-from merge_sumo.scenario import DT_S, DX_CRASH_M, LEVELS, V_VUT0_MPS, X_VUT0_M
+from merge_sumo.scenario import DEADLINE_S, DT_S, DX_CRASH_M, LEVELS, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.score import FAILURE_SCORE, Outcome
 from merge_sumo.summary import LevelSummary, Summary, summarise
 from merge_sumo.sumo.net import LaneLine, Net
@@ -453,10 +453,17 @@ def _truth(run: Run, net: Net, level: int) -> Truth | None:
         and settings.get("versions") == versions()
         and settings.get("v_vut0_mps") == V_VUT0_MPS
     )
-    try:
-        return cached_truth(str(settings.get("vut")), level) if same else None
-    except UserError:
-        return None  # a VUT that is no longer where it was
+    if not same:
+        return None
+    kept = Kept(
+        str(settings.get("vut")),
+        level,
+        TRUTH_CASES[level],
+        0,
+        settings.get("vut_command"),
+        settings.get("deadline_s", DEADLINE_S),
+    )
+    return read_truth(kept.path(), level, kept.cases)
 
 
 def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:

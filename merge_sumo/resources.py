@@ -1,7 +1,8 @@
-"""Where the files that travel with the package are: the net and the policies."""
+"""Where files are: the net and the policies that travel with the package, the user's cache."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 
@@ -13,3 +14,11 @@ def resource(name: str) -> Path:
     package = Path(__file__).resolve().parent
     shipped = package / "shipped" / name
     return shipped if shipped.is_dir() else package.parent / name
+
+
+def cache_folder() -> Path:
+    """Return where what is kept for the user is: MERGE_SUMO_CACHE, or the user's cache folder."""
+    named = os.environ.get("MERGE_SUMO_CACHE")
+    if named:
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "merge-sumo"

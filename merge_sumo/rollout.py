@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -10,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.case import Case, FloatArray
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, X_VUT0_M
 from merge_sumo.sumo.world import POV, VUT, SimulationError, World
 from merge_sumo.trajectory import End, Trajectory
@@ -24,6 +25,9 @@ ROUNDING_MPS2: Final = 1e-9
 
 WRONGS: Final = (Exception, SystemExit)
 """A black box may raise anything; only a person's own interruption is not its doing."""
+
+MAX_LOSSES: Final = 2
+"""A case that made the driver lose its memory so often, on its own, is not tried again."""
 
 IDLE: Final = -(2**62)
 """Step count of a corridor without an episode: it never times out."""
@@ -45,8 +49,9 @@ def rollout(
 
     Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
     episode does not depend on the number of corridors nor on its neighbours. What the VUT does
-    wrong ends its episode as VUT_ERROR. When SUMO fails, the episodes that were running end as
-    SIM_ERROR, SUMO is started again, and the others go on.
+    wrong ends its episode as VUT_ERROR; where that took the memory of the others' controllers with
+    it, they begin anew. When SUMO fails, the episodes that were running end as SIM_ERROR, SUMO is
+    started again, and the others go on.
     """
     return _Rollout(world, pov, vut, cases).run()
 
@@ -56,6 +61,13 @@ class _Rollout:
         corridors = world.corridors
         self.world, self.pov, self.vut = world, pov, vut
         self.queue = enumerate(cases)
+        self.again: deque[tuple[int, Case]] = deque()
+        """Episodes that have to begin anew through no fault of theirs."""
+        self.suspects: deque[tuple[int, Case]] = deque()
+        """Those that may have been at fault: each runs alone, so that a second loss is its own."""
+        self.quarantine = False
+        """Whether a suspect runs alone."""
+        self.losses: Counter[int] = Counter()
         self.episodes: list[_Episode | None] = [None] * corridors
         self.active = np.zeros(corridors, dtype=bool)
         self.step = np.zeros(corridors, dtype=np.int64)
@@ -68,19 +80,22 @@ class _Rollout:
         self.row = 0
 
     def run(self) -> Iterator[tuple[int, Trajectory]]:
-        world = self.world
-        self.refill_all()
+        world, everywhere = self.world, range(self.world.corridors)
+        self.refill(everywhere)
         while self.active.any():
             self.observe()
             try:
                 world.advance()
                 world.command(self.ask_drivers())
+            except VutLostError as lost:
+                yield from self.begin_anew(lost)
+                continue
             except SimulationError as error:
                 for corridor in np.flatnonzero(self.active).tolist():
                     yield self.finish(corridor, End.SIM_ERROR, f"SUMO failed: {error}")
                 world.restart()
                 self.errors.clear()
-                self.refill_all()
+                self.refill(everywhere)
                 continue
             self.step += 1
             x_vut_m = world.x_m[VUT]
@@ -88,22 +103,56 @@ class _Rollout:
             if x_vut_m.max() >= 0.0 or self.step.max() >= MAX_STEPS or self.errors:
                 ended = (x_vut_m >= 0.0) | (self.step >= MAX_STEPS)
                 ended[list(self.errors)] = True
-                for corridor in np.flatnonzero(ended).tolist():
+                corridors = np.flatnonzero(ended).tolist()
+                for corridor in corridors:
                     if corridor in self.errors:
                         yield self.finish(corridor, End.VUT_ERROR, self.errors.pop(corridor))
                     else:
                         arrived = x_vut_m[corridor] >= 0.0
                         yield self.finish(corridor, End.MERGED if arrived else End.TIMEOUT)
-                    self.refill(corridor)
+                self.refill(corridors)
 
-    def refill_all(self) -> None:
-        """Begin an episode in every corridor."""
-        for corridor in range(self.world.corridors):
-            self.refill(corridor)
+    def begin_anew(self, lost: VutLostError) -> Iterator[tuple[int, Trajectory]]:
+        """Start over what was running; yield the episode that is known to be at fault, if any."""
+        running = np.flatnonzero(self.active).tolist()
+        guilty = running[0] if len(running) == 1 else lost.corridor
+        for corridor in running:
+            episode = self.episodes[corridor]
+            assert episode is not None, "it runs"  # noqa: S101
+            if guilty is not None and corridor != guilty:
+                self.again.append((episode.index, episode.case))
+                continue
+            self.losses[episode.index] += guilty is not None
+            final = lost.final or self.losses[episode.index] >= MAX_LOSSES
+            if guilty is not None and final:
+                yield self.finish(corridor, End.VUT_ERROR, lost.reason)
+            else:
+                self.suspects.append((episode.index, episode.case))
+        self.errors.clear()
+        self.active[:] = False
+        self.quarantine = bool(self.suspects)
+        self.refill(range(self.world.corridors))
 
-    def refill(self, corridor: int) -> None:
-        """Begin the next episode in a corridor, or park it when there is none."""
-        index, case = next(self.queue, (-1, None))
+    def refill(self, corridors: Iterable[int]) -> None:
+        """Begin the next episodes in corridors whose own have ended."""
+        if self.quarantine:  # nothing else runs
+            self.quarantine = bool(self.suspects)
+            corridors = range(self.world.corridors)
+        for corridor in corridors:
+            self.active[corridor] = False
+        for corridor in corridors:
+            self.begin(corridor, *self.next_case())
+
+    def next_case(self) -> tuple[int, Case | None]:
+        """Return what is to run next; None where a corridor is to stay empty."""
+        if self.quarantine:
+            return (-1, None) if self.active.any() else self.suspects.popleft()
+        if self.again:
+            return self.again.popleft()
+        return next(self.queue, (-1, None))
+
+    def begin(self, corridor: int, index: int, case: Case | None) -> None:
+        """Begin an episode in a corridor, or park it."""
         self.active[corridor] = case is not None
         self.step[corridor] = self.clipped[corridor] = 0
         if case is None:
@@ -112,6 +161,7 @@ class _Rollout:
             self.step[corridor] = IDLE
             self.a_min[:, corridor] = self.a_max[:, corridor] = 0.0
             return
+        self.a_min[:, corridor], self.a_max[:, corridor] = A_MIN_MPS2, A_MAX_MPS2
         self.episodes[corridor] = _Episode(index, case, self.row)
         self.world.place(corridor, case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps)
         self.pov.begin(corridor, case)
@@ -144,7 +194,7 @@ class _Rollout:
             answer = np.asarray(self.vut.act(scene), dtype=np.float64)
             if answer.shape != (corridors,):
                 raise ValueError(f"answered shape {answer.shape} instead of ({corridors},)")
-        except SimulationError:
+        except (SimulationError, VutLostError):
             raise
         except WRONGS as error:
             answer = np.full(corridors, np.nan)

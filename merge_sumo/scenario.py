@@ -37,3 +37,6 @@ LEVEL0_V_MPS: Final = 28.0
 
 DEADLINE_S: Final = 5.0
 """A VUT that takes longer than this for one step, or for one reset, is a VUT_ERROR."""
+
+MEMORY_GIB: Final = 4.0
+"""A user's code that takes more memory than this fails to get it."""

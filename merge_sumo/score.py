@@ -25,7 +25,7 @@ from merge_sumo.scenario import (
     V_HW_MIN_MPS,
     V_MIN_MPS,
 )
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
 """lambda: a case fails when its score is below."""
@@ -181,8 +181,7 @@ def measure(trajectory: Trajectory) -> Measures:
         last_avoidable_s=last_avoidable,
         avoidable=avoidable,
         clipped_steps=trajectory.clipped_steps,
-        # Half a character, which a VUT's message may hold, cannot be written.
-        error=trajectory.error and trajectory.error.encode("utf-8", "replace").decode(),
+        error=None if trajectory.error is None else as_reason(trajectory.error),
     )
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
 from merge_sumo.case import Case, FloatArray
 from merge_sumo.scenario import DT_S
@@ -17,6 +19,20 @@ class End(StrEnum):
     TIMEOUT = "TIMEOUT"
     VUT_ERROR = "VUT_ERROR"
     SIM_ERROR = "SIM_ERROR"
+
+
+REASON_CHARACTERS: Final = 600
+_ADDRESS: Final = re.compile(r"\b0x[0-9a-fA-F]{5,}\b")
+
+
+def as_reason(text: str) -> str:
+    """Return what somebody said went wrong as it is recorded: one printable line, not too long.
+
+    Without memory addresses: they differ from run to run, and records of equal runs must not.
+    """
+    line = " ".join(_ADDRESS.sub("0x...", text[: 2 * REASON_CHARACTERS]).split())
+    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    return "".join(shown)[:REASON_CHARACTERS]
 
 
 @dataclass(frozen=True, slots=True)

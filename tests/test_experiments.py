@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
-from merge_sumo import experiments
 from merge_sumo.case import from_unit, to_unit
-from merge_sumo.experiments import Search, Truth, compare, ground_truth, oracle, search
+from merge_sumo.experiments import Kept, Search, Truth, compare, ground_truth, oracle, search
 from merge_sumo.fmc import fmc
 from merge_sumo.score import Measures, Outcome
 from merge_sumo.trajectory import End
@@ -49,11 +48,21 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
     assert sum(counted) == 600
 
 
-@pytest.mark.parametrize("change", [{"vut": "design2"}, {"level": 1}, {"cases": 601}, {"seed": 1}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"vut": "design2"},
+        {"level": 1},
+        {"cases": 601},
+        {"seed": 1},
+        {"command": "./controller"},
+        {"deadline_s": 1.0},
+    ],
+)
 def test_the_key_of_the_cache_names_what_the_truth_depends_on(change):
-    values = {"vut": "design1", "level": 0, "cases": 600, "seed": 0}
-    assert experiments._key(**values) == experiments._key(**values)
-    assert experiments._key(**values) != experiments._key(**(values | change))
+    kept = Kept("design1", 0, 600, 0, None, 5.0)
+    assert kept.path() == replace(kept).path()
+    assert kept.path() != replace(kept, **change).path()
 
 
 def test_a_comparison_says_what_samplers_found_of_the_truth(truth):

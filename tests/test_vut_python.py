@@ -308,6 +308,7 @@ def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
     hashes = []
     for source in (FUNCTION, FUNCTION + "# changed"):
         settings = CampaignSettings(vut=vut(source), levels=(0,), cases=2, batch=2)
-        hashes.append(record_of(settings, Net())["vut_sha256"])
+        (sha256,) = record_of(settings, Net())["vut_files"].values()
+        hashes.append(sha256)
     assert hashes[0] != hashes[1]
-    assert record_of(CampaignSettings(vut="level0", levels=(0,)), Net())["vut_sha256"] is None
+    assert record_of(CampaignSettings(vut="level0", levels=(0,)), Net())["vut_files"] is None

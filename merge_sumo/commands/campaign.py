@@ -14,15 +14,18 @@ import typer
 from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
+    InProcessOption,
     JsonOption,
     NetOption,
+    TrustOption,
     VutCommandOption,
+    VutMemoryOption,
     app,
     say,
 )
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.scenario import DEADLINE_S
+from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
     from merge_sumo.journal import Run
@@ -59,6 +62,8 @@ def campaign(
     ] = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
+    vut_memory: VutMemoryOption = MEMORY_GIB,
+    in_process: InProcessOption = False,
     out: Annotated[
         Path | None, typer.Option(help="New folder to write.  [default: runs/VUT-DATE]")
     ] = None,
@@ -68,6 +73,7 @@ def campaign(
     force: Annotated[
         bool, typer.Option(help="Resume although something differs; campaign.json records it.")
     ] = False,
+    trust_vut: TrustOption = False,
     workers: Annotated[
         int, typer.Option(help="Processes that run cases; the outcomes are the same.")
     ] = 1,
@@ -104,13 +110,15 @@ def campaign(
             stop_after_converged=stop_after_converged,
             vut_command=vut_command,
             deadline_s=deadline,
+            vut_memory_gib=vut_memory,
+            in_process=in_process,
         )
         folder = (
             out or Path("runs") / f"{_as_name(vut)}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
         )
     else:
         given = _given(context)
-        settings = conductor.settings_of(resume, {**read_settings(resume), **given})
+        settings = conductor.settings_of(resume, read_settings(resume), given, trust=trust_vut)
         folder, levels = resume, settings.levels
     title = f"{settings.vut} v level {'/'.join(map(str, levels))}"
     try:
@@ -138,6 +146,7 @@ def campaign(
                     workers=there,
                     check=interrupt.check,
                     warn=say,
+                    trust=trust_vut,
                 )
     except Stopped:
         say(_how_to_go_on(folder, net))
@@ -176,9 +185,11 @@ def _given(context: typer.Context) -> dict[str, object]:
             "seed",
             "stop_after_converged",
             "vut_command",
+            "in_process",
         )
     }
     names |= {"level": "levels", "v_vut0": "v_vut0_mps", "deadline": "deadline_s"}
+    names |= {"vut_memory": "vut_memory_gib"}
     given: dict[str, object] = {}
     for option, name in names.items():
         source = context.get_parameter_source(option)

@@ -10,10 +10,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from merge_sumo.commands.shared import DaskOption, JsonOption, NetOption, RunArgument, app, say
+from merge_sumo.commands.shared import (
+    DaskOption,
+    DeadlineOption,
+    JsonOption,
+    NetOption,
+    RunArgument,
+    TrustOption,
+    VutCommandOption,
+    VutMemoryOption,
+    app,
+    say,
+)
 from merge_sumo.errors import UserError
+from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
+    from merge_sumo.drivers.vut import VutFactory
     from merge_sumo.experiments import Comparison, Quartiles, Truth
     from merge_sumo.workers import Workers
 
@@ -26,26 +39,34 @@ def truth(
         int | None, typer.Option(help="Uniform cases.  [default: 10000, at level 2 20000]")
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
+    vut_command: VutCommandOption = None,
+    deadline: DeadlineOption = DEADLINE_S,
+    vut_memory: VutMemoryOption = MEMORY_GIB,
     workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the ground truth of a VUT at a level, by uniform cases on all cores.
 
-    It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of everything
-    that it depends on.
+    It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of what it
+    depends on, and used again while all files that the VUT has loaded are the same.
 
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
     """
     from merge_sumo import experiments
     from merge_sumo.conductor import one_level
-    from merge_sumo.drivers.vut import vut_factory
     from merge_sumo.fmc import fmc, regions
     from merge_sumo.workers import open_workers
 
     chosen = one_level(level)
-    with open_workers(vut_factory(vut).workers(workers), dask) as there:
-        found = _truth(vut, chosen, cases, seed, there)
+    factory = _factory(vut, vut_command, deadline, vut_memory)
+    with open_workers(factory.workers(workers), dask) as there:
+        found = _truth(factory, chosen, cases, seed, there)
+    if factory.vut.named_only:
+        say(
+            "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
+            "its command and the files that are named there"
+        )
     labels = regions(found.failures).tolist()
     sizes = [labels.count(label) for label in range(max(labels, default=-1) + 1)]
     result = {
@@ -80,6 +101,9 @@ def compare(
     truth_cases: Annotated[
         int | None, typer.Option(help="Cases of the truth.  [default: 10000, at level 2 20000]")
     ] = None,
+    vut_command: VutCommandOption = None,
+    deadline: DeadlineOption = DEADLINE_S,
+    vut_memory: VutMemoryOption = MEMORY_GIB,
     figure: Annotated[
         Path | None,
         typer.Option(help="New file for FMC against cases: .png, .svg or .html.", metavar="FILE"),
@@ -96,27 +120,34 @@ def compare(
     """
     from merge_sumo import experiments, figures
     from merge_sumo.conductor import CampaignSettings, parse_levels
-    from merge_sumo.drivers.vut import vut_factory
     from merge_sumo.fmc import fmc
     from merge_sumo.progress import Counter
     from merge_sumo.workers import open_workers
 
     levels = parse_levels(level)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
+    factory = _factory(vut, vut_command, deadline, vut_memory)
     for name in names:
-        CampaignSettings(vut=vut, levels=levels, sampler=name, cases=cases, batch=batch)
+        CampaignSettings(
+            vut=vut,
+            vut_command=vut_command,
+            levels=levels,
+            sampler=name,
+            cases=cases,
+            batch=batch,
+        )
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")
     if figure is not None:
         figures.check_figure(figure)
     title = f"{vut} v level {'/'.join(map(str, levels))}"
     with (
-        open_workers(vut_factory(vut).workers(workers), dask) as there,
+        open_workers(factory.workers(workers), dask) as there,
         Counter(title, len(names) * seeds, "runs") as counter,
     ):
-        truths = {level: _truth(vut, level, truth_cases, 0, there) for level in levels}
+        truths = {level: _truth(factory, level, truth_cases, 0, there) for level in levels}
         searches = experiments.search(
-            vut,
+            factory,
             levels,
             names,
             seeds=seeds,
@@ -239,6 +270,7 @@ def probability(
         typer.Option(metavar="FILE", help="New file to write.  [default: RUN/probability.json]"),
     ] = None,
     net: NetOption = None,
+    trust_vut: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how likely a VUT is to fail, with an interval that is valid.
@@ -265,6 +297,7 @@ def probability(
             confidence=confidence,
             seed=seed,
             net=Net(net),
+            trust=trust_vut,
             on_case=lambda _: counter.ended(1),
         )
     if as_json:
@@ -288,16 +321,24 @@ def probability(
     typer.echo(f"written: {target}")
 
 
-def _truth(vut: str, level: int, cases: int | None, seed: int, workers: Workers) -> Truth:
-    from merge_sumo import experiments
+def _factory(vut: str, command: str | None, deadline_s: float, memory_gib: float) -> VutFactory:
     from merge_sumo.drivers.vut import vut_factory
+    from merge_sumo.drivers.vuts.base import VutOptions
+
+    options = VutOptions(command=command, deadline_s=deadline_s, memory_gib=memory_gib)
+    return vut_factory(vut, options)
+
+
+def _truth(
+    factory: VutFactory, level: int, cases: int | None, seed: int, workers: Workers
+) -> Truth:
+    from merge_sumo import experiments
     from merge_sumo.progress import Counter
 
-    vut_factory(vut)
     total = experiments.TRUTH_CASES[level] if cases is None else cases
     if total < 1:
         raise UserError(f"--cases is {total}: it must be 1 or more")
-    with Counter(f"truth of {vut} at level {level}", total, "cases") as counter:
+    with Counter(f"truth of {factory.spec} at level {level}", total, "cases") as counter:
         return experiments.ground_truth(
-            vut, level, total, seed, workers=workers, on_cases=counter.ended
+            factory, level, total, seed, workers=workers, on_cases=counter.ended
         )

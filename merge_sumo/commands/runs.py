@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from merge_sumo.commands.shared import JsonOption, NetOption, RunArgument, app
+from merge_sumo.commands.shared import JsonOption, NetOption, RunArgument, TrustOption, app
 from merge_sumo.errors import UserError
 
 if TYPE_CHECKING:
@@ -122,6 +122,7 @@ def compare_runs(
         typer.Option("--rerun/--no-rerun", help="Run the failures of each with the other's VUT."),
     ] = True,
     net: NetOption = None,
+    trust_vut: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare two VUTs, or two versions of one: what got fixed, and what broke.
@@ -138,7 +139,7 @@ def compare_runs(
     if not tolerance >= 0.0:
         raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
     runs = Run(a), Run(b)
-    compared = comparison.compare_runs(*runs, rerun=rerun, net=Net(net))
+    compared = comparison.compare_runs(*runs, rerun=rerun, net=Net(net), trust=trust_vut)
     worse = compared.is_worse(tolerance)
     if as_json:
         typer.echo(json.dumps({**asdict(compared), "tolerance": tolerance, "worse": worse}))

@@ -42,6 +42,24 @@ VutCommandOption = Annotated[
 DeadlineOption = Annotated[
     float, typer.Option(help="Seconds that a VUT may take for a step before it is a VUT_ERROR.")
 ]
+InProcessOption = Annotated[
+    bool,
+    typer.Option(
+        "--in-process",
+        help="Run a VUT of your own in this process, where a debugger reaches it, instead of in "
+        "one of its own that it may ruin.",
+    ),
+]
+VutMemoryOption = Annotated[
+    float, typer.Option(help="GiB of memory that the process of a VUT of your own may take.")
+]
+TrustOption = Annotated[
+    bool,
+    typer.Option(
+        "--trust-vut",
+        help="Run the controller that a folder names although the folder was not made here.",
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 

@@ -9,8 +9,15 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands.shared import DeadlineOption, JsonOption, VutCommandOption, app
-from merge_sumo.scenario import DEADLINE_S
+from merge_sumo.commands.shared import (
+    DeadlineOption,
+    InProcessOption,
+    JsonOption,
+    VutCommandOption,
+    VutMemoryOption,
+    app,
+)
+from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
 
 policies = typer.Typer(help="The learned drivers as files for others.", no_args_is_help=True)
 app.add_typer(policies, name="policies")
@@ -43,6 +50,8 @@ def check_vut(
     vut: Annotated[str, typer.Argument(help="What you would write after --vut.")],
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
+    vut_memory: VutMemoryOption = MEMORY_GIB,
+    in_process: InProcessOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Let a VUT drive a few cases and say what is wrong with it, and what a step of it costs.
@@ -55,7 +64,9 @@ def check_vut(
     from merge_sumo.drivers.vut import vut_factory
     from merge_sumo.drivers.vuts.base import VutOptions
 
-    options = VutOptions(command=vut_command, deadline_s=deadline)
+    options = VutOptions(
+        command=vut_command, deadline_s=deadline, memory_gib=vut_memory, in_process=in_process
+    )
     found = vut_check.check_vut(vut_factory(vut, options))
     if as_json:
         typer.echo(json.dumps({"vut": vut, "ok": not found.problems, **asdict(found)}))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,22 @@ class Scene:
     v_vut_mps: FloatArray
 
 
+class VutLostError(Exception):
+    """What a driver knew of its corridors is gone: their episodes have to begin anew.
+
+    Attributes:
+        reason: what happened.
+        corridor: whose doing it was; None where nobody knows.
+        final: whether the case whose doing it was would do it again; a process that died may have
+            died of what came before.
+    """
+
+    def __init__(self, reason: str, corridor: int | None = None, *, final: bool = False) -> None:
+        """Take what happened, and what is known of it."""
+        super().__init__(reason)
+        self.reason, self.corridor, self.final = reason, corridor, final
+
+
 class Driver(ABC):
     """Drives the same vehicle in K corridors at once; the corridors are independent."""
 
@@ -46,12 +63,17 @@ class Driver(ABC):
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration in each corridor, (K,), m/s2, until the next step.
 
-        A value that is not finite ends the episode of its corridor as VUT_ERROR.
+        A value that is not finite ends the episode of its corridor as VUT_ERROR. Raises
+        `VutLostError` where the episodes of all corridors have to begin anew.
         """
 
     def reason(self, corridor: int) -> str | None:
         """Return why the last answer for a corridor was not finite, if the driver knows."""
         return None
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the files of the user's that have decided on its answers so far."""
+        return ()
 
     def close(self) -> None:  # noqa: B027 (most drivers hold nothing)
         """Release what the driver holds: processes, sockets."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Final
 
 from merge_sumo.drivers.base import Driver
@@ -13,9 +13,11 @@ from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.drivers.policies import load_driver, read_manifest
 from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.drivers.vuts.base import Vut, VutOptions
+from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.drivers.vuts.fmu import fmu_vut
+from merge_sumo.drivers.vuts.hosted import SUPPORTED, hosted_vut
 from merge_sumo.drivers.vuts.onnx import onnx_vut
-from merge_sumo.drivers.vuts.python import installed_vuts, python_vut, vut_of
+from merge_sumo.drivers.vuts.python import installed_vut, installed_vuts, python_vut
 from merge_sumo.drivers.vuts.sumo_model import sumo_vut
 from merge_sumo.drivers.vuts.traci import traci_vut
 from merge_sumo.errors import UserError
@@ -31,14 +33,18 @@ class Kind:
     what: str
     example: str
     prepare: Callable[[str, VutOptions], Vut]
+    hosted: bool = False
+    """Whether it runs a user's code in this process, unless that is hosted in one of its own."""
 
 
 PYTHON: Final = Kind(
     form="MODULE:NAME or FILE.py:NAME",
-    what="a class with act(seen), a function of seen, or a batched class, in this process",
+    what="a class with act(seen), a function of seen, or a batched class",
     example="--vut my_vut.py:MyVut",
     prepare=python_vut,
+    hosted=True,
 )
+INSTALLED: Final = replace(PYTHON, prepare=installed_vut)
 KINDS: Final[dict[str, Kind]] = {
     "traci": Kind(
         form="traci[:PORT]",
@@ -57,12 +63,14 @@ KINDS: Final[dict[str, Kind]] = {
         what="a network from the state to an acceleration, or to values of the 7 actions",
         example="--vut onnx:policy.onnx",
         prepare=onnx_vut,
+        hosted=True,
     ),
     "fmu": Kind(
         form="fmu:FILE[?VARIABLE=NAME&...]",
         what="an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables",
         example='--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"',
         prepare=fmu_vut,
+        hosted=True,
     ),
 }
 """The kinds that have a name of their own before the colon."""
@@ -83,26 +91,29 @@ def built_in_vuts() -> dict[str, Callable[[int], Driver]]:
 class VutFactory:
     """Makes the driver that `spec` names; made of plain values, so that a process can be told it.
 
+    `files` are the user's files that the VUT is made of, with their hashes, as far as they are
+    known before it drives; they are found unless they are given.
+
     Raises `UserError` for a spec that names no VUT, or one that cannot be loaded.
     """
 
     spec: str
     options: VutOptions
+    files: Files | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
         """Find the VUT."""
-        _ = self.vut
+        if self.files is None:
+            object.__setattr__(self, "files", hashed(self.vut.files))
 
     @cached_property
     def vut(self) -> Vut:
         """What the spec names."""
-        return _find(self.spec, self.options)
+        return find_vut(self.spec, self.options)
 
-    @property
-    def sha256(self) -> str | None:
-        """Hash of the file that the VUT was loaded from; None where there is none."""
-        file = self.vut.file
-        return None if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+    def with_log(self, log: Path) -> VutFactory:
+        """Return what makes the same VUT, with what it prints added to a file."""
+        return VutFactory(self.spec, replace(self.options, log=log), self.files)
 
     def workers(self, asked: int | None) -> int:
         """Return in how many processes it is tested: as many as asked, or one a core.
@@ -117,12 +128,29 @@ class VutFactory:
         raise UserError(f"--workers is {asked}: {self.spec} serves at most {most} at a time")
 
     def __call__(self, corridors: int, world: World | None = None) -> Driver:
-        """Return a driver for corridors 0 to `corridors` - 1 of a world."""
+        """Return a driver for corridors 0 to `corridors` - 1 of a world.
+
+        Raises `UserError` where the VUT is not made of the same files as when it was found.
+        """
+        then, now = self.files or {}, hashed(self.vut.files)
+        if set(then.values()) != set(now.values()):
+            raise UserError(
+                f"the files of the VUT {self.spec} are not those with which this began: let them "
+                "be while it runs, and let all workers have the same"
+            )
         return self.vut.make(corridors, world)
 
-    def __reduce__(self) -> tuple[type[VutFactory], tuple[str, VutOptions]]:
-        """Travel as the spec and the options; the VUT is found again on arrival."""
-        return (VutFactory, (self.spec, self.options))
+    def __reduce__(self) -> tuple[type[VutFactory], tuple[str, VutOptions, Files | None]]:
+        """Travel as plain values; the VUT is found again on arrival."""
+        return (VutFactory, (self.spec, self.options, self.files))
+
+
+def runs_code(spec: str, command: str | None) -> bool:
+    """Return whether to test a VUT is to run code that is not of this package or of SUMO."""
+    prefix = spec.partition(":")[0]
+    if prefix == "traci":
+        return command is not None
+    return prefix != "sumo" and spec not in built_in_vuts()
 
 
 def vut_factory(spec: str, options: VutOptions | None = None) -> VutFactory:
@@ -130,10 +158,11 @@ def vut_factory(spec: str, options: VutOptions | None = None) -> VutFactory:
     return VutFactory(spec, options or VutOptions())
 
 
-def _find(spec: str, options: VutOptions) -> Vut:
+def find_vut(spec: str, options: VutOptions) -> Vut:
+    """Return the VUT that a spec names; `UserError` for a name nobody knows."""
     prefix, colon, argument = spec.partition(":")
     if prefix in KINDS:
-        return KINDS[prefix].prepare(argument, options)
+        return _prepared(KINDS[prefix], argument, spec, options)
     if options.command is not None:
         raise UserError(f"--vut-command goes with --vut traci, not with {spec}")
     built_in = built_in_vuts()
@@ -141,18 +170,18 @@ def _find(spec: str, options: VutOptions) -> Vut:
         make = built_in[spec]
         return Vut(make=lambda corridors, _world: make(corridors))
     if colon:
-        return PYTHON.prepare(spec, options)
+        return _prepared(PYTHON, spec, spec, options)
     installed = installed_vuts()
     if spec in installed:
-        try:
-            target = installed[spec].load()
-        except (Exception, SystemExit) as error:
-            raise UserError(
-                f"cannot load the VUT {spec}: {type(error).__name__}: {error}"
-            ) from error
-        return vut_of(target, spec, options)
+        return _prepared(INSTALLED, spec, spec, options)
     names = ", ".join([*built_in, *installed])
     raise UserError(
         f"there is no VUT {spec!r}: choose one of {names}, or bring your own "
         "(`merge-sumo vuts` lists the kinds)"
     )
+
+
+def _prepared(kind: Kind, argument: str, spec: str, options: VutOptions) -> Vut:
+    if kind.hosted and not options.in_process and SUPPORTED:
+        return hosted_vut(spec, options)
+    return kind.prepare(argument, options)

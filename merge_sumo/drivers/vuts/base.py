@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import struct
 import sys
 import threading
 import traceback
@@ -20,7 +21,8 @@ import numpy as np
 from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DEADLINE_S, DT_S, X_VUT0_M
+from merge_sumo.interrupt import Stopped
+from merge_sumo.scenario import DEADLINE_S, DT_S, MEMORY_GIB, X_VUT0_M
 from merge_sumo.sumo.world import World
 
 
@@ -32,16 +34,25 @@ class VutOptions:
         command: command line of a controller that is a program of its own, else None.
         deadline_s: time for one step, and for one reset.
         connect_s: time for a program to start and connect.
+        in_process: whether a user's code runs in this process instead of one of its own: there a
+            debugger reaches it, and what it does wrong may take this process with it.
+        memory_gib: memory that the process of a user's code may take.
+        log: file to which what a controller prints is added; None is standard error.
     """
 
     command: str | None = None
     deadline_s: float = DEADLINE_S
     connect_s: float = 60.0
+    in_process: bool = False
+    memory_gib: float = MEMORY_GIB
+    log: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the times."""
+        """Check the numbers."""
         if not (math.isfinite(self.deadline_s) and self.deadline_s > 0.0):
             raise UserError(f"--deadline is {self.deadline_s}: give seconds, more than 0")
+        if not (math.isfinite(self.memory_gib) and self.memory_gib > 0.0):
+            raise UserError(f"--vut-memory is {self.memory_gib}: give GiB, more than 0")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -53,14 +64,16 @@ class Vut:
         max_corridors: corridors that one driver can serve; None for any number.
         max_workers: processes that can each have such a driver at a time; None for any number.
         vut_type: attributes of the SUMO vType with which SUMO itself drives; None if it does not.
-        file: the file that it was loaded from; None where there is none.
+        files: files of the user's that it is made of, as far as they are known.
+        named_only: whether it may be made of more than `files`, which nobody can know.
     """
 
     make: Callable[[int, World | None], Driver]
     max_corridors: int | None = None
     max_workers: int | None = None
     vut_type: Mapping[str, str] | None = None
-    file: Path | None = None
+    files: tuple[Path, ...] = ()
+    named_only: bool = False
 
 
 class Seen(NamedTuple):
@@ -88,6 +101,46 @@ def seen_at_start(case: Case) -> Seen:
 
 class TooLate(BaseException):
     """A call ran into its deadline. Not an Exception, so that a VUT does not catch it by habit."""
+
+
+NOBODY: Final = -1
+EVERYBODY: Final = -2
+"""Whom a batched VUT is asked for."""
+
+
+class Asked:
+    """Which corridor's controller is being asked, in memory that outlives the process.
+
+    Whoever watches the process reads from it whose doing it was that the process died or hangs.
+    """
+
+    FORMAT: Final = struct.Struct("<Qq")
+
+    def __init__(self) -> None:
+        """Note it where nobody else reads it."""
+        self.shared = False
+        """Whether somebody does: then this process is there for a VUT alone."""
+        self._memory: Any = bytearray(self.FORMAT.size)
+        self._count = 0
+
+    def share(self, memory: Any) -> None:
+        """Note it from now on in a buffer that another process reads, too."""
+        self.shared, self._memory = True, memory
+
+    @classmethod
+    def read(cls, memory: Any) -> tuple[int, int]:
+        """Return from such a buffer how often something was noted, and what was last."""
+        count, corridor = cls.FORMAT.unpack_from(memory)
+        return count, corridor
+
+    def note(self, corridor: int) -> None:
+        """Note a corridor, `NOBODY` or `EVERYBODY`."""
+        self._count += 1
+        self.FORMAT.pack_into(self._memory, 0, self._count, corridor)
+
+
+asked: Final = Asked()
+"""Of this process."""
 
 
 @dataclass(slots=True)
@@ -120,6 +173,7 @@ class Watch:
 
     def __exit__(self, *_: object) -> None:
         """Stop the timer."""
+        asked.note(NOBODY)
         if self._restore is not None:
             self._restore()
             self._restore = None
@@ -130,8 +184,9 @@ class Watch:
         if perf_counter() - self._since_s > self.deadline_s:
             raise TooLate
 
-    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return function(*arguments); `TooLate` when that takes too long."""
+    def call(self, corridor: int, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return function(*arguments), asked for a corridor; `TooLate` when that takes too long."""
+        asked.note(corridor)
         self._since_s = start = perf_counter()
         try:
             answer = function(*arguments)
@@ -142,18 +197,36 @@ class Watch:
         return answer
 
     def reason(self, error: BaseException) -> str:
-        """Return what a call did wrong, with the place where it happened."""
+        """Return what a call did wrong, with the place where it happened.
+
+        Raises the error again where it is no VUT's: a person wants to stop.
+        """
+        if isinstance(error, (Stopped, KeyboardInterrupt)) and not asked.shared:
+            raise error
         if isinstance(error, TooLate):
-            return f"took longer than the deadline of {self.deadline_s:g} s"
+            return self.too_late
         place = ""
         frames = traceback.extract_tb(error.__traceback__)
         if frames and frames[-1].filename != __file__:
             place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"
-        return f"{type(error).__name__}: {error}{place}"
+        return f"{type(error).__name__}: {text_of(error)}{place}"
+
+    @property
+    def too_late(self) -> str:
+        """The reason of a call that was too late."""
+        return f"took longer than the deadline of {self.deadline_s:g} s"
 
 
-WRONGS: Final = (Exception, SystemExit, TooLate)
-"""What a call to a VUT may raise, and that is then its fault."""
+MOST_CHARACTERS: Final = 300
+"""Of what a VUT says of itself."""
+
+
+def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
+    """Return what a thing of a VUT says of itself, shortened; it may raise instead, or lie."""
+    try:
+        return f"{as_text(thing):.{MOST_CHARACTERS}}"
+    except Exception as error:
+        return f"({type(error).__name__} when it was to be shown)"
 
 
 class PerCorridor(Driver):
@@ -187,10 +260,10 @@ class PerCorridor(Driver):
         try:
             with self._watch as watch:
                 if self._renew_first[corridor]:
-                    watch.call(self.renew, corridor)
+                    watch.call(corridor, self.renew, corridor)
                     self._renew_first[corridor] = False
-                watch.call(self.reset, corridor, seen_at_start(case))
-        except WRONGS as error:
+                watch.call(corridor, self.reset, corridor, seen_at_start(case))
+        except BaseException as error:
             self._fault(corridor, f"reset: {self._watch.reason(error)}")
 
     def act(self, scene: Scene) -> FloatArray:
@@ -209,8 +282,8 @@ class PerCorridor(Driver):
                     continue
                 try:
                     seen = Seen(round(step * DT_S, 1), *state)
-                    answers[k] = as_number(watch.call(self.answer, k, seen))
-                except WRONGS as error:
+                    answers[k] = watch.call(k, self._number, k, seen)
+                except BaseException as error:
                     self._fault(k, watch.reason(error))
                     answers[k] = math.nan
         return np.array(answers)
@@ -218,6 +291,9 @@ class PerCorridor(Driver):
     def reason(self, corridor: int) -> str | None:
         """Return what the controller of a corridor did wrong."""
         return self._reasons[corridor]
+
+    def _number(self, corridor: int, seen: Seen) -> float:
+        return as_number(self.answer(corridor, seen))
 
     def _fault(self, corridor: int, reason: str) -> None:
         self._reasons[corridor] = reason
@@ -236,4 +312,5 @@ def as_number(answer: Any) -> float:
         return float(answer)
     if isinstance(answer, np.ndarray) and answer.shape == () and answer.dtype.kind in "fiu":
         return float(answer)
-    raise WrongAnswerError(f"answered {answer!r:.60} ({type(answer).__name__}) instead of a number")
+    said = text_of(answer, repr)[:60]
+    raise WrongAnswerError(f"answered {said} ({type(answer).__name__}) instead of a number")

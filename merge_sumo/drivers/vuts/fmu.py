@@ -35,7 +35,7 @@ def fmu_vut(argument: str, options: VutOptions) -> Vut:
     def make(corridors: int, _world: World | None) -> Driver:
         return FmuVut(corridors, unit, options.deadline_s)
 
-    return Vut(make=make, max_corridors=1 if unit.only_once else None, file=Path(file))
+    return Vut(make=make, max_corridors=1 if unit.only_once else None, files=(Path(file),))
 
 
 class Unit:

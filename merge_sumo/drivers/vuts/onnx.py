@@ -34,7 +34,7 @@ def onnx_vut(argument: str, options: VutOptions) -> Vut:
     def make(corridors: int, _world: World | None) -> Driver:
         return OnnxVut(corridors, network, options.deadline_s)
 
-    return Vut(make=make, file=Path(file))
+    return Vut(make=make, files=(Path(file),))
 
 
 class Network:

@@ -7,17 +7,17 @@ import shlex
 import shutil
 import signal
 import subprocess
-import tempfile
 from contextlib import suppress
-from typing import IO, Final
+from pathlib import Path
+from typing import Final
 
+from merge_sumo.drivers.vuts.output import Output
 from merge_sumo.errors import UserError
 
 PORT_FIELD: Final = "{port}"
 PORT_VARIABLE: Final = "MERGE_SUMO_PORT"
 GRACE_S: Final = 2.0
 """Time that a program has to end by itself before it is killed."""
-TAIL_BYTES: Final = 2000
 
 
 def split_command(command: str) -> list[str]:
@@ -35,23 +35,23 @@ def split_command(command: str) -> list[str]:
 
 
 class Program:
-    """A running program in a process group of its own; what it prints goes to a nameless file."""
+    """A running program in a process group of its own; what it prints goes to a log."""
 
-    def __init__(self, arguments: list[str], port: int) -> None:
+    def __init__(self, arguments: list[str], port: int, log: Path | None = None) -> None:
         """Start it, told the port as `{port}` in its arguments and by the environment."""
-        self._output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed in `stop`)
         try:
             self._process = subprocess.Popen(
                 [argument.replace(PORT_FIELD, str(port)) for argument in arguments],
                 stdin=subprocess.DEVNULL,
-                stdout=self._output,
+                stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, PORT_VARIABLE: str(port)},
                 start_new_session=True,
             )
         except OSError as error:
-            self._output.close()
             raise UserError(f"--vut-command cannot be started: {error.strerror}") from error
+        assert self._process.stdout is not None, "piped"  # noqa: S101
+        self._output = Output(self._process.stdout, log)
 
     @property
     def running(self) -> bool:
@@ -65,10 +65,8 @@ class Program:
         except subprocess.TimeoutExpired:
             return ""
         how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        size = self._output.seek(0, os.SEEK_END)
-        self._output.seek(max(size - TAIL_BYTES, 0))
-        lines = self._output.read().decode("utf-8", errors="replace").strip().splitlines()
-        return f"the controller {how}" + (f": {lines[-1]:.200}" if lines else "")
+        line = self._output.last_line()
+        return f"the controller {how}" + (f": {line:.200}" if line else "")
 
     def stop(self, grace_s: float = GRACE_S) -> None:
         """End the program and what it started; it may end by itself for a while first."""

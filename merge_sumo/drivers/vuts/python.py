@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.case import Case, FloatArray
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.drivers.vuts.base import (
-    WRONGS,
+    EVERYBODY,
+    NOBODY,
     PerCorridor,
     Seen,
     Vut,
@@ -28,6 +29,7 @@ from merge_sumo.drivers.vuts.base import (
     Watch,
     WrongAnswerError,
     seen_at_start,
+    text_of,
 )
 from merge_sumo.errors import UserError
 from merge_sumo.scenario import DT_S
@@ -42,6 +44,16 @@ def installed_vuts() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
+def installed_vut(name: str, options: VutOptions) -> Vut:
+    """Return the VUT that an installed package registers; `UserError` when it cannot be loaded."""
+    try:
+        target = installed_vuts()[name].load()
+    except (Exception, SystemExit) as error:
+        raise UserError(_cannot_load(name, error)) from error
+    file = getattr(sys.modules.get(getattr(target, "__module__", "")), "__file__", None)
+    return replace(vut_of(target, name, options), files=(Path(file),) if file else ())
+
+
 def python_vut(spec: str, options: VutOptions) -> Vut:
     """Return the VUT `module:Name` or `file.py:Name`; `UserError` when there is none."""
     source, _, name = spec.rpartition(":")
@@ -52,7 +64,7 @@ def python_vut(spec: str, options: VutOptions) -> Vut:
     if target is None:
         raise UserError(f"{source} has no {name!r}: name a class or a function of it")
     file = getattr(module, "__file__", None)
-    return replace(vut_of(target, spec, options), file=Path(file) if file else None)
+    return replace(vut_of(target, spec, options), files=(Path(file),) if file else ())
 
 
 def vut_of(target: Any, spec: str, options: VutOptions) -> Vut:
@@ -76,8 +88,8 @@ def vut_of(target: Any, spec: str, options: VutOptions) -> Vut:
 
         return Vut(make=make_function)
     raise UserError(
-        f"{spec} is {target!r:.80}: a VUT is a class with `act(self, seen)`, a class with "
-        "`act_batch(self, seen)`, or a function `f(seen)`"
+        f"{spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)`, a class "
+        "with `act_batch(self, seen)`, or a function `f(seen)`"
     )
 
 
@@ -153,23 +165,28 @@ class BatchedVut(Driver):
         if self._reset is not None:
             try:
                 with self._watch as watch:
-                    watch.call(self._reset, corridor, seen_at_start(case))
-            except WRONGS as error:
+                    watch.call(corridor, self._reset, corridor, seen_at_start(case))
+            except BaseException as error:
                 self._reset_raised[corridor] = f"reset: {self._watch.reason(error)}"
 
     def act(self, scene: Scene) -> FloatArray:
-        """Call `act_batch` on a copy of the scene; what it raises fails every corridor."""
+        """Call `act_batch` on a copy of the scene.
+
+        Raises `VutLostError` when it fails and several episodes run: nobody knows whose it is.
+        """
         self._raised = None
         try:
             with self._watch as watch:
-                answer = np.asarray(watch.call(self._object.act_batch, _batch(scene)))
+                answer = np.asarray(watch.call(EVERYBODY, self._object.act_batch, _batch(scene)))
             if answer.shape != (self.corridors,) or answer.dtype.kind not in "fiu":
                 raise WrongAnswerError(
                     f"answered shape {answer.shape} of {answer.dtype} instead of "
                     f"{self.corridors} numbers"
                 )
-        except WRONGS as error:
+        except BaseException as error:
             self._raised = self._watch.reason(error)
+            if scene.active.sum() > 1:
+                raise VutLostError(self._raised, final=True) from None
             return np.full(self.corridors, np.nan)
         answer = answer.astype(np.float64)
         answer[list(self._reset_raised)] = np.nan
@@ -210,7 +227,8 @@ def _made(target: type, spec: str, *arguments: int) -> Any:
         return target(*arguments)
     except (Exception, SystemExit) as error:
         given = f" with {arguments[0]} corridors" if arguments else " without arguments"
-        raise UserError(f"{spec} cannot be made{given}: {type(error).__name__}: {error}") from error
+        what = f"{type(error).__name__}: {text_of(error)}"
+        raise UserError(f"{spec} cannot be made{given}: {what}") from error
 
 
 def _close(vut: Any, watch: Watch) -> None:
@@ -218,8 +236,8 @@ def _close(vut: Any, watch: Watch) -> None:
     if close is not None:
         try:
             with watch:
-                watch.call(close)
-        except WRONGS as error:
+                watch.call(NOBODY, close)
+        except BaseException as error:
             sys.stderr.write(f"closing the VUT: {watch.reason(error)}\n")
 
 
@@ -270,4 +288,4 @@ def _execute(path: Path, _changed_ns: int) -> ModuleType:
 
 
 def _cannot_load(what: str, error: BaseException) -> str:
-    return f"cannot load the VUT {what}: {type(error).__name__}: {error}"
+    return f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}"

@@ -13,6 +13,7 @@ import sys
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from time import monotonic
 from typing import Final, TypeVar
 
@@ -51,7 +52,14 @@ def traci_vut(argument: str, options: VutOptions) -> Vut:
         net = Net() if world is None else world.net
         return TraciVut(corridors, net, port, command, options)
 
-    return Vut(make=make, max_corridors=1, max_workers=None if port == 0 else 1)
+    files = [Path(word) for word in command or () if Path(word).is_file()]
+    return Vut(
+        make=make,
+        max_corridors=1,
+        max_workers=None if port == 0 else 1,
+        files=tuple(files),
+        named_only=True,
+    )
 
 
 class FaultError(Exception):
@@ -163,7 +171,7 @@ class TraciVut(Driver):
             self._listener = _listen(self._port)
         port = self._listener.getsockname()[1]
         if self._command is not None:
-            self._program = Program(self._command, port)
+            self._program = Program(self._command, port, self._options.log)
         else:
             sys.stderr.write(
                 f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"

@@ -1,0 +1,59 @@
+"""Whose folder a campaign is: one of this user's own, or one that somebody sent.
+
+The folder of a campaign names its controller: a file, a module, a command. Going on with a campaign
+runs it. In a folder of the user's own that is what is wanted; in one that was received it would be
+code of a stranger. So a campaign is sealed with a key that never leaves the user's cache folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.resources import cache_folder
+
+SEAL: Final = "seal"
+"""Key of `campaign.json`."""
+KEY: Final = "key"
+KEY_BYTES: Final = 32
+
+
+def seal(settings: Mapping[str, Any]) -> str | None:
+    """Return the seal of what a campaign's settings run; None where no key can be kept."""
+    key = _key(cache_folder() / KEY)
+    if key is None:
+        return None
+    named = "\0".join(str(settings.get(name)) for name in ("vut", "vut_command"))
+    return hmac.new(key, named.encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()
+
+
+def is_own(settings: Mapping[str, Any]) -> bool:
+    """Return whether the settings of a campaign, as read from its folder, have our seal."""
+    ours, theirs = seal(settings), settings.get(SEAL)
+    return ours is not None and isinstance(theirs, str) and hmac.compare_digest(ours, theirs)
+
+
+def _key(path: Path) -> bytes | None:
+    """Return the user's key, made where there is none yet; None where that cannot be."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        made = path.with_name(f"{KEY}.{secrets.token_hex(4)}")
+        if not path.exists():
+            descriptor = os.open(made, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(secrets.token_bytes(KEY_BYTES))
+            try:
+                os.link(made, path)  # whole, and never over another process's key
+            except FileExistsError:
+                pass
+            finally:
+                made.unlink()
+        key = path.read_bytes()
+    except OSError:
+        return None
+    return key if len(key) == KEY_BYTES else None
