@@ -1,6 +1,7 @@
 """Measure what a step of each kind of VUT costs, in one run: `python tools/bench_vuts.py`.
 
-    python   an object with act(seen), in one corridor and per corridor of 32
+    python   an object with act(seen), in one corridor and per corridor of 32, in a process of its
+             own and in this one
     traci    a client of the stock `traci` package in a process of its own: an id list, four
              getters, setSpeed and a step; and one that subscribes to what it sees
     peer     the same client with SUMO's own TraCI server for two clients, where the other client
@@ -172,12 +173,16 @@ def main() -> None:
         with_command = VutOptions(command=command)
         subscribing = VutOptions(command=command.replace("client.py", "subscriber.py"))
 
+        in_process = VutOptions(in_process=True)
+
         def driver(spec: str, corridors: int = 1, given: VutOptions | None = None) -> Driver:
             return vut_factory(spec, given)(corridors)
 
         drivers = {
             "python": driver(f"{folder / 'law.py'}:Vut"),
+            "python, in process": driver(f"{folder / 'law.py'}:Vut", given=in_process),
             "python, 32 corridors": driver(f"{folder / 'law.py'}:Vut", 32),
+            "in process, 32 corridors": driver(f"{folder / 'law.py'}:Vut", 32, in_process),
             "traci": driver("traci", given=with_command),
             "traci, subscribing": driver("traci", given=subscribing),
             "fmu": driver(f"fmu:{folder / 'level0.fmu'}"),
@@ -196,17 +201,28 @@ def main() -> None:
         finally:
             for made in drivers.values():
                 made.close()
-    ratios = [a / b for a, b in zip(found["traci"], found["peer"], strict=True)]
+    peers = {
+        "traci": "peer",
+        "python": "python, in process",
+        "python, 32 corridors": "in process, 32 corridors",
+    }
+    ratios = {
+        kind: [a / b for a, b in zip(found[kind], found[peer], strict=True)]
+        for kind, peer in peers.items()
+    }
     if options.json:
         medians = {kind: statistics.median(us) for kind, us in found.items()}
-        print(json.dumps({"us_per_step": medians, "traci_to_peer": statistics.median(ratios)}))
+        by_kind = {kind: statistics.median(all_) for kind, all_ in ratios.items()}
+        print(json.dumps({"us_per_step": medians, "ratio": by_kind}))
         return
     for kind, us in found.items():
-        print(f"{kind:22} {statistics.median(us):8.1f} us a step [{min(us):.1f}, {max(us):.1f}]")
-    print(
-        f"traci costs {statistics.median(ratios):.2f} times the peer "
-        f"[{min(ratios):.2f}, {max(ratios):.2f}]"
-    )
+        print(f"{kind:24} {statistics.median(us):8.1f} us a step [{min(us):.1f}, {max(us):.1f}]")
+    for kind, peer in peers.items():
+        all_ = ratios[kind]
+        print(
+            f"{kind} costs {statistics.median(all_):.2f} times {peer} "
+            f"[{min(all_):.2f}, {max(all_):.2f}]"
+        )
 
 
 if __name__ == "__main__":

@@ -49,7 +49,10 @@ class LoadedFiles:
         path, mode, flags = arguments
         if not isinstance(path, str | bytes):
             return  # a descriptor, opened before
-        where = os.path.realpath(os.fsdecode(path))
+        try:
+            where = os.path.realpath(os.fsdecode(path))
+        except (OSError, ValueError):  # the name is none; the VUT shall hear it from `open`
+            return
         reads = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR) == 0
         if isinstance(mode, str):
             reads = not set(mode) & set("wax+")
@@ -60,4 +63,4 @@ def _not_theirs() -> set[str]:
     installed = [sys.prefix, sys.base_prefix, sys.exec_prefix, *site.getsitepackages()]
     installed += [site.getusersitepackages(), *sysconfig.get_paths().values()]
     ours = [Path(__file__).parents[2], resource("policies"), resource("sumo_net")]
-    return {os.path.realpath(folder) for folder in (*installed, *ours, *SYSTEM)} - {"/"}
+    return {os.path.realpath(folder) for folder in (*installed, *map(str, ours), *SYSTEM)} - {"/"}
