@@ -12,7 +12,7 @@ import numpy as np
 
 from merge_sumo.case import Case, FloatArray
 from merge_sumo.conductor import ProvingGround
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.drivers.vut import VutFactory
 from merge_sumo.trajectory import End, Trajectory
 
@@ -151,7 +151,10 @@ def _not_numbers(ground: ProvingGround) -> list[str]:
     nothing = np.full(corridors, np.nan)
     ground.vut.begin(0, CASES[0])
     scene = Scene(active, np.zeros(corridors, dtype=np.int64), *[nothing] * 4)
-    answer = float(ground.vut.act(scene)[0])
+    try:
+        answer = float(ground.vut.act(scene)[0])
+    except VutLostError as lost:
+        return [f"To a state that is not a number it answers nothing, but {lost.reason}."]
     if np.isfinite(answer):
         return [f"To a state that is not a number it answers {answer:g} m/s2."]
     return []

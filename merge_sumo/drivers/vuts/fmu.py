@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.vuts.base import PerCorridor, Seen, Vut, VutOptions
+from merge_sumo.drivers.vuts.base import PerCorridor, Seen, Vut, VutOptions, asked
 from merge_sumo.drivers.vuts.options import split_options
 from merge_sumo.errors import UserError
 from merge_sumo.scenario import DT_S
@@ -153,6 +153,7 @@ class FmuVut(PerCorridor):
 
     def renew(self, corridor: int) -> None:
         """Replace the instance of a corridor."""
+        asked.note(corridor)
         _free(self._instances[corridor])
         self._instances[corridor] = None
         self._instances[corridor] = self._unit.instance(f"vut{corridor}")

@@ -28,6 +28,7 @@ from merge_sumo.drivers.vuts.base import (
     VutOptions,
     Watch,
     WrongAnswerError,
+    asked,
     seen_at_start,
     text_of,
 )
@@ -223,6 +224,7 @@ def _batch(scene: Scene) -> SeenBatch:
 
 
 def _made(target: type, spec: str, *arguments: int) -> Any:
+    asked.note(NOBODY)  # it goes on: each object may take its time
     try:
         return target(*arguments)
     except (Exception, SystemExit) as error:
