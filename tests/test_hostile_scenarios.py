@@ -29,7 +29,7 @@ from conftest import require
 from merge_sumo.errors import UserError
 from merge_sumo.sumo import opendrive, received
 from merge_sumo.sumo import replay as replay_module
-from merge_sumo.sumo.binding import run_program
+from merge_sumo.sumo.binding import run_program, sumo_program
 from merge_sumo.sumo.net import Net, default_net_path
 from merge_sumo.sumo.opendrive import write_opendrive
 from merge_sumo.sumo.replay import CASE, CONFIG, NET, RECORD, TYPES, VIEW, Replay, open_gui, replay
@@ -214,7 +214,7 @@ OUTPUTS = [
     *("lanedata-output", "person-summary-output", "personinfo-output"),
     *("personroute-output", "substations-output", "deadlock-output"),
     *("save-configuration", "save-template", "save-schema"),
-    *("save-commented", "device.ssm.file", "save-state.files"),
+    *("save-commented", "device.toc.file", "save-state.files"),
     *("summary", "tripinfo", "fcd"),
     *("emissions", "netstate"),
 ]
@@ -243,7 +243,7 @@ ADDITIONAL = {
     "switch times": '<timedEvent type="SaveTLSSwitchTimes" source="M" dest="{NEW}"/>',
     "a traffic light with a file": '<tlLogic id="M" type="actuated" programID="0" offset="0">'
     '<param key="file" value="{VICTIM}"/><phase duration="9" state="GGG"/></tlLogic>',
-    "a parameter": '<param key="device.ssm.file" value="{VICTIM}"/>',
+    "a parameter": '<param key="device.toc.file" value="{VICTIM}"/>',
     "a polygon with a picture": '<poly id="a" imgFile="{SECRET}" shape="0,0 9,9" layer="1"/>',
     "a point with a picture": '<poi id="a" x="0" y="0" imgFile="{SECRET}"/>',
     "a charging station": '<chargingStation id="a" lane="ramp_0" startPos="1" endPos="9"/>',
@@ -261,7 +261,7 @@ ADDITIONAL = {
 """What an additional file, and so a net, may hold beside what is allowed: all of it is dropped."""
 
 DEVICES = {
-    "ssm": '<param key="has.ssm.device" value="true"/><param key="device.ssm.file" '
+    "ssm": '<param key="has.ssm.device" value="true"/><param key="device.toc.file" '
     'value="{VICTIM}"/>',
     "fcd": '<param key="has.fcd.device" value="true"/>',
     "toc": '<param key="has.toc.device" value="true"/><param key="device.toc.file" '
@@ -338,7 +338,11 @@ TEXTS: dict[str, tuple[str, Edit, str]] = {
         ]
     },
     **{
-        f"a length {value} of a type": (TYPES, instead('length="5"', f'length="{value}"'), REFUSED)
+        f"a length {value:.5} of a type": (
+            TYPES,
+            instead('length="5"', f'length="{value}"'),
+            REFUSED,
+        )
         for value in ("nan", "inf", "-5", "0", "1e300", "9" * 5000, "1e-400", "{SECRET}", "")
     },
     "a gigantic decel": (TYPES, instead('decel="1000"', 'decel="1e308"'), REFUSED),
@@ -393,7 +397,7 @@ TEXTS: dict[str, tuple[str, Edit, str]] = {
         UNPLAYABLE,
     ),
     **{
-        f"{column} {value} in the record": (
+        f"{column} {value:.5} in the record": (
             RECORD,
             lambda text, column=column, value=value: re.sub(
                 rf' {column}="[^"]*"', f' {column}="{value}"', text, count=1
@@ -553,6 +557,25 @@ def verdict(result: object) -> str:
 
 def test_there_are_more_than_sixty_attacks_and_each_has_a_name_of_its_own():
     assert len(ATTACKS) == len(set(ATTACKS)) > 60
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"{option} in the configuration" for option in ("log", "tripinfo-output", "save-schema")),
+        *(f"{element} in the types" for element in ("edgeData", "a route probe", "a calibrator")),
+        *("edgeData in the net", "an e2 detector in the net", "the device ssm of a type"),
+        *("error-log in the configuration", "a socket of edgeData in the types"),
+    ],
+)
+def test_plain_sumo_does_what_the_attack_wants(scene, name):
+    """That is: these attacks are none that would fail anyhow."""
+    attack_of(name)[0](scene)
+    before = scene.tree()
+    command = [sumo_program("sumo"), "-c", str(scene.folder / CONFIG)]
+    subprocess.run(command, cwd=scene.root, capture_output=True, check=False, timeout=LIMIT_S)
+    if scene.tree() == before:
+        scene.listener.accept()[0].close()
 
 
 @pytest.mark.parametrize("name", ATTACKS)
