@@ -410,6 +410,11 @@ TEXTS: dict[str, tuple[str, Edit, str]] = {
     "a negative speed": (RECORD, instead('speed="31.0', 'speed="-31.0'), REFUSED),
     "a time in the far future": (RECORD, instead('time="0.10"', 'time="9e99"'), REFUSED),
     "times off the grid": (RECORD, instead('time="0.10"', 'time="0.15"'), REFUSED),
+    "no vehicle in a row": (
+        RECORD,
+        lambda text: re.sub(r'(time="2.00">).*?(</timestep>)', r"\1\2", text, flags=re.DOTALL),
+        REFUSED,
+    ),
     "a row twice": (RECORD, instead('time="0.10"', 'time="0.00"'), REFUSED),
     "a million rows": (RECORD, added('<timestep time="99"/>' * 190_000), REFUSED),
     "ten thousand rows": (RECORD, added('<timestep time="99"/>' * 10_000), REFUSED),
@@ -434,6 +439,9 @@ TEXTS: dict[str, tuple[str, Edit, str]] = {
             "a schema of its own": instead(SCHEMA, "http://{HOST}/net.xsd"),
             "a schema in a file": instead(SCHEMA, "{SECRET}"),
             "an id that is a path": instead('id="main_end"', 'id="../{SECRET}"'),
+            "an endless list of ids": instead('incLanes=""', f'incLanes="{"a" * 60_000}|"'),
+            "a long number": instead('x="2000.000000"', f'x="{"1" * 60_000}x"'),
+            "a name in several lines": instead('name="US-23 ', 'name="US-23&#10;'),
             "a state that is a word": instead('state="Z"', 'state="{SECRET}"'),
             "an index of a billion": instead(
                 '<lane id="main_in_1" index="1"', '<lane id="main_in_1" index="1000000000"'
@@ -724,7 +732,7 @@ def test_what_is_read_is_bounded_in_elements_and_in_bytes(tmp_path):
     most = b"<net>" + b"<a/>" * (received.MAX_ELEMENTS - 1) + b"</net>"
     root, intact = received.parse(most, received.NET, "it")
     assert (len(root), intact) == (0, False)
-    with pytest.raises(UserError, match="more than 20000 elements"):
+    with pytest.raises(UserError, match="more than 5000 elements"):
         received.parse(most.replace(b"</net>", b"<a/></net>"), received.NET, "it")
     file = tmp_path / "file"
     file.write_bytes(b"x" * received.MAX_BYTES)

@@ -24,9 +24,8 @@ from lxml import etree
 from merge_sumo.errors import UserError
 
 MAX_BYTES: Final = 4 * 2**20
-MAX_ELEMENTS: Final = 20_000
-"""As many as fit into such a file; a corridor has some twenty, and a record less than a thousand.
-A world holds the net up to 32 times."""
+MAX_ELEMENTS: Final = 5_000
+"""A corridor has some twenty and a record less than a thousand; a world has its net 32 times."""
 MAX_CHARS: Final = 2**16
 """Of the value of an attribute."""
 MAX_NUMBER_CHARS: Final = 64
@@ -59,8 +58,11 @@ def number(low: float, high: float) -> Values:
     return Values(f"a number from {low:g} to {high:g}", lambda text: _is_number(text, low, high))
 
 
-def match(pattern: str, words: str) -> Values:
-    """Return the texts that match a pattern as a whole; it must not backtrack far."""
+def matching(pattern: str, words: str) -> Values:
+    """Return the texts that match a pattern as a whole.
+
+    No two of its repetitions may compete for the same characters: that would take for ever.
+    """
     compiled = re.compile(pattern)
     return Values(words, lambda text: compiled.fullmatch(text) is not None)
 
@@ -80,21 +82,21 @@ def _are_points(text: str) -> bool:
 
 MAX_M: Final = 1e6
 """Farthest from the origin that a net may reach."""
-_SWITCH = match("0|1|true|false", "0, 1, true or false")
+_SWITCH = matching("0|1|true|false", "0, 1, true or false")
 _COUNT = number(0, 10_000)
 _METRES = number(0, MAX_M)
 _PLACE = number(-MAX_M, MAX_M)
 _EARTH_M = r"[+-]?[0-9]{1,9}(?:\.[0-9]{0,12})?"
 _SPEED = number(0, 1000)
-_ID = match(r"[\w.:#+\-]{1,250}", "an id of letters, digits and . : # + - _")
-_IDS = match(r"(?:[\w.:#+\-]{1,250} ?)*", "a list of ids")
-_WORD = match(r"[A-Za-z_]{1,40}", "a word")
-_CLASSES = match(r"[a-z_0-9 ]*", "a list of vehicle classes")
+_ID = matching(r"[\w.:#+\-]{1,250}", "an id of letters, digits and . : # + - _")
+_IDS = Values("a list of ids", lambda text: all(map(_ID.include, text.split())))
+_WORD = matching(r"[A-Za-z_]{1,40}", "a word")
+_CLASSES = matching(r"[a-z_0-9 ]*", "a list of vehicle classes")
 _SHAPE = Values(f"points x,y within {MAX_M:g} m", _are_points)
-_BITS = match("[01]{1,256}", "a row of 0 and 1")
-_NAME = Values("a name of at most 200 characters", lambda text: len(text) <= 200)
+_BITS = matching("[01]{1,256}", "a row of 0 and 1")
+_NAME = Values("a name", lambda text: len(text) <= 200 and text.isprintable())
 
-_PROJECTION = match(
+_PROJECTION = matching(
     r"[!.\-]|(?:\+(?:no_defs|south|(?:proj|zone|ellps|datum|units|lat_0|lat_1|lat_2|lat_ts|lon_0|k|k_0"
     r"|x_0|y_0|type|towgs84)=[A-Za-z0-9.,\-]{1,80})(?: |$))+",
     "a projection that names no file",
@@ -115,7 +117,7 @@ _EDGE: Final = Allowed(
         **dict.fromkeys(("function", "spreadType"), _WORD),
         **{"length": _METRES, "distance": _PLACE},
         **{"priority": number(-1000, 1000), "name": _NAME, "shape": _SHAPE},
-        "type": match(r"[\w.:#+|\-]{0,250}", "an edge type"),
+        "type": matching(r"[\w.:#+|\-]{0,250}", "an edge type"),
     },
     {"lane": _LANE},
 )
@@ -138,14 +140,14 @@ _CONNECTION: Final = Allowed(
         **dict.fromkeys(("allow", "disallow", "changeLeft", "changeRight"), _CLASSES),
         **dict.fromkeys(("contPos", "visibility", "length"), _PLACE),
         **{"speed": number(-1, 1000), "shape": _SHAPE},
-        "dir": match("[a-zA-Z]|invalid", "a letter"),
-        "state": match("[a-zA-Z=-]", "a letter, = or -"),
+        "dir": matching("[a-zA-Z]|invalid", "a letter"),
+        "state": matching("[a-zA-Z=-]", "a letter, = or -"),
     }
 )
 NET: Final = {
     "net": Allowed(
         {
-            "version": match(r"[0-9]{1,4}(?:\.[0-9]{1,4}){0,3}", "a version"),
+            "version": matching(r"[0-9]{1,4}(?:\.[0-9]{1,4}){0,3}", "a version"),
             "junctionCornerDetail": number(0, 1000),
             "junctionLinkDetail": number(0, 1000),
             "limitTurnSpeed": number(-1, 1000),
@@ -154,16 +156,16 @@ NET: Final = {
             **dict.fromkeys(("checkLaneFoes.roundabout",), _SWITCH),
             "spreadType": _WORD,
             # A reader that validates fetches what stands here.
-            "{http://www.w3.org/2001/XMLSchema-instance}noNamespaceSchemaLocation": match(
+            "{http://www.w3.org/2001/XMLSchema-instance}noNamespaceSchemaLocation": matching(
                 r"https?://sumo\.dlr\.de/xsd/net_file\.xsd", "the schema of SUMO's nets"
             ),
         },
         {
             "location": Allowed(
                 {
-                    "netOffset": match(f"{_EARTH_M},{_EARTH_M}", "x,y"),
-                    "convBoundary": match(f"(?:{_EARTH_M},){{3}}{_EARTH_M}", "four numbers"),
-                    "origBoundary": match(f"(?:{_EARTH_M},){{3}}{_EARTH_M}", "four numbers"),
+                    "netOffset": matching(f"{_EARTH_M},{_EARTH_M}", "x,y"),
+                    "convBoundary": matching(f"(?:{_EARTH_M},){{3}}{_EARTH_M}", "four numbers"),
+                    "origBoundary": matching(f"(?:{_EARTH_M},){{3}}{_EARTH_M}", "four numbers"),
                     "projParameter": _PROJECTION,
                 }
             ),
@@ -175,7 +177,7 @@ NET: Final = {
 }
 """A net: no traffic lights, types, roundabouts or parameters, which a corridor does without."""
 
-_WHO: Final = match("pov|vut", "pov or vut")
+_WHO: Final = matching("pov|vut", "pov or vut")
 
 TYPES: Final = {
     "additional": Allowed(
@@ -184,8 +186,10 @@ TYPES: Final = {
             "vType": Allowed(
                 {
                     "id": _WHO,
-                    "color": match(r"[0-9.]{1,20}(?:,[0-9.]{1,20}){2,3}|[a-z]{1,20}", "a colour"),
-                    "guiShape": match("[a-z]{1,20}(?:/[a-z]{1,20})?", "a shape of a vehicle"),
+                    "color": matching(
+                        r"[0-9.]{1,20}(?:,[0-9.]{1,20}){2,3}|[a-z]{1,20}", "a colour"
+                    ),
+                    "guiShape": matching("[a-z]{1,20}(?:/[a-z]{1,20})?", "a shape of a vehicle"),
                     "length": number(0.1, 100),
                     "minGap": number(0, 100),
                     **dict.fromkeys(("maxSpeed", "speedFactor"), number(1e-9, 1000)),
@@ -209,7 +213,7 @@ _RECORDED: Final = {
     **_MOTION,
     "angle": number(-360, 360),
     "type": _WHO,
-    "lane": match("(?:main_in|main_out|ramp)_0", "main_in_0, main_out_0 or ramp_0"),
+    "lane": matching("(?:main_in|main_out|ramp)_0", "main_in_0, main_out_0 or ramp_0"),
 }
 
 
