@@ -211,11 +211,17 @@ class TestAScenario:
     @given(data=st.data())
     def test_with_a_spoilt_record(self, scenario, data):
         head = (scenario / replay.RECORD).read_bytes()[:1500]
-        record = scenario.parent / "spoilt.fcd.xml"
-        record.write_bytes(data.draw(some(head, head + b"</timestep></fcd-export>")))
-        rows = answer(lambda: {(t, who): values for t, who, values in replay._rows(record)})
-        if rows is not None:
-            replay._fault_of_record(rows, Net(scenario / replay.NET))
+        whole = (scenario / replay.RECORD).read_bytes()
+        record = data.draw(some(head, head + b"</timestep></fcd-export>", whole))
+        found = answer(lambda: replay._checked_record(record, Path(replay.RECORD)))
+        if found is not None:
+            replay._fault_of_record(found[1], Net(scenario / replay.NET))
+
+    @here
+    @given(data=st.data())
+    def test_with_spoilt_types(self, scenario, data):
+        types = data.draw(some((scenario / replay.TYPES).read_bytes()))
+        answer(lambda: replay._checked_types(types, Path(replay.TYPES)))
 
     @here
     @given(data=st.data())
@@ -234,7 +240,8 @@ class TestAScenario:
         path.write_text(f"{bomb}]><net><edge id='&a11;'/></net>")
         with pytest.raises(UserError):
             Net(path)
-        assert not answer(lambda: list(replay._rows(path)))
+        assert answer(lambda: replay._checked_record(path.read_bytes(), path)) is None
+        assert answer(lambda: replay._checked_types(path.read_bytes(), path)) is None
 
 
 words = st.text(max_size=12) | st.integers().map(str) | st.floats().map(str)

@@ -18,11 +18,35 @@ from PIL import Image
 
 from merge_sumo.conductor import export_case
 from merge_sumo.journal import failures
-from merge_sumo.sumo.replay import COLOURS, CONFIG, VIEW
+from merge_sumo.sumo.replay import COLOURS, VIEW
 
 PICTURE_TIMES_S = (2.0, 7.0)
 NEAR = 40
 """Distance in each channel of 255 below which a pixel has a colour."""
+
+SHOW = """
+from lxml import etree
+from merge_sumo.cli import main
+from merge_sumo.sumo import replay
+
+view, config = replay._view, replay._config
+
+def with_pictures():
+    root = view()
+    root.find("delay").set("value", "0")
+    for file, time in {times}.items():
+        etree.SubElement(root, "snapshot", file=file, time=time)
+    return root
+
+def that_ends(timesteps):
+    root = config(timesteps)
+    root.find("gui_only/delay").set("value", "0")
+    etree.SubElement(root.find("gui_only"), "quit-on-end", value="true")
+    return root
+
+replay._view, replay._config = with_pictures, that_ends
+main()
+"""
 
 
 @pytest.fixture(scope="module")
@@ -51,23 +75,20 @@ def display() -> Iterator[str]:
 def pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
     """Open an exported failure with `replay --gui`; return its pictures at two times as arrays.
 
-    Only a copy of the view settings asks for the pictures, and only the copied configuration
-    tells the window to close at the end instead of waiting for a person.
+    The view and the configuration that merge-sumo writes are made to take pictures and to end by
+    themselves. Those of the folder ask for a picture, too: it must not be taken.
     """
-    folder = tmp_path_factory.mktemp("gui") / "case"
+    scratch = tmp_path_factory.mktemp("gui")
+    folder, hostile = scratch / "case", scratch / "hostile.png"
     export_case(run, failures(run.outcomes)[0].index, folder)
-    files = [folder / f"at-{time_s:g}-s.png" for time_s in PICTURE_TIMES_S]
     view = etree.parse(folder / VIEW)
-    view.find("delay").set("value", "0")
-    for file, time_s in zip(files, PICTURE_TIMES_S, strict=True):
-        etree.SubElement(view.getroot(), "snapshot", file=str(file), time=str(time_s))
+    etree.SubElement(view.getroot(), "snapshot", file=str(hostile), time="1")
     view.write(folder / VIEW)
-    config = etree.parse(folder / CONFIG)
-    config.find("gui_only/delay").set("value", "0")
-    etree.SubElement(config.find("gui_only"), "quit-on-end", value="true")
-    config.write(folder / CONFIG)
+    files = [scratch / f"at-{time_s:g}-s.png" for time_s in PICTURE_TIMES_S]
+    times = {str(file): str(time_s) for file, time_s in zip(files, PICTURE_TIMES_S, strict=True)}
+    (scratch / "show.py").write_text(SHOW.format(times=times))
     window = subprocess.Popen(
-        [sys.executable, "-m", "merge_sumo.cli", "replay", str(folder), "--gui"],
+        [sys.executable, scratch / "show.py", "replay", str(folder), "--gui"],
         env={**os.environ, "DISPLAY": display},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -80,6 +101,7 @@ def pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
         if window.poll() is None:
             os.killpg(window.pid, signal.SIGKILL)
     assert window.returncode == 0, said
+    assert not hostile.exists()
     return [picture(file) for file in files]
 
 

@@ -133,7 +133,8 @@ BROKEN = {
     "empty": (lambda text: "", "not readable XML"),
     "no XML": (lambda text: "ceci n'est pas une route", "not readable XML"),
     "cut off": (lambda text: text[: len(text) // 2], "not readable XML"),
-    "another root": (lambda text: "<routes/>", "no edge main_in"),
+    "another root": (lambda text: "<routes/>", "another root than <net>"),
+    "no edge": (lambda text: "<net/>", "no edge main_in"),
     "no ramp": (without(r'<edge id="ramp".*?</edge>'), "no edge ramp"),
     "no main road behind M": (without(r'<edge id="main_out".*?</edge>'), "no edge main_out"),
     "no lane 0": (
@@ -160,14 +161,17 @@ BROKEN = {
         edited(f'shape="{RAMP_SHAPE}"/>', 'shape="-420,-65 -200,-30 0,0"/>'),
         "straight",
     ),
-    "a shape of words": (edited(f'shape="{RAMP_SHAPE}"/>', 'shape="here there"/>'), "straight"),
+    "a shape of words": (
+        edited(f'shape="{RAMP_SHAPE}"/>', 'shape="here there"/>'),
+        "is not points x,y",
+    ),
     "a shape that is no number": (
         edited(f'shape="{RAMP_SHAPE}"/>', 'shape="-420,nan 0,0"/>'),
-        "cannot host the scenario",
+        "lane whose shape is not points x,y",
     ),
     "a length that is no number": (
         edited('length="425.000000" shape="-4', 'length="nan" shape="-4'),
-        "cannot host the scenario",
+        "edge whose length is not a number",
     ),
     "no speed": (edited('speed="45.000000" length="425', 'length="425'), "straight"),
     "internal links": (
@@ -226,7 +230,7 @@ class TestABrokenNet:
         secret.write_text(ramp)
         doctype = f'<!DOCTYPE net [<!ENTITY ramp SYSTEM "{secret.as_uri()}">]>\n<net '
         path.write_text(text.replace(ramp, "&ramp;").replace("<net ", doctype))
-        with pytest.raises(UserError, match="no edge ramp"):
+        with pytest.raises(UserError, match="declares a document type"):
             Net(path)
 
 

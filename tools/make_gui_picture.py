@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 from lxml import etree
 
+from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.replay import CONFIG, VIEW
 
 
@@ -36,9 +35,8 @@ def take(scenario: Path, time_s: float, picture: Path) -> None:
             found = only.find(option)
             (etree.SubElement(only, option) if found is None else found).set("value", value)
         etree.ElementTree(config).write(folder / CONFIG)
-        subprocess.run(
-            [sys.executable, "-m", "merge_sumo.cli", "replay", str(folder), "--gui"], check=True
-        )
+        ended = run_program("sumo-gui", ["-c", CONFIG], folder, limit_s=None)
+        assert ended.code == 0, "sumo-gui says why"  # noqa: S101
 
 
 def main() -> None:

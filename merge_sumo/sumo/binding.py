@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import os
+import signal
+import subprocess
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +16,8 @@ from merge_sumo.errors import UserError
 
 DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
 """Shared libraries that SUMO's wheels load, even without a window."""
+PROGRAM_LIMIT_S: Final = 15.0
+"""Time that SUMO has for an episode, and netconvert for a net; both need a tenth of a second."""
 
 
 def load_libsumo() -> Any:
@@ -46,3 +54,51 @@ def sumo_program(name: str) -> str:
             "eclipse-sumo==1.28.0`"
         )
     return str(program)
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How a program ended: its exit code, and why where that is not 0."""
+
+    code: int
+    reason: str
+
+
+def run_program(
+    name: str, arguments: Sequence[str], folder: Path, limit_s: float | None = PROGRAM_LIMIT_S
+) -> Ended:
+    """Run a SUMO program in a folder of ours, and kill it and what it started after `limit_s`.
+
+    What SUMO takes from the environment is that of the installation. Without a limit, what the
+    program says goes to the terminal.
+    """
+    program = sumo_program(name)
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("SUMO_")}
+    with subprocess.Popen(
+        [program, *arguments],
+        cwd=folder,
+        env={**environment, "SUMO_HOME": str(Path(program).parents[1])},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=None if limit_s is None else subprocess.PIPE,
+        text=True,
+        errors="replace",
+        start_new_session=True,
+    ) as process:
+        try:
+            _, said = process.communicate(timeout=limit_s)
+        except BaseException as error:
+            _kill(process)
+            if isinstance(error, subprocess.TimeoutExpired):
+                return Ended(-1, f"it did not end within {limit_s:g} s")
+            raise
+    reason = ((said or "").strip() or "no message").splitlines()[0]
+    return Ended(process.returncode, reason.removeprefix("Error: ") if process.returncode else "")
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    with suppress(ProcessLookupError, PermissionError):  # nobody may be left
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()

@@ -13,6 +13,7 @@ from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.resources import resource
+from merge_sumo.sumo import received
 
 MAIN_IN: Final = "main_in"
 MAIN_OUT: Final = "main_out"
@@ -65,30 +66,24 @@ class Net:
     def __init__(self, path: Path | None = None) -> None:
         """Read and check the net at `path`, or the shipped one."""
         self.path = path or default_net_path()
-        try:
-            content = self.path.read_bytes()
-        except OSError as error:
-            raise UserError(f"cannot read the net {self.path}: {error.strerror}") from error
-        self._parse(content)
+        self._parse(received.read_bytes(self.path, "the net", follow_links=True))
+
+    @classmethod
+    def of_bytes(cls, content: bytes, path: Path) -> Net:
+        """Return the net in the bytes of a file; `path` is what sentences call it."""
+        net = cls.__new__(cls)
+        net.path = path
+        net._parse(content)
+        return net
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel to another process or machine as path and bytes."""
-        return Net.__new__, (Net,), (self.path, self._bytes)
-
-    def __setstate__(self, state: tuple[Path, bytes]) -> None:
-        """Arrive: no file is read."""
-        self.path, content = state
-        self._parse(content)
+        """Travel to another process or machine as path and bytes: no file is read there."""
+        return Net.of_bytes, (self._bytes, self.path)
 
     def _parse(self, content: bytes) -> None:
         self._bytes = content
-        parser = etree.XMLParser(
-            resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
-        )
-        try:
-            self._root = etree.fromstring(self._bytes, parser)
-        except etree.XMLSyntaxError as error:
-            raise UserError(f"the net {self.path} is not readable XML: {error}") from error
+        self._root, intact = received.parse(content, received.NET, f"the net {self.path}")
+        self._text = content if intact else received.serialize(self._root)
         self.main_in = self._lane(MAIN_IN)
         self.main_out = self._lane(MAIN_OUT)
         self.ramp = self._lane(RAMP)
@@ -122,8 +117,8 @@ class Net:
 
     @property
     def text(self) -> bytes:
-        """The file's bytes, for exports."""
-        return self._bytes
+        """The net for SUMO and for exports: the file's bytes, or what is allowed of them."""
+        return self._text
 
     def lane_point(self, x_m: float, *, on_ramp: bool) -> tuple[str, float, float, float, float]:
         """Return (lane id, position, x, y, angle) of a lane coordinate, M = 0, metres, degrees."""
@@ -145,13 +140,6 @@ class Net:
     def replicate(self, corridors: int) -> bytes:
         """Return a net of `corridors` copies, `CORRIDOR_SPACING_M` apart, ids suffixed ".k"."""
         root = copy.deepcopy(self._root)
-        try:
-            return self._replicated(root, corridors)
-        except ValueError as error:
-            raise self._broken(f"it has a coordinate that is no number ({error})") from error
-
-    @staticmethod
-    def _replicated(root: etree._Element, corridors: int) -> bytes:
         # SUMO reads edges before the junctions that name their lanes, and connections last.
         for tag in ("edge", "junction", "connection"):
             parts = list(root.iterfind(tag))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
-import subprocess
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -15,9 +15,10 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DT_S
+from merge_sumo.scenario import DT_S, MAX_STEPS
 from merge_sumo.score import Outcome
-from merge_sumo.sumo.binding import sumo_program
+from merge_sumo.sumo import received
+from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.net import Net
 from merge_sumo.trajectory import Trajectory
 
@@ -27,6 +28,7 @@ TYPES: Final = "vehicles.add.xml"
 RECORD: Final = "episode.fcd.xml"
 VIEW: Final = "view.settings.xml"
 CASE: Final = "case.json"
+REPLAYED: Final = "replayed.fcd.xml"
 
 COMPARED: Final = ("x", "y", "pos", "speed")
 TOLERANCE: Final = 1e-6
@@ -38,6 +40,8 @@ LANE_END_M: Final = 2e-3
 COLOURS: Final = {"pov": "0.90,0.25,0.15", "vut": "0.10,0.35,0.90"}
 HOLD_STEPS: Final = 10
 """Steps for which the last picture stays, so that a person sees how it ended."""
+MIN_TIMESTEPS: Final = 1 + HOLD_STEPS
+MAX_TIMESTEPS: Final = MAX_STEPS + 1 + HOLD_STEPS
 
 
 def write_scenario(folder: Path, net: Net, outcome: Outcome, trajectory: Trajectory) -> Path:
@@ -47,17 +51,22 @@ def write_scenario(folder: Path, net: Net, outcome: Outcome, trajectory: Traject
     """
     try:
         folder.mkdir(parents=True)
-        (folder / NET).write_bytes(net.text)
-        (folder / TYPES).write_bytes(_xml(_types(net, trajectory)))
-        (folder / RECORD).write_bytes(_xml(_fcd(net, trajectory)))
-        (folder / VIEW).write_bytes(_xml(_view()))
         (folder / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
-        (folder / CONFIG).write_bytes(_xml(_config(trajectory)))
+        _write(folder, net, _types(trajectory), _fcd(net, trajectory))
     except FileExistsError as error:
         raise UserError(f"{folder} exists: choose another folder or remove it first") from error
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror}") from error
     return folder / CONFIG
+
+
+def _write(folder: Path, net: Net, types: etree._Element, record: etree._Element) -> None:
+    """Write all that SUMO reads, the configuration last."""
+    (folder / NET).write_bytes(net.text)
+    (folder / TYPES).write_bytes(received.serialize(types))
+    (folder / RECORD).write_bytes(received.serialize(record))
+    (folder / VIEW).write_bytes(received.serialize(_view()))
+    (folder / CONFIG).write_bytes(received.serialize(_config(len(record))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,28 +82,83 @@ def replay(folder: Path) -> Replay:
     """Replay a folder in headless SUMO and compare every row of both vehicles with the record.
 
     Positions (x, y, along the lane) and speeds must agree within 1e-6, and the record must be an
-    episode: both vehicles in every row, on their lanes, moved by eq. (4). Raises `UserError` when
-    the folder is no replay folder or SUMO cannot run it.
+    episode: both vehicles on their lanes, moved by eq. (4) and held at its end.
+
+    The folder is data: net, vehicle types and record are read from it and nothing else, and SUMO
+    runs in a temporary folder on what is allowed of them and on a configuration of ours. Raises
+    `UserError` when the folder is no replay folder or SUMO cannot run it.
     """
-    recorded = list(_rows(_existing(folder, RECORD)))
-    with tempfile.TemporaryDirectory(prefix="merge-sumo-") as scratch:
-        output = Path(scratch) / "replayed.fcd.xml"
-        command = [
-            *(sumo_program("sumo"), "-c", str(_existing(folder, CONFIG))),
-            *("--fcd-output", str(output), "--precision", "9", "--no-step-log", "true"),
-        ]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            reason = (done.stderr.strip() or "no message").splitlines()[0]
-            raise UserError(f"SUMO cannot replay {folder}: {reason}")
-        replayed = {(time, who): values for time, who, values in _rows(output)}
-    rows = {(time, who): values for time, who, values in recorded}
-    fault = _difference(rows, replayed) or _fault_of_record(rows, Net(folder / NET))
-    return Replay(len(rows), *(fault or (None, "")))
+    episode = _received(folder)
+    with _staged(episode) as stage:
+        arguments = ["-c", CONFIG, "--fcd-output", REPLAYED, "--precision", "9"]
+        ended = run_program("sumo", [*arguments, "--no-step-log", "true"], stage)
+        if ended.code != 0:
+            raise UserError(f"SUMO cannot replay {folder}: {ended.reason}")
+        written = received.read_bytes(stage / REPLAYED, "the replay", follow_links=False)
+    name = f"SUMO's replay of {folder}"
+    replayed = _rows(received.parse(written, received.REPLAYED, name)[0], name)
+    fault = _difference(episode.rows, replayed) or _fault_of_record(episode.rows, episode.net)
+    return Replay(len(episode.rows), *(fault or (None, "")))
 
 
 Rows = dict[tuple[float, str], tuple[float, ...]]
 """The values of `COMPARED` by time and vehicle."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Episode:
+    """What is allowed of a received folder."""
+
+    net: Net
+    types: etree._Element
+    record: etree._Element
+    rows: Rows
+
+
+def _received(folder: Path) -> _Episode:
+    """Read net, vehicle types and record of a folder that somebody may have sent."""
+    for name in (NET, TYPES, RECORD):
+        if not os.path.lexists(folder / name):
+            raise UserError(f"{folder} is not a replay folder: it has no {name}")
+    net, types, record = (
+        received.read_bytes(folder / name, "the file", follow_links=False)
+        for name in (NET, TYPES, RECORD)
+    )
+    return _Episode(
+        Net.of_bytes(net, folder / NET),
+        _checked_types(types, folder / TYPES),
+        *_checked_record(record, folder / RECORD),
+    )
+
+
+def _checked_types(content: bytes, path: Path) -> etree._Element:
+    root, _ = received.parse(content, received.TYPES, f"the file {path}")
+    if sorted(str(vtype.get("id")) for vtype in root) != sorted(COLOURS):
+        raise UserError(f"the file {path} must have one vType pov and one vType vut")
+    return root
+
+
+def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
+    root, _ = received.parse(content, received.RECORD, f"the record {path}")
+    if not MIN_TIMESTEPS <= len(root) <= MAX_TIMESTEPS:
+        raise UserError(
+            f"the record {path} must have from {MIN_TIMESTEPS} to {MAX_TIMESTEPS} timesteps"
+        )
+    for step, timestep in enumerate(root):
+        if not abs(float(timestep.get("time", "")) - step * DT_S) <= TOLERANCE:
+            raise UserError(f"the record {path} must have a timestep every {DT_S:g} s from 0 s on")
+    rows = _rows(root, f"the record {path}")
+    if len(rows) != len(COLOURS) * len(root):
+        raise UserError(f"the record {path} must have both vehicles in every timestep")
+    return root, rows
+
+
+@contextmanager
+def _staged(episode: _Episode) -> Iterator[Path]:
+    """Yield a temporary folder that holds an episode, with nothing in it that was not checked."""
+    with tempfile.TemporaryDirectory(prefix="merge-sumo-") as name:
+        _write(Path(name), episode.net, episode.types, episode.record)
+        yield Path(name)
 
 
 def _difference(recorded: Rows, replayed: Rows) -> tuple[float, str] | None:
@@ -114,25 +178,26 @@ def _difference(recorded: Rows, replayed: Rows) -> tuple[float, str] | None:
 
 
 def _fault_of_record(rows: Rows, net: Net) -> tuple[float, str] | None:
-    """Return when and why a record is no episode of two vehicles, or None when it is one."""
+    """Return when and why a checked record is no episode, or None when it is one."""
     times = sorted({time for time, _ in rows})
-    if not times:
-        return (0.0, "the record is empty")
-    moving = times[: -HOLD_STEPS - 1]
+    moving = set(times[: -HOLD_STEPS - 1])
     for time, after in zip(times, [*times[1:], None], strict=True):
         for who in COLOURS:
-            if (time, who) not in rows:
-                return (time, f"{who} is not in the record")
             x, y, position, speed = rows[time, who]
             x_m = _lane_coordinate(x, position, net, on_ramp=who == "vut")
             _, _, x_of_lane, y_of_lane, _ = net.lane_point(x_m, on_ramp=who == "vut")
             if not math.hypot(x - x_of_lane, y - y_of_lane) <= LANE_END_M:
                 return (time, f"{who} is recorded beside its lane")
-            if after is not None and time in moving and (after, who) in rows:
-                x_after, _, position_after, _ = rows[after, who]
-                to_m = _lane_coordinate(x_after, position_after, net, on_ramp=who == "vut")
-                if not abs(to_m - x_m - speed * DT_S) <= TOLERANCE:
-                    return (time, f"{who} is recorded as not moving at its speed of {speed}")
+            if after is None:
+                continue
+            if time not in moving:
+                if rows[after, who] != rows[time, who]:
+                    return (after, f"{who} is not held where the episode ended")
+                continue
+            x_after, _, position_after, _ = rows[after, who]
+            to_m = _lane_coordinate(x_after, position_after, net, on_ramp=who == "vut")
+            if not abs(to_m - x_m - speed * DT_S) <= TOLERANCE:
+                return (time, f"{who} is recorded as not moving at its speed of {speed}")
     return None
 
 
@@ -142,42 +207,33 @@ def _lane_coordinate(x: float, position: float, net: Net, *, on_ramp: bool) -> f
 
 
 def open_gui(folder: Path) -> int:
-    """Open a replay folder in sumo-gui, wait until it is closed, and return its exit code."""
+    """Open a replay folder in sumo-gui, wait until it is closed, and return its exit code.
+
+    As for `replay`, sumo-gui runs in a temporary folder, on nothing that was not checked. Raises
+    `UserError` when there is no display or the folder is no replay folder.
+    """
     if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise UserError(
             "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
         )
-    config = _existing(folder, CONFIG)
-    return subprocess.run([sumo_program("sumo-gui"), "-c", str(config)], check=False).returncode
+    with _staged(_received(folder)) as stage:
+        return run_program("sumo-gui", ["-c", CONFIG], stage, limit_s=None).code
 
 
-def _existing(folder: Path, name: str) -> Path:
-    path = folder / name
-    if not path.is_file():
-        raise UserError(f"{folder} is not a replay folder: it has no {name}")
-    return path
+def _rows(root: etree._Element, name: str) -> Rows:
+    """Return the rows of an FCD file that was checked; `UserError` where one stands there twice."""
+    rows: Rows = {}
+    for timestep in root:
+        time = round(float(timestep.get("time", "")), 3)
+        for vehicle in timestep:
+            key = (time, str(vehicle.get("id")))
+            if key in rows:
+                raise UserError(f"{name} has two rows of {key[1]} at {time:g} s")
+            rows[key] = tuple(float(vehicle.get(column, "")) for column in COMPARED)
+    return rows
 
 
-def _rows(path: Path) -> Iterator[tuple[float, str, tuple[float, ...]]]:
-    """Yield (time, vehicle, (x, y, pos, speed)) of an FCD file."""
-    try:
-        events = etree.iterparse(path, events=("end",), tag="timestep", resolve_entities=False)
-        for _, timestep in events:
-            time = round(float(timestep.get("time")), 3)
-            for vehicle in timestep.iterfind("vehicle"):
-                values = tuple(float(vehicle.get(name)) for name in COMPARED)
-                yield time, vehicle.get("id"), values
-            timestep.clear()
-    except (etree.XMLSyntaxError, TypeError, ValueError) as error:
-        raise UserError(f"{path} is not a readable FCD file: {error}") from error
-
-
-def _xml(root: etree._Element) -> bytes:
-    etree.indent(root, space="    ")
-    return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
-
-
-def _types(net: Net, trajectory: Trajectory) -> etree._Element:
+def _types(trajectory: Trajectory) -> etree._Element:
     root = etree.Element("additional")
     first_speeds = {"pov": trajectory.v_pov_mps[0], "vut": trajectory.v_vut_mps[0]}
     for name, colour in COLOURS.items():
@@ -241,8 +297,8 @@ def _view() -> etree._Element:
     return root
 
 
-def _config(trajectory: Trajectory) -> etree._Element:
-    end_s = (len(trajectory.motion) + HOLD_STEPS) * DT_S
+def _config(timesteps: int) -> etree._Element:
+    end_s = timesteps * DT_S
     sections = {
         "input": {"net-file": NET, "additional-files": TYPES},
         "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
