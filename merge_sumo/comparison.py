@@ -176,11 +176,14 @@ def compare_runs(a: Run, b: Run, *, rerun: bool = True, net: Net | None = None) 
         rerun: run the failures, errors and timeouts of each with the VUT of the other.
         net: net for that; must be the one of the campaigns.
 
-    Raises `UserError` where the campaigns have no level in common, differ in the initial speed of
-    the VUT, or were run on another net than the one to run again on.
+    Raises `UserError` where the campaigns have no level in common or no case there, differ in
+    the initial speed of the VUT, or were run on another net than the one to run again on.
     """
     levels = _common_levels(a, b)
     own_a, own_b = ([o for o in run.outcomes if o.case.level in levels] for run in (a, b))
+    for run, own in ((a, own_a), (b, own_b)):
+        if not own:
+            raise UserError(f"{run.folder} has no case at a POV level of both: it shows nothing")
     telling_a, telling_b = (
         [*failures(own), *(o for o in own if not o.measures.end.is_tested)]
         for own in (own_a, own_b)

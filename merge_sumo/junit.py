@@ -15,6 +15,7 @@ from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.journal import Run
+from merge_sumo.printable import printable
 from merge_sumo.score import Outcome
 from merge_sumo.trajectory import End
 from merge_sumo.verdict import (
@@ -22,7 +23,6 @@ from merge_sumo.verdict import (
     GateResult,
     Verdict,
     message_of,
-    printable,
 )
 
 CLASS: Final = "merge-sumo"

@@ -34,11 +34,13 @@ from merge_sumo.summary import LevelSummary, Summary, summarise
 from merge_sumo.sumo.net import LaneLine, Net
 from merge_sumo.surface import FEWEST_FAILURES, PLAUSIBLE, Surface, learn_surface
 from merge_sumo.trajectory import End, Trajectory
-from merge_sumo.verdict import Trouble, Verdict, counted, in_words, judge
+from merge_sumo.verdict import Trouble, Verdict, counted, in_words, judge, shortened
 
 REPORT: Final = "report.html"
 LISTED: Final = 10
 """Cases in a list, and messages of errors and timeouts."""
+ERROR_CHARACTERS: Final = 2000
+"""Of the message of a case; `outcomes.jsonl` has the whole."""
 SHOWN: Final = 2000
 """Cases that the page holds one by one, with their motion; more are shown as counts."""
 COUNT_GRID: Final = (32, 20)
@@ -303,7 +305,11 @@ class _Facts:
             "ends": [end.value for end in End],
             "kinds": [kind.value for kind in Kind],
             "cases": self._columns(offsets),
-            "errors": {o.index: o.measures.error for o in self.shown if o.measures.error},
+            "errors": {
+                o.index: shortened(o.measures.error, ERROR_CHARACTERS)
+                for o in self.shown
+                if o.measures.error
+            },
             "speeds": speeds,
             "counts": self._counts(),
             "chance": {

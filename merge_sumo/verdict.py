@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.printable import printable
 from merge_sumo.score import Measures, Outcome
 from merge_sumo.summary import Summary
 from merge_sumo.trajectory import End
@@ -155,17 +156,6 @@ def message_of(measures: Measures) -> str:
     if measures.end.is_error:
         return "no reason given"
     return f"the VUT did not reach the merge point in {measures.t_end_s:g} s"
-
-
-def printable(text: str) -> str:
-    """Return a text with an escape for every character that does not print.
-
-    So no message moves the cursor of a terminal, and every message can stand in XML.
-    """
-    return "".join(
-        letter if letter.isprintable() else letter.encode("unicode_escape").decode()
-        for letter in text
-    )
 
 
 def shortened(text: str, characters: int) -> str:

@@ -153,6 +153,13 @@ class TestRefused:
         with pytest.raises(UserError, match="no POV level in common"):
             compare_runs(run, changed(tmp_path / "b", run, levels=[1]))
 
+    def test_without_a_case(self, tmp_path, run):
+        empty = changed(tmp_path / "b", run)
+        (empty.folder / "outcomes.jsonl").write_bytes(b"")
+        for pair in ((run, Run(empty.folder)), (Run(empty.folder), run)):
+            with pytest.raises(UserError, match="has no case at a POV level of both"):
+                compare_runs(*pair)
+
     def test_with_another_initial_speed(self, tmp_path, run):
         with pytest.raises(UserError, match="--v-vut0"):
             compare_runs(run, changed(tmp_path / "b", run, v_vut0_mps=10.0))

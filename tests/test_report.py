@@ -162,6 +162,11 @@ class TestWhatWasNotTested:
         assert "untested" not in html.fromstring(page).xpath("//@aria-labelledby")
         assert "broken" not in "".join(html.fromstring(page).xpath("//body//@class"))
 
+    def test_has_no_message_of_megabytes(self, tmp_path):
+        page = report_page(write_run(tmp_path / "run", 10, errors={0: "x" * 10**7}))
+        assert len(page) < 1e6
+        assert data_of(page)["errors"]["0"] == "x" * 1997 + "..."
+
     def test_gives_no_coverage_where_nothing_was_tested(self, tmp_path):
         page = report_page(write_run(tmp_path / "run", 10, levels=(0,), timeouts=range(10)))
         assert "0.0000" not in text_of(page)

@@ -20,9 +20,10 @@ from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Stopped
 from merge_sumo.journal import Run, failures
 from merge_sumo.junit import check_junit, junit, write_junit
+from merge_sumo.printable import printable
 from merge_sumo.summary import LevelSummary, Summary, summarise
 from merge_sumo.trajectory import End
-from merge_sumo.verdict import Gate, judge, parse_gates, printable
+from merge_sumo.verdict import Gate, judge, parse_gates
 
 HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
 VUTS = {

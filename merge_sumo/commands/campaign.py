@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -23,6 +22,7 @@ from merge_sumo.commands.shared import (
     say,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.printable import quoted
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenario import DEADLINE_S
 
@@ -246,8 +246,8 @@ def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path 
     command = f"merge-sumo campaign --resume {folder}"
     command += f" --net {net}" if net is not None else ""
     # Neither is a setting of the campaign, which its folder would remember.
-    command += "".join(f" --gate {shlex.quote(gate)}" for gate in gates)
-    command += f" --junit {shlex.quote(str(junit))}" if junit is not None else ""
+    command += "".join(f" --gate {quoted(gate)}" for gate in gates)
+    command += f" --junit {quoted(junit)}" if junit is not None else ""
     return f"stopped; go on with: {command}"
 
 
