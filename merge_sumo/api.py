@@ -31,14 +31,15 @@ from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB, V_VUT0_MPS
 from merge_sumo.score import Outcome
 from merge_sumo.summary import Summary, summarise
 from merge_sumo.sumo.net import Net
-from merge_sumo.trajectory import Trajectory
+from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
 from merge_sumo.workers import open_workers
 
 MOST_ROWS: Final = 20
 """Rows that a notebook shows of a table."""
 IN_A_NOTEBOOK: Final = (
     *("index", "level", "x_pov0_m", "v_pov0_mps", "svo_rad", "end"),
-    *("score", "dx_m", "dv_mps", "avoidable"),
+    *("score", "dx_m", "dv_mps", "avoidable", "error"),
 )
 """Columns that it shows; the rows hold all of `outcomes.jsonl`."""
 
@@ -63,7 +64,8 @@ class Table(list[dict[str, Any]]):
 def _cell(value: object) -> str:
     if value is None:
         return ""
-    return escape(f"{value:.2f}" if isinstance(value, float) else str(value))
+    text = f"{value:.2f}" if isinstance(value, float) else str(value)
+    return escape(shortened(text, MESSAGE_CHARACTERS))
 
 
 class CampaignRun:
@@ -95,6 +97,21 @@ class CampaignRun:
         """The failing cases, the worst first."""
         return Table(failures(self._run.outcomes))
 
+    @property
+    def errors(self) -> Table:
+        """The cases that ended in an error of the VUT or of the simulation, with the message."""
+        return Table(o for o in self._run.outcomes if o.measures.end.is_error)
+
+    @property
+    def timeouts(self) -> Table:
+        """The cases in which the VUT never reached the merge point."""
+        return Table(o for o in self._run.outcomes if o.measures.end is End.TIMEOUT)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """How many cases failed, erred or timed out; errors and timeouts by message."""
+        return judge(self._run.outcomes)
+
     @cached_property
     def summary(self) -> Summary:
         """Cases, failures, regions and failure mode coverage by POV level."""
@@ -112,8 +129,7 @@ class CampaignRun:
 
     def __repr__(self) -> str:
         """Return folder and result in a line."""
-        found = self.summary
-        return f"<campaign {self.folder}: {found.failures} failures in {found.cases} cases>"
+        return f"<campaign {self.folder}: {self.verdict.counts}>"
 
     def _repr_html_(self) -> str:
         rows = "".join(
@@ -121,9 +137,10 @@ class CampaignRun:
             f"<td>{found.regions}</td><td>{found.fmc:.4f}</td></tr>"
             for level, found in self.summary.levels.items()
         )
-        title = escape(f"{self.settings.get('vut')}: {self.summary.failures} failures in ")
+        title = escape(f"{self.settings.get('vut')}: {self.verdict.counts}")
+        wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in self.verdict.sentences)
         return (
-            f"<p><b>{title}{self.summary.cases} cases</b><br>{escape(str(self.folder))}</p>"
+            f"<p><b>{title}</b><br>{escape(str(self.folder))}</p>{wrong}"
             "<table><thead><tr><th>POV level</th><th>cases</th><th>failures</th><th>regions</th>"
             f"<th>FMC</th></tr></thead><tbody>{rows}</tbody></table>"
         )

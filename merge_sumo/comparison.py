@@ -1,13 +1,15 @@
 """Two campaigns side by side: what got fixed and what broke from VUT A to VUT B.
 
-Two campaigns have different cases, so the failures of each are run again with the VUT of the other:
-then both VUTs have been tried on the same cases, those with which at least one of them was seen to
-fail. That a VUT is still the one of its campaign is checked first: it must give again the scores
-that were recorded. Volumes are failure mode coverages of what is known by then.
+Two campaigns have different cases, so the failures, errors and timeouts of each are run again with
+the VUT of the other: then both VUTs have been tried on the same cases, those with which at least
+one of them was seen to fail or to give no verdict. That a VUT is still the one of its campaign is
+checked first: it must give again the scores that were recorded. Volumes are failure mode coverages
+of what is known by then.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,6 +22,8 @@ from merge_sumo.fmc import fmc
 from merge_sumo.journal import SETTINGS, Run, failures
 from merge_sumo.score import FAILURE_SCORE, Measures, Outcome, measure
 from merge_sumo.sumo.net import Net
+from merge_sumo.trajectory import End
+from merge_sumo.verdict import Verdict, counted, judge
 
 FIRST_LOOKS: Final = 10
 CHECKED: Final = 32
@@ -30,25 +34,29 @@ VOLUME_NOISE: Final = 2e-4
 
 
 class Change(StrEnum):
-    """What became of a case from A to B."""
+    """What became of a case from A to B; an error or a timeout is no verdict."""
 
     FIXED = "fixed"
     BROKE = "broke"
     BOTH_FAIL = "both fail"
+    NO_VERDICT_OF_A = "no verdict of A"
+    NO_VERDICT_OF_B = "no verdict of B"
     NO_VERDICT = "no verdict"
     NOT_RUN_AGAIN = "not run again"
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedCase:
-    """A case in which at least one of the two VUTs failed.
+    """A case in which at least one of the two VUTs failed or gave no verdict.
 
     Attributes:
         run: "A" or "B", the campaign that has the case.
         index: its index there.
         case: the case.
-        score_a: P of A; None where A gave no verdict or was not run.
+        score_a: P of A; None where an error ended it or A was not run.
         score_b: P of B.
+        end_a: how it ended with A; None where A was not run.
+        end_b: how it ended with B.
         change: what became of it.
     """
 
@@ -57,7 +65,31 @@ class ComparedCase:
     case: Case
     score_a: float | None
     score_b: float | None
+    end_a: End | None
+    end_b: End | None
     change: Change
+
+
+@dataclass(frozen=True, slots=True)
+class Untested:
+    """Cases at a level in which a VUT did not reach the merge point.
+
+    Attributes:
+        cases: cases that were looked at: those of both campaigns where both VUTs were run again,
+            else those of its own.
+        errors: that ended in an error.
+        timeouts: in which it never reached the merge point.
+        nothing_tested: whether its own campaign has cases at this level, and none was tested.
+    """
+
+    cases: int
+    errors: int
+    timeouts: int
+    nothing_tested: bool = False
+
+    def share(self, number: int) -> float:
+        """Return a number of the cases as a share of them."""
+        return number / self.cases if self.cases else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +97,18 @@ class LevelChange:
     """What changed at a POV level; volumes in the level's unit cube.
 
     Attributes:
+        untested_a: cases without a verdict of A.
+        untested_b: the same of B.
         fmc_a: coverage of the cases in which A is known to fail.
         fmc_b: the same of B.
-        fmc_fixed: volume that A's failures cover and B's do not.
-        fmc_broke: volume that B's failures cover and A's do not.
+        fmc_fixed: volume that A's failures cover and B's do not; failures on which B gives no
+            verdict are not fixed.
+        fmc_broke: volume that B's failures cover and A's do not, in the same way.
         changes: number of cases by what became of them.
     """
 
+    untested_a: Untested
+    untested_b: Untested
     fmc_a: float
     fmc_b: float
     fmc_fixed: float
@@ -85,7 +122,8 @@ class RunComparison:
 
     Attributes:
         levels: by POV level.
-        cases: every case in which one failed; what broke comes first, the worst of B first.
+        cases: every case in which one failed or gave no verdict; what broke comes first, the
+            worst of B first.
         evidence: how the verdicts of the other VUT came about, as a sentence.
     """
 
@@ -93,17 +131,40 @@ class RunComparison:
     cases: list[ComparedCase]
     evidence: str
 
-    def is_worse(self, tolerance: float) -> bool:
-        """Return whether B's coverage of failures exceeds A's by more than this at some level."""
-        return any(
-            level.fmc_b - level.fmc_a > tolerance + VOLUME_NOISE * level.fmc_b
-            for level in self.levels.values()
-        )
+    def worse(self, tolerance: float) -> list[str]:
+        """Return in sentences why B is worse than A; empty where it is not.
+
+        At some level B reached the merge point in no case of its campaign, or one of these grew by
+        more than the tolerance: the share of cases with an error, the share of cases with an error
+        or a timeout, FMC.
+        """
+        return [
+            why for level, found in self.levels.items() for why in _worse(level, found, tolerance)
+        ]
 
     def look_first(self) -> list[ComparedCase]:
         """Return the cases to look at first: those that broke, then those without a verdict."""
-        telling = (Change.BROKE, Change.NO_VERDICT, Change.NOT_RUN_AGAIN)
+        telling = (Change.BROKE, Change.NO_VERDICT_OF_B, Change.NOT_RUN_AGAIN)
         return [case for case in self.cases if case.change in telling][:FIRST_LOOKS]
+
+
+def _worse(level: int, found: LevelChange, tolerance: float) -> list[str]:
+    at, a, b = f"at POV level {level}", found.untested_a, found.untested_b
+    why = []
+    if b.nothing_tested:
+        why.append(f"{at} B reached the merge point in no case of its campaign")
+    for what, number_a, number_b in (
+        ("error", a.errors, b.errors),
+        ("error or timeout", a.errors + a.timeouts, b.errors + b.timeouts),
+    ):
+        if b.share(number_b) - a.share(number_a) > tolerance:
+            why.append(
+                f"{at} B has an {what} in {number_b} of {counted(b.cases, 'case')}, "
+                f"A in {number_a} of {a.cases}"
+            )
+    if found.fmc_b - found.fmc_a > tolerance + VOLUME_NOISE * found.fmc_b:
+        why.append(f"{at} FMC is {found.fmc_b:.4f} with B, {found.fmc_a:.4f} with A")
+    return why
 
 
 def compare_runs(
@@ -114,44 +175,46 @@ def compare_runs(
     Args:
         a: campaign of the VUT before.
         b: campaign of the VUT after.
-        rerun: run the failures of each with the VUT of the other.
+        rerun: run the failures, errors and timeouts of each with the VUT of the other.
         net: net for that; must be the one of the campaigns.
         trust: run the controllers that the folders name although they may be a stranger's.
 
-    Raises `UserError` where the campaigns have no level in common, differ in the initial speed of
-    the VUT, or were run on another net than the one to run again on.
+    Raises `UserError` where the campaigns have no level in common or no case there, differ in
+    the initial speed of the VUT, or were run on another net than the one to run again on.
     """
     levels = _common_levels(a, b)
-    failing_a, failing_b = (
-        [o for o in failures(run.outcomes) if o.case.level in levels] for run in (a, b)
+    own_a, own_b = ([o for o in run.outcomes if o.case.level in levels] for run in (a, b))
+    for run, own in ((a, own_a), (b, own_b)):
+        if not own:
+            raise UserError(f"{run.folder} has no case at a POV level of both: it shows nothing")
+    telling_a, telling_b = (
+        [*failures(own), *(o for o in own if not o.measures.end.is_tested)]
+        for own in (own_a, own_b)
     )
     again_a = again_b = _Again({}, "was not run again")
     if rerun:
         net = _common_net(a, b, net or Net())
-        again_b = _run_again(b, failing_a, net, trust=trust)
-        again_a = _run_again(a, failing_b, net, trust=trust)
+        again_b = _run_again(b, telling_a, net, trust=trust)
+        again_a = _run_again(a, telling_b, net, trust=trust)
     cases = [
-        ComparedCase(
-            "A",
-            o.index,
-            o.case,
-            o.measures.score,
-            *_became(again_b.measures.get(o.index), fails=Change.BOTH_FAIL, passes=Change.FIXED),
-        )
-        for o in failing_a
+        *(_compared("A", o, o.measures, again_b.measures.get(o.index)) for o in telling_a),
+        *(_compared("B", o, again_a.measures.get(o.index), o.measures) for o in telling_b),
     ]
-    for o in failing_b:
-        score_a, change = _became(
-            again_a.measures.get(o.index), fails=Change.BOTH_FAIL, passes=Change.BROKE
-        )
-        cases.append(ComparedCase("B", o.index, o.case, score_a, o.measures.score, change))
     cases.sort(key=_telling)
     return RunComparison(
-        {level: _level(level, cases) for level in levels},
+        {level: _level(level, cases, own_a, own_b) for level in levels},
         cases,
-        f"with the {len(failing_a)} failures of A, B {again_b.how}; "
-        f"with the {len(failing_b)} failures of B, A {again_a.how}",
+        f"with {_what(own_a)} of A, B {again_b.how}; with {_what(own_b)} of B, A {again_a.how}",
     )
+
+
+def _what(own: Sequence[Outcome]) -> str:
+    """Return in words what of a campaign is run again."""
+    found = judge(own)
+    text = f"the {counted(found.failures, 'failure')}"
+    if found.errors or found.timeouts:
+        text += f", {counted(found.errors, 'error')} and {counted(found.timeouts, 'timeout')}"
+    return text
 
 
 def _common_levels(a: Run, b: Run) -> list[int]:
@@ -185,14 +248,14 @@ def _common_net(a: Run, b: Run, net: Net) -> Net:
 
 @dataclass(frozen=True, slots=True)
 class _Again:
-    """What a VUT made of the other one's failures, by index, and how that came about."""
+    """What a VUT made of the other one's telling cases, by index, and how that came about."""
 
     measures: dict[int, Measures]
     how: str
 
 
 def _run_again(run: Run, failing: Sequence[Outcome], net: Net, *, trust: bool) -> _Again:
-    """Run a campaign's VUT on the other campaign's failures, if it is still the same VUT."""
+    """Run a campaign's VUT on the other's telling cases, if it is still the same VUT."""
     told = [o for o in run.outcomes if o.measures.score is not None]
     told = sorted(told, key=lambda o: (o.measures.score, o.index))[:CHECKED]
     cases = [o.case for o in (*told, *failing)]
@@ -214,22 +277,45 @@ def _run_again(run: Run, failing: Sequence[Outcome], net: Net, *, trust: bool) -
     return _Again({o.index: measures[first + n] for n, o in enumerate(failing)}, "was run again")
 
 
-def _became(
-    tried: Measures | None, *, fails: Change, passes: Change
-) -> tuple[float | None, Change]:
-    if tried is None:
-        return None, Change.NOT_RUN_AGAIN
-    if tried.score is None:
-        return None, Change.NO_VERDICT
-    return tried.score, fails if tried.score < FAILURE_SCORE else passes
+def _compared(run: str, of: Outcome, a: Measures | None, b: Measures | None) -> ComparedCase:
+    return ComparedCase(
+        run=run,
+        index=of.index,
+        case=of.case,
+        score_a=None if a is None else a.score,
+        score_b=None if b is None else b.score,
+        end_a=None if a is None else a.end,
+        end_b=None if b is None else b.end,
+        change=_change(a, b),
+    )
+
+
+def _change(a: Measures | None, b: Measures | None) -> Change:
+    if a is None or b is None:
+        return Change.NOT_RUN_AGAIN
+    if not (a.end.is_tested or b.end.is_tested):
+        return Change.NO_VERDICT
+    if not a.end.is_tested:
+        return Change.NO_VERDICT_OF_A
+    if not b.end.is_tested:
+        return Change.NO_VERDICT_OF_B
+    if _fails(a.score) and _fails(b.score):
+        return Change.BOTH_FAIL
+    return Change.BROKE if _fails(b.score) else Change.FIXED
+
+
+def _fails(score: float | None) -> bool:
+    return score is not None and score < FAILURE_SCORE
 
 
 def _telling(case: ComparedCase) -> tuple[int, float, str, int]:
     order = (
         Change.BROKE,
-        Change.NO_VERDICT,
+        Change.NO_VERDICT_OF_B,
         Change.NOT_RUN_AGAIN,
+        Change.NO_VERDICT,
         Change.BOTH_FAIL,
+        Change.NO_VERDICT_OF_A,
         Change.FIXED,
     )
     # Of what was not run again, B's cases may have broken, A's may be fixed.
@@ -237,21 +323,50 @@ def _telling(case: ComparedCase) -> tuple[int, float, str, int]:
     return order.index(case.change), score, case.run, case.index
 
 
-def _level(level: int, cases: Sequence[ComparedCase]) -> LevelChange:
+def _level(
+    level: int, cases: Sequence[ComparedCase], own_a: Sequence[Outcome], own_b: Sequence[Outcome]
+) -> LevelChange:
     at_level = [case for case in cases if case.case.level == level]
-    fails_a = [c.case for c in at_level if c.run == "A" or c.change is Change.BOTH_FAIL]
-    fails_b = [c.case for c in at_level if c.run == "B" or c.change is Change.BOTH_FAIL]
+    fails_a = [c.case for c in at_level if _fails(c.score_a)]
+    fails_b = [c.case for c in at_level if _fails(c.score_b)]
+    alone_a, alone_b = (judge(o for o in own if o.case.level == level) for own in (own_a, own_b))
+    if all(case.change is not Change.NOT_RUN_AGAIN for case in at_level):
+        # Both VUTs were tried on the same cases: the others of both campaigns raise no question.
+        together = alone_a.cases + alone_b.cases
+        untested_a = _untested(alone_a, together, (case.end_a for case in at_level))
+        untested_b = _untested(alone_b, together, (case.end_b for case in at_level))
+    else:
+        untested_a = _untested(alone_a, alone_a.cases, (c.end_a for c in at_level if c.run == "A"))
+        untested_b = _untested(alone_b, alone_b.cases, (c.end_b for c in at_level if c.run == "B"))
+
+    # Where one fails and the other gives no verdict, nothing was fixed and nothing broke.
+    silent = (Change.NO_VERDICT_OF_A, Change.NO_VERDICT_OF_B)
+    unknown = [
+        c.case for c in at_level if c.change in silent and (_fails(c.score_a) or _fails(c.score_b))
+    ]
 
     def volume(failing: Iterable[Case]) -> float:
         return fmc(to_unit(failing, level))
 
     fmc_a, fmc_b, either = volume(fails_a), volume(fails_b), volume(fails_a + fails_b)
     return LevelChange(
+        untested_a=untested_a,
+        untested_b=untested_b,
         fmc_a=fmc_a,
         fmc_b=fmc_b,
-        fmc_fixed=max(either - fmc_b, 0.0),
-        fmc_broke=max(either - fmc_a, 0.0),
+        fmc_fixed=max(either - volume(fails_b + unknown), 0.0),
+        fmc_broke=max(either - volume(fails_a + unknown), 0.0),
         changes={
             change.value: sum(case.change is change for case in at_level) for change in Change
         },
+    )
+
+
+def _untested(alone: Verdict, cases: int, ends: Iterable[End | None]) -> Untested:
+    counts = Counter(ends)
+    return Untested(
+        cases=cases,
+        errors=counts[End.VUT_ERROR] + counts[End.SIM_ERROR],
+        timeouts=counts[End.TIMEOUT],
+        nothing_tested=alone.cases > 0 and alone.tested == 0,
     )

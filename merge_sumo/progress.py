@@ -24,6 +24,8 @@ from rich.text import Text
 from merge_sumo.case import Case, to_unit
 from merge_sumo.fmc import fmc
 from merge_sumo.score import Outcome
+from merge_sumo.trajectory import End
+from merge_sumo.verdict import in_counts
 
 if TYPE_CHECKING:
     from merge_sumo.training.check import PolicyCheck
@@ -119,7 +121,7 @@ class CampaignPanel:
         self._console = console or Console(stderr=True)
         self._live: Live | None = None
         self._start_s = self._fresh_s = 0.0
-        self._ran = 0
+        self._ran = self._errors = self._timeouts = 0
         self._cases = dict.fromkeys(levels, 0)
         self._failing: dict[int, list[Case]] = {level: [] for level in levels}
         self._fmc = dict.fromkeys(levels, 0.0)
@@ -135,6 +137,8 @@ class CampaignPanel:
         level = outcome.case.level
         self._ran += 1
         self._cases[level] += 1
+        self._errors += outcome.measures.end.is_error
+        self._timeouts += outcome.measures.end is End.TIMEOUT
         if outcome.failed:
             self._failing[level].append(outcome.case)
             self._stale.add(level)
@@ -158,12 +162,13 @@ class CampaignPanel:
     def _rate(self) -> float:
         return self._ran / max(time.monotonic() - self._start_s, 1e-9)
 
-    def _failures(self) -> int:
-        return sum(map(len, self._failing.values()))
+    def _found(self) -> str:
+        failures = sum(map(len, self._failing.values()))
+        return ", ".join(in_counts(self._errors, self._timeouts, failures))
 
     def _line(self) -> str:
         return (
-            f"{self._title}: {self._ran}/{self._total} cases, {self._failures()} failures, "
+            f"{self._title}: {self._ran}/{self._total} cases, {self._found()}, "
             f"{self._rate():.3g} cases/s"
         )
 
@@ -173,7 +178,7 @@ class CampaignPanel:
         head.add_row(
             ProgressBar(total=self._total, completed=self._ran, width=30),
             f"{self._ran}/{self._total} cases",
-            f"{self._failures()} failures",
+            self._found(),
             f"{self._rate():.3g} cases/s",
             f"{int(left_s) // 60}:{int(left_s) % 60:02d} left",
         )

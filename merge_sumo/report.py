@@ -34,9 +34,13 @@ from merge_sumo.summary import LevelSummary, Summary, summarise
 from merge_sumo.sumo.net import LaneLine, Net
 from merge_sumo.surface import FEWEST_FAILURES, PLAUSIBLE, Surface, learn_surface
 from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.verdict import Trouble, Verdict, counted, in_words, judge, shortened
 
 REPORT: Final = "report.html"
 LISTED: Final = 10
+"""Cases in a list, and messages of errors and timeouts."""
+ERROR_CHARACTERS: Final = 2000
+"""Of the message of a case; `outcomes.jsonl` has the whole."""
 SHOWN: Final = 2000
 """Cases that the page holds one by one, with their motion; more are shown as counts."""
 COUNT_GRID: Final = (32, 20)
@@ -99,8 +103,10 @@ class _Level:
     about: str
     cases: int
     failures: int
+    untested: int
     share_bar: float
-    fmc: float
+    untested_bar: float
+    fmc: float | None
     fmc_bar: float | None
     plausible: float | None
     plausible_bar: float
@@ -126,15 +132,17 @@ class _Facts:
         self.run = run
         self.net = Net()
         self.summary = summarise(run.outcomes, levels)
+        self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
         self.worst = failures(run.outcomes)
         self.near = sorted(
-            (o for o in run.outcomes if o.measures.score is not None and not o.failed),
+            (o for o in run.outcomes if _is_told(o) and not o.failed),
             key=lambda o: (o.measures.score, o.index),
         )
-        self.errors = [o for o in run.outcomes if o.measures.score is None]
-        listed = self.worst[:LISTED] + self.errors[:LISTED] + self.near[:LISTED]
-        telling = {o.index: o for o in (*listed, *self.worst, *self.errors, *self.near)}
+        self.untested = [o for o in run.outcomes if not _is_told(o)]
+        examples = [o for trouble in self._troubles() for o in self._examples(trouble)]
+        listed = examples + self.worst[:LISTED] + self.near[:LISTED]
+        telling = {o.index: o for o in (*listed, *self.worst, *self.untested, *self.near)}
         self.shown = sorted(list(telling.values())[:SHOWN], key=lambda outcome: outcome.index)
         self.motion = {o.index: motion for o in self.shown if (motion := _motion(run, o.index))}
         self.diagnoses: dict[int, Diagnosis] = {
@@ -155,20 +163,26 @@ class _Facts:
         boxes = [
             box
             for level in self.levels
-            for box in failure_boxes(self.worst_first, level, self.kinds)
+            for box in failure_boxes(self.worst + self.near, level, self.kinds)
         ]
         described = Counter(box.level for box in boxes for _ in range(box.failures))
         left = {n: summary.levels[n].failures - described[n] for n in self.levels}
         levels = self._levels()
-        tables = {
-            "Ten worst failures": self.worst[:LISTED],
-            "Ten nearest misses": self.near[:LISTED],
-        }
-        if self.errors:
-            tables["Errors"] = self.errors[:LISTED]
+        tables = [
+            (f"{trouble.count} {trouble.end}: {trouble.message}", self._examples(trouble))
+            for trouble in self._troubles()
+        ]
+        tables += [
+            ("Ten worst failures", self.worst[:LISTED]),
+            ("Ten nearest misses", self.near[:LISTED]),
+        ]
         return {
             "vut": str(settings.get("vut")),
-            "verdict": verdict(summary, self.worst, self.kinds),
+            "headline": headline(self.verdict, summary, self.worst, self.kinds),
+            "counts": self.verdict.counts,
+            "found": self.verdict,
+            "troubles": self._troubles(),
+            "more_troubles": self.verdict.troubles[LISTED:],
             "torn": self.run.torn or (isinstance(wanted, int) and summary.cases < wanted),
             "counted": summary.cases - len(self.shown),
             "summary": summary,
@@ -184,7 +198,7 @@ class _Facts:
             "driven": _duration(sum(o.measures.t_end_s for o in self.run.outcomes)),
             "sentences": [box.sentence for box in boxes],
             "scattered": ", ".join(
-                f"{_count(count, 'failure')} at level {level}"
+                f"{counted(count, 'failure')} at level {level}"
                 for level, count in left.items()
                 if count > 0
             ),
@@ -196,10 +210,12 @@ class _Facts:
             "other_net": settings.get("net_sha256") != self.net.sha256,
         }
 
-    @property
-    def worst_first(self) -> list[Outcome]:
-        """Return all outcomes with a verdict."""
-        return self.worst + self.near
+    def _troubles(self) -> Sequence[Trouble]:
+        """Return the errors and timeouts that are listed, by message."""
+        return self.verdict.troubles[:LISTED]
+
+    def _examples(self, trouble: Trouble) -> list[Outcome]:
+        return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
 
     def _levels(self) -> list[_Level]:
         plausible = {
@@ -210,21 +226,30 @@ class _Facts:
             level: None if found is None else fmc(found.failures)
             for level, found in self.truths.items()
         }
-        shares = {n: s.failures / s.cases for n, s in self.summary.levels.items() if s.cases}
-        most_share = max(shares.values(), default=0.0) or 1.0
+        most_share = max(
+            (
+                (s.failures + s.cases - s.tested) / s.cases
+                for s in self.summary.levels.values()
+                if s.cases
+            ),
+            default=0.0,
+        )
 
         def row(level: int, found: LevelSummary) -> _Level:
             # Found against what there may be: a bar shows nothing where only one of them is known.
             most = max(found.fmc, plausible[level] or 0.0, truth[level] or 0.0)
             known = plausible[level] is not None or truth[level] is not None
             scale = 90.0 / most if known and most > 0.0 else 0.0
+            share = 100.0 / (most_share * found.cases) if most_share > 0.0 and found.cases else 0.0
             return _Level(
                 level=level,
                 about=ABOUT.get(level, ""),
                 cases=found.cases,
                 failures=found.failures,
-                share_bar=round(100.0 * shares.get(level, 0.0) / most_share, 1),
-                fmc=found.fmc,
+                untested=found.cases - found.tested,
+                share_bar=round(share * found.failures, 1),
+                untested_bar=round(share * (found.cases - found.tested), 1),
+                fmc=found.fmc if found.tested else None,
                 fmc_bar=round(scale * found.fmc, 1) if scale else None,
                 plausible=plausible[level],
                 plausible_bar=round(scale * (plausible[level] or 0.0), 1),
@@ -236,9 +261,13 @@ class _Facts:
         return [row(level, found) for level, found in self.summary.levels.items()]
 
     def _note(self, level: int, found: LevelSummary) -> str:
-        text = f"{_count(found.failures, 'failure')} in {_count(found.cases, 'case')}"
+        if found.cases and not found.tested:
+            return f"Nothing was tested in {counted(found.cases, 'case')}."
+        text = f"{counted(found.failures, 'failure')} in {counted(found.cases, 'case')}"
         if found.failures:
-            text += f", {_count(found.regions, 'region')}"
+            text += f", {counted(found.regions, 'region')}"
+        if found.tested < found.cases:
+            text += f"; {found.cases - found.tested} not tested"
         if self.surfaces[level] is None:
             text += f". No surrogate: it takes {FEWEST_FAILURES} failures to learn one"
         return text + "."
@@ -276,7 +305,11 @@ class _Facts:
             "ends": [end.value for end in End],
             "kinds": [kind.value for kind in Kind],
             "cases": self._columns(offsets),
-            "errors": {o.index: o.measures.error for o in self.shown if o.measures.error},
+            "errors": {
+                o.index: shortened(o.measures.error, ERROR_CHARACTERS)
+                for o in self.shown
+                if o.measures.error
+            },
             "speeds": speeds,
             "counts": self._counts(),
             "chance": {
@@ -377,34 +410,49 @@ class _Facts:
         }
 
 
-def verdict(summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]) -> str:
-    """Return the result of a campaign in a few sentences."""
-    if not summary.cases:
+def headline(
+    verdict: Verdict, summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]
+) -> str:
+    """Return the result of a campaign in a few sentences: what was not tested comes first."""
+    if not verdict.cases:
         return "No case has run."
-    others = sum(n for end, n in summary.ends.items() if end in (End.VUT_ERROR, End.SIM_ERROR))
-    without = (
-        f" {_count(others, 'case')} ended with an error and without a verdict." if others else ""
-    )
+    said = verdict.sentences
+    if verdict.tested:
+        for level, found in summary.levels.items():
+            if found.cases and not found.tested:
+                said.append(f"At POV level {level} nothing was tested.")
+        said.append(_collisions(verdict, summary, worst, kinds))
+    return " ".join(said)
+
+
+def _collisions(
+    verdict: Verdict, summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]
+) -> str:
     if not summary.failures:
+        others = "the other " if verdict.tested < verdict.cases else ""
         return (
-            f"No collision in {_count(summary.cases, 'case')}. That is no proof: the search saw "
-            f"these cases and no others.{without}"
+            f"No collision in {others}{counted(verdict.tested, 'case')}. That is no proof: the "
+            "search saw these cases and no others."
         )
     failing = {level: found for level, found in summary.levels.items() if found.failures}
-    never = [str(n) for n, found in summary.levels.items() if found.cases and not found.failures]
+    never = [str(n) for n, found in summary.levels.items() if found.tested and not found.failures]
     parts = [
         f"{found.failures} of {found.cases} cases at POV level {level} "
-        f"({_count(found.regions, 'region')})"
+        f"({counted(found.regions, 'region')})"
         for level, found in failing.items()
     ]
-    text = f"Collides in {_and(parts)}"
-    text += f", never at level {_and(never)}." if never else "."
+    text = f"Collides in {in_words(parts)}"
+    text += f", never at level {in_words(never)}." if never else "."
     common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
     if common:
         kind, count = common[0]
         share = "All are" if count == summary.failures else f"{count} of {summary.failures} are"
         text += f" {share} of the kind “{kind}”: {MEANING[kind]}."
-    return text + without
+    return text
+
+
+def _is_told(outcome: Outcome) -> bool:
+    return outcome.measures.end.is_tested and outcome.measures.score is not None
 
 
 def _avoidable(worst: Sequence[Outcome]) -> str | None:
@@ -412,14 +460,6 @@ def _avoidable(worst: Sequence[Outcome]) -> str | None:
         return None
     count = sum(bool(o.measures.avoidable) for o in worst)
     return f"{count} of {len(worst)} could have been avoided by the VUT."
-
-
-def _and(parts: Sequence[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _duration(seconds: float) -> str:

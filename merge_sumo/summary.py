@@ -18,12 +18,14 @@ class LevelSummary:
 
     Attributes:
         cases: cases that ran.
+        tested: cases in which the VUT reached the merge point.
         failures: cases with P < -500.
         fmc: failure mode coverage, M(s, 0.05, -500), in the level's unit cube.
         regions: groups of failures that are linked at a distance of 0.05.
     """
 
     cases: int
+    tested: int
     failures: int
     fmc: float
     regions: int
@@ -56,6 +58,7 @@ def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
     points = to_unit((outcome.case for outcome in at_level if outcome.failed), level)
     return LevelSummary(
         cases=len(at_level),
+        tested=sum(outcome.measures.end.is_tested for outcome in at_level),
         failures=len(points),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,

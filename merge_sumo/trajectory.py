@@ -20,6 +20,16 @@ class End(StrEnum):
     VUT_ERROR = "VUT_ERROR"
     SIM_ERROR = "SIM_ERROR"
 
+    @property
+    def is_tested(self) -> bool:
+        """Whether the VUT reached the merge point."""
+        return self in (End.MERGED, End.COLLISION)
+
+    @property
+    def is_error(self) -> bool:
+        """Whether the VUT or the simulation went wrong."""
+        return self in (End.VUT_ERROR, End.SIM_ERROR)
+
 
 REASON_CHARACTERS: Final = 600
 _ADDRESS: Final = re.compile(r"\b0x[0-9a-fA-F]{5,}\b")

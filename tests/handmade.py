@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from merge_sumo.trajectory import End, Trajectory
 BATCH = 20
 
 
-def drive(case: Case, error: str | None = None) -> Trajectory:
+def drive(case: Case, error: str | None = None, *, timeout: bool = False) -> Trajectory:
     """Return an episode: the POV brakes a little at level 1 and 2, the VUT coasts from 3 s."""
     rows = []
     x_pov, v_pov, x_vut, v_vut = case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps
@@ -30,7 +31,7 @@ def drive(case: Case, error: str | None = None) -> Trajectory:
         v_pov, v_vut = v_pov + a_pov * DT_S, v_vut + a_vut * DT_S
         step += 1
     rows.append((x_pov, v_pov, 0.0, x_vut, v_vut, 0.0))
-    end = End.MERGED if error is None else End.VUT_ERROR
+    end = End.TIMEOUT if timeout else End.MERGED if error is None else End.VUT_ERROR
     return Trajectory(case, np.array(rows), end, error)
 
 
@@ -57,9 +58,14 @@ def write_run(
     per_level: int = 60,
     levels: tuple[int, ...] = (0, 1, 2),
     error: str | None = "answered nan",
+    errors: Mapping[int, str] | None = None,
+    timeouts: Collection[int] = (),
     **settings: Any,
 ) -> Run:
-    """Write a campaign of `per_level` cases at each level and return it; the last case errs."""
+    """Write a campaign of `per_level` cases at each level and return it.
+
+    The last case errs, or instead of it those in `errors` and `timeouts`, by index.
+    """
     by_level = [cases_of(level, per_level) for level in levels]
     cases = [case for group in zip(*by_level, strict=True) for case in group]
     record = {
@@ -73,11 +79,13 @@ def write_run(
         "versions": versions(),
         **settings,
     }
+    if errors is None:
+        errors = {len(cases) - 1: error} if error is not None and not timeouts else {}
     journal = Journal.create(folder, record)
     for batch, first in enumerate(range(0, len(cases), BATCH)):
         ran = []
         for index, case in enumerate(cases[first : first + BATCH], start=first):
-            trajectory = drive(case, error if index == len(cases) - 1 else None)
+            trajectory = drive(case, errors.get(index), timeout=index in timeouts)
             ran.append((Outcome(index, batch, case, measure(trajectory)), trajectory))
         journal.append(ran)
     return Run(folder)

@@ -9,7 +9,13 @@ import pytest
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.comparison import Change, LevelChange, RunComparison, compare_runs
+from merge_sumo.comparison import (
+    Change,
+    LevelChange,
+    RunComparison,
+    Untested,
+    compare_runs,
+)
 from merge_sumo.conductor import CampaignSettings, run_campaign
 from merge_sumo.errors import UserError
 from merge_sumo.journal import Run, failures
@@ -26,6 +32,16 @@ def fixed(tmp_path_factory) -> Run:
 def other_seed(tmp_path_factory) -> Run:
     settings = CampaignSettings(vut="design1", levels=(0,), cases=60, batch=20, seed=2)
     return run_campaign(settings, tmp_path_factory.mktemp("other") / "run")
+
+
+def level_change(
+    fmc_a: float = 0.0,
+    fmc_b: float = 0.0,
+    a: tuple[int, int] = (0, 0),
+    b: tuple[int, int] = (0, 0),
+) -> LevelChange:
+    """Return a change at a level of 100 cases; `a` and `b` are numbers of errors and timeouts."""
+    return LevelChange(Untested(100, *a), Untested(100, *b), fmc_a, fmc_b, 0.0, 0.0, {})
 
 
 def changed(folder, run, **settings) -> Run:
@@ -46,7 +62,7 @@ class TestFromABadVutToAGoodOne:
         assert found.changes[Change.FIXED] == count == len(compared.cases)
         assert found.fmc_b == found.fmc_broke == 0.0
         assert found.fmc_a == found.fmc_fixed > 0.0
-        assert not compared.is_worse(0.0)
+        assert compared.worse(0.0) == []
         assert compared.look_first() == []
 
     def test_and_back_everything_broke(self, run, fixed):
@@ -55,8 +71,8 @@ class TestFromABadVutToAGoodOne:
         assert found.changes[Change.BROKE] == len(failures(run.outcomes))
         assert found.fmc_a == found.fmc_fixed == 0.0
         assert found.fmc_b == found.fmc_broke > 0.0
-        assert compared.is_worse(0.0)
-        assert not compared.is_worse(found.fmc_b + 0.01)
+        assert len(compared.worse(0.0)) == 1
+        assert compared.worse(found.fmc_b + 0.01) == []
         worst = failures(run.outcomes)[0]
         assert compared.look_first()[0].index == worst.index
 
@@ -68,7 +84,7 @@ class TestTheSameVut:
         assert found.changes[Change.BOTH_FAIL] == len(compared.cases) > 5
         assert found.fmc_a == found.fmc_b
         assert found.fmc_fixed == found.fmc_broke == 0.0
-        assert not compared.is_worse(0.0)
+        assert compared.worse(0.0) == []
 
     def test_that_does_not_do_again_what_it_did_is_not_believed(self, tmp_path, run, other_seed):
         # The record says design2, as if the design had been changed under its name since.
@@ -97,18 +113,52 @@ class TestWorse:
         [(0.1, 0.0, False), (0.11, 0.0, True), (0.11, 0.02, False), (0.09, 0.0, False)],
     )
     def test_is_a_growth_beyond_the_tolerance(self, fmc_b, tolerance, worse):
-        compared = RunComparison({0: LevelChange(0.1, fmc_b, 0.0, 0.0, {})}, [], "")
-        assert compared.is_worse(tolerance) is worse
+        compared = RunComparison({0: level_change(0.1, fmc_b)}, [], "")
+        assert bool(compared.worse(tolerance)) is worse
 
     def test_at_one_level_is_not_made_good_at_another(self):
-        levels = {0: LevelChange(0.5, 0.0, 0.0, 0.0, {}), 1: LevelChange(0.1, 0.2, 0.0, 0.0, {})}
-        assert RunComparison(levels, [], "").is_worse(0.05)
+        levels = {0: level_change(0.5, 0.0), 1: level_change(0.1, 0.2)}
+        (why,) = RunComparison(levels, [], "").worse(0.05)
+        assert why == "at POV level 1 FMC is 0.2000 with B, 0.1000 with A"
+
+    @pytest.mark.parametrize(
+        ("a", "b", "tolerance", "reasons"),
+        [
+            ((0, 0), (1, 0), 0.0, ["an error in 1", "an error or timeout in 1"]),
+            ((0, 0), (0, 1), 0.0, ["an error or timeout in 1"]),
+            ((0, 1), (1, 0), 0.0, ["an error in 1"]),
+            ((1, 0), (0, 1), 0.0, []),
+            ((2, 3), (2, 3), 0.0, []),
+            ((5, 5), (0, 0), 0.0, []),
+            ((0, 0), (3, 2), 0.06, []),
+            ((0, 0), (3, 4), 0.06, ["an error or timeout in 7"]),
+        ],
+    )
+    def test_is_a_larger_share_of_errors_or_of_errors_and_timeouts(self, a, b, tolerance, reasons):
+        said = RunComparison({1: level_change(a=a, b=b)}, [], "").worse(tolerance)
+        assert len(said) == len(reasons)
+        for sentence, reason in zip(said, reasons, strict=True):
+            assert sentence.startswith(f"at POV level 1 B has {reason} of 100 cases")
+
+    def test_is_to_have_tested_nothing_whatever_the_tolerance_and_whatever_a_did(self):
+        silent = Untested(100, 100, 0, nothing_tested=True)
+        compared = RunComparison({0: LevelChange(silent, silent, 0.0, 0.0, 0.0, 0.0, {})}, [], "")
+        assert compared.worse(9.0) == [
+            "at POV level 0 B reached the merge point in no case of its campaign"
+        ]
 
 
 class TestRefused:
     def test_without_a_common_level(self, tmp_path, run):
         with pytest.raises(UserError, match="no POV level in common"):
             compare_runs(run, changed(tmp_path / "b", run, levels=[1]))
+
+    def test_without_a_case(self, tmp_path, run):
+        empty = changed(tmp_path / "b", run)
+        (empty.folder / "outcomes.jsonl").write_bytes(b"")
+        for pair in ((run, Run(empty.folder)), (Run(empty.folder), run)):
+            with pytest.raises(UserError, match="has no case at a POV level of both"):
+                compare_runs(*pair)
 
     def test_with_another_initial_speed(self, tmp_path, run):
         with pytest.raises(UserError, match="--v-vut0"):

@@ -31,7 +31,7 @@ def test_without_a_terminal_a_line_for_every_tenth(outcomes):
     assert len(lines) == 10
     assert lines[0].startswith("a [b]: 18/180 cases, ")
     failing = sum(outcome.failed for outcome in outcomes)
-    assert lines[-1].startswith(f"a [b]: 180/180 cases, {failing} failures, ")
+    assert lines[-1].startswith(f"a [b]: 180/180 cases, 1 error, {failing} failures, ")
     assert lines[-1].endswith(" cases/s")
 
 

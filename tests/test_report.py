@@ -17,11 +17,12 @@ from merge_sumo.case import dimensions, to_unit
 from merge_sumo.experiments import Truth
 from merge_sumo.fmc import fmc
 from merge_sumo.journal import Run, failures
-from merge_sumo.report import SPEED_UNIT_MPS, report_page, verdict, write_report
+from merge_sumo.report import SPEED_UNIT_MPS, headline, report_page, write_report
 from merge_sumo.scenario import DT_S, X_VUT0_M
 from merge_sumo.summary import summarise
 from merge_sumo.sumo.net import Net
 from merge_sumo.surface import learn_surface
+from merge_sumo.verdict import judge
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
 
@@ -53,7 +54,7 @@ class TestThePage:
         found = len(failures(made.outcomes))
         assert found > 10
         text = text_of(page)
-        assert f"handmade: {found} failures in 180 cases" in text
+        assert f"handmade: 1 error and {found} failures in 180 cases" in text
         assert f"{found} failures in 180 cases" in text
         assert text.index("Collides in") < text.index("Failure mode coverage")
 
@@ -101,8 +102,10 @@ class TestThePage:
     def test_lists_the_worst_and_the_nearest_misses(self, made, page):
         root = html.fromstring(page)
         listed = [int(n) for n in root.xpath("//button/@data-case")]
-        assert listed[:10] == [o.index for o in failures(made.outcomes)[:10]]
-        near = [made.outcome(index) for index in listed[10:20]]
+        assert listed[0] == 179, "the case that ended with an error"
+        assert listed[1:11] == [o.index for o in failures(made.outcomes)[:10]]
+        near = [made.outcome(index) for index in listed[11:]]
+        assert len(near) == 10
         assert not any(o.failed for o in near)
         scores = [o.measures.score for o in near]
         assert scores == sorted(scores)
@@ -111,7 +114,6 @@ class TestThePage:
             for o in made.outcomes
             if o.measures.score is not None and not o.failed and o not in near
         )
-        assert listed[20:] == [179], "the case that ended with an error"
 
     def test_says_when_a_campaign_was_interrupted(self, made, tmp_path):
         assert "interrupted" not in text_of(report_page(made))
@@ -122,6 +124,53 @@ class TestThePage:
         shutil.rmtree(run.folder / "trajectories")
         data = data_of(report_page(Run(run.folder)))
         assert set(data["cases"]["rows"]) == {0}
+
+
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory) -> str:
+    errors = {3: f"{EVIL}\x1b[31m", 6: f"{EVIL}\x1b[31m", 9: "other"}
+    folder = tmp_path_factory.mktemp("broken") / "run"
+    return report_page(write_run(folder, 20, errors=errors, timeouts=(0, 1, 2, 4)))
+
+
+class TestWhatWasNotTested:
+    def test_is_listed_by_message_with_counts_before_all_else(self, broken):
+        root = html.fromstring(broken)
+        rows = root.xpath("//section[@aria-labelledby='untested']//tbody/tr")
+        assert [[cell.text_content() for cell in row] for row in rows] == [
+            [f"{EVIL}\\x1b[31m", "VUT_ERROR", "2", "3"],
+            ["other", "VUT_ERROR", "1", "9"],
+            ["the VUT did not reach the merge point in 9.1 s", "TIMEOUT", "4", "0"],
+        ]
+        assert broken.index('id="untested"') < broken.index("Failure mode coverage")
+        assert root.xpath("//p[contains(@class, 'verdict')]/@class") == ["verdict broken"]
+
+    def test_has_its_cases_in_lists_of_their_own_and_in_no_other(self, broken):
+        root = html.fromstring(broken)
+        lists = {
+            table.get("aria-label"): [int(n) for n in table.xpath(".//button/@data-case")]
+            for table in root.xpath("//table[@class='list']")
+        }
+        by_message = list(lists.values())[:3]
+        assert by_message == [[3, 6], [9], [0, 1, 2, 4]]
+        others = set(lists["Ten worst failures"]) | set(lists["Ten nearest misses"])
+        assert len(others) > 10
+        assert others & {0, 1, 2, 3, 4, 6, 9} == set()
+
+    def test_is_no_part_of_a_report_of_a_campaign_without(self, tmp_path):
+        page = report_page(write_run(tmp_path / "run", 10, error=None))
+        assert "untested" not in html.fromstring(page).xpath("//@aria-labelledby")
+        assert "broken" not in "".join(html.fromstring(page).xpath("//body//@class"))
+
+    def test_has_no_message_of_megabytes(self, tmp_path):
+        page = report_page(write_run(tmp_path / "run", 10, errors={0: "x" * 10**7}))
+        assert len(page) < 1e6
+        assert data_of(page)["errors"]["0"] == "x" * 1997 + "..."
+
+    def test_gives_no_coverage_where_nothing_was_tested(self, tmp_path):
+        page = report_page(write_run(tmp_path / "run", 10, levels=(0,), timeouts=range(10)))
+        assert "0.0000" not in text_of(page)
+        assert "Nothing was tested in 10 cases." in text_of(page)
 
 
 class TestTheMotion:
@@ -225,18 +274,56 @@ class TestTheSurrogate:
         assert all(learn_surface(few, level) is None for level in (0, 1, 2))
 
 
-class TestTheVerdict:
+def headline_of(outcomes) -> str:
+    levels = (0, 1, 2) if outcomes else (0,)
+    return headline(judge(outcomes), summarise(outcomes, levels), failures(outcomes), {})
+
+
+class TestTheHeadline:
     def test_of_no_failure_is_no_proof(self, made):
+        safe = [o for o in made.outcomes if o.measures.end.is_tested and not o.failed]
+        assert headline_of(safe) == (
+            f"No collision in {len(safe)} cases. That is no proof: the search saw these cases and "
+            "no others."
+        )
+
+    def test_names_what_was_not_tested_before_what_was(self, made):
         safe = [o for o in made.outcomes if not o.failed]
-        text = verdict(summarise(safe, (0, 1, 2)), [], {})
-        assert text.startswith(f"No collision in {len(safe)} cases. That is no proof")
-        assert text.endswith("1 case ended with an error and without a verdict.")
+        assert headline_of(safe).startswith(
+            f"1 of {len(safe)} cases ended in a VUT error: “answered nan”. "
+            f"No collision in the other {len(safe) - 1} cases. That is no proof"
+        )
 
     def test_of_nothing_says_so(self):
-        assert verdict(summarise([], (0,)), [], {}) == "No case has run."
+        assert headline_of([]) == "No case has run."
+
+    def test_of_timeouts_alone_speaks_of_no_collision(self, tmp_path):
+        run = write_run(tmp_path / "run", 10, levels=(0,), timeouts=range(10))
+        said = "All 10 cases timed out: the VUT never reached the merge point. Nothing was tested."
+        assert headline_of(run.outcomes) == said
+
+    def test_of_errors_alone_speaks_of_no_collision(self, tmp_path):
+        run = write_run(tmp_path / "run", 10, levels=(0,), errors=dict.fromkeys(range(10), "boom"))
+        said = "All 10 cases ended in a VUT error: “boom”. Nothing was tested."
+        assert headline_of(run.outcomes) == said
+
+    def test_of_a_mix_has_errors_then_timeouts_then_collisions(self, tmp_path):
+        errors = {1: "boom", 4: "boom", 7: "other"}
+        run = write_run(tmp_path / "run", 40, levels=(0,), errors=errors, timeouts=(2, 3))
+        assert failures(run.outcomes)
+        assert headline_of(run.outcomes).startswith(
+            "3 of 40 cases ended in a VUT error, 2 of them: “boom”. 2 of 40 cases timed out: there "
+            "the VUT never reached the merge point. Collides in "
+        )
+
+    def test_names_a_level_at_which_nothing_was_tested(self, tmp_path):
+        run = write_run(tmp_path / "run", 10, levels=(0, 1), timeouts=range(1, 20, 2))
+        text = headline_of(run.outcomes)
+        assert "At POV level 1 nothing was tested." in text
+        assert "never at level 1" not in text
 
     def test_names_levels_that_fail_and_levels_that_do_not(self, made):
         some = [o for o in made.outcomes if o.case.level == 0 or not o.failed]
-        text = verdict(summarise(some, (0, 1, 2)), failures(some), {})
+        text = headline_of(some)
         assert "cases at POV level 0" in text
         assert "never at level 1 and 2." in text

@@ -21,15 +21,19 @@ from merge_sumo.commands.shared import (
     VutCommandOption,
     VutMemoryOption,
     app,
+    print_troubles,
     say,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.printable import quoted
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
+    from merge_sumo.conductor import CampaignSettings
     from merge_sumo.journal import Run
     from merge_sumo.summary import Summary
+    from merge_sumo.verdict import Gate, Verdict
 
 
 @app.command()
@@ -79,6 +83,17 @@ def campaign(
     ] = 1,
     dask: DaskOption = None,
     net: NetOption = None,
+    gate: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GATE",
+            help='Exit with 1 if there are failures, errors, timeouts, or "fmc>X": an FMC above X '
+            "at some level. May be given several times.",
+        ),
+    ] = None,
+    junit: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="New file to write for CI: JUnit XML.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -86,17 +101,21 @@ def campaign(
 
     Ctrl-C lets the running batch end and says how to go on; twice stops at once.
 
+    Exit code 1 when a --gate is met, and always when the VUT reached the merge point in no case:
+    then nothing was tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
+
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
     """
     from merge_sumo import conductor
     from merge_sumo.interrupt import Interrupt, Stopped
     from merge_sumo.journal import read_settings
+    from merge_sumo.junit import check_junit
     from merge_sumo.progress import CampaignPanel
-    from merge_sumo.report import write_report
-    from merge_sumo.summary import summarise
     from merge_sumo.sumo.net import Net
+    from merge_sumo.verdict import parse_gates
     from merge_sumo.workers import open_workers
 
+    gates = parse_gates(gate or ())
     if resume is None:
         levels = conductor.parse_levels(level)
         settings = conductor.CampaignSettings(
@@ -120,6 +139,8 @@ def campaign(
         given = _given(context)
         settings = conductor.settings_of(resume, read_settings(resume), given, trust=trust_vut)
         folder, levels = resume, settings.levels
+    if junit is not None:
+        check_junit(junit, folder)
     title = f"{settings.vut} v level {'/'.join(map(str, levels))}"
     try:
         with (
@@ -149,26 +170,55 @@ def campaign(
                     trust=trust_vut,
                 )
     except Stopped:
-        say(_how_to_go_on(folder, net))
+        say(_how_to_go_on(folder, net, [gate.name for gate in gates], junit))
         raise
     if resume is None and level == "all" and len(levels) < 3:
         named = ", ".join(map(str, levels))
         say(f"--level all: policies are there for level {named}; `merge-sumo train` makes others")
+    raise typer.Exit(0 if _conclude(run, settings, gates, junit, as_json=as_json) else 1)
+
+
+def _conclude(
+    run: Run, settings: CampaignSettings, gates: list[Gate], junit: Path | None, *, as_json: bool
+) -> bool:
+    """Write and print what a campaign found; return whether it passed."""
+    from merge_sumo.junit import write_junit
+    from merge_sumo.report import write_report
+    from merge_sumo.summary import summarise
+    from merge_sumo.verdict import NOTHING_TESTED, judge
+
     report_file = write_report(run)
-    summary = summarise(run.outcomes, levels)
-    converged = len(run.outcomes) < cases
+    summary = summarise(run.outcomes, settings.levels)
+    verdict = judge(run.outcomes)
+    results = [gate.check(verdict, summary) for gate in gates]
+    passed = verdict.tested > 0 and not any(result.met for result in results)
+    converged = len(run.outcomes) < settings.cases
     if as_json:
-        stopped = "converged" if converged else "cases"
-        paths = {"run": str(folder), "report": str(report_file)}
-        typer.echo(json.dumps({**asdict(summary), "stopped": stopped, **paths}))
+        judged = {
+            **asdict(summary),
+            **verdict.to_record(),
+            "gates": {result.name: result.met for result in results},
+            "passed": passed,
+            "stopped": "converged" if converged else "cases",
+        }
+        paths = {"run": str(run.folder), "report": str(report_file)}
+        typer.echo(json.dumps({**judged, **paths}))
     else:
         if converged:
             typer.echo(
-                f"stopped after {len(run.outcomes)} of {cases} cases: three times in a row the "
-                f"next batch was expected to add less than {stop_after_converged:.2%} to the "
-                "coverage (this says nothing of regions that no case has come near)"
+                f"stopped after {len(run.outcomes)} of {settings.cases} cases: three times in a "
+                "row the next batch was expected to add less than "
+                f"{settings.stop_after_converged:.2%} to the coverage (this says nothing of "
+                "regions that no case has come near)"
             )
-        _print_summary(run, summary, report_file)
+        _print_summary(run, summary, verdict, report_file)
+    if junit is not None:
+        write_junit(junit, run, summary.levels, verdict, results)
+    for result in results:
+        say(result.sentence)
+    if not verdict.tested:
+        say(NOTHING_TESTED)
+    return passed
 
 
 def _given(context: typer.Context) -> dict[str, object]:
@@ -201,11 +251,15 @@ def _given(context: typer.Context) -> dict[str, object]:
     return given
 
 
-def _how_to_go_on(folder: Path, net: Path | None) -> str:
+def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path | None) -> str:
     if not folder.exists():
         return "stopped before the first case; nothing was written"
     command = f"merge-sumo campaign --resume {folder}"
-    return f"stopped; go on with: {command}" + (f" --net {net}" if net is not None else "")
+    command += f" --net {net}" if net is not None else ""
+    # Neither is a setting of the campaign, which its folder would remember.
+    command += "".join(f" --gate {quoted(gate)}" for gate in gates)
+    command += f" --junit {quoted(junit)}" if junit is not None else ""
+    return f"stopped; go on with: {command}"
 
 
 def _as_name(vut: str) -> str:
@@ -213,19 +267,20 @@ def _as_name(vut: str) -> str:
     return re.sub(r"[^\w.-]+", "-", vut).strip("-.")
 
 
-def _print_summary(run: Run, summary: Summary, report_file: Path) -> None:
+def _print_summary(run: Run, summary: Summary, verdict: Verdict, report_file: Path) -> None:
     from merge_sumo.conductor import SCENARIOS, case_name
     from merge_sumo.journal import failures
 
-    typer.echo(f"{summary.failures} failures in {summary.cases} cases")
+    typer.echo(verdict.counts)
+    print_troubles(verdict)
     for level, found in summary.levels.items():
+        if found.cases and not found.tested:
+            typer.echo(f"  level {level}: nothing was tested in {found.cases} cases")
+            continue
         typer.echo(
             f"  level {level}: {found.failures} failures in {found.cases} cases, "
             f"FMC {found.fmc:.4f}, {found.regions} regions"
         )
-    others = {end: n for end, n in summary.ends.items() if end not in ("MERGED", "COLLISION")}
-    if others:
-        typer.echo("  " + ", ".join(f"{n} {end}" for end, n in others.items()))
     typer.echo(f"report: {report_file}")
     worst = failures(run.outcomes)
     if worst:

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from merge_sumo.commands.shared import JsonOption, NetOption, RunArgument, TrustOption, app
+from merge_sumo.commands.shared import (
+    JsonOption,
+    NetOption,
+    RunArgument,
+    TrustOption,
+    app,
+    print_troubles,
+)
 from merge_sumo.errors import UserError
 
 if TYPE_CHECKING:
@@ -115,11 +122,18 @@ def compare_runs(
     a: Annotated[Path, typer.Argument(help="Folder of the campaign before.")],
     b: Annotated[Path, typer.Argument(help="Folder of the campaign after.")],
     tolerance: Annotated[
-        float, typer.Option(help="Growth of FMC at a level that is still no regression.")
+        float,
+        typer.Option(
+            help="Growth of FMC, or of the share of cases without a verdict, at a level that is "
+            "still no regression."
+        ),
     ] = 0.0,
     rerun: Annotated[
         bool,
-        typer.Option("--rerun/--no-rerun", help="Run the failures of each with the other's VUT."),
+        typer.Option(
+            "--rerun/--no-rerun",
+            help="Run the failures, errors and timeouts of each with the other's VUT.",
+        ),
     ] = True,
     net: NetOption = None,
     trust_vut: TrustOption = False,
@@ -127,44 +141,51 @@ def compare_runs(
 ) -> None:
     """Compare two VUTs, or two versions of one: what got fixed, and what broke.
 
-    The failures of each campaign are run again with the other's VUT. Exit code 1 when the failure
-    mode coverage (FMC) of B exceeds that of A by more than the tolerance at some level.
+    The failures, errors and timeouts of each campaign are run again with the other's VUT. Exit
+    code 1 when B is worse at some level: when one of these grew by more than the tolerance, the
+    share of cases with an error, the share of cases with an error or a timeout, or the failure
+    mode coverage (FMC); and whenever B reached the merge point in no case of its campaign.
 
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --tolerance 0.005
     """
     from merge_sumo import comparison
     from merge_sumo.journal import Run
     from merge_sumo.sumo.net import Net
+    from merge_sumo.verdict import judge
 
     if not tolerance >= 0.0:
         raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
     runs = Run(a), Run(b)
     compared = comparison.compare_runs(*runs, rerun=rerun, net=Net(net), trust=trust_vut)
-    worse = compared.is_worse(tolerance)
+    why = compared.worse(tolerance)
+    verdicts = {name: judge(loaded.outcomes) for name, loaded in zip("AB", runs, strict=True)}
     if as_json:
-        typer.echo(json.dumps({**asdict(compared), "tolerance": tolerance, "worse": worse}))
+        own = {name.lower(): verdict.to_record() for name, verdict in verdicts.items()}
+        judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
+        typer.echo(json.dumps({**own, **asdict(compared), **judged}))
     else:
-        for name, loaded in zip("AB", runs, strict=True):
-            typer.echo(f"{name}: {loaded.folder} ({loaded.settings.get('vut')})")
+        for (name, verdict), loaded in zip(verdicts.items(), runs, strict=True):
+            typer.echo(f"{name}: {loaded.folder} ({loaded.settings.get('vut')}): {verdict.counts}")
+            print_troubles(verdict)
         _print_comparison(compared, {"A": a, "B": b})
-        than = f"by more than {tolerance:g} in FMC at some level"
-        typer.echo(f"B is worse than A {than}" if worse else f"B is not worse than A {than}")
-    raise typer.Exit(1 if worse else 0)
+        worse = "worse" if why else "not worse"
+        typer.echo(f"B is {worse} than A, with a tolerance of {tolerance:g}")
+        for sentence in why:
+            typer.echo(f"  {sentence}")
+    raise typer.Exit(1 if why else 0)
 
 
 def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
+    from merge_sumo.comparison import Change
+
     typer.echo(
         f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "
-        "cases: fixed, broke, both fail, not run again, no verdict"
+        f"cases: {', '.join(Change)}"
     )
     for level, found in compared.levels.items():
-        counts = [
-            found.changes[name]
-            for name in ("fixed", "broke", "both fail", "not run again", "no verdict")
-        ]
         typer.echo(
             f"{level:<6} {found.fmc_a:8.4f} {found.fmc_b:8.4f} {found.fmc_fixed:8.4f} "
-            f"{found.fmc_broke:8.4f}   {', '.join(map(str, counts))}"
+            f"{found.fmc_broke:8.4f}   {', '.join(str(found.changes[change]) for change in Change)}"
         )
     typer.echo(f"evidence: {compared.evidence}")
     first = compared.look_first()

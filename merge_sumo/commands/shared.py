@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+
+if TYPE_CHECKING:
+    from merge_sumo.verdict import Verdict
+
+MOST_MESSAGES: Final = 5
+"""Messages of errors and timeouts that are printed; the report has the others."""
 
 app = typer.Typer(
     help="""Find where a merging controller fails against drivers who react to it.
@@ -61,6 +67,19 @@ TrustOption = Annotated[
     ),
 ]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
+
+
+def print_troubles(verdict: Verdict) -> None:
+    """Print what ended in an error or a timeout, by message; nothing where nothing did."""
+    for trouble in verdict.troubles[:MOST_MESSAGES]:
+        typer.echo(
+            f"  {trouble.count} {trouble.end}, the first in case {trouble.cases[0]}: "
+            f"{trouble.message}"
+        )
+    others = verdict.troubles[MOST_MESSAGES:]
+    if others:
+        number = sum(trouble.count for trouble in others)
+        typer.echo(f"  {number} with {len(others)} other messages")
 
 
 def say(text: str) -> None:

@@ -42,6 +42,7 @@ function motion(i) {
   return { rows, vPov, vVut, xPov, xVut };
 }
 const failed = (i) => cases.failed[i] === 1;
+const tested = (i) => ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
 const psiText = (psi) => `${fixed(psi, 2)} rad`;
 
 function title(i) {
@@ -168,7 +169,7 @@ function FailureMap(figure) {
     for (const { i, x, y } of marks) {
       const faint = apart(i) > PSI_NEAR ? " faint" : "";
       if (failed(i)) draw(svg, "path", { class: `mark fail${faint}`, d: `M${x} ${y - 5}l5 5l-5 5l-5 -5Z`, "data-case": cases.index[i] });
-      else if (cases.score[i] === null) draw(svg, "rect", { class: `mark error${faint}`, x: x - 3, y: y - 3, width: 6, height: 6, "data-case": cases.index[i] });
+      else if (!tested(i)) draw(svg, "rect", { class: `mark error${faint}`, x: x - 3, y: y - 3, width: 6, height: 6, "data-case": cases.index[i] });
       else draw(svg, "circle", { class: `mark safe${faint}`, cx: x, cy: y, r: 2.4, "data-case": cases.index[i] });
     }
     this.choose();

@@ -1,0 +1,128 @@
+"""A campaign as JUnit XML, which CI systems read: Jenkins, GitLab, GitHub actions and others.
+
+Every case is a test case, in a test suite per POV level, so that a CI system shows the share that
+passes: a collision or a timeout is a `failure`, an error of the VUT or of the simulation an
+`error`. A first suite has the gates, and whether anything was tested. Times are simulated seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+from lxml import etree
+
+from merge_sumo.errors import UserError
+from merge_sumo.journal import Run
+from merge_sumo.printable import printable
+from merge_sumo.score import Outcome
+from merge_sumo.trajectory import End
+from merge_sumo.verdict import (
+    NOTHING_TESTED,
+    GateResult,
+    Verdict,
+    message_of,
+)
+
+CLASS: Final = "merge-sumo"
+
+
+def check_junit(path: Path, folder: Path) -> None:
+    """Raise `UserError` where no JUnit file can be written when the campaign has ended.
+
+    Args:
+        path: file to write.
+        folder: folder of the campaign, which may not be there yet.
+    """
+    if path.exists() or path.is_symlink():
+        raise UserError(f"{path} exists: choose another file with --junit, or remove it first")
+    if path.absolute() == folder.absolute():
+        raise UserError(f"--junit is {path}, the folder of the campaign: choose a file")
+    if not path.parent.is_dir() and path.parent.absolute() != folder.absolute():
+        raise UserError(f"cannot write {path}: there is no folder {path.parent}")
+
+
+def write_junit(
+    path: Path, run: Run, levels: Iterable[int], verdict: Verdict, gates: Sequence[GateResult]
+) -> None:
+    """Write the JUnit file of a campaign; `UserError` when it exists or cannot be written."""
+    text = etree.tostring(
+        junit(run, levels, verdict, gates),
+        xml_declaration=True,
+        encoding="UTF-8",
+        pretty_print=True,
+    )
+    try:
+        with path.open("xb") as file:
+            file.write(text)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def junit(
+    run: Run, levels: Iterable[int], verdict: Verdict, gates: Sequence[GateResult]
+) -> etree._Element:
+    """Return a campaign as the element `testsuites`."""
+    name = printable(f"merge-sumo {run.settings.get('vut')}")
+    root = etree.Element("testsuites", name=name)
+    _gates(root, verdict, gates)
+    for level in levels:
+        suite = etree.SubElement(root, "testsuite", name=f"POV level {level}")
+        for outcome in run.outcomes:
+            if outcome.case.level == level:
+                _case(suite, outcome)
+        _count(suite)
+    suites = root.findall("testsuite")
+    for key in ("tests", "failures", "errors"):
+        root.set(key, str(sum(int(suite.get(key, "0")) for suite in suites)))
+    root.set("time", f"{sum(float(suite.get('time', '0')) for suite in suites):.1f}")
+    return root
+
+
+def _gates(root: etree._Element, verdict: Verdict, gates: Sequence[GateResult]) -> None:
+    suite = etree.SubElement(root, "testsuite", name="gates")
+    tested = _test(suite, "the VUT reaches the merge point", f"{CLASS}.gates", 0.0)
+    if not verdict.tested:
+        _wrong(tested, "failure", "NOTHING_TESTED", NOTHING_TESTED)
+    for gate in gates:
+        test = _test(suite, gate.name, f"{CLASS}.gates", 0.0)
+        if gate.met:
+            _wrong(test, "failure", "GATE", gate.sentence)
+    _count(suite)
+
+
+def _case(suite: etree._Element, outcome: Outcome) -> None:
+    case, measures = outcome.case, outcome.measures
+    name = (
+        f"case {outcome.index}: x_POV0 {case.x_pov0_m:.1f} m, v_POV0 {case.v_pov0_mps:.2f} m/s"
+    ) + ("" if case.svo_rad is None else f", psi {case.svo_rad:.2f} rad")
+    test = _test(suite, name, f"{CLASS}.level{case.level}", measures.t_end_s)
+    if measures.end.is_error:
+        _wrong(test, "error", measures.end.value, message_of(measures))
+    elif not measures.end.is_tested:
+        _wrong(test, "failure", End.TIMEOUT.value, message_of(measures))
+    elif outcome.failed:
+        gap = "" if measures.dx_m is None else f", gap {measures.dx_m:.1f} m"
+        _wrong(test, "failure", End.COLLISION.value, f"collision at the merge point{gap}")
+
+
+def _test(suite: etree._Element, name: str, class_name: str, time_s: float) -> etree._Element:
+    return etree.SubElement(
+        suite, "testcase", name=name, classname=class_name, time=f"{time_s:.1f}"
+    )
+
+
+def _wrong(test: etree._Element, tag: str, kind: str, message: str) -> None:
+    # Jenkins shows the message, GitLab the text.
+    etree.SubElement(test, tag, type=kind, message=message).text = message
+
+
+def _count(suite: etree._Element) -> None:
+    """Set what a suite says of its test cases."""
+    tests = suite.findall("testcase")
+    suite.set("tests", str(len(tests)))
+    suite.set("failures", str(len(suite.findall("testcase/failure"))))
+    suite.set("errors", str(len(suite.findall("testcase/error"))))
+    suite.set("skipped", "0")
+    suite.set("time", f"{sum(float(test.get('time', '0')) for test in tests):.1f}")
