@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from merge_sumo.case import SVO, V_POV0, X_POV0, FloatArray, dimensions, to_unit
 from merge_sumo.conductor import SCENARIOS, case_name, versions
 from merge_sumo.diagnosis import CEDED_MPS, MEANING, Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.errors import UserError
 from merge_sumo.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.fmc import RADIUS, fmc
@@ -204,6 +205,7 @@ class _Facts:
             ),
             "kinds": self._kinds(),
             "ceded": f"{CEDED_MPS:g}",
+            "printed": end_of(self.run.folder / LOG),
             "tables": tables,
             "settings": settings,
             "flat_settings": list(_flat(settings)),

@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import Final
 
 from merge_sumo.case import Case, FloatArray
+from merge_sumo.printable import printable
 from merge_sumo.scenario import DT_S
 
 
@@ -41,8 +42,7 @@ def as_reason(text: str) -> str:
     Without memory addresses: they differ from run to run, and records of equal runs must not.
     """
     line = " ".join(_ADDRESS.sub("0x...", text[: 2 * REASON_CHARACTERS]).split())
-    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
-    return "".join(shown)[:REASON_CHARACTERS]
+    return printable(line)[:REASON_CHARACTERS]
 
 
 @dataclass(frozen=True, slots=True)

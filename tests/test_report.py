@@ -14,6 +14,7 @@ from lxml import html
 
 from merge_sumo import report
 from merge_sumo.case import dimensions, to_unit
+from merge_sumo.drivers.vuts.output import LINES, LOG
 from merge_sumo.experiments import Truth
 from merge_sumo.fmc import fmc
 from merge_sumo.journal import Run, failures
@@ -22,6 +23,7 @@ from merge_sumo.scenario import DT_S, X_VUT0_M
 from merge_sumo.summary import summarise
 from merge_sumo.sumo.net import Net
 from merge_sumo.surface import learn_surface
+from merge_sumo.trajectory import REASON_CHARACTERS
 from merge_sumo.verdict import judge
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
@@ -165,7 +167,19 @@ class TestWhatWasNotTested:
     def test_has_no_message_of_megabytes(self, tmp_path):
         page = report_page(write_run(tmp_path / "run", 10, errors={0: "x" * 10**7}))
         assert len(page) < 1e6
-        assert data_of(page)["errors"]["0"] == "x" * 1997 + "..."
+        assert data_of(page)["errors"]["0"] == "x" * REASON_CHARACTERS
+
+    def test_ends_with_what_the_controller_printed_last(self, tmp_path):
+        run = write_run(tmp_path / "run", 10, error=None)
+        assert "Printed by the controller" not in text_of(report_page(run))
+        lines = [f"line {n} </pre><script>" for n in range(1000)]
+        (run.folder / LOG).write_text("\x1b[31m" + "\n".join(lines), encoding="utf-8")
+        page = report_page(run)
+        (shown,) = html.fromstring(page).xpath("//pre")
+        assert shown.text.splitlines() == lines[-LINES:]
+        (run.folder / LOG).unlink()
+        (run.folder / LOG).symlink_to(tmp_path / "run" / "campaign.json")
+        assert "Printed by the controller" not in text_of(report_page(run))
 
     def test_gives_no_coverage_where_nothing_was_tested(self, tmp_path):
         page = report_page(write_run(tmp_path / "run", 10, levels=(0,), timeouts=range(10)))
@@ -228,11 +242,11 @@ class TestTheTruth:
     def cached(self, monkeypatch):
         """Keep a truth where the left half of each pool fails."""
 
-        def truth(vut: str, level: int) -> Truth:
+        def truth(path: object, level: int, cases: int) -> Truth:
             points = np.random.default_rng(1).random((2000, len(dimensions(level))))
             return Truth(points, np.where(points[:, 0] < 0.5, -900.0, -10.0))
 
-        monkeypatch.setattr(report, "cached_truth", truth)
+        monkeypatch.setattr(report, "read_truth", truth)
         return truth
 
     def test_is_drawn_where_it_is_cached(self, tmp_path, cached):
@@ -243,7 +257,7 @@ class TestTheTruth:
         values = values.reshape(grid["ny"], grid["nx"])
         assert (values[:, :46] == 255).all()
         assert (values[:, -46:] == 0).all()
-        assert f"{fmc(cached('handmade', 0).failures):.4f}" in text_of(page)
+        assert f"{fmc(cached(None, 0, 0).failures):.4f}" in text_of(page)
 
     @pytest.mark.parametrize(
         "settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}, {"v_vut0_mps": 10.0}]

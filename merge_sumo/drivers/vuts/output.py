@@ -10,6 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
 
+from merge_sumo.printable import printable
+
 LOG: Final = "controller.log"
 """In the folder of a campaign."""
 TAIL_BYTES: Final = 2000
@@ -18,6 +20,9 @@ MOST_BYTES: Final = 4 << 20
 KEPT_BYTES: Final = 1 << 20
 PENDING_BYTES: Final = 1 << 16
 """What is kept of what is printed before the folder of the log is there."""
+LINE_BYTES: Final = 200
+_CAREFUL: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+"""Whatever stands in the place of a log is neither followed nor waited for."""
 
 
 class Output:
@@ -55,11 +60,27 @@ class Output:
                         self._pending = b""
 
 
+LINES: Final = 40
+"""Of the end of a log that a person is shown."""
+
+
+def end_of(log: Path) -> str:
+    """Return the last lines of a log, printable; "" where there is no such file."""
+    try:
+        descriptor = os.open(log, os.O_RDONLY | _CAREFUL)
+        with os.fdopen(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                return ""
+            file.seek(max(file.seek(0, os.SEEK_END) - LINES * LINE_BYTES, 0))
+            text = file.read(LINES * LINE_BYTES).decode("utf-8", errors="replace")
+    except OSError:
+        return ""
+    return "\n".join(printable(line) for line in text.splitlines()[-LINES:])
+
+
 def append(log: Path, content: bytes) -> None:
     """Add to a log, from whichever of several processes; OSError when that cannot be done."""
-    # Whatever stands in the place of the file is neither followed nor waited for.
-    careful = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-    descriptor = os.open(log, os.O_RDWR | os.O_CREAT | os.O_APPEND | careful, 0o644)
+    descriptor = os.open(log, os.O_RDWR | os.O_CREAT | os.O_APPEND | _CAREFUL, 0o644)
     with os.fdopen(descriptor, "r+b", buffering=0) as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             return
