@@ -31,6 +31,7 @@ CHECKED: Final = 32
 SAME_SCORE: Final = 1e-6
 VOLUME_NOISE: Final = 2e-4
 """Share of a volume in three dimensions that is rounding of the integral (see `fmc`)."""
+SHARE_ROUNDING: Final = 1e-9
 
 
 class Change(StrEnum):
@@ -157,7 +158,7 @@ def _worse(level: int, found: LevelChange, tolerance: float) -> list[str]:
         ("error", a.errors, b.errors),
         ("error or timeout", a.errors + a.timeouts, b.errors + b.timeouts),
     ):
-        if b.share(number_b) - a.share(number_a) > tolerance:
+        if b.share(number_b) - a.share(number_a) > tolerance + SHARE_ROUNDING:
             why.append(
                 f"{at} B has an {what} in {number_b} of {counted(b.cases, 'case')}, "
                 f"A in {number_a} of {a.cases}"

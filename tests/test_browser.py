@@ -32,7 +32,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Run:
-    run = write_run(tmp_path_factory.mktemp("browser") / "run")
+    run = write_run(tmp_path_factory.mktemp("browser") / "run", error=None)
     report.write_report(run)
     return run
 
@@ -202,8 +202,21 @@ def test_nothing_from_outside_runs(browser, tmp_path):
     report.write_report(run)
     with shown(browser, run.folder / report.REPORT) as page:
         assert page.inner_text("h1") == EVIL
-        page.locator(".list button").last.click()
+        page.locator(".list button").first.click()
         assert EVIL in page.inner_text("#case-words")
+
+
+def test_errors_and_timeouts_are_drawn_as_no_result_and_shown_first(browser, tmp_path):
+    run = write_run(tmp_path / "run", 20, errors={4: "boom"}, timeouts=(0, 3, 6))
+    report.write_report(run)
+    with shown(browser, run.folder / report.REPORT) as page:
+        drawn = page.locator(".map .mark.error").evaluate_all(
+            "all => all.map((m) => m.dataset.case)"
+        )
+        assert sorted(map(int, drawn)) == [0, 3, 4, 6]
+        assert page.inner_text("#case-words").startswith("VUT_ERROR: boom")
+        page.locator("[data-case='3']").last.click()
+        assert page.inner_text("#case-words").startswith("Timeout: the VUT did not arrive")
 
 
 def test_a_long_campaign_opens_too(browser, made, tmp_path, monkeypatch):

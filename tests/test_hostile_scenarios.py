@@ -678,6 +678,18 @@ class TestAnHonestNet:
         with World(2, net) as world:
             world.advance()
 
+    @pytest.mark.parametrize(
+        "kind", ["--grid", "--spider --sidewalks.guess", "--rand --rand.iterations 30 --tls.guess"]
+    )
+    def test_has_no_value_that_is_refused_whatever_made_it(self, kind, tmp_path):
+        arguments = [*kind.split(), "--seed", "1", "--output-file", "made.net.xml"]
+        ended = run_program("netgenerate", arguments, tmp_path)
+        assert ended.code == 0, ended.reason
+        content = (tmp_path / "made.net.xml").read_bytes()
+        root, intact = received.parse(content, received.NET, "it")
+        assert len(root.findall("edge")) == content.count(b"<edge ")
+        assert not intact, "internal links go, and traffic lights"
+
 
 class TestTheProgramsThatAreStarted:
     def test_get_no_option_from_the_environment(self, scene, monkeypatch):
