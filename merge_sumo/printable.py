@@ -1,0 +1,37 @@
+"""Names and messages that come from outside, as a terminal and a shell may see them."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from unicodedata import category
+
+
+def printable(text: str) -> str:
+    """Return a line with everything escaped that moves a cursor, ends a line or is no character."""
+    return "".join(
+        letter if letter.isprintable() or category(letter) == "Zs" else _escaped(letter)
+        for letter in text
+    )
+
+
+def _escaped(letter: str) -> str:
+    return letter.encode("unicode_escape").decode()
+
+
+def quoted(argument: str | Path) -> str:
+    """Return an argument of a command that a person may paste into a shell.
+
+    What cannot be printed is written as bytes in `$'...'`, which bash, zsh and ksh read.
+    """
+    text = str(argument)
+    if text.isprintable():
+        return shlex.quote(text)
+    plain = "".join(
+        letter
+        if letter.isascii() and letter.isprintable() and letter not in "'\\"
+        else "".join(f"\\x{byte:02x}" for byte in os.fsencode(letter))
+        for letter in text
+    )
+    return f"$'{plain}'"
