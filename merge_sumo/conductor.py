@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import platform
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
@@ -22,6 +22,7 @@ from merge_sumo.drivers.pov import PovLibrary, available_levels
 from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new, check_own
 from merge_sumo.journal import SETTINGS, Journal, Run, failures
 from merge_sumo.rollout import rollout
 from merge_sumo.samplers import DEFAULT_SAMPLER
@@ -30,7 +31,7 @@ from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario import DEADLINE_S, LEVELS, V_VUT0_MAX_MPS, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.score import Measures, Outcome, measure
 from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.replay import CONFIG, write_scenario
+from merge_sumo.sumo.replay import write_scenario
 from merge_sumo.sumo.world import World
 from merge_sumo.trajectory import End, Trajectory
 from merge_sumo.workers import MAX_DEATHS, Workers, open_workers, when_worker_ends
@@ -64,6 +65,12 @@ class CampaignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels."""
+        for option, text in (("--vut", self.vut), ("--vut-command", self.vut_command or "")):
+            if not _is_text(text):
+                raise UserError(
+                    f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
+                    "rename the file"
+                )
         _ = self.vut_factory
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
@@ -103,6 +110,15 @@ class CampaignSettings:
     def pool(self) -> Pool:
         """The cases to choose from."""
         return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps)
+
+
+def _is_text(text: str) -> bool:
+    """Return whether a text from the command line is one; other bytes come as half characters."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def parse_levels(text: str) -> tuple[int, ...]:
@@ -327,6 +343,8 @@ def run_campaign(
         workers: where cases run, by default in this process.
         check: called after every batch; may raise to stop there, and `resume_campaign` goes on.
     """
+    check_new(folder)
+    check_new(folder / SCENARIOS / case_name(settings.cases))
     net = net or Net()
     with workers_or_here(workers) as there:
         run = runs_on(there, _plan(settings, net))
@@ -362,6 +380,7 @@ def resume_campaign(
         warn: told in a sentence what was dropped.
     """
     net = net or Net()
+    check_own(folder / SCENARIOS)
     journal, before, dropped = Journal.reopen(folder)
     with journal, workers_or_here(workers) as there:
         recorded = {k: v for k, v in before.settings.items() if k != FORCED}
@@ -403,10 +422,8 @@ def _go_on(
     done = Run(journal.folder)
     for outcome in failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
-        if (folder / CONFIG).is_file():  # it is written last, so the others are there
-            continue
-        shutil.rmtree(folder, ignore_errors=True)
-        export_case(done, outcome.index, folder, net)
+        if not os.path.lexists(folder):  # written whole, before the campaign was stopped
+            export_case(done, outcome.index, folder, net)
     return done
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import os
@@ -30,6 +31,7 @@ from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
 from merge_sumo.fmc import RADIUS, fmc, regions
+from merge_sumo.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.journal import UNREADABLE_NPZ
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
@@ -110,6 +112,8 @@ def ground_truth(
     kept = _read_truth(path)
     if kept is not None:
         return kept
+    check_place(folder, "MERGE_SUMO_CACHE")
+    check_own(path)
     points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
     scores = np.full(count, np.nan)
     plan = GroundPlan(vut=vut_factory(vut), corridors=MAX_CORRIDORS, net=Net())
@@ -121,14 +125,10 @@ def ground_truth(
             if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
                 on_cases((ended - 1) % PROGRESS_CASES + 1)
     truth = Truth(points, scores)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        torn = path.with_suffix(f".{os.getpid()}.tmp")
-        with torn.open("wb") as file:
-            np.savez(file, points=truth.points, score=truth.score)
-        torn.replace(path)
-    except OSError as error:
-        raise UserError(f"cannot write the cache {folder}: {error.strerror}") from error
+    arrays = io.BytesIO()
+    np.savez(arrays, points=truth.points, score=truth.score)
+    make_place(folder, "MERGE_SUMO_CACHE")
+    replace_own(path, arrays.getvalue())
     return truth
 
 

@@ -15,6 +15,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.folders import new_folder
 from merge_sumo.scenario import DT_S
 from merge_sumo.score import Outcome
 from merge_sumo.sumo.binding import sumo_program
@@ -45,18 +46,13 @@ def write_scenario(folder: Path, net: Net, outcome: Outcome, trajectory: Traject
 
     Raises `UserError` when the folder exists or cannot be written; nothing is overwritten.
     """
-    try:
-        folder.mkdir(parents=True)
-        (folder / NET).write_bytes(net.text)
-        (folder / TYPES).write_bytes(_xml(_types(net, trajectory)))
-        (folder / RECORD).write_bytes(_xml(_fcd(net, trajectory)))
-        (folder / VIEW).write_bytes(_xml(_view()))
-        (folder / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
-        (folder / CONFIG).write_bytes(_xml(_config(trajectory)))
-    except FileExistsError as error:
-        raise UserError(f"{folder} exists: choose another folder or remove it first") from error
-    except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}") from error
+    with new_folder(folder) as new:
+        (new / NET).write_bytes(net.text)
+        (new / TYPES).write_bytes(_xml(_types(net, trajectory)))
+        (new / RECORD).write_bytes(_xml(_fcd(net, trajectory)))
+        (new / VIEW).write_bytes(_xml(_view()))
+        (new / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
+        (new / CONFIG).write_bytes(_xml(_config(trajectory)))
     return folder / CONFIG
 
 
