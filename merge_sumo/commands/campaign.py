@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,8 +17,11 @@ from merge_sumo.commands.shared import (
     VutCommandOption,
     app,
     say,
+    show,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.folders import dated
+from merge_sumo.printable import quoted
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenario import DEADLINE_S
 
@@ -86,7 +87,7 @@ def campaign(
     from merge_sumo.interrupt import Interrupt, Stopped
     from merge_sumo.journal import read_settings
     from merge_sumo.progress import CampaignPanel
-    from merge_sumo.report import write_report
+    from merge_sumo.report import check_report, write_report
     from merge_sumo.summary import summarise
     from merge_sumo.sumo.net import Net
     from merge_sumo.workers import open_workers
@@ -105,13 +106,12 @@ def campaign(
             vut_command=vut_command,
             deadline_s=deadline,
         )
-        folder = (
-            out or Path("runs") / f"{_as_name(vut)}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
-        )
+        folder = out or dated(vut)
     else:
         given = _given(context)
         settings = conductor.settings_of(resume, {**read_settings(resume), **given})
         folder, levels = resume, settings.levels
+        check_report(folder)
     title = f"{settings.vut} v level {'/'.join(map(str, levels))}"
     try:
         with (
@@ -154,7 +154,7 @@ def campaign(
         typer.echo(json.dumps({**asdict(summary), "stopped": stopped, **paths}))
     else:
         if converged:
-            typer.echo(
+            show(
                 f"stopped after {len(run.outcomes)} of {cases} cases: three times in a row the "
                 f"next batch was expected to add less than {stop_after_converged:.2%} to the "
                 "coverage (this says nothing of regions that no case has come near)"
@@ -193,30 +193,25 @@ def _given(context: typer.Context) -> dict[str, object]:
 def _how_to_go_on(folder: Path, net: Path | None) -> str:
     if not folder.exists():
         return "stopped before the first case; nothing was written"
-    command = f"merge-sumo campaign --resume {folder}"
-    return f"stopped; go on with: {command}" + (f" --net {net}" if net is not None else "")
-
-
-def _as_name(vut: str) -> str:
-    """Return a VUT's spec as part of a folder's name."""
-    return re.sub(r"[^\w.-]+", "-", vut).strip("-.")
+    command = f"merge-sumo campaign --resume {quoted(folder)}"
+    return f"stopped; go on with: {command}" + (f" --net {quoted(net)}" if net is not None else "")
 
 
 def _print_summary(run: Run, summary: Summary, report_file: Path) -> None:
     from merge_sumo.conductor import SCENARIOS, case_name
     from merge_sumo.journal import failures
 
-    typer.echo(f"{summary.failures} failures in {summary.cases} cases")
+    show(f"{summary.failures} failures in {summary.cases} cases")
     for level, found in summary.levels.items():
-        typer.echo(
+        show(
             f"  level {level}: {found.failures} failures in {found.cases} cases, "
             f"FMC {found.fmc:.4f}, {found.regions} regions"
         )
     others = {end: n for end, n in summary.ends.items() if end not in ("MERGED", "COLLISION")}
     if others:
-        typer.echo("  " + ", ".join(f"{n} {end}" for end, n in others.items()))
-    typer.echo(f"report: {report_file}")
+        show("  " + ", ".join(f"{n} {end}" for end, n in others.items()))
+    show(f"report: {report_file}")
     worst = failures(run.outcomes)
     if worst:
         folder = run.folder / SCENARIOS / case_name(worst[0].index)
-        typer.echo(f"worst case: merge-sumo replay {folder} --gui")
+        show(f"worst case: merge-sumo replay {quoted(folder)} --gui")

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from merge_sumo.commands.shared import JsonOption, NetOption, RunArgument, app
+from merge_sumo.commands.shared import JsonOption, NetOption, RunArgument, app, show
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_own
+from merge_sumo.printable import quoted
 
 if TYPE_CHECKING:
     from merge_sumo.comparison import RunComparison
@@ -58,9 +60,11 @@ def export(
     from merge_sumo.sumo.net import Net
 
     loaded = Run(run)
+    if out is None:
+        check_own(run / SCENARIOS, run / EXPORTS)
     if file_format in (Format.CSV, Format.PARQUET):
         indices = case or [outcome.index for outcome in loaded.outcomes]
-        typer.echo(exports.write_table(loaded, indices, out or run / EXPORTS, file_format.value))
+        show(exports.write_table(loaded, indices, out or run / EXPORTS, file_format.value))
         return
     if not case:
         raise UserError(f"--format {file_format} needs the indices of cases")
@@ -68,7 +72,7 @@ def export(
     target = out or run / (SCENARIOS if to_sumo else EXPORTS)
     write = exports.write_sumo if to_sumo else exports.write_openscenario
     for path in exports.write_folders(loaded, case, target, write, Net(net)):
-        typer.echo(path)
+        show(path)
 
 
 @app.command()
@@ -92,9 +96,9 @@ def replay(
     if as_json:
         typer.echo(json.dumps({"identical": identical, **asdict(result)}))
     elif identical:
-        typer.echo(f"identical: {result.rows} rows of x, y, position and speed")
+        show(f"identical: {result.rows} rows of x, y, position and speed")
     else:
-        typer.echo(f"diverged at t = {result.diverged_at_s:.1f} s: {result.detail}")
+        show(f"diverged at t = {result.diverged_at_s:.1f} s: {result.detail}")
     raise typer.Exit(0 if identical else 1)
 
 
@@ -107,7 +111,7 @@ def report(run: RunArgument) -> None:
     from merge_sumo.journal import Run
     from merge_sumo.report import write_report
 
-    typer.echo(write_report(Run(run)))
+    show(write_report(Run(run)))
 
 
 @app.command("compare-runs")
@@ -144,15 +148,15 @@ def compare_runs(
         typer.echo(json.dumps({**asdict(compared), "tolerance": tolerance, "worse": worse}))
     else:
         for name, loaded in zip("AB", runs, strict=True):
-            typer.echo(f"{name}: {loaded.folder} ({loaded.settings.get('vut')})")
+            show(f"{name}: {loaded.folder} ({loaded.settings.get('vut')})")
         _print_comparison(compared, {"A": a, "B": b})
         than = f"by more than {tolerance:g} in FMC at some level"
-        typer.echo(f"B is worse than A {than}" if worse else f"B is not worse than A {than}")
+        show(f"B is worse than A {than}" if worse else f"B is not worse than A {than}")
     raise typer.Exit(1 if worse else 0)
 
 
 def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
-    typer.echo(
+    show(
         f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "
         "cases: fixed, broke, both fail, not run again, no verdict"
     )
@@ -161,13 +165,13 @@ def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None
             found.changes[name]
             for name in ("fixed", "broke", "both fail", "not run again", "no verdict")
         ]
-        typer.echo(
+        show(
             f"{level:<6} {found.fmc_a:8.4f} {found.fmc_b:8.4f} {found.fmc_fixed:8.4f} "
             f"{found.fmc_broke:8.4f}   {', '.join(map(str, counts))}"
         )
-    typer.echo(f"evidence: {compared.evidence}")
+    show(f"evidence: {compared.evidence}")
     first = compared.look_first()
     if first:
-        typer.echo("look first at:")
+        show("look first at:")
     for case in first:
-        typer.echo(f"  {case.change}: merge-sumo export {folders[case.run]} {case.index}")
+        show(f"  {case.change}: merge-sumo export {quoted(folders[case.run])} {case.index}")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from merge_sumo.printable import printable
+
 app = typer.Typer(
     help="""Find where a merging controller fails against drivers who react to it.
 
@@ -45,6 +47,11 @@ DeadlineOption = Annotated[
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 
-def say(text: str) -> None:
+def show(line: object) -> None:
+    """Print a line of a result on standard output; JSON goes there as it is."""
+    typer.echo(printable(str(line)))
+
+
+def say(line: str) -> None:
     """Print a line for a person, on standard error: standard output is for results."""
-    typer.echo(text, err=True)
+    typer.echo(printable(line), err=True)
