@@ -10,7 +10,6 @@ run.report()        # path of the HTML report
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -25,6 +24,7 @@ from merge_sumo.conductor import (
     run_campaign,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.folders import dated
 from merge_sumo.journal import SETTINGS, Run, failures
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB, V_VUT0_MPS
@@ -201,9 +201,7 @@ def campaign(
         vut_memory_gib=vut_memory_gib,
         in_process=in_process,
     )
-    name = "".join(letter if letter.isalnum() or letter in "._" else "-" for letter in vut)
-    default = Path("runs") / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
-    folder = default if out is None else Path(out)
+    folder = dated(vut) if out is None else Path(out)
     road = Net(None if net is None else Path(net))
     with open_workers(settings.vut_factory.workers(workers)) as there:
         run_campaign(settings, folder, road, on_case, workers=there)

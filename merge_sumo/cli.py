@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from io import TextIOWrapper
 from typing import Annotated
 
 import typer
@@ -31,6 +32,10 @@ def main() -> None:
 
     What a signal stopped ends with 128 + its number.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            # No name of a file ends a command because a terminal has no such letter.
+            stream.reconfigure(errors="backslashreplace")
     try:
         app()
     except UserError as error:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import platform
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, field, fields
@@ -24,6 +24,7 @@ from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.files import Files, hashed, sha256_of
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new, check_own
 from merge_sumo.journal import SETTINGS, Journal, Run, failures
 from merge_sumo.rollout import rollout
 from merge_sumo.samplers import DEFAULT_SAMPLER
@@ -39,7 +40,7 @@ from merge_sumo.scenario import (
 )
 from merge_sumo.score import Measures, Outcome, measure
 from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.replay import CONFIG, write_scenario
+from merge_sumo.sumo.replay import write_scenario
 from merge_sumo.sumo.world import World
 from merge_sumo.trajectory import End, Trajectory
 from merge_sumo.trust import SEAL, is_own, seal
@@ -76,6 +77,12 @@ class CampaignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels."""
+        for option, text in (("--vut", self.vut), ("--vut-command", self.vut_command or "")):
+            if not _is_text(text):
+                raise UserError(
+                    f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
+                    "rename the file"
+                )
         _ = self.vut_factory
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
@@ -124,6 +131,15 @@ class CampaignSettings:
 
 _DEFAULTS: Final = {f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING}
 """What the settings were in a campaign that does not record them."""
+
+
+def _is_text(text: str) -> bool:
+    """Return whether a text from the command line is one; other bytes come as half characters."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def parse_levels(text: str) -> tuple[int, ...]:
@@ -348,6 +364,8 @@ def run_campaign(
         workers: where cases run, by default in this process.
         check: called after every batch; may raise to stop there, and `resume_campaign` goes on.
     """
+    check_new(folder)
+    check_new(folder / SCENARIOS / case_name(settings.cases))
     net = net or Net()
     with workers_or_here(workers) as there:
         run = runs_on(there, _plan(settings, net, folder))
@@ -387,6 +405,7 @@ def resume_campaign(
         trust: run the controller that the folder names although the folder may be a stranger's.
     """
     net = net or Net()
+    check_own(folder / SCENARIOS)
     journal, before, dropped = Journal.reopen(folder)
     with journal, workers_or_here(workers) as there:
         recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, SEAL)}
@@ -452,10 +471,8 @@ def _go_on(
     done = Run(journal.folder)
     for outcome in failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
-        if (folder / CONFIG).is_file():  # it is written last, so the others are there
-            continue
-        shutil.rmtree(folder, ignore_errors=True)
-        export_case(done, outcome.index, folder, net)
+        if not os.path.lexists(folder):  # written whole, before the campaign was stopped
+            export_case(done, outcome.index, folder, net)
     return done
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -31,6 +31,7 @@ from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
 from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
 from merge_sumo.fmc import RADIUS, fmc, regions
+from merge_sumo.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.journal import UNREADABLE_NPZ
 from merge_sumo.resources import cache_folder
 from merge_sumo.samplers.ground import Ground
@@ -116,6 +117,8 @@ def ground_truth(
     found = read_truth(path, level, count)
     if found is not None:
         return found
+    check_place(path.parent, "MERGE_SUMO_CACHE")
+    check_own(path)
     points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
     scores = np.full(count, np.nan)
     files = dict(factory.files or {})
@@ -130,14 +133,10 @@ def ground_truth(
             if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
                 on_cases((ended - 1) % PROGRESS_CASES + 1)
     truth = Truth(points, scores)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torn = path.with_suffix(f".{os.getpid()}.tmp")
-        with torn.open("wb") as file:
-            np.savez(file, points=truth.points, score=truth.score, files=json.dumps(files))
-        torn.replace(path)
-    except OSError as error:
-        raise UserError(f"cannot write the cache {path.parent}: {error.strerror}") from error
+    arrays = io.BytesIO()
+    np.savez(arrays, points=truth.points, score=truth.score, files=json.dumps(files))
+    make_place(path.parent, "MERGE_SUMO_CACHE")
+    replace_own(path, arrays.getvalue())
     return truth
 
 

@@ -7,6 +7,7 @@ an Arrow of its own and warns wherever a pyarrow is installed.
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
@@ -17,10 +18,11 @@ import numpy as np
 
 from merge_sumo.conductor import case_name, export_case
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new, check_place, make_place, new_file, new_folder
 from merge_sumo.journal import Run
 from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.opendrive import write_opendrive
+from merge_sumo.sumo.opendrive import opendrive
 
 TABLE: Final = "trajectories"
 COLUMNS: Final = (
@@ -46,11 +48,11 @@ def write_folders(
 
     Raises `UserError`, before anything is written, when a case or a folder is not as it should be.
     """
+    check_place(target)
     folders = {index: target / case_name(index) for index in indices}
     for index, folder in folders.items():
         run.outcome(index)
-        if folder.exists():
-            raise UserError(f"{folder} exists: choose another folder with --out")
+        check_new(folder)
     for index, folder in folders.items():
         yield write(run, index, folder, net)
 
@@ -65,23 +67,23 @@ def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str
 
     Raises `UserError` when the file exists, a case has no trajectory, or polars is missing.
     """
+    check_place(folder)
     path = folder / f"{TABLE}.{file_format}"
-    if path.exists():
-        raise UserError(f"{path} exists: choose another folder with --out")
+    check_new(path)
     if file_format == "parquet":
         polars = _need("polars")
     rows = _rows(run, indices)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    make_place(folder)
+    with new_file(path) as file:
         if file_format == "parquet":
-            polars.DataFrame(rows, schema=list(COLUMNS), orient="row").write_parquet(path)
+            polars.DataFrame(rows, schema=list(COLUMNS), orient="row").write_parquet(file)
         else:
-            with path.open("x", newline="", encoding="utf-8") as file:
-                writer = csv.writer(file)
-                writer.writerow(COLUMNS)
-                writer.writerows(rows)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+            text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+            writer = csv.writer(text)
+            writer.writerow(COLUMNS)
+            writer.writerows(rows)
+            text.flush()
+            text.detach()
     return path
 
 
@@ -104,13 +106,6 @@ def write_openscenario(run: Run, index: int, folder: Path, net: Net) -> Path:
     """
     xosc = _need("scenariogeneration").xosc
     trajectory, name = run.trajectory(index), case_name(index)
-    try:
-        folder.mkdir(parents=True)
-    except FileExistsError as error:
-        raise UserError(f"{folder} exists: choose another folder or remove it first") from error
-    except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}") from error
-    write_opendrive(net, folder / ROAD)
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
     for who, column, on_ramp in (("pov", 0, False), ("vut", 3, True)):
@@ -137,9 +132,10 @@ def write_openscenario(run: Run, index: int, folder: Path, net: Net) -> Path:
         # A fixed date: the same case gives the same bytes.
         creation_date=_EPOCH,
     )
-    path = folder / f"{name}.xosc"
-    scenario.write_xml(str(path))
-    return path
+    with new_folder(folder) as new:
+        (new / ROAD).write_bytes(opendrive(net))
+        scenario.write_xml(str(new / f"{name}.xosc"))
+    return folder / f"{name}.xosc"
 
 
 def _need(package: str) -> Any:

@@ -21,6 +21,7 @@ from merge_sumo.case import Dimension, FloatArray, dimensions
 from merge_sumo.errors import UserError
 from merge_sumo.experiments import Comparison
 from merge_sumo.fmc import RADIUS
+from merge_sumo.folders import check_new_file, write_new
 from merge_sumo.score import FAILURE_SCORE
 
 if TYPE_CHECKING:
@@ -75,10 +76,7 @@ def check_figure(path: Path) -> None:
     """Raise `UserError` where a figure cannot be drawn to `path`, before anything is run for it."""
     if path.suffix not in KINDS:
         raise UserError(f"--figure is {path}: end it in {', '.join(KINDS[:-1])} or {KINDS[-1]}")
-    if path.exists():
-        raise UserError(f"{path} exists: choose another file with --figure")
-    if not path.parent.is_dir():
-        raise UserError(f"--figure is {path}: there is no folder {path.parent}")
+    check_new_file(path, "--figure")
     require_matplotlib()
 
 
@@ -93,20 +91,20 @@ def require_matplotlib() -> None:
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, SVG or a page that needs no network, by the end of the file's name.
 
-    Raises `UserError` when the file cannot be written.
+    Raises `UserError` when the file exists or cannot be written.
     """
-    try:
-        if path.suffix == ".html":
-            with io.StringIO() as file:
-                _write(figure, file, "svg")
-                svg = file.getvalue()
-            title = html.escape(figure.get_suptitle())
-            page = f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{title}'
-            path.write_text(f"{page}</title>\n{svg[svg.index('<svg') :]}", encoding="utf-8")
-        else:
-            _write(figure, path, path.suffix[1:])
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    if path.suffix == ".html":
+        with io.StringIO() as text:
+            _write(figure, text, "svg")
+            svg = text.getvalue()
+        title = html.escape(figure.get_suptitle())
+        page = f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{title}'
+        content = f"{page}</title>\n{svg[svg.index('<svg') :]}".encode(errors="backslashreplace")
+    else:
+        with io.BytesIO() as picture:
+            _write(figure, picture, path.suffix[1:])
+            content = picture.getvalue()
+    write_new(path, content, "--figure")
 
 
 def _write(figure: Figure, file: Any, kind: str) -> None:

@@ -11,8 +11,6 @@ import errno
 import io
 import json
 import os
-import secrets
-import shutil
 import struct
 import sys
 import tokenize
@@ -27,6 +25,8 @@ from numpy.typing import NDArray
 
 from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_own, new_folder, replace_own, sync_folder
+from merge_sumo.printable import quoted
 from merge_sumo.score import Outcome
 from merge_sumo.trajectory import End, Trajectory
 
@@ -63,23 +63,11 @@ class Journal:
     @classmethod
     def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
         """Create the folder with its settings; `UserError` when it exists or cannot be written."""
-        new = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}") if folder.name else folder
-        try:
-            if folder.exists():
-                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
-            (new / TRAJECTORIES).mkdir(parents=True)
+        with new_folder(folder) as new:
+            (new / TRAJECTORIES).mkdir()
             _write(new / SETTINGS, _settings_text(settings))
             journal = cls(folder, (new / OUTCOMES).open("wb", buffering=0))
-            _sync_folder(new)
-            new.rename(folder)
-            _sync_folder(folder.parent)
-        except OSError as error:
-            shutil.rmtree(new, ignore_errors=True)
-            if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
-                raise UserError(
-                    f"{folder} exists: choose another folder with --out, or remove it first"
-                ) from error
-            raise UserError(f"cannot write {folder}: {error.strerror}") from error
+            sync_folder(new)
         return journal
 
     @classmethod
@@ -87,8 +75,11 @@ class Journal:
         """Return the journal of a campaign to go on with, what it holds, and what was dropped.
 
         Dropped are outcomes, whole or torn, of a batch that was not written to its end: they are
-        run again. Raises `UserError` when another process writes the folder, or as `Run` does.
+        run again. Raises `UserError` when another process writes the folder, when a link in it
+        leads elsewhere, or as `Run` does.
         """
+        check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
+        check_own(*(folder / TRAJECTORIES).glob("*"))
         try:
             outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
         except OSError as error:
@@ -134,7 +125,7 @@ class Journal:
             end = self._outcomes.seek(0, os.SEEK_END)
             path = _batch_file(self.folder, outcomes[0].batch)
             _write(path, arrays.getvalue())
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
             try:
                 _write_all(self._outcomes, "".join(map(to_line, outcomes)).encode())
             except OSError:
@@ -143,18 +134,12 @@ class Journal:
         except OSError as error:
             raise UserError(
                 f"cannot write {self.folder}: {error.strerror}; what ran before is kept: go on "
-                f"with `merge-sumo campaign --resume {self.folder}`"
+                f"with `merge-sumo campaign --resume {quoted(self.folder)}`"
             ) from error
 
     def rewrite_settings(self, settings: dict[str, Any]) -> None:
         """Put other settings in the place of those that were there, all or nothing."""
-        new = self.folder / f".{SETTINGS}"
-        try:
-            _write(new, _settings_text(settings))
-            new.replace(self.folder / SETTINGS)
-            _sync_folder(self.folder)
-        except OSError as error:
-            raise UserError(f"cannot write {self.folder}: {error.strerror}") from error
+        replace_own(self.folder / SETTINGS, _settings_text(settings))
 
     def __enter__(self) -> Self:
         """Return the journal."""
@@ -343,14 +328,3 @@ def _write_all(file: io.FileIO, content: bytes) -> None:
     while rest:
         rest = rest[file.write(rest) :]
     os.fsync(file.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    """Sync the entries of a folder to the disk, so that a new file is found after a crash."""
-    if sys.platform == "win32":  # folders cannot be opened there
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

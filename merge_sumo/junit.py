@@ -14,6 +14,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new, check_new_file, write_new
 from merge_sumo.journal import Run
 from merge_sumo.printable import printable
 from merge_sumo.score import Outcome
@@ -35,12 +36,12 @@ def check_junit(path: Path, folder: Path) -> None:
         path: file to write.
         folder: folder of the campaign, which may not be there yet.
     """
-    if path.exists() or path.is_symlink():
-        raise UserError(f"{path} exists: choose another file with --junit, or remove it first")
     if path.absolute() == folder.absolute():
         raise UserError(f"--junit is {path}, the folder of the campaign: choose a file")
-    if not path.parent.is_dir() and path.parent.absolute() != folder.absolute():
-        raise UserError(f"cannot write {path}: there is no folder {path.parent}")
+    if path.parent.absolute() == folder.absolute():
+        check_new(path, "--junit")
+    else:
+        check_new_file(path, "--junit")
 
 
 def write_junit(
@@ -53,11 +54,7 @@ def write_junit(
         encoding="UTF-8",
         pretty_print=True,
     )
-    try:
-        with path.open("xb") as file:
-            file.write(text)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    write_new(path, text, "--junit")
 
 
 def junit(

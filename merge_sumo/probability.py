@@ -23,7 +23,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -41,6 +41,7 @@ from merge_sumo.conductor import (
     settings_of,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new_file, write_new
 from merge_sumo.journal import Run
 from merge_sumo.samplers.base import LevelHistory
 from merge_sumo.samplers.coverage import learn_chance
@@ -49,6 +50,8 @@ from merge_sumo.score import Outcome, measure
 from merge_sumo.sumo.net import Net
 
 RESULT: Final = "probability.json"
+LINES: Final = ".jsonl"
+"""End of the name of the file beside it, with a line per fresh case."""
 DEFENSIVE: Final = 0.5
 """Share of the fresh cases that are drawn from the stated distribution itself."""
 DEFAULT_CASES: Final = 4000
@@ -481,10 +484,11 @@ def failure_probability(
     settings = settings_of(run.folder, run.settings, trust=trust)
     _same_system(run, record_of(settings, net))
     stated = read_distribution(distribution, settings.levels)
-    lines = out.with_suffix(".jsonl")
-    for path in (out, lines):
-        if path.exists():
-            raise UserError(f"{path} exists: choose another file with --out")
+    check_new_file(out)
+    lines = out.with_suffix(LINES)
+    if lines == out:
+        raise UserError(f"--out is {out}: end it in .json, as cases go to {LINES} beside it")
+    check_new_file(lines)
     told = make_sampler("uniform", settings.pool, 0)
     told.tell(run.outcomes)
     chance = {
@@ -504,11 +508,7 @@ def failure_probability(
         "seed": seed,
         "campaign": record_of(settings, net),
     }
-    try:
-        with out.open("x", encoding="utf-8") as file:
-            file.write(json.dumps(record, indent=2, allow_nan=False) + "\n")
-    except OSError as error:
-        raise UserError(f"cannot write {out}: {error.strerror}") from error
+    write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
     return result
 
 
@@ -553,9 +553,9 @@ def _run(
     return outcomes
 
 
-def _append(lines: Path, outcomes: Iterable[Outcome], draws: Draws) -> None:
+def _append(lines: Path, outcomes: Sequence[Outcome], draws: Draws) -> None:
     try:
-        with lines.open("a", encoding="utf-8") as file:
+        with lines.open("a" if outcomes[0].index else "x", encoding="utf-8") as file:
             for o in outcomes:
                 record = o.to_record()
                 record["weight"] = float(draws.weight[o.index])

@@ -23,6 +23,7 @@ from rich.text import Text
 
 from merge_sumo.case import Case, to_unit
 from merge_sumo.fmc import fmc
+from merge_sumo.printable import printable
 from merge_sumo.score import Outcome
 from merge_sumo.trajectory import End
 from merge_sumo.verdict import in_counts
@@ -41,10 +42,10 @@ class Bars:
     def __init__(self) -> None:
         """Show nothing yet."""
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             TimeRemainingColumn(),
             console=Console(stderr=True),
         )
@@ -54,7 +55,8 @@ class Bars:
         """Set a bar."""
         if title not in self._tasks:
             self._progress.start()
-            self._tasks[title] = self._progress.add_task(title, total=total, note=note)
+            shown = printable(title)
+            self._tasks[title] = self._progress.add_task(shown, total=total, note=note)
         self._progress.update(self._tasks[title], completed=completed, note=note)
 
     def say(self, text: str) -> None:
@@ -117,7 +119,7 @@ class CampaignPanel:
         console: Console | None = None,
     ) -> None:
         """Show nothing yet."""
-        self._title, self._total, self._quiet = title, cases, quiet
+        self._title, self._total, self._quiet = printable(title), cases, quiet
         self._console = console or Console(stderr=True)
         self._live: Live | None = None
         self._start_s = self._fresh_s = 0.0

@@ -28,6 +28,7 @@ from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.errors import UserError
 from merge_sumo.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.fmc import RADIUS, fmc
+from merge_sumo.folders import cannot_write, check_own, replace_own
 from merge_sumo.journal import SETTINGS, Run, failures
 from merge_sumo.scenario import DEADLINE_S, DT_S, DX_CRASH_M, LEVELS, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.score import FAILURE_SCORE, Outcome
@@ -38,6 +39,9 @@ from merge_sumo.trajectory import End, Trajectory
 from merge_sumo.verdict import Trouble, Verdict, counted, in_words, judge, shortened
 
 REPORT: Final = "report.html"
+GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
+"""By this a report is known as ours, and may be replaced by a newer one."""
+HEAD_BYTES: Final = 1000
 LISTED: Final = 10
 """Cases in a list, and messages of errors and timeouts."""
 ERROR_CHARACTERS: Final = 2000
@@ -58,14 +62,29 @@ MOST_BALLS: Final = 20_000
 
 
 def write_report(run: Run) -> Path:
-    """Write `report.html` into the folder of a run, in place of an older one; return its path."""
+    """Write `report.html` into the folder of a run, in place of an older one; return its path.
+
+    Raises `UserError` when it cannot be written, or what is there is no report of ours.
+    """
+    check_report(run.folder)
     path = run.folder / REPORT
-    page = report_page(run)
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    replace_own(path, report_page(run).encode(errors="backslashreplace"))
     return path
+
+
+def check_report(folder: Path) -> None:
+    """Raise `UserError` where `report.html` in a folder is something else than our report."""
+    path = folder / REPORT
+    check_own(path)
+    try:
+        with path.open("rb") as file:
+            ours = GENERATOR in file.read(HEAD_BYTES)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    if not ours:
+        raise UserError(f"{path} is no report of merge-sumo and is not replaced: move it away")
 
 
 def report_page(run: Run) -> str:

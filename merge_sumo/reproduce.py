@@ -30,6 +30,7 @@ from merge_sumo.experiments import (
 )
 from merge_sumo.figures import Levels, Panel, Surface
 from merge_sumo.fmc import fmc
+from merge_sumo.folders import make_folder, write_new
 from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario import LEVELS
@@ -124,12 +125,7 @@ def reproduce(
     folder exists or cannot be written, or where matplotlib is missing.
     """
     figures.require_matplotlib()
-    try:
-        folder.mkdir(parents=True)
-    except FileExistsError as error:
-        raise UserError(f"{folder} exists: choose another folder with --out") from error
-    except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}") from error
+    make_folder(folder)
     work = _Work(folder, scale, workers, on_run or (lambda *_: None))
     table = {column.title: work.column(column) for column in TABLE_II}
     work.all_levels()
@@ -399,7 +395,4 @@ def _page(table: Mapping[str, Result], scale: Scale, pictures: Mapping[str, str]
 
 
 def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    write_new(path, text.encode())

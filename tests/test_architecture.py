@@ -83,6 +83,21 @@ def unsafe_calls(source: str) -> list[str]:
     return found
 
 
+REMOVERS = {"rmtree", "rmdir", "unlink", "removedirs", "rename", "renames", "move"}
+MAY_REMOVE = {"merge_sumo.folders", "merge_sumo.drivers.vuts.fmu"}
+"""The first asks what is ours; the second removes what was unpacked for it."""
+
+
+def removals(source: str) -> list[str]:
+    """Return the calls that remove or rename files."""
+    calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
+    return [
+        f"line {node.lineno}: {called(node)}"
+        for node in calls
+        if called(node) in REMOVERS or ast.unparse(node.func) in ("os.remove", "os.replace")
+    ]
+
+
 def entity_calls(source: str) -> list[str]:
     """Return the calls that read XML and may follow an entity that it names."""
     found = []
@@ -163,6 +178,11 @@ class TestImports:
             ours = imports_any(imports_of(file), {"merge_sumo"})
             assert {name.split(".")[1] for name in ours} <= allowed, file.name
 
+    def test_of_what_writes_and_what_prints_know_nothing_but_the_error(self):
+        for name in ("folders", "printable"):
+            ours = imports_any(imports_of(PACKAGE / f"{name}.py"), {"merge_sumo"})
+            assert {full.split(".")[1] for full in ours} <= {"errors"}, name
+
     def test_of_the_command_line_are_nobodys_but_its_own(self):
         line = {PACKAGE / "cli.py", *files_below("commands")}
         others = [file for file in FILES if file not in line]
@@ -193,7 +213,18 @@ def test_no_file_follows_an_xml_entity_or_listens_beyond_loopback(file):
     assert open_listeners(source) == []
 
 
+def test_what_removes_files_is_in_one_place():
+    removing = {module_of(file) for file in FILES if removals(file.read_text(encoding="utf-8"))}
+    assert removing == MAY_REMOVE
+
+
 class TestTheChecksThemselves:
+    @pytest.mark.parametrize(
+        "source", ["shutil.rmtree(p)", "path.unlink()", "os.remove(p)", "new.rename(old)"]
+    )
+    def test_see_a_removal(self, source):
+        assert removals(source)
+
     @pytest.mark.parametrize(
         "source",
         [

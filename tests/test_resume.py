@@ -16,7 +16,7 @@ import pytest
 from conftest import require
 from typer.testing import CliRunner
 
-from merge_sumo import cli, interrupt
+from merge_sumo import cli, folders, interrupt
 from merge_sumo.conductor import (
     SCENARIOS,
     CampaignSettings,
@@ -133,10 +133,10 @@ class TestResuming:
         assert len(resume_campaign(whole).outcomes) == 28
         assert contents(whole) == before
 
-    def test_exports_failures_that_were_cut_off(self, run, tmp_path):
+    def test_exports_failures_that_are_not_there_yet(self, run, tmp_path):
         folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
         first, *_ = sorted((folder / SCENARIOS).iterdir())
-        (first / "replay.sumocfg").unlink()
+        shutil.rmtree(first)
         resume_campaign(folder)
         names = {path.relative_to(folder) for path in folder.rglob("*")}
         assert names >= {path.relative_to(run.folder) for path in run.folder.rglob("*")}
@@ -250,14 +250,14 @@ class TestTwoProcessesOnOneFolder:
         resume_campaign(folder)
 
     def test_that_create_one_folder_leave_it_to_the_first(self, tmp_path, monkeypatch):
-        rename = Path.rename
+        take_name = folders._take_name
 
-        def overtaken(self: Path, target: Path) -> Path:
-            monkeypatch.setattr(Path, "rename", rename)
-            Journal.create(target, {"first": True})
-            return rename(self, target)
+        def overtaken(new: Path, path: Path, option: str) -> None:
+            monkeypatch.setattr(folders, "_take_name", take_name)
+            Journal.create(path, {"first": True})
+            take_name(new, path, option)
 
-        monkeypatch.setattr(Path, "rename", overtaken)
+        monkeypatch.setattr(folders, "_take_name", overtaken)
         with pytest.raises(UserError, match="run exists"):
             Journal.create(tmp_path / "run", {"first": False})
         assert json.loads((tmp_path / "run" / SETTINGS).read_text()) == {"first": True}

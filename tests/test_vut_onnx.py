@@ -102,7 +102,7 @@ def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
 
 
 def test_an_export_overwrites_nothing_and_knows_its_policies(exported, tmp_path):
-    with pytest.raises(UserError, match="exists: choose another file"):
+    with pytest.raises(UserError, match="exists: choose another name"):
         export_onnx("vut1", exported / "vut1.onnx")
     with pytest.raises(UserError, match="there is no policy 'vut9'"):
         export_onnx("vut9", tmp_path / "x.onnx")

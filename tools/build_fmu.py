@@ -129,7 +129,7 @@ def build_fmu(
         subprocess.run(
             [found, "-shared", "-fPIC", "-w", "-o", str(library), str(source), "-lm"], check=True
         )
-        with zipfile.ZipFile(path, "w") as archive:
+        with zipfile.ZipFile(path, "x") as archive:
             archive.writestr("modelDescription.xml", description(version, names))
             binaries = "linux64" if version == "2.0" else "x86_64-linux"
             archive.write(library, f"binaries/{binaries}/vut.so")

@@ -13,26 +13,30 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from merge_sumo.folders import check_new_file, replace_own
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.net import Net
 
 SOURCES = Path(__file__).resolve().parent.parent / "sumo_net"
+NET = SOURCES / "us23.net.xml"
 
 
 def build(output: Path) -> Net:
-    """Build the net into `output` and return it, checked."""
+    """Build the net into `output`, ours or a new file, and return it, checked."""
+    if output != NET:
+        check_new_file(output)
     with tempfile.TemporaryDirectory() as folder:
         for source in SOURCES.glob("us23.*"):
             shutil.copy(source, folder)
         command = [sumo_program("netconvert"), "-c", "us23.netccfg"]
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
         text = (Path(folder) / "us23.net.xml").read_text(encoding="utf-8")
-    output.write_text(re.sub(r"<!--.*?-->\n*", "", text, flags=re.DOTALL), encoding="utf-8")
+    replace_own(output, re.sub(r"<!--.*?-->\n*", "", text, flags=re.DOTALL).encode())
     return Net(output)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--out", type=Path, default=SOURCES / "us23.net.xml")
+    parser.add_argument("--out", type=Path, default=NET)
     net = build(parser.parse_args().out)
     print(f"{net.path.name}: sha256 {net.sha256}")

@@ -1,7 +1,8 @@
 """Make the picture of sumo-gui: `python tools/make_gui_picture.py FOLDER TIME_S PICTURE`.
 
 Opens a copy of a scenario folder in sumo-gui and takes its picture at a time. Needs a display:
-without one, `xvfb-run` in front of it. The picture in README is that of
+without one, `xvfb-run` in front of it. An older picture is to be removed first. The picture in
+README is that of
 
     xvfb-run -a python tools/make_gui_picture.py scenarios/stalemate 8.7 scenarios/sumo-gui.png
 """
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from lxml import etree
 
+from merge_sumo.folders import check_new_file
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.replay import CONFIG, VIEW
 
@@ -46,6 +48,7 @@ def main() -> None:
     parser.add_argument("time_s", type=float)
     parser.add_argument("picture", type=Path)
     arguments = parser.parse_args()
+    check_new_file(arguments.picture, "PICTURE")
     take(arguments.folder, arguments.time_s, arguments.picture)
     print(arguments.picture)
 

@@ -7,7 +7,6 @@ vehicles into `motion.png` beside it. Needs matplotlib.
 from __future__ import annotations
 
 import argparse
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,7 +74,7 @@ def draw(trajectory: Trajectory, title: str, path: Path) -> None:
 
 
 def main() -> None:
-    """Write all examples, in place of older ones."""
+    """Write all examples; older ones are to be removed first."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=SCENARIOS)
     out = parser.parse_args().out
@@ -85,7 +84,6 @@ def main() -> None:
             trajectory = play(example, world)
             measures = measure(trajectory)
             folder = out / name
-            shutil.rmtree(folder, ignore_errors=True)
             write_scenario(folder, net, Outcome(0, 0, example.case, measures), trajectory)
             case = example.case
             pov = f"POV level {case.level}" + (

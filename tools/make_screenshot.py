@@ -1,6 +1,7 @@
 """Make the pictures of a report: `python tools/make_screenshot.py RUN [PICTURE]`.
 
-Needs Chromium (`apt-get install chromium`). The picture in README is that of
+Needs Chromium (`apt-get install chromium`). An older picture is to be removed first. The picture
+in README is that of
 
     for level in 0 1 2; do merge-sumo truth --vut design2 --level $level; done
     merge-sumo campaign --vut design2 --seed 1 --out runs/picture
@@ -16,6 +17,7 @@ from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
+from merge_sumo.folders import check_new_file
 from merge_sumo.journal import Run
 from merge_sumo.report import write_report
 
@@ -42,6 +44,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("picture", type=Path, nargs="?", default=Path("scenarios/report.png"))
     arguments = parser.parse_args()
+    check_new_file(arguments.picture, "PICTURE")
     take(write_report(Run(arguments.run)), arguments.picture)
     print(arguments.picture)
 

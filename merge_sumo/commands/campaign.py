@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,8 +21,10 @@ from merge_sumo.commands.shared import (
     app,
     print_troubles,
     say,
+    show,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.folders import dated
 from merge_sumo.printable import quoted
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
@@ -111,6 +111,7 @@ def campaign(
     from merge_sumo.journal import read_settings
     from merge_sumo.junit import check_junit
     from merge_sumo.progress import CampaignPanel
+    from merge_sumo.report import check_report
     from merge_sumo.sumo.net import Net
     from merge_sumo.verdict import parse_gates
     from merge_sumo.workers import open_workers
@@ -132,13 +133,12 @@ def campaign(
             vut_memory_gib=vut_memory,
             in_process=in_process,
         )
-        folder = (
-            out or Path("runs") / f"{_as_name(vut)}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
-        )
+        folder = out or dated(vut)
     else:
         given = _given(context)
         settings = conductor.settings_of(resume, read_settings(resume), given, trust=trust_vut)
         folder, levels = resume, settings.levels
+        check_report(folder)
     if junit is not None:
         check_junit(junit, folder)
     title = f"{settings.vut} v level {'/'.join(map(str, levels))}"
@@ -205,7 +205,7 @@ def _conclude(
         typer.echo(json.dumps({**judged, **paths}))
     else:
         if converged:
-            typer.echo(
+            show(
                 f"stopped after {len(run.outcomes)} of {settings.cases} cases: three times in a "
                 "row the next batch was expected to add less than "
                 f"{settings.stop_after_converged:.2%} to the coverage (this says nothing of "
@@ -254,35 +254,30 @@ def _given(context: typer.Context) -> dict[str, object]:
 def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path | None) -> str:
     if not folder.exists():
         return "stopped before the first case; nothing was written"
-    command = f"merge-sumo campaign --resume {folder}"
-    command += f" --net {net}" if net is not None else ""
+    command = f"merge-sumo campaign --resume {quoted(folder)}"
+    command += f" --net {quoted(net)}" if net is not None else ""
     # Neither is a setting of the campaign, which its folder would remember.
     command += "".join(f" --gate {quoted(gate)}" for gate in gates)
     command += f" --junit {quoted(junit)}" if junit is not None else ""
     return f"stopped; go on with: {command}"
 
 
-def _as_name(vut: str) -> str:
-    """Return a VUT's spec as part of a folder's name."""
-    return re.sub(r"[^\w.-]+", "-", vut).strip("-.")
-
-
 def _print_summary(run: Run, summary: Summary, verdict: Verdict, report_file: Path) -> None:
     from merge_sumo.conductor import SCENARIOS, case_name
     from merge_sumo.journal import failures
 
-    typer.echo(verdict.counts)
+    show(verdict.counts)
     print_troubles(verdict)
     for level, found in summary.levels.items():
         if found.cases and not found.tested:
-            typer.echo(f"  level {level}: nothing was tested in {found.cases} cases")
+            show(f"  level {level}: nothing was tested in {found.cases} cases")
             continue
-        typer.echo(
+        show(
             f"  level {level}: {found.failures} failures in {found.cases} cases, "
             f"FMC {found.fmc:.4f}, {found.regions} regions"
         )
-    typer.echo(f"report: {report_file}")
+    show(f"report: {report_file}")
     worst = failures(run.outcomes)
     if worst:
         folder = run.folder / SCENARIOS / case_name(worst[0].index)
-        typer.echo(f"worst case: merge-sumo replay {folder} --gui")
+        show(f"worst case: merge-sumo replay {quoted(folder)} --gui")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,8 +20,10 @@ from merge_sumo.commands.shared import (
     VutMemoryOption,
     app,
     say,
+    show,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.folders import dated
 from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def truth(
     if as_json:
         typer.echo(json.dumps(result))
         return
-    typer.echo(
+    show(
         f"{vut} at level {chosen}: {result['failures']} failures in {result['cases']} cases, "
         f"FMC {result['fmc']:.4f}, {result['real_regions']} regions with at least "
         f"{experiments.REAL_REGION:.0%} of the failures"
@@ -170,11 +171,11 @@ def compare(
         return
     failures = sum(len(found.failures) for found in truths.values())
     real = sum(len(found.real_regions()) for found in truths.values())
-    typer.echo(f"truth: FMC {truth_fmc:.4f}, {failures} failures, {real} regions")
-    typer.echo(f"oracle: FMC {of_oracle[cases]:.4f} with {cases} cases")
+    show(f"truth: FMC {truth_fmc:.4f}, {failures} failures, {real} regions")
+    show(f"oracle: FMC {of_oracle[cases]:.4f} with {cases} cases")
     _print_comparisons(compared)
     if figure is not None:
-        typer.echo(f"figure: {figure}")
+        show(f"figure: {figure}")
 
 
 def _print_comparisons(compared: dict[str, Comparison]) -> None:
@@ -236,21 +237,21 @@ def reproduce(
     if seeds is None:
         seeds = 2 if quick else 10
     scale = paper.quick(seeds) if quick else paper.Scale(seeds=seeds)
-    folder = out or Path("runs") / f"reproduce-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    folder = out or dated("reproduce")
     with open_workers(workers, dask) as there, Bars() as bars:
 
-        def show(title: str, done: int, total: int, unit: str) -> None:
+        def ran(title: str, done: int, total: int, unit: str) -> None:
             elapsed_s = bars.elapsed_s(title)
             rate = f"{done / elapsed_s:.3g}" if elapsed_s > 0.0 else "-"
             bars.show(title, done, total, f"{rate} {unit}/s")
 
-        index = paper.reproduce(folder, scale, workers=there, on_run=show)
+        index = paper.reproduce(folder, scale, workers=there, on_run=ran)
     if as_json:
         typer.echo((folder / paper.TABLE_JSON).read_text(encoding="utf-8").strip())
         say(f"all of it: {index}")
         return
     typer.echo((folder / paper.TABLE_MARKDOWN).read_text(encoding="utf-8"), nl=False)
-    typer.echo(f"all of it: {index}")
+    show(f"all of it: {index}")
 
 
 @app.command()
@@ -304,21 +305,21 @@ def probability(
         typer.echo(json.dumps({**asdict(found), "file": str(target)}, allow_nan=False))
         return
     how = "under the stated distribution" if distribution else "under uniform cases"
-    typer.echo(
+    show(
         f"P(fail) {how}: {found.probability:.3g}, {100.0 * confidence:g} % interval "
         f"[{found.low:.3g}, {found.high:.3g}] ({found.failures} failures in {cases} fresh cases)"
     )
     if found.without_verdict:
-        typer.echo(
+        show(
             f"  {found.without_verdict} cases without a verdict: safe for the lower end, failures "
             "for the upper end"
         )
     arm = found.uniform_arm
-    typer.echo(
+    show(
         f"  for comparison, the {arm.cases} plain cases among them alone: {arm.failures} failures, "
         f"[{arm.low:.3g}, {arm.high:.3g}]"
     )
-    typer.echo(f"written: {target}")
+    show(f"written: {target}")
 
 
 def _factory(vut: str, command: str | None, deadline_s: float, memory_gib: float) -> VutFactory:

@@ -17,8 +17,11 @@ from merge_sumo.commands.shared import (
     TrustOption,
     app,
     print_troubles,
+    show,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_own
+from merge_sumo.printable import quoted
 
 if TYPE_CHECKING:
     from merge_sumo.comparison import RunComparison
@@ -65,9 +68,11 @@ def export(
     from merge_sumo.sumo.net import Net
 
     loaded = Run(run)
+    if out is None:
+        check_own(run / SCENARIOS, run / EXPORTS)
     if file_format in (Format.CSV, Format.PARQUET):
         indices = case or [outcome.index for outcome in loaded.outcomes]
-        typer.echo(exports.write_table(loaded, indices, out or run / EXPORTS, file_format.value))
+        show(exports.write_table(loaded, indices, out or run / EXPORTS, file_format.value))
         return
     if not case:
         raise UserError(f"--format {file_format} needs the indices of cases")
@@ -75,7 +80,7 @@ def export(
     target = out or run / (SCENARIOS if to_sumo else EXPORTS)
     write = exports.write_sumo if to_sumo else exports.write_openscenario
     for path in exports.write_folders(loaded, case, target, write, Net(net)):
-        typer.echo(path)
+        show(path)
 
 
 @app.command()
@@ -99,9 +104,9 @@ def replay(
     if as_json:
         typer.echo(json.dumps({"identical": identical, **asdict(result)}))
     elif identical:
-        typer.echo(f"identical: {result.rows} rows of x, y, position and speed")
+        show(f"identical: {result.rows} rows of x, y, position and speed")
     else:
-        typer.echo(f"diverged at t = {result.diverged_at_s:.1f} s: {result.detail}")
+        show(f"diverged at t = {result.diverged_at_s:.1f} s: {result.detail}")
     raise typer.Exit(0 if identical else 1)
 
 
@@ -114,7 +119,7 @@ def report(run: RunArgument) -> None:
     from merge_sumo.journal import Run
     from merge_sumo.report import write_report
 
-    typer.echo(write_report(Run(run)))
+    show(write_report(Run(run)))
 
 
 @app.command("compare-runs")
@@ -165,31 +170,31 @@ def compare_runs(
         typer.echo(json.dumps({**own, **asdict(compared), **judged}))
     else:
         for (name, verdict), loaded in zip(verdicts.items(), runs, strict=True):
-            typer.echo(f"{name}: {loaded.folder} ({loaded.settings.get('vut')}): {verdict.counts}")
+            show(f"{name}: {loaded.folder} ({loaded.settings.get('vut')}): {verdict.counts}")
             print_troubles(verdict)
         _print_comparison(compared, {"A": a, "B": b})
         worse = "worse" if why else "not worse"
-        typer.echo(f"B is {worse} than A, with a tolerance of {tolerance:g}")
+        show(f"B is {worse} than A, with a tolerance of {tolerance:g}")
         for sentence in why:
-            typer.echo(f"  {sentence}")
+            show(f"  {sentence}")
     raise typer.Exit(1 if why else 0)
 
 
 def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
     from merge_sumo.comparison import Change
 
-    typer.echo(
+    show(
         f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "
         f"cases: {', '.join(Change)}"
     )
     for level, found in compared.levels.items():
-        typer.echo(
+        show(
             f"{level:<6} {found.fmc_a:8.4f} {found.fmc_b:8.4f} {found.fmc_fixed:8.4f} "
             f"{found.fmc_broke:8.4f}   {', '.join(str(found.changes[change]) for change in Change)}"
         )
-    typer.echo(f"evidence: {compared.evidence}")
+    show(f"evidence: {compared.evidence}")
     first = compared.look_first()
     if first:
-        typer.echo("look first at:")
+        show("look first at:")
     for case in first:
-        typer.echo(f"  {case.change}: merge-sumo export {folders[case.run]} {case.index}")
+        show(f"  {case.change}: merge-sumo export {quoted(folders[case.run])} {case.index}")

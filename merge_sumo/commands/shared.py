@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from merge_sumo.printable import printable
+
 if TYPE_CHECKING:
     from merge_sumo.verdict import Verdict
 
@@ -72,16 +74,21 @@ RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 def print_troubles(verdict: Verdict) -> None:
     """Print what ended in an error or a timeout, by message; nothing where nothing did."""
     for trouble in verdict.troubles[:MOST_MESSAGES]:
-        typer.echo(
+        show(
             f"  {trouble.count} {trouble.end}, the first in case {trouble.cases[0]}: "
             f"{trouble.message}"
         )
     others = verdict.troubles[MOST_MESSAGES:]
     if others:
         number = sum(trouble.count for trouble in others)
-        typer.echo(f"  {number} with {len(others)} other messages")
+        show(f"  {number} with {len(others)} other messages")
 
 
-def say(text: str) -> None:
+def show(line: object) -> None:
+    """Print a line of a result on standard output; JSON goes there as it is."""
+    typer.echo(printable(str(line)))
+
+
+def say(line: str) -> None:
     """Print a line for a person, on standard error: standard output is for results."""
-    typer.echo(text, err=True)
+    typer.echo(printable(line), err=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from merge_sumo.commands.shared import JsonOption, app
+from merge_sumo.commands.shared import JsonOption, app, show
 from merge_sumo.errors import UserError
 
 if TYPE_CHECKING:
@@ -62,11 +62,9 @@ def train(
     if as_json:
         typer.echo(json.dumps(checks))
         return
-    typer.echo(
-        "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0"
-    )
+    show("network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0")
     for name, found in checks.items():
-        typer.echo(
+        show(
             f"{name:<7}  {found['mean_regret']:11.2%}  {found['p99_regret']:10.2%}  "
             f"{found['collisions']:10d}  {found['avoidable_collisions']:9d}  "
             f"{found['mean_return']:11.3f}  {found['mean_best']:.3f}  {found['mean_level0']:.3f}"

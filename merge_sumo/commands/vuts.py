@@ -16,6 +16,7 @@ from merge_sumo.commands.shared import (
     VutCommandOption,
     VutMemoryOption,
     app,
+    show,
 )
 from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
 
@@ -40,9 +41,10 @@ def vuts(as_json: JsonOption = False) -> None:
         return
     for title, found in names.items():
         if found:
-            typer.echo(f"{title}: {', '.join(found)}")
+            show(f"{title}: {', '.join(found)}")
     for kind in kinds:
-        typer.echo(f"{kind.form}\n    {kind.what}\n    {kind.example}")
+        for line in (kind.form, f"    {kind.what}", f"    {kind.example}"):
+            show(line)
 
 
 @app.command("check-vut")
@@ -72,10 +74,10 @@ def check_vut(
         typer.echo(json.dumps({"vut": vut, "ok": not found.problems, **asdict(found)}))
     else:
         for sentence in found.problems or ["nothing wrong"]:
-            typer.echo(sentence)
+            show(sentence)
         for sentence in found.notes:
-            typer.echo(f"note: {sentence}")
-        typer.echo(
+            show(f"note: {sentence}")
+        show(
             f"a step costs {found.us_per_step_median:.0f} us (median), "
             f"{found.us_per_step_worst:.0f} us at worst"
         )
@@ -94,4 +96,4 @@ def export_policy(
     from merge_sumo.drivers.onnx_export import export_onnx
 
     export_onnx(name, out)
-    typer.echo(out)
+    show(out)

@@ -16,6 +16,7 @@ from merge_sumo.drivers.levelk import DECISION_STEPS, features
 from merge_sumo.drivers.policies import NETWORKS, load_network
 from merge_sumo.drivers.vuts.onnx import PERIOD, STATE
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new_file, write_new
 from merge_sumo.scenario import DT_S
 
 OPSET: Final = 17
@@ -51,8 +52,7 @@ def export_onnx(name: str, path: Path, folder: Path | None = None) -> None:
         raise UserError("an export needs onnx: run `pip install 'merge-sumo[onnx]'`") from error
     if name not in NETWORKS:
         raise UserError(f"there is no policy {name!r}: choose one of {', '.join(NETWORKS)}")
-    if path.exists():
-        raise UserError(f"{path} exists: choose another file with --out")
+    check_new_file(path)
     network = load_network(name, folder)
     graph = _Graph(helper, numpy_helper)
     # Typed as anything: what `features` takes for arrays are columns that record.
@@ -83,10 +83,7 @@ def export_onnx(name: str, path: Path, folder: Path | None = None) -> None:
     )
     helper.set_model_props(model, {PERIOD: f"{DECISION_STEPS * DT_S:g}"})
     onnx.checker.check_model(model)
-    try:
-        path.write_bytes(model.SerializeToString())
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    write_new(path, model.SerializeToString())
 
 
 class _Graph:

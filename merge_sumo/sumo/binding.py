@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import signal
 import subprocess
-from collections.abc import Sequence
-from contextlib import suppress
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +20,28 @@ DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexp
 """Shared libraries that SUMO's wheels load, even without a window."""
 PROGRAM_LIMIT_S: Final = 15.0
 """Time that SUMO has for an episode, and netconvert for a net; both need a tenth of a second."""
+
+NOT_A_NAME: Final = re.compile(r"[,:%\ud800-\udfff]|\$\{")
+"""To SUMO a comma parts names, a colon parts host and port, and the others stand for something."""
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Give a temporary folder whose name SUMO takes as it is; `UserError` where there is none."""
+    try:
+        above = Path(tempfile.gettempdir())
+        if NOT_A_NAME.search(str(above)[len(above.drive) :]):
+            raise UserError(
+                f"SUMO cannot use the folder for temporary files {str(above)!r}: set TMPDIR to one "
+                "without commas, colons, percent signs, ${ and what is not UTF-8 in its name"
+            )
+        made = tempfile.TemporaryDirectory(prefix="merge-sumo-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot write a temporary folder: {error.strerror}; set TMPDIR to a folder"
+        ) from error
+    with made as name:
+        yield Path(name)
 
 
 def load_libsumo() -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,10 +14,11 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.folders import new_folder
 from merge_sumo.scenario import DT_S, MAX_STEPS
 from merge_sumo.score import Outcome
 from merge_sumo.sumo import received
-from merge_sumo.sumo.binding import run_program
+from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.net import Net
 from merge_sumo.trajectory import Trajectory
 
@@ -49,14 +49,9 @@ def write_scenario(folder: Path, net: Net, outcome: Outcome, trajectory: Traject
 
     Raises `UserError` when the folder exists or cannot be written; nothing is overwritten.
     """
-    try:
-        folder.mkdir(parents=True)
-        (folder / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
-        _write(folder, net, _types(trajectory), _fcd(net, trajectory))
-    except FileExistsError as error:
-        raise UserError(f"{folder} exists: choose another folder or remove it first") from error
-    except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}") from error
+    with new_folder(folder) as new:
+        (new / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
+        _write(new, net, _types(trajectory), _fcd(net, trajectory))
     return folder / CONFIG
 
 
@@ -156,9 +151,9 @@ def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
 @contextmanager
 def _staged(episode: _Episode) -> Iterator[Path]:
     """Yield a temporary folder that holds an episode, with nothing in it that was not checked."""
-    with tempfile.TemporaryDirectory(prefix="merge-sumo-") as name:
-        _write(Path(name), episode.net, episode.types, episode.record)
-        yield Path(name)
+    with scratch_folder() as stage:
+        _write(stage, episode.net, episode.types, episode.record)
+        yield stage
 
 
 def _difference(recorded: Rows, replayed: Rows) -> tuple[float, str] | None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +26,7 @@ from lxml import etree
 from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
 from merge_sumo.scenario import DT_S
-from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.sumo.binding import load_libsumo, scratch_folder
 from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net
 
 POV: Final = 0
@@ -105,12 +104,12 @@ class World:
 
     def _start(self) -> None:
         libsumo = self._libsumo
-        with tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder:
-            net_file = Path(folder) / "corridors.net.xml"
+        with scratch_folder() as folder:
+            net_file = folder / "corridors.net.xml"
             net_file.write_bytes(self.net.replicate(self.corridors))
-            types_file = Path(folder) / "types.add.xml"
+            types_file = folder / "types.add.xml"
             types_file.write_bytes(_types(self.vut_type))
-            messages = Path(folder) / "messages"
+            messages = folder / "messages"
             files = ("--net-file", str(net_file), "--additional-files", str(types_file))
             try:
                 with _standard_error_into(messages):

@@ -10,7 +10,7 @@ import hashlib
 import json
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -23,6 +23,7 @@ from safetensors.numpy import save
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import MANIFEST, NETWORKS, load_network, read_manifest
 from merge_sumo.errors import UserError
+from merge_sumo.folders import cannot_write, check_own, make_place, replace_own, write_new
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, QuickRegret, check_network
 from merge_sumo.training.ddqn import DdqnProgress, DdqnSettings, train
 from merge_sumo.training.env import MergeGame, make_opponent
@@ -39,6 +40,8 @@ OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
 """Role and opponent of each network, in the order of the helix."""
 PAIRS: Final[tuple[tuple[str, ...], ...]] = (NETWORKS[:2], NETWORKS[2:])
 """The networks of a level, which do not depend on each other."""
+LOG: Final = ".training.jsonl"
+WEIGHTS: Final = ".safetensors"
 GAMES: Final = 64
 """Corridors in which transitions are collected."""
 REGRET_EVERY: Final = 5
@@ -120,13 +123,11 @@ def train_library(
     A network that the folder's manifest already has with the same seed, weights, settings and
     opponent is not trained again, so an interrupted training goes on with what is not finished.
     Next to each network lies a log, `<name>.training.jsonl`. Raises `UserError` when an opponent
-    is missing, the folder has such a network of another plan, or the folder cannot be written.
+    is missing, the folder has such a network of another plan, or the folder cannot be written or
+    holds something else.
     """
     weights = weights or RewardWeights()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}") from error
+    _take(folder)
     for level, pair in enumerate(PAIRS, start=1):
         of_level = settings or LEVEL_SETTINGS[level]
         plans = {
@@ -151,6 +152,27 @@ def train_library(
             _keep(folder, trained, network, entry, check)
             if on_done is not None:
                 on_done(trained, check)
+
+
+def _take(folder: Path) -> None:
+    """Make a folder ours; its manifest, empty at first, says that what is in it is of our making.
+
+    Raises `UserError` where there is none and the folder is not empty.
+    """
+    make_place(folder)
+    manifest = folder / MANIFEST
+    files = [folder / f"{name}{end}" for name in NETWORKS for end in (LOG, WEIGHTS)]
+    check_own(manifest, *files)
+    if read_manifest(folder) or manifest.is_file():
+        return
+    try:
+        if any(folder.iterdir()):
+            raise UserError(
+                f"{folder} holds other things than policies: choose another folder with --out"
+            )
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    write_new(manifest, _manifest({}))
 
 
 def _plan(
@@ -187,9 +209,7 @@ def _train_beside(
         return []
     context = get_context("spawn")
     told = context.Queue()
-    logs = {
-        t.name: (folder / f"{t.name}.training.jsonl").open("w", encoding="utf-8") for t in tasks
-    }
+    logs = {t.name: (folder / f"{t.name}{LOG}").open("w", encoding="utf-8") for t in tasks}
     try:
         # Spawned, because libsumo's simulation must not be forked.
         with ProcessPoolExecutor(len(tasks), context, _report_into, (told,)) as pool:
@@ -267,7 +287,7 @@ def _keep(
             for part, tensor in zip(("weight", "bias"), layer, strict=True)
         }
     )
-    (folder / f"{name}.safetensors").write_bytes(content)
+    replace_own(folder / f"{name}{WEIGHTS}", content)
     packages = ("torch", "numpy", "libsumo")
     known = {
         **read_manifest(folder),
@@ -278,5 +298,8 @@ def _keep(
             "check": asdict(check),
         },
     }
-    text = json.dumps({"networks": {n: known[n] for n in NETWORKS if n in known}}, indent=2)
-    (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+    replace_own(folder / MANIFEST, _manifest({n: known[n] for n in NETWORKS if n in known}))
+
+
+def _manifest(networks: Mapping[str, Any]) -> bytes:
+    return (json.dumps({"networks": networks}, indent=2) + "\n").encode()

@@ -1,0 +1,263 @@
+"""Where we write: nothing that a call did not make itself is removed, replaced or followed.
+
+What a person names is checked before anything runs for it. A new folder is filled under a name of
+ours and takes its own in the end, whole or not at all. Files of ours in a folder of ours may be
+written again, but not through links, which somebody may have put there.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from merge_sumo.errors import UserError
+
+TEMPORARY: Final = ".merge-sumo-"
+"""How the name begins under which a folder or file is written; the name has 28 bytes."""
+LONGEST_NAME: Final = 255
+"""Bytes of a name that file systems take."""
+ROOM: Final = 64
+"""Bytes that the name of a file of ours in a folder needs, with the folder's other name."""
+DEFAULT: Final = Path("runs")
+"""Folder of what nobody gave a name to."""
+
+
+def check_new(path: Path, option: str = "--out") -> None:
+    """Raise `UserError` where no new folder or file can be made at `path`; make nothing.
+
+    `option` is what the person named it by. Folders above it that are missing can be made.
+    """
+    if path.name in ("", ".."):
+        raise UserError(f"{option} is {str(path)!r} or empty: write the name of what is to be made")
+    try:
+        if any(len(os.fsencode(part)) > LONGEST_NAME for part in path.parts):
+            raise UserError(f"cannot write {path}: a name in it has more than 255 bytes")
+        if _is_there(path):
+            raise _exists(path, option)
+        _is_there(path / ("x" * ROOM))  # raises where that is too long
+        parent = next((p for p in path.parents if os.path.lexists(p)), path.parent)
+        if not parent.is_dir():
+            raise UserError(f"cannot write {path}: {parent} is no folder")
+        _try(parent)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    except ValueError as error:
+        raise UserError(
+            f"{option} is {str(path)!r}: no folder or file can have that name"
+        ) from error
+
+
+def _try(folder: Path) -> None:
+    """Raise OSError where a folder cannot be written, with the reason."""
+    # On Linux the file never has a name: nothing changes in the folder.
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+
+
+def _is_there(path: Path) -> bool:
+    """Return whether anything has that name, be it a link that leads nowhere."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def check_new_file(path: Path, option: str = "--out") -> None:
+    """Raise `UserError` where no new file can be written at `path`, in a folder that is there."""
+    check_new(path, option)
+    if not path.parent.is_dir():
+        raise UserError(f"{option} is {str(path)!r}: there is no folder {path.parent}")
+
+
+def check_place(folder: Path, option: str = "--out") -> None:
+    """Raise `UserError` where `folder` is neither a folder to add to nor one that can be made."""
+    if folder.name in ("", "..") or not _is_folder(folder):
+        check_new(folder, option)
+        return
+    try:
+        _try(folder)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def check_own(*paths: Path) -> None:
+    """Raise `UserError` where one of the paths is there and is neither a file nor a folder.
+
+    To be called before writing what we wrote before: in a folder that somebody sent, a link leads
+    anywhere, and a pipe never answers.
+    """
+    for path in paths:
+        try:
+            mode = path.lstat().st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            what = "a link" if stat.S_ISLNK(mode) else "no file"
+            raise UserError(f"cannot write {path}: it is {what}, and not of our making; remove it")
+
+
+@contextmanager
+def new_folder(path: Path, option: str = "--out") -> Iterator[Path]:
+    """Give an empty folder to fill; it is at `path` in the end, or nowhere.
+
+    Raises `UserError` where `path` exists, or when something cannot be written. Then what was made
+    here is gone again, folders above `path` included.
+    """
+    check_new(path, option)
+    with ExitStack() as undo:
+        try:
+            _make_above(path, undo)
+            new = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}")
+            new.mkdir()
+            undo.callback(shutil.rmtree, new, ignore_errors=True)
+            yield new
+            _take_name(new, path, option)
+            sync_folder(path.parent)
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        undo.pop_all()
+
+
+def make_folder(path: Path, option: str = "--out") -> None:
+    """Make an empty folder; `UserError` where it exists or cannot be made."""
+    check_new(path, option)
+    with ExitStack() as undo:
+        try:
+            _make_above(path, undo)
+            path.mkdir()
+        except FileExistsError as error:
+            raise _exists(path, option) from error
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        undo.pop_all()
+
+
+def make_place(folder: Path, option: str = "--out") -> None:
+    """Make a folder unless it is there; `UserError` where it cannot be."""
+    check_place(folder, option)
+    if not folder.is_dir():
+        make_folder(folder, option)
+
+
+def _make_above(path: Path, undo: ExitStack) -> None:
+    """Make the folders above a path; `undo` removes those of them that were made here."""
+    missing = [parent for parent in path.parents if not parent.is_dir()]
+    for folder in reversed(missing):
+        try:
+            folder.mkdir()
+        except FileExistsError:  # as "a/..", or by somebody else since
+            continue
+        undo.callback(_remove_if_empty, folder)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def _take_name(new: Path, path: Path, option: str) -> None:
+    """Rename a folder, and never over another one: a rename replaces one that is empty."""
+    if sys.platform == "win32":  # a rename replaces nothing there
+        new.rename(path)
+        return
+    try:
+        path.mkdir()
+    except FileExistsError as error:
+        raise _exists(path, option) from error
+    try:
+        new.replace(path)
+    except BaseException:
+        _remove_if_empty(path)
+        raise
+
+
+@contextmanager
+def new_file(path: Path, option: str = "--out") -> Iterator[BinaryIO]:
+    """Give a new file to write; where that fails, it is gone again.
+
+    Raises `UserError` where something is at `path` or it cannot be written.
+    """
+    try:
+        with path.open("xb") as file:
+            try:
+                yield file
+                file.flush()
+            except BaseException:
+                path.unlink(missing_ok=True)
+                raise
+    except FileExistsError as error:
+        raise _exists(path, option) from error
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def write_new(path: Path, content: bytes, option: str = "--out") -> None:
+    """Write a new file; `UserError` where something is there or it cannot be written."""
+    with new_file(path, option) as file:
+        file.write(content)
+
+
+def replace_own(path: Path, content: bytes) -> None:
+    """Write a file of ours, in the place of an older one, whole or not at all; sync it.
+
+    Raises `UserError` when a link is there or it cannot be written.
+    """
+    check_own(path)
+    new = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}")
+    with new_file(new) as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    try:
+        new.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
+        raise cannot_write(path, error) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Sync the entries of a folder to the disk, so that a new file is found after a crash."""
+    if sys.platform == "win32":  # folders cannot be opened there
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def dated(what: str) -> Path:
+    """Return where something goes that nobody gave a name to; `what` becomes part of its name."""
+    name = re.sub(r"[^\w.-]+", "-", what, flags=re.ASCII).strip("-.")[-100:]
+    return DEFAULT / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+
+
+def cannot_write(path: Path, error: OSError) -> UserError:
+    """Return what to say when something could not be written."""
+    return UserError(f"cannot write {path}: {error.strerror or error}")
+
+
+def _exists(path: Path, option: str) -> UserError:
+    return UserError(f"{path} exists: choose another name with {option}, or remove it first")
