@@ -106,7 +106,7 @@ def scene(tmp_path, monkeypatch) -> Iterator[Scene]:
         def looked_at(name: str, arguments: list[str], stage: Path, **options: object) -> object:
             assert stage.parent == tmp_path / "tmp"
             if name == "netconvert":
-                assert {path.name for path in stage.iterdir()} == {opendrive.NET}
+                assert {path.name for path in stage.iterdir()} == {opendrive_module.NET}
             else:
                 assert {path.name for path in stage.iterdir()} == RUNNABLE
             assert all(path.is_file() and not path.is_symlink() for path in stage.iterdir())
@@ -117,7 +117,7 @@ def scene(tmp_path, monkeypatch) -> Iterator[Scene]:
             return run_program(name, arguments, stage, **options)
 
         monkeypatch.setattr(replay_module, "run_program", looked_at)
-        monkeypatch.setattr(opendrive, "run_program", looked_at)
+        monkeypatch.setattr(opendrive_module, "run_program", looked_at)
         yield scene
 
 
