@@ -192,13 +192,13 @@ def _take_name(new: Path, path: Path, option: str) -> None:
 
 
 @contextmanager
-def new_file(path: Path, option: str = "--out") -> Iterator[BinaryIO]:
-    """Give a new file to write; where that fails, it is gone again.
+def new_file(path: Path, option: str = "--out", mode: int = 0o666) -> Iterator[BinaryIO]:
+    """Give a new file to write, readable as `mode` says; where that fails, it is gone again.
 
     Raises `UserError` where something is at `path` or it cannot be written.
     """
     try:
-        with path.open("xb") as file:
+        with open(path, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             try:
                 yield file
                 file.flush()
@@ -211,9 +211,9 @@ def new_file(path: Path, option: str = "--out") -> Iterator[BinaryIO]:
         raise cannot_write(path, error) from error
 
 
-def write_new(path: Path, content: bytes, option: str = "--out") -> None:
+def write_new(path: Path, content: bytes, option: str = "--out", mode: int = 0o666) -> None:
     """Write a new file; `UserError` where something is there or it cannot be written."""
-    with new_file(path, option) as file:
+    with new_file(path, option, mode) as file:
         file.write(content)
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import os
 import secrets
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.errors import UserError
+from merge_sumo.folders import make_place, write_new
 from merge_sumo.resources import cache_folder
 
 SEAL: Final = "seal"
@@ -40,19 +42,10 @@ def is_own(settings: Mapping[str, Any]) -> bool:
 
 def _key(path: Path) -> bytes | None:
     """Return the user's key, made where there is none yet; None where that cannot be."""
+    with suppress(UserError):  # it is there, or was made by another process in between
+        make_place(path.parent, "MERGE_SUMO_CACHE")
+        write_new(path, secrets.token_bytes(KEY_BYTES), mode=0o600)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        made = path.with_name(f"{KEY}.{secrets.token_hex(4)}")
-        if not path.exists():
-            descriptor = os.open(made, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(secrets.token_bytes(KEY_BYTES))
-            try:
-                os.link(made, path)  # whole, and never over another process's key
-            except FileExistsError:
-                pass
-            finally:
-                made.unlink()
         key = path.read_bytes()
     except OSError:
         return None

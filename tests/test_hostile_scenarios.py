@@ -27,6 +27,7 @@ import pytest
 from conftest import require
 
 from merge_sumo.errors import UserError
+from merge_sumo.sumo import opendrive as opendrive_module
 from merge_sumo.sumo import received
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program

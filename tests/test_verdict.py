@@ -252,7 +252,7 @@ class TestJUnit:
     def test_overwrites_nothing_that_came_in_between(self, tmp_path):
         run = write_run(tmp_path / "run", 4, levels=(0,))
         (tmp_path / "junit.xml").write_text("mine")
-        with pytest.raises(UserError, match="cannot write"):
+        with pytest.raises(UserError, match="exists"):
             write_junit(tmp_path / "junit.xml", run, (0,), judge(run.outcomes), [])
         assert (tmp_path / "junit.xml").read_text() == "mine"
 
@@ -347,7 +347,7 @@ class TestACampaignWithGates:
         ):
             said = invoke("campaign", *words, "--junit", file)
             assert isinstance(said.exception, UserError)
-            assert "choose another file with --junit" in str(said.exception)
+            assert "choose another name with --junit" in str(said.exception)
         assert not (tmp_path / "other").exists()
         assert file.read_bytes() == before
         again = invoke("campaign", "--resume", mixed, "--junit", mixed / "junit.xml", *options[2:])
