@@ -13,6 +13,7 @@ the state at t. SUMO then moves by v(t+1) instead of v(t), so the VUT is put whe
 
 from __future__ import annotations
 
+import bisect
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -27,7 +28,11 @@ from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
 from merge_sumo.scenario import DT_S
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.sumo.finder import find_corridor
+from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net
+from merge_sumo.sumo.netfile import NetFile
 
 POV: Final = 0
 VUT: Final = 1
@@ -35,7 +40,9 @@ VUT: Final = 1
 SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
 PARKING_M: Final = 182.0
-"""Distance to M at which the vehicles of an idle corridor stand."""
+"""Distance to M at which the vehicles of an idle corridor stand, or where their path begins."""
+EXACT_M: Final = 1e-9
+"""What SUMO may differ from eq. (4) in a step; more on one lane is a position on another lane."""
 MAX_SPEED_MPS: Final = 200.0
 """Above what a POV can reach by the timeout, so that SUMO never caps a commanded speed."""
 
@@ -73,29 +80,49 @@ class World:
     def __init__(
         self,
         corridors: int = 32,
-        net: Net | None = None,
+        road: Net | Corridor | None = None,
         vut_type: Mapping[str, str] | None = None,
     ) -> None:
         """Start SUMO; raises `UserError` when it cannot start, or when a world is open already.
 
+        `road` is where the merge is, by default the shipped net.
         `vut_type` are attributes of a SUMO vType: with them SUMO's own models decide on the speed
         of the VUTs, and `wanted_v_mps` tells what they want.
         """
         if World._open:
             raise UserError("libsumo holds one simulation per process: close the other World first")
         self.corridors = corridors
-        self.net = net or Net()
+        road = road or Net()
+        self._net = road if isinstance(road, Net) else None
+        self.road = _corridor_of(road) if isinstance(road, Net) else road
         self.vut_type = vut_type
         self._libsumo = load_libsumo()
         self.x_m: FloatArray = np.empty((2, corridors))
         self.v_mps: FloatArray = np.empty((2, corridors))
-        self._before_m = np.repeat(
-            [[self.net.main_in.length_m], [self.net.ramp.length_m]], corridors, axis=1
-        )
-        self._to_m = self._before_m.copy()
-        """What to subtract from a lane position: lane length before M, 0 behind it."""
-        self._position_m: FloatArray = np.zeros((2, corridors))
+        self._paths = hosted_paths(self.road)
+        self._parking_m = [max(-PARKING_M, path.starts_m[0]) for path in self._paths]
+        self._lanes = [[path.lanes(k) for k in range(corridors)] for path in self._paths]
+        self._start_m_of_lane = {
+            lane: start_m
+            for path in self._paths
+            for k in range(corridors)
+            for lane, start_m in zip(path.lanes(k), path.starts_m, strict=True)
+        }
+        self._start_m: FloatArray = np.zeros((2, corridors))
+        """Lane coordinates at which the lanes begin on which the vehicles are."""
+        self._expected_m = self.x_m
+        """Where eq. (4) leads; no number where that is not known."""
         self._start()
+
+    @property
+    def net(self) -> Net:
+        """The net with the edges main_in, main_out and ramp; `UserError` on any other road."""
+        if self._net is None:
+            raise UserError(
+                f"the VUT asks for the shipped road and {self.road.path} is another one: choose "
+                "another kind of VUT"
+            )
+        return self._net
 
     def restart(self) -> None:
         """Start SUMO afresh, with parked vehicles; what ran is gone."""
@@ -106,7 +133,7 @@ class World:
         libsumo = self._libsumo
         with scratch_folder() as folder:
             net_file = folder / "corridors.net.xml"
-            net_file.write_bytes(self.net.replicate(self.corridors))
+            net_file.write_bytes(hosted_net(self.road, self.corridors))
             types_file = folder / "types.add.xml"
             types_file.write_bytes(_types(self.vut_type))
             messages = folder / "messages"
@@ -117,7 +144,7 @@ class World:
             except libsumo.TraCIException as error:
                 said = messages.read_text(encoding="utf-8", errors="replace").split("\n")[0]
                 reason = said.removeprefix("Error: ") or error
-                raise UserError(f"SUMO cannot load the net {self.net.path}: {reason}") from error
+                raise UserError(f"SUMO cannot load the net {self.road.path}: {reason}") from error
         vehicle = libsumo.vehicle
         self._add, self._remove = vehicle.add, vehicle.remove
         self._ids = [f"{who}.{k}" for who in ("pov", "vut") for k in range(self.corridors)]
@@ -126,9 +153,8 @@ class World:
             libsumo.vehicletype.setMinGap(vtype, 0.0)
             libsumo.vehicletype.setMaxSpeed(vtype, MAX_SPEED_MPS)
             for index, name in enumerate(self._ids):
-                k = index % self.corridors
-                edge = RAMP if index >= self.corridors else MAIN_IN
-                libsumo.route.add(f"route.{name}", [f"{edge}.{k}", f"{MAIN_OUT}.{k}"])
+                row, k = divmod(index, self.corridors)
+                libsumo.route.add(f"route.{name}", self._paths[row].route(k))
                 self._enter(name, vtype)
             libsumo.simulation.step()
             for name in self._ids:
@@ -137,15 +163,17 @@ class World:
                 vehicle.setSpeed(name, 0.0)
         except libsumo.TraCIException as error:
             libsumo.close()
-            raise UserError(f"SUMO cannot use the net {self.net.path}: {error}") from error
+            raise UserError(f"SUMO cannot use the net {self.road.path}: {error}") from error
         # Bound once: attribute look-ups cost as much as the calls themselves.
         self._step_simulation = libsumo.simulation.step
         self._move_to, self._set_lane_change_mode = vehicle.moveTo, vehicle.setLaneChangeMode
         self._set_speed, self._set_previous_speed = _raw(libsumo, "setSpeed", "setPreviousSpeed")
         self._get_position, self._get_speed = _raw(libsumo, "getLanePosition", "getSpeed")
+        self._get_lane = vehicle.getLaneID
         self._commanded = len(self._ids) if self.vut_type is None else self.corridors
         """How many of `_ids` hold the speed that they are told."""
         World._open = True
+        self._expected_m = np.full_like(self.x_m, np.nan)
         self.read()
 
     def _enter(self, name: str, vtype: str) -> None:
@@ -154,7 +182,7 @@ class World:
             f"route.{name}",
             typeID=vtype,
             departLane="0",
-            departPos="10",
+            departPos="0",
             departSpeed="0",
         )
 
@@ -162,31 +190,39 @@ class World:
         self, corridor: int, x_pov_m: float, v_pov_mps: float, x_vut_m: float, v_vut_mps: float
     ) -> None:
         """Put both vehicles of a corridor where an episode starts, and read them back."""
-        for row, edge, x, v in (
-            (POV, MAIN_IN, x_pov_m, v_pov_mps),
-            (VUT, RAMP, x_vut_m, v_vut_mps),
-        ):
+        for row, x, v in ((POV, x_pov_m, v_pov_mps), (VUT, x_vut_m, v_vut_mps)):
             name = self._ids[row * self.corridors + corridor]
-            to_m = float(self._before_m[row, corridor]) if x < 0.0 else 0.0
+            lane, start_m = self._lane_at(row, corridor, x)
             driven_by_sumo = row == VUT and self.vut_type is not None
             if driven_by_sumo:
                 # A new vehicle: some of SUMO's models remember how they drove.
                 self._remove(name)
                 self._enter(name, VUT_TYPE)
-            self._move_to(name, f"{edge if x < 0.0 else MAIN_OUT}.{corridor}_0", to_m + x)
+            self._move_to(name, lane, x - start_m)
             self._set_previous_speed(name, v, 0.0)
             if driven_by_sumo:
                 self._set_lane_change_mode(name, 0)
             else:
                 self._set_speed(name, v)
-            self._to_m[row, corridor] = to_m
-            self._position_m[row, corridor] = position = self._get_position(name)
-            self.x_m[row, corridor] = position - to_m
+            self._start_m[row, corridor] = start_m
+            self.x_m[row, corridor] = self._get_position(name) + start_m
+            self._expected_m[row, corridor] = self.x_m[row, corridor]
             self.v_mps[row, corridor] = self._get_speed(name)
 
     def park(self, corridor: int) -> None:
         """Put both vehicles of a corridor aside, at a stand before M."""
-        self.place(corridor, -PARKING_M, 0.0, -PARKING_M, 0.0)
+        self.place(corridor, self._parking_m[POV], 0.0, self._parking_m[VUT], 0.0)
+
+    def _lane_at(self, row: int, corridor: int, x_m: float) -> tuple[str, float]:
+        """Return the lane at a coordinate of a vehicle's path, and where that lane begins."""
+        starts_m = self._paths[row].starts_m
+        number = bisect.bisect_right(starts_m, x_m) - 1
+        if number < 0:
+            raise UserError(
+                f"a vehicle cannot be {-x_m:g} m before the merge point of {self.road.path}: its "
+                f"path begins {-starts_m[0]:g} m before it"
+            )
+        return self._lanes[row][corridor][number], starts_m[number]
 
     def step(self, a_mps2: FloatArray) -> None:
         """Advance all corridors by one step of eq. (4) and read the state.
@@ -219,9 +255,10 @@ class World:
         v_next = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
         # A vehicle that keeps its speed needs no command: SUMO holds the last one.
         changed = v_next != self.v_mps
+        self._expected_m = self.x_m + self.v_mps * DT_S
         try:
             if self.vut_type is not None:
-                self._put_vuts(self.x_m[VUT] + self.v_mps[VUT] * DT_S)
+                self._put_vuts(self._expected_m[VUT])
                 changed[VUT] = True
             speeds, accelerations = v_next.ravel().tolist(), a_mps2.ravel().tolist()
             ids, set_previous_speed = self._ids, self._set_previous_speed
@@ -231,7 +268,9 @@ class World:
                 set_previous_speed(name, speed, accelerations[index])
                 if index < commanded:
                     set_speed(name, speed)
-            self.read()
+            if not self.read():
+                off_m = np.abs(self.x_m - self._expected_m).max()
+                raise SimulationError(f"SUMO moved a vehicle {off_m} m away from where it drives")
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
 
@@ -239,20 +278,34 @@ class World:
         """Put the VUTs at lane coordinates, (corridors,)."""
         names = self._ids[self.corridors :]
         for k, (name, x) in enumerate(zip(names, x_m.tolist(), strict=True)):
-            if x < 0.0:
-                self._move_to(name, f"{RAMP}.{k}_0", self.net.ramp.length_m + x)
-            else:
-                self._move_to(name, f"{MAIN_OUT}.{k}_0", x)
+            lane, start_m = self._lane_at(VUT, k, x)
+            self._move_to(name, lane, x - start_m)
 
-    def read(self) -> None:
-        """Read positions and speeds of all vehicles from SUMO into `x_m` and `v_mps`."""
+    def read(self) -> bool:
+        """Read positions and speeds of all vehicles from SUMO into `x_m` and `v_mps`.
+
+        Returns whether all are where eq. (4) leads from their last state.
+        """
         count, shape = len(self._ids), self.x_m.shape
         position = np.fromiter(map(self._get_position, self._ids), float, count).reshape(shape)
         self.v_mps = np.fromiter(map(self._get_speed, self._ids), float, count).reshape(shape)
-        # Nothing drives backwards, so a lane position that falls means the lane behind M.
-        self._to_m *= position >= self._position_m
-        self._position_m = position
-        self.x_m = position - self._to_m
+        self.x_m = position + self._start_m
+        # In most steps every vehicle is on the lane on which it was.
+        off_m = self.x_m - self._expected_m
+        if np.vdot(off_m, off_m) <= EXACT_M**2:
+            return True
+        self._find_lanes(position)
+        return bool(np.abs(self.x_m - self._expected_m).max() <= EXACT_M)
+
+    def _find_lanes(self, position_m: FloatArray) -> None:
+        """Ask for the lanes of the vehicles that are not where they would be on the last one."""
+        off_m = np.abs(self.x_m - self._expected_m).ravel()
+        for index in np.flatnonzero(~(off_m <= EXACT_M / len(off_m))).tolist():
+            at = divmod(index, self.corridors)
+            # A vehicle that is on no lane is nowhere.
+            lane = self._get_lane(self._ids[index])
+            self._start_m[at] = self._start_m_of_lane.get(lane, np.nan)
+        self.x_m = position_m + self._start_m
 
     def acceleration_mps2(self) -> FloatArray:
         """Return SUMO's own accelerations, (2, corridors)."""
@@ -272,6 +325,11 @@ class World:
     def __exit__(self, *_: object) -> None:
         """Close the world."""
         self.close()
+
+
+def _corridor_of(net: Net) -> Corridor:
+    """Return the corridor of a net whose edges have the names of the shipped one."""
+    return find_corridor(NetFile(net.path, net.text), (MAIN_IN, MAIN_OUT), (RAMP, MAIN_OUT))
 
 
 def _types(vut_type: Mapping[str, str] | None) -> bytes:
