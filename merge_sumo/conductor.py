@@ -36,7 +36,6 @@ from merge_sumo.scenario import (
     MEMORY_GIB,
     V_VUT0_MAX_MPS,
     V_VUT0_MPS,
-    X_VUT0_M,
 )
 from merge_sumo.score import Measures, Outcome, measure
 from merge_sumo.sumo.net import Net
@@ -284,7 +283,8 @@ def _close_ground() -> None:
 
 def lost_case(case: Case) -> Ran:
     """Return what is recorded of a case that ended every worker that ran it."""
-    start = [[case.x_pov0_m, case.v_pov0_mps, 0.0, X_VUT0_M, case.v_vut0_mps, 0.0]]
+    x_vut0_m = case.scenario.x_vut0_m
+    start = [[case.x_pov0_m, case.v_pov0_mps, 0.0, x_vut0_m, case.v_vut0_mps, 0.0]]
     reason = f"its worker process died {MAX_DEATHS} times"
     trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, reason)
     return Ran(measure(trajectory), trajectory)

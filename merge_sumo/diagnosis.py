@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.case import Case, FloatArray
-from merge_sumo.scenario import DT_S, LEVEL0_A_MPS2, LEVEL0_V_MPS, MAX_STEPS
+from merge_sumo.scenario import DT_S
 from merge_sumo.score import Measures, Outcome
 from merge_sumo.trajectory import End, Trajectory
 
@@ -67,8 +67,9 @@ def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
     """Return who yielded in an episode and which kind of failure it was."""
     time_s = np.arange(len(trajectory.motion)) * DT_S
     v_vut, v_pov = trajectory.v_vut_mps, trajectory.v_pov_mps
-    cruise_mps = max(float(v_vut[0]), LEVEL0_V_MPS)
-    vut = _yields_s(np.minimum(v_vut[0] + LEVEL0_A_MPS2 * time_s, cruise_mps) - v_vut)
+    scenario = trajectory.case.scenario
+    cruise_mps = max(float(v_vut[0]), scenario.level0_v_mps)
+    vut = _yields_s(np.minimum(v_vut[0] + scenario.level0_a_mps2 * time_s, cruise_mps) - v_vut)
     pov = _yields_s(v_pov[0] - v_pov)
     kind = None
     if measures.end is End.COLLISION:
@@ -121,7 +122,9 @@ DUE_FEATURE: Final = Feature(
     "POV due at M (at constant speed)",
     "s",
     2,
-    lambda case: -case.x_pov0_m / case.v_pov0_mps if case.v_pov0_mps > 0.0 else MAX_STEPS * DT_S,
+    lambda case: (
+        -case.x_pov0_m / case.v_pov0_mps if case.v_pov0_mps > 0.0 else case.scenario.timeout_s
+    ),
 )
 """Failures lie in bands along which the POV would reach M at the same time."""
 SVO_FEATURE: Final = Feature("psi", "rad", 2, lambda case: case.svo_rad or 0.0)

@@ -16,7 +16,7 @@ import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -27,6 +27,7 @@ from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
 from merge_sumo.folders import check_own, new_folder, replace_own, sync_folder
 from merge_sumo.printable import quoted
+from merge_sumo.scenario import US23, Scenario
 from merge_sumo.score import Outcome
 from merge_sumo.trajectory import End, Trajectory
 
@@ -164,7 +165,8 @@ class Run:
             text = (folder / OUTCOMES).read_bytes()
         except OSError as error:
             raise _no_campaign(folder, error) from error
-        self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES))
+        self.scenario = scenario_of(self.settings, folder / SETTINGS)
+        self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES), self.scenario)
         self._batches: dict[int, dict[int, FloatArray]] = {}
 
     def outcome(self, index: int) -> Outcome:
@@ -235,7 +237,19 @@ def to_line(outcome: Outcome) -> str:
     return json.dumps(outcome.to_record(), allow_nan=False) + "\n"
 
 
-def read_outcomes(text: bytes, name: str) -> tuple[list[Outcome], bool]:
+def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
+    """Return the scenario of a campaign; `UserError` where its settings say something else.
+
+    A campaign that names none was of the paper's.
+    """
+    recorded = settings.get("scenario")
+    try:
+        return US23 if recorded is None else Scenario.from_record(recorded)
+    except UserError as error:
+        raise UserError(f"{path} has no scenario: {error}") from error
+
+
+def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[list[Outcome], bool]:
     """Return the outcomes in the bytes of an `outcomes.jsonl`, and whether the last was torn.
 
     A last line without its end was being written when the campaign stopped: it is dropped. Any
@@ -247,7 +261,7 @@ def read_outcomes(text: bytes, name: str) -> tuple[list[Outcome], bool]:
         if not line.endswith(b"\n"):
             break
         try:
-            outcome = Outcome.from_record(_decode(line.decode()))
+            outcome = Outcome.from_record(_decode(line.decode()), scenario)
             if outcome.index != number - 1:
                 raise ValueError(f"index is {outcome.index}")
         except UNREADABLE_RECORD as error:

@@ -31,7 +31,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import SVO, V_POV0, X_POV0, Case, Dimension, FloatArray, dimensions, from_unit
+from merge_sumo.case import V_POV0, X_POV0, Case, FloatArray, dimensions, from_unit
 from merge_sumo.conductor import (
     MAX_CORRIDORS,
     CampaignSettings,
@@ -46,6 +46,7 @@ from merge_sumo.journal import Run
 from merge_sumo.samplers.base import LevelHistory
 from merge_sumo.samplers.coverage import learn_chance
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.scenario import SVO, Dimension
 from merge_sumo.score import Outcome, measure
 from merge_sumo.sumo.net import Net
 

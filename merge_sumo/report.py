@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import SVO, V_POV0, X_POV0, FloatArray, dimensions, to_unit
+from merge_sumo.case import V_POV0, X_POV0, FloatArray, dimensions, to_unit
 from merge_sumo.conductor import SCENARIOS, case_name, versions
 from merge_sumo.diagnosis import CEDED_MPS, MEANING, Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.drivers.vuts.output import LOG, end_of
@@ -30,7 +30,7 @@ from merge_sumo.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.fmc import RADIUS, fmc
 from merge_sumo.folders import cannot_write, check_own, replace_own
 from merge_sumo.journal import SETTINGS, Run, failures
-from merge_sumo.scenario import DEADLINE_S, DT_S, DX_CRASH_M, LEVELS, V_VUT0_MPS, X_VUT0_M
+from merge_sumo.scenario import DEADLINE_S, DT_S, DX_CRASH_M, LEVELS, SVO, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.score import FAILURE_SCORE, Outcome
 from merge_sumo.summary import LevelSummary, Summary, summarise
 from merge_sumo.sumo.net import LaneLine, Net

@@ -12,11 +12,11 @@ import numpy as np
 
 from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, X_VUT0_M
+from merge_sumo.scenario import DT_S, MAX_EPISODE_S
 from merge_sumo.sumo.world import POV, VUT, SimulationError, World
 from merge_sumo.trajectory import End, Trajectory
 
-RING_ROWS: Final = MAX_STEPS + 2
+RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
 """Rows of the record: an episode is copied out before its first row is written over."""
 
 
@@ -29,8 +29,8 @@ WRONGS: Final = (Exception, SystemExit)
 MAX_LOSSES: Final = 2
 """A case that made the driver lose its memory so often, on its own, is not tried again."""
 
-IDLE: Final = -(2**62)
-"""Step count of a corridor without an episode: it never times out."""
+IDLE: Final = 2**62
+"""Steps left in a corridor without an episode: it never times out."""
 
 
 @dataclass(slots=True)
@@ -73,8 +73,10 @@ class _Rollout:
         self.step = np.zeros(corridors, dtype=np.int64)
         self.clipped = np.zeros(corridors, dtype=np.int64)
         self.errors: dict[int, str] = {}
-        self.a_min = np.full((2, corridors), A_MIN_MPS2)
-        self.a_max = np.full((2, corridors), A_MAX_MPS2)
+        self.a_min = np.zeros((2, corridors))
+        self.a_max = np.zeros((2, corridors))
+        self.left = np.full(corridors, IDLE)
+        """Steps until the timeout."""
         # One row per step of the world, shared by all corridors: x, v, a of POV and of VUT.
         self.record = np.zeros((RING_ROWS, 2, 3, corridors))
         self.row = 0
@@ -98,10 +100,11 @@ class _Rollout:
                 self.refill(everywhere)
                 continue
             self.step += 1
+            self.left -= 1
             x_vut_m = world.x_m[VUT]
             # Scalars first: in most steps no episode ends. Idle corridors stand before M.
-            if x_vut_m.max() >= 0.0 or self.step.max() >= MAX_STEPS or self.errors:
-                ended = (x_vut_m >= 0.0) | (self.step >= MAX_STEPS)
+            if x_vut_m.max() >= 0.0 or self.left.min() <= 0 or self.errors:
+                ended = (x_vut_m >= 0.0) | (self.left <= 0)
                 ended[list(self.errors)] = True
                 corridors = np.flatnonzero(ended).tolist()
                 for corridor in corridors:
@@ -158,12 +161,17 @@ class _Rollout:
         if case is None:
             self.episodes[corridor] = None
             self.world.park(corridor)
-            self.step[corridor] = IDLE
+            self.left[corridor] = IDLE
             self.a_min[:, corridor] = self.a_max[:, corridor] = 0.0
             return
-        self.a_min[:, corridor], self.a_max[:, corridor] = A_MIN_MPS2, A_MAX_MPS2
+        scenario = case.scenario
+        self.a_min[:, corridor] = scenario.a_min_mps2
+        self.a_max[:, corridor] = scenario.a_max_mps2
+        self.left[corridor] = scenario.max_steps
         self.episodes[corridor] = _Episode(index, case, self.row)
-        self.world.place(corridor, case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps)
+        self.world.place(
+            corridor, case.x_pov0_m, case.v_pov0_mps, scenario.x_vut0_m, case.v_vut0_mps
+        )
         self.pov.begin(corridor, case)
         try:
             self.vut.begin(corridor, case)

@@ -13,18 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
-from merge_sumo.scenario import (
-    A_MAX_MPS2,
-    A_MIN_MPS2,
-    DT_S,
-    DX_CRASH_M,
-    MAX_STEPS,
-    TTC_MIN_S,
-    V_HW_MAX_MPS,
-    V_HW_MIN_MPS,
-    V_MIN_MPS,
-)
+from merge_sumo.case import COORDINATES, Case, FloatArray
+from merge_sumo.scenario import DT_S, US23, Scenario
 from merge_sumo.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
@@ -119,13 +109,13 @@ class Outcome:
         }
 
     @classmethod
-    def from_record(cls, record: dict[str, Any]) -> Outcome:
+    def from_record(cls, record: dict[str, Any], scenario: Scenario = US23) -> Outcome:
         """Return the outcome of a record; KeyError, TypeError or ValueError where it is not one."""
         values = dict(record)
         index, batch = values.pop("index"), values.pop("batch")
         if type(index) is not int or type(batch) is not int:
             raise TypeError("index and batch must be whole numbers")
-        case = Case(**{name: values.pop(name) for name in Case.__dataclass_fields__})
+        case = Case(**{name: values.pop(name) for name in COORDINATES}, scenario=scenario)
         values["end"] = End(values["end"])
         for name, types in _TYPES.items():
             if type(value := values[name]) not in types:
@@ -148,7 +138,7 @@ def measure(trajectory: Trajectory) -> Measures:
     """Return the verdict and the measures of an episode."""
     motion = trajectory.motion
     x_pov, v_pov, _, x_vut, v_vut, _ = motion[-1].tolist()
-    end = trajectory.end
+    end, crash_m = trajectory.end, trajectory.case.scenario.dx_crash_m
     arrived = end is End.MERGED
     dx = dv = ttc = pet = drac = impact = first = avoidable = last_avoidable = None
     if arrived:
@@ -156,13 +146,13 @@ def measure(trajectory: Trajectory) -> Measures:
         ttc = time_to_collision(dx, dv)
         pet = _post_encroachment_time(trajectory)
         first = "VUT" if dx < 0 else "POV"
-        if abs(dx) < DX_CRASH_M:
+        if abs(dx) < crash_m:
             end = End.COLLISION
             impact = abs(dv)
             last_avoidable = _last_avoidable_s(trajectory)
             avoidable = last_avoidable is not None
         else:
-            gap = abs(dx) - DX_CRASH_M
+            gap = abs(dx) - crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
     lowest = motion.min(axis=0)
     return Measures(
@@ -193,11 +183,12 @@ def time_to_collision(dx_m: float, dv_mps: float) -> float | None:
 def _score(trajectory: Trajectory, end: End, dx: float | None, ttc: float | None) -> float:
     p_safety = 0.0
     if dx is not None:
-        overlap = DX_CRASH_M - abs(dx)
+        scenario = trajectory.case.scenario
+        overlap = scenario.dx_crash_m - abs(dx)
         if end is End.COLLISION:
-            p_safety = -1.0 - overlap / DX_CRASH_M
+            p_safety = -1.0 - overlap / scenario.dx_crash_m
         else:
-            short_ttc = 0.0 if ttc is None else max(0.0, 1.0 - ttc / TTC_MIN_S)
+            short_ttc = 0.0 if ttc is None else max(0.0, 1.0 - ttc / scenario.ttc_min_s)
             near = math.exp(overlap / GAP_SCALE_M)
             p_safety = -(1.0 - TTC_SHARE) * near - TTC_SHARE * short_ttc
     crash = MU_CRASH if end is End.COLLISION else 0.0
@@ -206,12 +197,13 @@ def _score(trajectory: Trajectory, end: End, dx: float | None, ttc: float | None
 
 def _task(trajectory: Trajectory, end: End) -> float:
     """Return P_task in [-1, 0]: a slow ramp, a final speed off the highway's, harshness, no end."""
-    v_vut = trajectory.v_vut_mps
+    v_vut, scenario = trajectory.v_vut_mps, trajectory.case.scenario
     v_end = float(v_vut[-1])
-    slow = float(np.maximum(V_MIN_MPS - v_vut, 0.0).mean()) / V_MIN_MPS
-    off_range = max(V_HW_MIN_MPS - v_end, v_end - V_HW_MAX_MPS, 0.0)
-    off_range = min(off_range / V_HW_MIN_MPS, 1.0)
-    harsh = float(np.square(trajectory.a_vut_mps2).mean()) / A_MIN_MPS2**2
+    slow = float(np.maximum(scenario.v_min_mps - v_vut, 0.0).mean()) / scenario.v_min_mps
+    off_range = max(scenario.v_hw_min_mps - v_end, v_end - scenario.v_hw_max_mps, 0.0)
+    off_range = min(off_range / scenario.v_hw_min_mps, 1.0)
+    hardest = max(-scenario.a_min_mps2, scenario.a_max_mps2)
+    harsh = float(np.square(trajectory.a_vut_mps2).mean()) / hardest**2
     return -(slow + off_range + harsh + (end is End.TIMEOUT)) / 4.0
 
 
@@ -244,20 +236,20 @@ def _last_avoidable_s(trajectory: Trajectory) -> float | None:
     decide: the VUT passes in front at full acceleration, or waits at full braking. Both are
     rolled out from every step of the record at once.
     """
-    x_pov = trajectory.x_pov_m
-    beyond = np.arange(1, MAX_STEPS + 1) * (trajectory.v_pov_mps[-1] * DT_S) + x_pov[-1]
+    x_pov, scenario = trajectory.x_pov_m, trajectory.case.scenario
+    beyond = np.arange(1, scenario.max_steps + 1) * (trajectory.v_pov_mps[-1] * DT_S) + x_pov[-1]
     x_pov_on = np.concatenate([x_pov, beyond])
     starts = np.arange(len(x_pov) - 1)
     way_out = np.zeros(len(starts), dtype=bool)
-    for acceleration in (A_MAX_MPS2, A_MIN_MPS2):
+    for acceleration in (scenario.a_max_mps2, scenario.a_min_mps2):
         x, v = trajectory.x_vut_m[:-1].copy(), trajectory.v_vut_mps[:-1].copy()
         driving = np.ones(len(starts), dtype=bool)
-        for ahead in range(1, MAX_STEPS + 1):
+        for ahead in range(1, scenario.max_steps + 1):
             x = x + v * DT_S
             v = np.maximum(v + acceleration * DT_S, 0.0)
             arrived = driving & (x >= 0.0)
             dx = x_pov_on[starts[arrived] + ahead] - x[arrived]
-            way_out[arrived] |= np.abs(dx) >= DX_CRASH_M
+            way_out[arrived] |= np.abs(dx) >= scenario.dx_crash_m
             driving &= ~arrived
             if not driving.any():
                 break

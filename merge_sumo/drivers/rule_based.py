@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.case import Case, FloatArray
-from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.drivers.level0 import level0_acceleration, level0_time_to
+from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.scenario import DT_S, US23
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,7 +58,7 @@ DESIGNS: Final = {
 """Found by `tools/calibrate.py`: `design1` reacts late, `design2` sooner and harder."""
 
 
-class RuleBasedVut(Driver):
+class RuleBasedVut(Level0Vut):
     """Follows the level-0 profile, coasts when it will be too close, regulates the gap at last.
 
     All stages predict dx at M with the POV at constant speed and the VUT on the level-0 profile.
@@ -75,9 +75,14 @@ class RuleBasedVut(Driver):
         self._last_error = np.zeros(corridors)
         self._regulated = np.zeros(corridors, dtype=bool)
         self._actuator = np.zeros(corridors)
+        self._a_min = np.full(corridors, US23.a_min_mps2)
+        self._a_max = np.full(corridors, US23.a_max_mps2)
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Reset the PID and the actuator of a corridor."""
+        """Reset the PID and the actuator of a corridor; take the limits of its scenario."""
+        super().begin(corridor, case)
+        self._a_min[corridor] = case.scenario.a_min_mps2
+        self._a_max[corridor] = case.scenario.a_max_mps2
         self._regulated[corridor] = False
         self._actuator[corridor] = 0.0
 
@@ -85,9 +90,9 @@ class RuleBasedVut(Driver):
         """Return the commanded acceleration, behind the actuator's lag if there is one."""
         design = self.design
         distance = -scene.x_vut_m
-        t_m = level0_time_to(distance, scene.v_vut_mps)
+        t_m = level0_time_to(distance, scene.v_vut_mps, self.a_mps2, self.v_cruise_mps)
         dx_at_m = scene.x_pov_m + scene.v_pov_mps * t_m
-        command = level0_acceleration(scene.v_vut_mps)
+        command = super().act(scene)
         too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
         command[too_close] = 0.0
         regulate = too_close & (distance <= design.x2_m)
@@ -107,4 +112,5 @@ class RuleBasedVut(Driver):
         rate = (error - self._last_error) * self._regulated / DT_S
         self._last_error = error
         pid = design.kp * error + design.ki * self._integral + design.kd * rate
-        return np.minimum(np.maximum(pid, A_MIN_MPS2), A_MAX_MPS2)
+        limited: FloatArray = np.minimum(np.maximum(pid, self._a_min), self._a_max)
+        return limited

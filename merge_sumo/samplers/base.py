@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import Case, FloatArray, Pool, dimensions, from_unit, to_unit
+from merge_sumo.case import Case, FloatArray, Pool, dimensions, to_unit
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.score import Outcome
 
@@ -111,7 +111,7 @@ class LevelwiseSampler(Sampler):
         for level, share in self.allocate(n).items():
             if share:
                 points = self.propose(self.history(level), share, self.rng(level), level)
-                cases += from_unit(points, level, self.pool.v_vut0_mps)
+                cases += self.pool.cases(points, level)
         return cases
 
     def allocate(self, n: int) -> dict[int, int]:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit, logit
 
-from merge_sumo.case import Case, FloatArray, dimensions, from_unit
+from merge_sumo.case import Case, FloatArray, dimensions
 from merge_sumo.fmc import RADIUS
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import LevelHistory, Sampler, uniform_points
@@ -103,7 +103,7 @@ class CoverageSampler(Sampler):
         return [
             case
             for level, share in self._shares(proposals, n).items()
-            for case in from_unit(proposals[level].points[:share], level, self.pool.v_vut0_mps)
+            for case in self.pool.cases(proposals[level].points[:share], level)
         ]
 
     def allocate(self, n: int) -> dict[int, int]:

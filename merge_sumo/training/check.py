@@ -8,13 +8,13 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import SVO, Case, FloatArray, from_unit
+from merge_sumo.case import Case, FloatArray, from_unit
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.rollout import rollout
-from merge_sumo.scenario import DX_CRASH_M, LEVEL0_A_MPS2, LEVEL0_V_MPS, V_VUT0_MPS, X_VUT0_M
+from merge_sumo.scenario import DX_CRASH_M, LEVEL0_A_MPS2, LEVEL0_V_MPS, SVO, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import (
     beam_search,

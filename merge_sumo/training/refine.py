@@ -26,8 +26,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from merge_sumo.case import SVO, FloatArray
+from merge_sumo.case import FloatArray
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, QNetwork
+from merge_sumo.scenario import SVO
 from merge_sumo.training.best_response import beam_search
 from merge_sumo.training.ddqn import as_torch, export, squash
 from merge_sumo.training.env import exploring_starts

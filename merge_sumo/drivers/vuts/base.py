@@ -22,7 +22,7 @@ from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Stopped
-from merge_sumo.scenario import DEADLINE_S, DT_S, MEMORY_GIB, X_VUT0_M
+from merge_sumo.scenario import DEADLINE_S, DT_S, MEMORY_GIB
 from merge_sumo.sumo.world import World
 
 
@@ -96,7 +96,7 @@ class Seen(NamedTuple):
 
 def seen_at_start(case: Case) -> Seen:
     """Return what a VUT sees as an episode begins; level and orientation of the POV are hidden."""
-    return Seen(0.0, case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps)
+    return Seen(0.0, case.x_pov0_m, case.v_pov0_mps, case.scenario.x_vut0_m, case.v_vut0_mps)
 
 
 class TooLate(BaseException):

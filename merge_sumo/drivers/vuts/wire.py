@@ -9,13 +9,16 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Scene
+from merge_sumo.scenario import US23, Scenario
 
 
 class About(IntEnum):
@@ -84,7 +87,7 @@ def from_json(content: bytes, kind: type[Any]) -> Any:
     return value
 
 
-_BEGIN: Final = struct.Struct("<Iddd")
+_BEGIN: Final = struct.Struct("<I4d")
 
 
 def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
@@ -94,7 +97,13 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
     """
     parts = [struct.pack("<II", len(begun), len(scene.active))]
     parts += [
-        _BEGIN.pack(corridor, case.x_pov0_m, case.v_pov0_mps, case.v_vut0_mps)
+        _BEGIN.pack(
+            corridor,
+            case.x_pov0_m,
+            case.v_pov0_mps,
+            case.v_vut0_mps,
+            case.scenario.x_vut0_m,
+        )
         for corridor, case in begun
     ]
     parts += [scene.active.tobytes(), scene.step.tobytes()]
@@ -103,14 +112,29 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
     return b"".join(parts)
 
 
+ANYTHING: Final = 1e9
+
+
+@lru_cache(maxsize=8)
+def _any_scenario(x_vut0_m: float) -> Scenario:
+    """Return a scenario in which the VUT starts there; the rest of it a VUT is not told."""
+    return replace(US23, x_vut0_m=x_vut0_m, reach_m=ANYTHING, v_start_max_mps=ANYTHING)
+
+
 def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     """Return what `pack_scene` packed; level and orientation of the cases are not in it."""
     count, k = struct.unpack_from("<II", content)
     at = 8
     begun = []
     for _ in range(count):
-        corridor, x_pov0_m, v_pov0_mps, v_vut0_mps = _BEGIN.unpack_from(content, at)
-        case = Case(level=0, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, v_vut0_mps=v_vut0_mps)
+        corridor, x_pov0_m, v_pov0_mps, v_vut0_mps, x_vut0_m = _BEGIN.unpack_from(content, at)
+        case = Case(
+            level=0,
+            x_pov0_m=x_pov0_m,
+            v_pov0_mps=v_pov0_mps,
+            v_vut0_mps=v_vut0_mps,
+            scenario=_any_scenario(x_vut0_m),
+        )
         begun.append((corridor, case))
         at += _BEGIN.size
     active = np.frombuffer(content, np.bool_, k, at)
