@@ -165,5 +165,7 @@ def _end_with(lifeline: int) -> None:
 
     asynchronous = getattr(os, "O_ASYNC", 0o20000)
     signal.signal(signal.SIGIO, signal.SIG_DFL)
+    if hasattr(fcntl, "F_SETSIG"):  # a signal that the VUT can neither block nor ignore
+        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
     fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | asynchronous)

@@ -10,6 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
 
+from merge_sumo.drivers.vuts.base import plain
+
 LOG: Final = "controller.log"
 """In the folder of a campaign."""
 TAIL_BYTES: Final = 2000
@@ -31,10 +33,13 @@ class Output:
         self._thread.start()
 
     def last_line(self, patience_s: float = 1.0) -> str:
-        """Return the last line that was printed, after a little wait for the end; "" for none."""
+        """Return the last line that was printed, after a little wait for the end; "" for none.
+
+        It is `plain` text.
+        """
         self._thread.join(patience_s)
         lines = self._tail.decode("utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else ""
+        return plain(lines[-1]) if lines else ""
 
     def close(self, patience_s: float = 1.0) -> None:
         """Take what is left; what a process that was left behind prints later is lost."""
