@@ -342,3 +342,25 @@ def test_the_outcomes_hold_no_address_and_no_control_characters(spec, tmp_path):
     assert lines[0] == lines[1]
     error = json.loads(lines[0].splitlines()[0])["error"]
     assert error == r"ValueError: (<object object at 0x...>, '\x1b[0m') (my_vut.py, line 2)"
+
+
+def test_it_takes_signals_the_same_whoever_starts_it(spec):
+    source = """
+import signal
+def Vut(seen):
+    ignored = [n.name for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+               if signal.getsignal(n) is signal.SIG_IGN]
+    raise ValueError(ignored, signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+"""
+    numbers = (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
+    before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        vut = HostedVut(1, spec(source), OPTIONS)
+        assert np.isnan(vut.act(scene(1))[0])
+        assert vut.reason(0).startswith("ValueError: ([], set())")
+        vut.close()
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
