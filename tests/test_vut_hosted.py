@@ -146,12 +146,16 @@ def Vut(seen):
 
 
 def test_what_it_loads_while_it_drives_is_of_its_files_and_what_it_writes_is_not(spec, tmp_path):
-    for name in ("helper.py", "late.py", "gains.txt", "more.txt", "never.txt"):
+    for name in ("helper.py", "late.py", "gains.txt", "more.txt", "control.so", "never.txt"):
         (tmp_path / name).touch()
     source = """
-import os, pathlib, helper
+import ctypes, os, pathlib, helper
 HERE = pathlib.Path(__file__).parent
 (HERE / "gains.txt").read_text()
+try:
+    ctypes.CDLL(str(HERE / "control.so"))
+except OSError:
+    pass
 def Vut(seen):
     import late
     os.close(os.open(HERE / "more.txt", os.O_RDONLY))
@@ -161,11 +165,10 @@ def Vut(seen):
 """
     vut = HostedVut(1, spec(source), OPTIONS)
     try:
-        assert {f.name for f in vut.files()} == {"my_vut.py", "helper.py", "gains.txt"}
+        loaded = {"my_vut.py", "helper.py", "gains.txt", "control.so"}
+        assert {f.name for f in vut.files()} == loaded
         vut.act(scene(1))
-        assert {f.name for f in vut.files()} == {
-            *("my_vut.py", "helper.py", "gains.txt", "late.py", "more.txt")
-        }
+        assert {f.name for f in vut.files()} == loaded | {"late.py", "more.txt"}
     finally:
         vut.close()
 
