@@ -33,7 +33,7 @@ class End(StrEnum):
 
 
 REASON_CHARACTERS: Final = 600
-_ADDRESS: Final = re.compile(r"\b0x[0-9a-fA-F]{5,}\b")
+_ADDRESS: Final = re.compile("0x[0-9a-fA-F]{6,}")
 
 
 def as_reason(text: str) -> str:
