@@ -20,11 +20,12 @@ from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.drivers.vuts import wire
-from merge_sumo.drivers.vuts.base import VutOptions, plain
+from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.hosted import Host, HostDiedError, HostedVut
 from merge_sumo.drivers.vuts.output import KEPT_BYTES, MOST_BYTES, append
 from merge_sumo.drivers.vuts.wire import About, WireError
 from merge_sumo.errors import UserError
+from merge_sumo.trajectory import as_reason
 
 OPTIONS = VutOptions(deadline_s=0.3)
 HANGS = f"""
@@ -245,11 +246,11 @@ def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path)
         ("größer", "größer"),
         ("at 0x7fc7fadabac0>, 0x7fc7fadabac1", "at 0x...>, 0x..."),
         ("0x1f", "0x1f"),
-        ("x" * 1000, "x" * 300),
+        ("x" * 1000, "x" * 600),
     ],
 )
 def test_text_of_a_vut_is_one_line_that_any_terminal_can_take(text, shown):
-    assert plain(text) == shown
+    assert as_reason(text) == shown
 
 
 class TestTheWire:
