@@ -118,7 +118,8 @@ class _Rollout:
     def begin_anew(self, lost: VutLostError) -> Iterator[tuple[int, Trajectory]]:
         """Start over what was running; yield the episode that is known to be at fault, if any."""
         running = np.flatnonzero(self.active).tolist()
-        guilty = running[0] if len(running) == 1 else lost.corridor
+        alone = len(running) == 1
+        guilty = running[0] if alone else lost.corridor if lost.corridor in running else None
         for corridor in running:
             episode = self.episodes[corridor]
             assert episode is not None, "it runs"  # noqa: S101
@@ -126,8 +127,8 @@ class _Rollout:
                 self.again.append((episode.index, episode.case))
                 continue
             self.losses[episode.index] += guilty is not None
-            final = lost.final or self.losses[episode.index] >= MAX_LOSSES
-            if guilty is not None and final:
+            # Beside others it may have been a thread of theirs that struck it.
+            if alone and (lost.final or self.losses[episode.index] >= MAX_LOSSES):
                 yield self.finish(corridor, End.VUT_ERROR, lost.reason)
             else:
                 self.suspects.append((episode.index, episode.case))

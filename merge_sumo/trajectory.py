@@ -33,7 +33,7 @@ class End(StrEnum):
 
 
 REASON_CHARACTERS: Final = 600
-_ADDRESS: Final = re.compile(r"\b0x[0-9a-fA-F]{5,}\b")
+_ADDRESS: Final = re.compile("0x[0-9a-fA-F]{6,}")
 
 
 def as_reason(text: str) -> str:
@@ -41,8 +41,8 @@ def as_reason(text: str) -> str:
 
     Without memory addresses: they differ from run to run, and records of equal runs must not.
     """
-    line = " ".join(_ADDRESS.sub("0x...", text[: 2 * REASON_CHARACTERS]).split())
-    return printable(line)[:REASON_CHARACTERS]
+    without = _ADDRESS.sub("0x...", text[: 2 * REASON_CHARACTERS])
+    return printable(without[:REASON_CHARACTERS])[:REASON_CHARACTERS]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import json
 import secrets
 from collections.abc import Mapping
 from contextlib import suppress
@@ -30,14 +31,14 @@ def seal(settings: Mapping[str, Any]) -> str | None:
     key = _key(cache_folder() / KEY)
     if key is None:
         return None
-    named = "\0".join(str(settings.get(name)) for name in ("vut", "vut_command"))
-    return hmac.new(key, named.encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()
+    named = json.dumps([settings.get(name) for name in ("vut", "vut_command")])
+    return hmac.new(key, named.encode(), hashlib.sha256).hexdigest()
 
 
 def is_own(settings: Mapping[str, Any]) -> bool:
     """Return whether the settings of a campaign, as read from its folder, have our seal."""
-    ours, theirs = seal(settings), settings.get(SEAL)
-    return ours is not None and isinstance(theirs, str) and hmac.compare_digest(ours, theirs)
+    ours, theirs = seal(settings), json.dumps(settings.get(SEAL))
+    return ours is not None and hmac.compare_digest(json.dumps(ours), theirs)
 
 
 def _key(path: Path) -> bytes | None:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import shlex
+import shutil
+import sys
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from vut_contract import factory
 
 from merge_sumo.case import from_unit, to_unit
+from merge_sumo.errors import UserError
 from merge_sumo.experiments import Kept, Search, Truth, compare, ground_truth, oracle, search
 from merge_sumo.fmc import fmc
 from merge_sumo.score import Measures, Outcome
@@ -63,6 +69,68 @@ def test_the_key_of_the_cache_names_what_the_truth_depends_on(change):
     kept = Kept("design1", 0, 600, 0, None, 5.0)
     assert kept.path() == replace(kept).path()
     assert kept.path() != replace(kept, **change).path()
+
+
+def truth_of(vut: str, cache, **options) -> int:
+    """Return in how many cases a VUT had to drive for its truth of four cases."""
+    counted: list[int] = []
+    ground_truth(factory(vut, **options), 0, 4, cache=cache, on_cases=counted.append)
+    return sum(counted)
+
+
+READER = """
+import pathlib
+import gain_of_mine
+HERE = pathlib.Path(__file__).parent
+class Vut:
+    def act(self, seen):
+        (HERE / "ran").touch()
+        if seen.t_s == 5.0:
+            import late_gain
+        return float((HERE / "gain.txt").read_text()) if seen.t_s > 2.0 else gain_of_mine.gain
+"""
+
+
+@pytest.mark.parametrize("name", ["my_vut.py", "gain_of_mine.py", "late_gain.py", "gain.txt"])
+def test_a_truth_is_of_every_file_that_the_vut_loaded_also_while_it_drove(tmp_path, name):
+    for file, content in {
+        "my_vut.py": READER,
+        "gain_of_mine.py": "gain = 1.0",
+        "late_gain.py": "",
+        "gain.txt": "1.0",
+    }.items():
+        (tmp_path / file).write_text(content)
+    vut = f"{tmp_path / 'my_vut.py'}:Vut"
+    assert truth_of(vut, tmp_path / "cache") == 4
+    (tmp_path / "ran").unlink()
+    assert truth_of(vut, tmp_path / "cache") == 0
+    assert not (tmp_path / "ran").exists()
+    content = (tmp_path / name).read_text()
+    (tmp_path / name).write_text("1.5" if name == "gain.txt" else content + "\n# changed")
+    assert truth_of(vut, tmp_path / "cache") == 4
+    assert truth_of(vut, tmp_path / "cache") == 0
+    (tmp_path / name).write_text(content)
+    assert truth_of(vut, tmp_path / "cache") == 4, "the truth of before was replaced"
+
+
+def test_a_truth_of_a_file_that_is_gone_is_not_used(tmp_path):
+    (tmp_path / "my_vut.py").write_text("def Vut(seen):\n    return 1.0\n")
+    vut = f"{tmp_path / 'my_vut.py'}:Vut"
+    assert truth_of(vut, tmp_path / "cache") == 4
+    (tmp_path / "my_vut.py").unlink()
+    with pytest.raises(UserError, match="cannot read the VUT"):
+        truth_of(vut, tmp_path / "cache")
+
+
+def test_a_truth_of_a_controller_behind_traci_is_of_its_command_and_the_files_named_there(tmp_path):
+    controller = tmp_path / "controller.py"
+    shutil.copy(Path(__file__).with_name("raw_traci.py"), controller)
+    command = f"{shlex.quote(sys.executable)} {shlex.quote(str(controller))} {{port}}"
+    assert truth_of("traci", tmp_path / "cache", command=command) == 4
+    assert truth_of("traci", tmp_path / "cache", command=command) == 0
+    assert truth_of("traci", tmp_path / "cache", command=command + " ") == 4
+    controller.write_text(controller.read_text() + "# changed")
+    assert truth_of("traci", tmp_path / "cache", command=command) == 4
 
 
 def test_a_comparison_says_what_samplers_found_of_the_truth(truth):

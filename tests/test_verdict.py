@@ -83,7 +83,7 @@ class TestErrorsAndTimeouts:
     def test_show_nothing_that_does_not_print_and_no_more_than_a_line(self, tmp_path):
         errors = {0: "a\nb\x1b[31mc\x00d\u202ee", 1: "x" * 10**6}
         found = judge(write_run(tmp_path / "run", 10, levels=(0,), errors=errors).outcomes)
-        assert found.troubles[0].message == "a b\\x1b[31mc\\x00d\\u202ee"
+        assert found.troubles[0].message == "a\\nb\\x1b[31mc\\x00d\\u202ee"
         assert found.troubles[1].message == "x" * 297 + "..."
 
     def test_are_absent_from_the_words_where_there_are_none(self, tmp_path):
@@ -219,7 +219,7 @@ class TestJUnit:
     def test_has_the_message_of_an_error_as_xml_can_hold_it(self, root):
         (error,) = root.xpath("//error")
         assert error.get("type") == "VUT_ERROR"
-        said = "</failure><x>\\x00\\x1b[2J\\ud800\\uffff\\u202e &\"'"
+        said = "</failure><x>\\x00\\x1b[2J\\ud800\\uffff\\u202e\\n&\"'"
         assert error.get("message") == error.text == said
 
     def test_tells_collisions_timeouts_and_gates_apart(self, root):

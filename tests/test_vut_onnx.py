@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from vut_contract import cases_of, factory, run_cases
@@ -11,6 +13,7 @@ from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.onnx_export import export_onnx
 from merge_sumo.drivers.policies import NETWORKS, load_network
 from merge_sumo.errors import UserError
+from merge_sumo.experiments import ground_truth
 from merge_sumo.trajectory import End
 
 onnx = pytest.importorskip("onnx")
@@ -74,6 +77,32 @@ def test_one_number_is_an_acceleration_and_seven_are_values_of_actions(tmp_path,
     for path, expected in ((one, 0.5), (seven, 1.0)):
         (trajectory,) = run_cases(factory(f"onnx:{path}"), cases_of(1))
         assert (trajectory.a_vut_mps2[:-1] == expected).all()
+
+
+def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
+    path = network(tmp_path / "here.onnx", answer=[0.5])
+    model = onnx.load(path)
+    for name, size in (("a.onnx", 0), ("b.onnx", 0)):
+        onnx.save_model(
+            onnx.load_from_string(model.SerializeToString()),
+            tmp_path / name,
+            save_as_external_data=True,
+            all_tensors_to_one_file=name == "a.onnx",
+            location="weights.bin" if name == "a.onnx" else None,
+            size_threshold=size,
+        )
+    assert [Path(f).name for f in factory(f"onnx:{path}").files] == ["here.onnx"]
+    vut = f"onnx:{tmp_path / 'a.onnx'}"
+    assert sorted(Path(f).name for f in factory(vut).files) == ["a.onnx", "weights.bin"]
+    separate = sorted(Path(f).name for f in factory(f"onnx:{tmp_path / 'b.onnx'}").files)
+    assert separate == ["b", "b.onnx", "w"]
+    truth = [ground_truth(vut, 0, 4, cache=tmp_path / "cache").score]
+    weights = tmp_path / "weights.bin"
+    half, one = np.float64(0.5).tobytes(), np.float64(1.0).tobytes()
+    assert weights.read_bytes().count(half) == 1
+    weights.write_bytes(weights.read_bytes().replace(half, one))
+    truth.append(ground_truth(vut, 0, 4, cache=tmp_path / "cache").score)
+    assert not np.array_equal(*truth)
 
 
 @pytest.mark.parametrize("answer", [[np.nan], [np.inf], [0, 0, 0, 0, np.nan, 0, 0]])

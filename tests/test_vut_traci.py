@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ import traci
 from conftest import require
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from raw_traci import MISDEEDS, Client, GoneError
+from raw_traci import GET_LANE, MISDEEDS, STEP, Client, GoneError, command, text
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
 from merge_sumo.case import Case
@@ -545,8 +546,8 @@ def test_the_server_listens_on_the_loopback_interface_only():
 class Monkey:
     """Connects again and again, drives for a while, and does something wrong."""
 
-    def __init__(self, port: int, seed: int, deadline_s: float) -> None:
-        self.port, self.rng, self.deadline_s = port, random.Random(seed), deadline_s  # noqa: S311
+    def __init__(self, port: int, seed: int, misdeeds=MISDEEDS) -> None:
+        self.port, self.rng, self.misdeeds = port, random.Random(seed), misdeeds  # noqa: S311
         self.done: list[str] = []
         self.stopped = False
         self.thread = threading.Thread(target=self.run)
@@ -561,9 +562,9 @@ class Monkey:
             with client.socket:
                 try:
                     client.drive(self.rng.randint(0, 60))
-                    misdeed = self.rng.choice(sorted(MISDEEDS))
+                    misdeed = self.rng.choice(sorted(self.misdeeds))
                     self.done.append(misdeed)
-                    MISDEEDS[misdeed](client, self.rng)
+                    self.misdeeds[misdeed](client, self.rng)
                 except (GoneError, OSError, struct.error):
                     continue
 
@@ -575,7 +576,7 @@ class Monkey:
 @pytest.mark.parametrize("count", [50, pytest.param(1000, marks=pytest.mark.long)])
 def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count):
     before, port, deadline_s = descriptors(), free_port(), 0.2
-    monkey = Monkey(port, count, deadline_s)
+    monkey = Monkey(port, count)
     cases, misdeeds, ran = cases_of(200, seed=9), 0, 0
     try:
         while misdeeds < count:
@@ -592,6 +593,200 @@ def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count)
     finally:
         monkey.stop()
     assert len(set(monkey.done)) > min(count, len(MISDEEDS)) // 2
+    assert descriptors() <= before
+
+
+class Recorder:
+    """A client's socket that remembers what was sent."""
+
+    def __init__(self, real: socket.socket) -> None:
+        self.real, self.sent = real, []
+
+    def send(self, content: bytes) -> int:
+        self.sent.append(bytes(content))
+        return self.real.send(content)
+
+    def __getattr__(self, name: str):
+        return getattr(self.real, name)
+
+
+def recorded_session() -> list[bytes]:
+    """Return the messages of a stock client that reads, subscribes and drives."""
+
+    def drive(c):
+        c._socket = recorder = Recorder(c._socket)
+        c.simulation.subscribe([traci.constants.VAR_DEPARTED_VEHICLES_IDS])
+        c.simulationStep()
+        c.vehicle.subscribe("vut", [traci.constants.VAR_SPEED])
+        domain = traci.constants.CMD_GET_VEHICLE_VARIABLE
+        c.vehicle.subscribeContext("vut", domain, 300.0, [traci.constants.VAR_POSITION])
+        c.vehicle.setSpeedMode("vut", 0)
+        c.vehicle.getLeader("vut", 100.0)
+        c.lane.getShape("main_out_0")
+        c.vehicle.slowDown("vut", 19.0, 1.0)
+        c.vehicle.setAcceleration("vut", 1.0, 0.5)
+        c.vehicle.setSpeed("vut", 18.1)
+        c.vehicle.setColor("vut", (1, 2, 3, 4))
+        c.simulationStep(c.simulation.getTime() + 0.2)
+        return recorder.sent
+
+    return Played(stock(drive), steps=4).result
+
+
+def mutated(message: bytes, rng: random.Random) -> bytes:
+    """Return a message with bytes changed, taken out, put in, or with another length."""
+    content = bytearray(message)
+    for _ in range(rng.randint(1, 4)):
+        at = rng.randrange(len(content))
+        match rng.randrange(5):
+            case 0:
+                content[at] = rng.randrange(256)
+            case 1:
+                content[at] ^= 1 << rng.randrange(8)
+            case 2:
+                del content[at : at + rng.randint(1, 8)]
+                content = content or bytearray(b"\0")
+            case 3:
+                content[at:at] = rng.randbytes(rng.randint(1, 8))
+            case 4:
+                length = rng.choice((-1, 0, 3, 1 << 20, 1 << 24, 2**31 - 1, -(2**31)))
+                content[at : at + 4] = struct.pack("!i", length)
+    if rng.random() < 0.7:  # else the length is wrong, too, and nothing behind it is looked at
+        content[:4] = struct.pack("!i", max(len(content), 4))
+    return bytes(content)
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(2000, marks=pytest.mark.long)])
+def test_of_mutated_messages_of_a_session_every_case_has_its_verdict_or_its_reason(count):
+    session = recorded_session()
+    assert len(session) > 10
+
+    def misbehave(client, rng):
+        client.socket.sendall(mutated(rng.choice(session), rng))
+        client.read(1)
+
+    before, port, ran = descriptors(), free_port(), 0
+    monkey = Monkey(port, count, {"mutated": misbehave})
+    cases = cases_of(50, seed=9)
+    try:
+        while len(monkey.done) < count:
+            vut = factory(f"traci:{port}", deadline_s=0.1, connect_s=5.0)
+            for trajectory in run_cases(vut, cases):
+                assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
+                assert trajectory.error is None or trajectory.error.startswith("the controller ")
+                ran += 1
+    finally:
+        monkey.stop()
+    assert ran >= count // 2
+    assert descriptors() <= before
+
+
+def bytewise(pause_s: float):
+    """Return a client that sends its messages byte by byte, and what it does at last."""
+
+    def client(port):
+        slow = Client(port)
+        content = command(STEP, bytes(8))
+        message = struct.pack("!i", len(content) + 4) + content
+        with suppress(GoneError, OSError):
+            for _ in range(4):
+                for byte in message:
+                    slow.socket.sendall(bytes((byte,)))
+                    time.sleep(pause_s)
+                slow.read(struct.unpack("!i", slow.read(4))[0] - 4)
+
+    return client
+
+
+def test_who_writes_slowly_has_until_the_deadline():
+    assert Played(bytewise(0.0), steps=3).reasons == [None]
+    (reason,) = Played(bytewise(0.1), steps=3, deadline_s=0.5).reasons
+    assert reason == "the controller sent half a message and no more within the deadline of 0.5 s"
+
+
+def test_who_asks_and_asks_and_makes_no_step_has_until_the_deadline():
+    def client(port):
+        curious = Client(port)
+        curious.step()
+        with suppress(GoneError):
+            while True:
+                curious.speed()
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason.endswith("within the deadline of 0.3 s")
+
+
+def test_who_asks_very_much_at_a_time_is_answered_or_dropped():
+    def client(port):
+        greedy = Client(port)
+        greedy.step()
+        ask = command(GET_LANE, bytes((0,)) + text(""))
+        with suppress(GoneError):
+            greedy.send(*[ask] * ((1 << 20) // len(ask) - 1))
+            greedy.socket.settimeout(20.0)
+            greedy.read(10_000_000)
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason is not None
+
+
+def test_of_two_clients_the_second_waits_and_changes_nothing():
+    def client(port):
+        first = Client(port)
+        first.step()
+        second = Client(port)
+        with suppress(GoneError):
+            second.send(command(STEP, bytes(8)))
+        with suppress(GoneError):
+            first.drive(10)
+
+    def alone(port):
+        first = Client(port)
+        first.step()
+        with suppress(GoneError):
+            first.drive(10)
+
+    both, one = (Played(c, steps=8) for c in (client, alone))
+    assert both.reasons == one.reasons == [None]
+    assert both.speeds == one.speeds
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+def test_a_storm_of_connections_ends_with_a_verdict_or_a_reason_for_every_case(seed):
+    before, port = descriptors(), free_port()
+    stopped = threading.Event()
+    rng = random.Random(seed)  # noqa: S311
+
+    def storm():
+        while not stopped.is_set():
+            crowd = []
+            for _ in range(200):
+                with suppress(OSError):
+                    one = socket.socket()
+                    crowd.append(one)
+                    one.setblocking(False)
+                    with suppress(BlockingIOError):
+                        one.connect(("127.0.0.1", port))
+            time.sleep(0.1)
+            rng.shuffle(crowd)
+            for one in crowd:
+                with suppress(OSError):
+                    one.send(rng.randbytes(20))
+                one.close()
+
+    storming = threading.Thread(target=storm)
+    monkey = Monkey(port, seed, {"none": lambda c, r: c.drive(10_000)})
+    storming.start()
+    try:
+        for trajectory in run_cases(
+            factory(f"traci:{port}", deadline_s=0.2, connect_s=5.0), cases_of(50)
+        ):
+            assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
+    finally:
+        stopped.set()
+        storming.join()
+        monkey.stop()
     assert descriptors() <= before
 
 
@@ -636,14 +831,14 @@ class TestTheProtocol:
             commands = tp.commands_of(data)
         except tp.ProtocolError:
             return
-        for command in commands:
+        for one in commands:
             try:
-                answer = session.handle(command)
+                answer = session.handle(one)
             except tp.ProtocolError:
                 continue
             # Status first, and nothing that is not a command of a stated length.
             first, *_ = tp.commands_of(answer)
-            assert first.identifier == command.identifier
+            assert first.identifier == one.identifier
             assert answer[0] > 0, "clients read the length of a status as one byte"
         session.results()
         session.acceleration_mps2()

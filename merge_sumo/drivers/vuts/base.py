@@ -7,13 +7,12 @@ import signal
 import struct
 import sys
 import threading
-import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import Any, Final, NamedTuple, Self, TextIO
 
 import numpy as np
@@ -24,6 +23,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Stopped
 from merge_sumo.scenario import DEADLINE_S, DT_S, MEMORY_GIB
 from merge_sumo.sumo.world import World
+from merge_sumo.trajectory import as_reason
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -205,11 +205,8 @@ class Watch:
             raise error
         if isinstance(error, TooLate):
             return self.too_late
-        place = ""
-        frames = traceback.extract_tb(error.__traceback__)
-        if frames and frames[-1].filename != __file__:
-            place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"
-        return f"{type(error).__name__}: {text_of(error)}{place}"
+        name = text_of(error, lambda error: type(error).__name__)
+        return f"{name}: {text_of(error)}{text_of(error, _place)}"
 
     @property
     def too_late(self) -> str:
@@ -222,11 +219,24 @@ MOST_CHARACTERS: Final = 300
 
 
 def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
-    """Return what a thing of a VUT says of itself, shortened; it may raise instead, or lie."""
+    """Return what a thing of a VUT says of itself, in a line; it may raise instead, or lie.
+
+    A text that is a VUT's own kind of string is taken as the characters that it has.
+    """
     try:
-        return f"{as_text(thing):.{MOST_CHARACTERS}}"
+        return as_reason(str.__str__(as_text(thing)))[:MOST_CHARACTERS]
     except Exception as error:
         return f"({type(error).__name__} when it was to be shown)"
+
+
+def _place(error: BaseException) -> str:
+    """Return where an error was raised, " (FILE, line N)"; "" where that was not in a VUT."""
+    last: TracebackType | None = error.__traceback__
+    while last is not None and last.tb_next is not None:  # a recursion leaves thousands
+        last = last.tb_next
+    if last is None or last.tb_frame.f_code.co_filename == __file__:
+        return ""
+    return f" ({Path(last.tb_frame.f_code.co_filename).name}, line {last.tb_lineno})"
 
 
 class PerCorridor(Driver):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import mmap
 import os
+import signal
 import sys
 from contextlib import suppress
 from typing import Any, Final
@@ -34,6 +35,7 @@ def main() -> None:
     settings = json.loads(sys.argv[1])
     sys.argv[1:] = []
     channel = _Channel()
+    _hear_signals()
     _limit(settings["memory_gib"])
     _end_with(settings["lifeline"])
     asked.share(mmap.mmap(settings["asked"], Asked.FORMAT.size))
@@ -142,6 +144,16 @@ class _Hosting:
         return wire.pack_answers(answers, reasons)
 
 
+def _hear_signals() -> None:
+    """Take signals as a program does that a person starts; a worker does not, and hands that on."""
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    # Python itself ignores these two.
+    for number in signal.valid_signals() - {signal.SIGPIPE, signal.SIGXFSZ}:
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+
+
 def _limit(memory_gib: float) -> None:
     """Let memory run out here before it runs out for everybody, and leave no core dump behind."""
     try:
@@ -161,9 +173,10 @@ def _end_with(lifeline: int) -> None:
     By a signal and not by a thread: native code that never returns would hold a thread up.
     """
     import fcntl
-    import signal
 
     asynchronous = getattr(os, "O_ASYNC", 0o20000)
     signal.signal(signal.SIGIO, signal.SIG_DFL)
+    if hasattr(fcntl, "F_SETSIG"):  # a signal that the VUT can neither block nor ignore
+        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
     fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | asynchronous)

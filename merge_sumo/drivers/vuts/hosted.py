@@ -124,7 +124,8 @@ class Host:
         """Start the process and open the VUT; `UserError` when that cannot be."""
         self._options = options
         self._number = 0
-        self._waits = False
+        self.alive = True
+        """Whether it can be asked; a process that once gave no answer is killed."""
         self._buffer = bytearray()
         self._start()
         try:
@@ -158,35 +159,44 @@ class Host:
             rest = memoryview(wire.frame(self._number, about, content))
             while rest:
                 rest = rest[os.write(self._to, rest) :]
-            answer = self._answer(patience_s)
-            self._waits = False
-            return answer
-        except (OSError, WireError):
+            return self._answer(patience_s)
+        except (OSError, EOFError):
             raise self._died() from None
+        except WireError:
+            corridor = self._corridor()
+            self.kill()
+            raise HostDiedError(_how_it_ended(None), corridor, hung=False) from None
+        except BaseException:  # a person stops: nobody waits for the answer any more
+            self.kill()
+            raise
 
     def kill(self) -> None:
         """End the process, and what it started."""
+        if not self.alive:
+            return  # what its descriptors were may be others' by now
+        self.alive = False
         for descriptor in (self._to, self._from, self._lifeline):
-            with suppress(OSError):
-                os.close(descriptor)
+            os.close(descriptor)
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
+        _end_strays(f"TMPDIR={self._scratch.name}")
         self._output.close()
+        self._scratch.cleanup()
 
     def close(self) -> None:
-        """Let the VUT close, unless it still owes an answer; then end the process."""
-        if not self._waits:
-            try:
+        """Let the VUT close, then end the process."""
+        if self.alive:
+            with suppress(HostDiedError, subprocess.TimeoutExpired):
                 self.ask(About.CLOSE)
                 self._process.wait(ENDING_S)
-            except HostDiedError:
-                return
-            except subprocess.TimeoutExpired:
-                pass  # something of its own keeps it from ending
         self.kill()
 
     def _start(self) -> None:
+        # What is killed leaves its temporary files behind: they are in a folder of ours.
+        self._scratch = tempfile.TemporaryDirectory(
+            prefix="merge-sumo-", ignore_cleanup_errors=True
+        )
         their_in, self._to = os.pipe()
         self._from, their_out = os.pipe()
         their_lifeline, self._lifeline = os.pipe()
@@ -198,19 +208,28 @@ class Host:
                 "lifeline": their_lifeline,
                 "asked": memory.fileno(),
             }
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", BOOT, json.dumps(settings)],
-                stdin=their_in,
-                stdout=their_out,
-                stderr=subprocess.PIPE,
-                pass_fds=(their_lifeline, memory.fileno()),
-                # The order of sets must not be another one in each run.
-                env={**os.environ, "PYTHONHASHSEED": "0"},
-                start_new_session=True,
-            )
+            try:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-c", BOOT, json.dumps(settings)],
+                    stdin=their_in,
+                    stdout=their_out,
+                    stderr=subprocess.PIPE,
+                    pass_fds=(their_lifeline, memory.fileno()),
+                    # The order of sets must not be another one in each run.
+                    env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": self._scratch.name},
+                    start_new_session=True,
+                )
+            except OSError as error:
+                for descriptor in (self._to, self._from, self._lifeline):
+                    os.close(descriptor)
+                self._scratch.cleanup()
+                raise UserError(f"cannot start a process for the VUT: {error.strerror}") from error
+            finally:
+                for descriptor in (their_in, their_out, their_lifeline):
+                    os.close(descriptor)
             self._asked = mmap.mmap(memory.fileno(), Asked.FORMAT.size)
-        for descriptor in (their_in, their_out, their_lifeline):
-            os.close(descriptor)
+        # A question fits into the pipe, unless the process has stopped to listen.
+        os.set_blocking(self._to, False)
         assert self._process.stderr is not None, "piped"  # noqa: S101
         self._output = Output(self._process.stderr, self._options.log)
         self._poll = select.poll()
@@ -222,7 +241,7 @@ class Host:
             answer = self.ask(about, content, patience_s=self._options.connect_s)
         except HostDiedError as died:
             line = self._output.last_line()
-            printed = f" (it printed: {line:.200})" if line else ""
+            printed = f" (it printed: {line})" if line else ""
             raise UserError(
                 f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
             ) from died
@@ -234,18 +253,8 @@ class Host:
         noted, since_s = Asked.read(self._asked)[0], monotonic()
         while True:
             answer = wire.take(self._buffer)
-            if answer is not None:
-                if answer.number == self._number:
-                    return answer
-                continue  # of a child that the VUT forked
-            if self._poll.poll(1e3 * min(LOOK_S, patience_s)):
-                part = os.read(self._from, 1 << 16)
-                if not part:
-                    raise WireError("it ended")
-                self._buffer += part
-                continue
-            if self._process.poll() is not None:
-                raise WireError("it ended")
+            if answer is not None and answer.number == self._number:
+                return answer
             now = Asked.read(self._asked)[0]
             if now != noted:
                 noted, since_s = now, monotonic()
@@ -253,19 +262,36 @@ class Host:
                 corridor = self._corridor()
                 self.kill()
                 raise HostDiedError(_too_late(patience_s, self._options), corridor, hung=True)
+            if answer is not None:
+                continue  # of a child that the VUT forked
+            if self._poll.poll(1e3 * min(LOOK_S, patience_s)):
+                part = os.read(self._from, 1 << 16)
+                if not part:
+                    raise EOFError
+                self._buffer += part
+            elif self._process.poll() is not None:
+                raise EOFError
 
     def _died(self) -> HostDiedError:
         corridor = self._corridor()
         try:
             code = self._process.wait(ENDING_S)
         except subprocess.TimeoutExpired:
-            code = None  # it closed the channel, or wrote something else into it
+            code = None  # it closed the channel and goes on
         self.kill()
         return HostDiedError(_how_it_ended(code), corridor, hung=False)
 
     def _corridor(self) -> int | None:
         corridor = Asked.read(self._asked)[1]
         return corridor if corridor >= 0 else None
+
+
+def _end_strays(inherited: str) -> None:
+    """End what the VUT started in a session of its own, by what it inherited (Linux only)."""
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it is another user's, or just ended
+            if inherited.encode() in (process / "environ").read_bytes().split(b"\0"):
+                os.kill(int(process.name), signal.SIGKILL)
 
 
 def _too_late(patience_s: float, options: VutOptions) -> str:
@@ -296,7 +322,7 @@ class HostedVut(Driver):
         self._begun: list[tuple[int, Case]] = []
         self._reasons: dict[int, str] = {}
         self._files: set[Path] = set()
-        self._host: Host | None = self._started()
+        self._host = self._started()
 
     def begin(self, corridor: int, case: Case) -> None:
         """Note that an episode begins; the VUT is told with the next scene."""
@@ -304,7 +330,7 @@ class HostedVut(Driver):
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the VUT's answers; NaN where it has a reason. Raises `VutLostError`."""
-        if self._host is None:
+        if not self._host.alive:
             try:
                 self._host = self._started()
             except UserError as error:
@@ -319,15 +345,14 @@ class HostedVut(Driver):
                 told = wire.from_json(answer.content, dict)
                 raise VutLostError(told["reason"], told["corridor"], final=told["final"])
             if answer.about is not About.DONE:
-                said = str(wire.from_json(answer.content, str))
-                raise VutLostError(said, final=True)
+                # Not its driver, but what surrounds it failed: the VUT has changed that.
+                self._host.kill()
+                raise VutLostError(str(wire.from_json(answer.content, str)), final=True)
             answers, self._reasons = wire.unpack_answers(answer.content, self.corridors)
         except HostDiedError as died:
-            self._host = None
             raise VutLostError(died.reason, self._own(died.corridor), final=died.hung) from None
         except (WireError, KeyError, ValueError):
             self._host.kill()
-            self._host = None
             raise VutLostError(_how_it_ended(None)) from None
         return answers
 
@@ -337,7 +362,7 @@ class HostedVut(Driver):
 
     def files(self) -> tuple[Path, ...]:
         """Return the files that the VUT has loaded so far."""
-        if self._host is not None:
+        if self._host.alive:
             with suppress(HostDiedError, WireError):
                 listed = wire.from_json(self._host.ask(About.FILES).content, list)
                 self._files |= {Path(str(file)) for file in listed}
@@ -345,9 +370,7 @@ class HostedVut(Driver):
 
     def close(self) -> None:
         """Let the VUT close and end its process."""
-        if self._host is not None:
-            self._host.close()
-            self._host = None
+        self._host.close()
 
     def _started(self) -> Host:
         host = Host(self._spec, self._options)

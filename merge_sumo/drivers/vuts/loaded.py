@@ -1,4 +1,4 @@
-"""Which files of the user's a VUT is made of: what it imported, and what it opened for reading."""
+"""Which files of the user's a VUT is made of: what it imported, opened for reading, or linked."""
 
 from __future__ import annotations
 
@@ -44,9 +44,14 @@ class LoadedFiles:
         return not path.startswith(self._not_theirs) and not path.endswith(".pyc")
 
     def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if event != "open" or len(self._read) > MOST_FILES:
+        if len(self._read) + len(self._written) > MOST_FILES:
             return
-        path, mode, flags = arguments
+        if event == "open":
+            path, mode, flags = arguments
+        elif event == "ctypes.dlopen":
+            path, mode, flags = *arguments, None, os.O_RDONLY
+        else:
+            return
         if not isinstance(path, str | bytes):
             return  # a descriptor, opened before
         try:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from merge_sumo.printable import printable
+from merge_sumo.trajectory import as_reason
 
 LOG: Final = "controller.log"
 """In the folder of a campaign."""
@@ -39,7 +40,7 @@ class Output:
         """Return the last line that was printed, after a little wait for the end; "" for none."""
         self._thread.join(patience_s)
         lines = self._tail.decode("utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else ""
+        return as_reason(lines[-1]) if lines else ""
 
     def close(self, patience_s: float = 1.0) -> None:
         """Take what is left; what a process that was left behind prints later is lost."""

@@ -66,7 +66,7 @@ class Program:
             return ""
         how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
         line = self._output.last_line()
-        return f"the controller {how}" + (f": {line:.200}" if line else "")
+        return f"the controller {how}" + (f": {line}" if line else "")
 
     def stop(self, grace_s: float = GRACE_S) -> None:
         """End the program and what it started; it may end by itself for a while first."""

@@ -155,20 +155,28 @@ class BatchedVut(Driver):
         """Make the object."""
         super().__init__(corridors)
         self._watch = Watch(deadline_s)
+        self._make = make
         self._object = make()
-        self._reset = getattr(self._object, "reset", None)
+        self._renew_first = False
         self._raised: str | None = None
         self._reset_raised: dict[int, str] = {}
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Call `reset`, if there is one; an error is kept as the reason of the answer."""
+        """Call `reset`, if there is one; an error is kept as the reason of the answer.
+
+        After an act that failed all episodes begin, and the object is made anew for the first.
+        """
         self._reset_raised.pop(corridor, None)
-        if self._reset is not None:
-            try:
-                with self._watch as watch:
-                    watch.call(corridor, self._reset, corridor, seen_at_start(case))
-            except BaseException as error:
-                self._reset_raised[corridor] = f"reset: {self._watch.reason(error)}"
+        try:
+            with self._watch as watch:
+                if self._renew_first:
+                    self._object = watch.call(corridor, self._make)
+                    self._renew_first = False
+                reset = getattr(self._object, "reset", None)
+                if reset is not None:
+                    watch.call(corridor, reset, corridor, seen_at_start(case))
+        except BaseException as error:
+            self._reset_raised[corridor] = f"reset: {self._watch.reason(error)}"
 
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
@@ -186,6 +194,7 @@ class BatchedVut(Driver):
                 )
         except BaseException as error:
             self._raised = self._watch.reason(error)
+            self._renew_first = True
             if scene.active.sum() > 1:
                 raise VutLostError(self._raised, final=True) from None
             return np.full(self.corridors, np.nan)

@@ -1,0 +1,35 @@
+"""Which processes a test has left behind, by a mark that they inherit."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+
+def marked(mark: str) -> list[str]:
+    """Return the command lines of the processes whose environment began with a mark."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            # What has ended and is not yet taken note of has no environment any more.
+            if mark.encode() in (process / "environ").read_bytes():
+                found.append((process / "cmdline").read_bytes().replace(b"\0", b" ").decode())
+    return found
+
+
+@contextmanager
+def none_left(patience_s: float = 5.0) -> Iterator[None]:
+    """Check that nothing that is started within, by whomever, is left a little later."""
+    with pytest.MonkeyPatch.context() as patch:
+        mark = secrets.token_hex(8)
+        patch.setenv("MERGE_SUMO_TEST", mark)
+        yield
+        until = time.monotonic() + patience_s
+        while (left := marked(mark)) and time.monotonic() < until:
+            time.sleep(0.05)
+        assert left == []

@@ -1,0 +1,194 @@
+"""A folder that somebody sent is data: what it names is not run, unless a person says so."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from merge_sumo import cli
+from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
+from merge_sumo.errors import UserError
+from merge_sumo.journal import SETTINGS
+from merge_sumo.trust import SEAL, is_own, seal
+
+TELLTALE = """
+import pathlib
+pathlib.Path(__file__).with_name("it-ran").touch()
+def Vut(seen):
+    return {answer}
+"""
+COMMAND = "{python} -c \"import pathlib; pathlib.Path('{file}').touch()\" {{port}}"
+
+
+@pytest.fixture(autouse=True)
+def of_a_user(tmp_path, monkeypatch):
+    """Work as a user with a cache of their own."""
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "mine"))
+
+
+@pytest.fixture
+def stranger(monkeypatch, tmp_path):
+    """Return a function after which whoever is here is somebody else."""
+    return lambda: monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
+
+
+@pytest.fixture
+def call(monkeypatch, capfd):
+    def main(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return end.value.code or 0, capfd.readouterr().err
+
+    return main
+
+
+def campaign(folder: Path, answer: float = 1.0, cases: int = 12) -> Path:
+    """Run a campaign of a VUT that leaves a file where it ran, and take that file away."""
+    folder.mkdir()
+    (folder / "my_vut.py").write_text(TELLTALE.format(answer=answer))
+    spec = f"{folder / 'my_vut.py'}:Vut"
+    settings = CampaignSettings(vut=spec, levels=(0,), cases=cases, batch=6, sampler="uniform")
+    run = run_campaign(settings, folder / "run").folder
+    (folder / "it-ran").unlink()
+    return run
+
+
+def edit(run: Path, **changes: object) -> None:
+    settings = json.loads((run / SETTINGS).read_text())
+    (run / SETTINGS).write_text(json.dumps(settings | changes))
+
+
+def refuses(said: tuple[int, str]) -> bool:
+    code, err = said
+    return code == 2 and "--trust-vut" in err and err.count("\n") == 1
+
+
+def test_what_a_received_folder_names_is_not_run(tmp_path, stranger, call):
+    one = campaign(tmp_path / "one")
+    other = campaign(tmp_path / "other", answer=2.0)
+    stranger()
+    assert refuses(call("campaign", "--resume", one, "--quiet"))
+    assert refuses(call("compare-runs", one, other))
+    assert refuses(call("probability", one, "--cases", 10, "--out", tmp_path / "p.json"))
+    assert not (tmp_path / "one" / "it-ran").exists()
+    assert not (tmp_path / "other" / "it-ran").exists()
+
+
+def test_reports_exports_and_replays_of_a_received_folder_run_none_of_its_code(
+    tmp_path, stranger, call
+):
+    run = campaign(tmp_path / "one")
+    stranger()
+    out = tmp_path / "out"
+    assert call("report", run)[0] == 0
+    for form in ("sumo", "openscenario", "csv"):
+        assert call("export", run, 0, "--format", form, "--out", out / form)[0] == 0
+    assert call("replay", out / "sumo" / "case-00000")[0] == 0
+    assert call("compare-runs", run, run, "--no-rerun")[0] == 0
+    assert not (tmp_path / "one" / "it-ran").exists()
+
+
+def test_a_person_may_trust_it(tmp_path, stranger, call):
+    run = campaign(tmp_path / "one")
+    stranger()
+    resume_campaign(run, trust=True)
+    assert (tmp_path / "one" / "it-ran").exists()
+
+
+def test_who_names_the_controller_again_trusts_it(tmp_path, stranger):
+    run = campaign(tmp_path / "one")
+    vut = json.loads((run / SETTINGS).read_text())["vut"]
+    stranger()
+    resume_campaign(run, given={"vut": vut})
+    assert (tmp_path / "one" / "it-ran").exists()
+
+
+def test_a_folder_of_ones_own_goes_on_wherever_it_is(tmp_path):
+    run = campaign(tmp_path / "one")
+    shutil.move(run, tmp_path / "elsewhere")
+    assert len(resume_campaign(tmp_path / "elsewhere").outcomes) == 12
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"vut": "theirs.py:Vut"},
+        {"vut": "onnx:theirs.onnx"},
+        {"vut": "fmu:theirs.fmu"},
+        {"vut": "an_installed_name"},
+        {"vut": "traci", "vut_command": "theirs"},
+        {"vut": "level0", "vut_command": "theirs"},
+        {SEAL: None},
+        {SEAL: ""},
+        {SEAL: 3},
+        {SEAL: ["0"]},
+        {SEAL: "\ud800"},
+        {SEAL: "größer"},
+        {SEAL: "0" * 64},
+        {SEAL: hashlib.sha256(b"").hexdigest()},
+    ],
+)
+def test_a_folder_of_ones_own_that_somebody_changed_is_a_strangers(tmp_path, forged):
+    run = campaign(tmp_path / "one")
+    edit(run, **forged)
+    with pytest.raises(UserError, match=r"--trust-vut|--vut-command goes|not readable JSON"):
+        resume_campaign(run)
+    assert not (tmp_path / "one" / "it-ran").exists()
+
+
+def test_a_command_in_a_received_folder_is_not_started(tmp_path, stranger, call):
+    run = campaign(tmp_path / "one")
+    file = tmp_path / "started"
+    edit(run, vut="traci", vut_command=COMMAND.format(python=sys.executable, file=file))
+    stranger()
+    assert refuses(call("campaign", "--resume", run, "--quiet"))
+    assert refuses(call("probability", run, "--cases", 10, "--out", tmp_path / "p.json"))
+    assert not file.exists()
+
+
+@pytest.mark.parametrize("vut", ["level0", "design1", "sumo:IDM"])
+def test_what_is_of_this_package_or_of_sumo_runs_from_any_folder(tmp_path, stranger, vut):
+    settings = CampaignSettings(vut=vut, levels=(0,), cases=2, batch=2)
+    run = run_campaign(settings, tmp_path / "run")
+    stranger()
+    assert len(resume_campaign(run.folder).outcomes) == 2
+
+
+def test_the_key_is_the_users_alone_and_stays(tmp_path, stranger):
+    settings = {"vut": "my_vut.py:Vut", "vut_command": None}
+    first = seal(settings)
+    key = tmp_path / "mine" / "key"
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert [file.name for file in key.parent.iterdir()] == ["key"]
+    assert seal(settings) == first
+    assert is_own(settings | {SEAL: first})
+    assert seal(settings | {"vut": "your_vut.py:Vut"}) != first
+    assert seal(settings | {"vut_command": "x"}) != first
+    stranger()
+    assert not is_own(settings | {SEAL: first})
+
+
+@pytest.mark.parametrize("torn", [b"", b"short", b"x" * 33])
+def test_without_a_key_nothing_is_ones_own(tmp_path, torn):
+    settings = {"vut": "my_vut.py:Vut", "vut_command": None}
+    sealed = settings | {SEAL: seal(settings)}
+    (tmp_path / "mine" / "key").write_bytes(torn)
+    assert seal(settings) is None
+    assert not is_own(sealed)
+    assert not is_own(settings | {SEAL: None})
+
+
+def test_a_cache_that_cannot_be_written_seals_nothing_and_stops_nobody(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "file"))
+    assert seal({"vut": "x"}) is None
+    run = campaign(tmp_path / "one")
+    with pytest.raises(UserError, match="--trust-vut"):
+        resume_campaign(run)
