@@ -31,15 +31,15 @@ from merge_sumo.sumo import replay
 
 view, config = replay._view, replay._config
 
-def with_pictures():
-    root = view()
+def with_pictures(*arguments):
+    root = view(*arguments)
     root.find("delay").set("value", "0")
     for file, time in {times}.items():
         etree.SubElement(root, "snapshot", file=file, time=time)
     return root
 
-def that_ends(timesteps):
-    root = config(timesteps)
+def that_ends(*arguments):
+    root = config(*arguments)
     root.find("gui_only/delay").set("value", "0")
     etree.SubElement(root.find("gui_only"), "quit-on-end", value="true")
     return root

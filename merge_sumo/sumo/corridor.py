@@ -10,7 +10,7 @@ from __future__ import annotations
 import bisect
 import math
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -52,13 +52,14 @@ class Piece:
     def point(self, position_m: float) -> tuple[float, float, float]:
         """Return (x, y, angle) of a position on the lane, where SUMO draws it."""
         drawn = [math.dist(a, b) for a, b in pairwise(self.shape)]
-        left = min(position_m * max(sum(drawn), DRAWN_MIN_M) / self.length_m, sum(drawn))
-        segment = 0
-        while left > drawn[segment] and segment < len(drawn) - 1:
-            left -= drawn[segment]
-            segment += 1
+        *_, total = reach = list(accumulate(drawn))
+        # Shares of the lane: where it is straight, that of its length, and nothing is rounded.
+        ends = [end / total for end in reach]
+        along = min(position_m / self.length_m * (max(total, DRAWN_MIN_M) / total), 1.0)
+        segment = min(bisect.bisect_left(ends, along), len(drawn) - 1)
+        begin = ends[segment - 1] if segment else 0.0
         (x0, y0, _), (x1, y1, _) = self.shape[segment : segment + 2]
-        share = left / drawn[segment]
+        share = (along - begin) / (ends[segment] - begin)
         angle_deg = math.degrees(math.atan2(x1 - x0, y1 - y0)) % 360.0
         return x0 + share * (x1 - x0), y0 + share * (y1 - y0), angle_deg
 
@@ -84,9 +85,13 @@ class LanePath:
         """Length behind M."""
         return self.pieces[-1].start_m + self.pieces[-1].length_m
 
+    def piece(self, x_m: float) -> Piece:
+        """Return the lane at a coordinate."""
+        return self.pieces[max(bisect.bisect_right(self.starts_m, x_m) - 1, 0)]
+
     def point(self, x_m: float) -> LanePoint:
         """Return where a lane coordinate is."""
-        piece = self.pieces[max(bisect.bisect_right(self.starts_m, x_m) - 1, 0)]
+        piece = self.piece(x_m)
         position_m = x_m - piece.start_m
         return LanePoint(piece.lane, position_m, *piece.point(position_m))
 
@@ -123,6 +128,7 @@ class Corridor:
     ramp: LanePath
     junction_type: str
     """Of the junction at M."""
+    junction_id: str
     mainline_approach: Approach
     ramp_approach: Approach
     lane_drop: bool

@@ -66,6 +66,7 @@ def find_corridor(
         mainline=paths[0],
         ramp=paths[1],
         junction_type=junction_type,
+        junction_id=net.junction_id(meeting.ramp.source),
         mainline_approach=approaches[0],
         ramp_approach=approaches[1],
         lane_drop=meeting.drop is not None,

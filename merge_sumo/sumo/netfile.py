@@ -120,15 +120,22 @@ class NetFile:
         }
         return sorted(name for name in sources if not name.startswith(":"))
 
+    def junction_id(self, source: Lane) -> str:
+        """Return the id of the junction at the end of a lane; `UserError` where there is none."""
+        return str(self._junction(source).get("id"))
+
     def junction_type(self, source: Lane) -> str:
         """Return the type of the junction at the end of a lane; `UserError` when SUMO has none."""
-        junction = self._junctions.get(source.id)
-        if junction is None:
-            raise self.broken(f"there is no junction at the end of lane {source.id}")
-        kind = str(junction.get("type"))
+        kind = str(self._junction(source).get("type"))
         if kind not in JUNCTION_TYPES:
             raise self.broken(f"SUMO has no junctions of type {kind}")
         return kind
+
+    def _junction(self, source: Lane) -> etree._Element:
+        junction = self._junctions.get(source.id)
+        if junction is None:
+            raise self.broken(f"there is no junction at the end of lane {source.id}")
+        return junction
 
     def yields(self, link: Link, to: Link) -> bool:
         """Return whether the junction's rules make a link yield to another one of it."""

@@ -24,6 +24,8 @@ from lxml import etree
 from merge_sumo.errors import UserError
 
 MAX_BYTES: Final = 4 * 2**20
+MAX_NET_BYTES: Final = 2**28
+"""Of a net that a user names: that of a city has 50 MB. What somebody sent is a corridor."""
 MAX_ELEMENTS: Final = 5_000
 """A corridor has some twenty and a record less than a thousand; a world has its net 32 times."""
 MAX_CHARS: Final = 2**16
@@ -80,8 +82,8 @@ def _are_points(text: str) -> bool:
     )
 
 
-MAX_M: Final = 1e6
-"""Farthest from the origin that a net may reach."""
+MAX_M: Final = 2e7
+"""Farthest from the origin that a net may reach: half way round the earth, in metres of UTM."""
 _SWITCH = matching("0|1|true|false", "0, 1, true or false")
 _COUNT = number(0, 10_000)
 _METRES = number(0, MAX_M)
@@ -144,10 +146,11 @@ _CONNECTION: Final = Allowed(
         "state": matching("[a-zA-Z=-]", "a letter, = or -"),
     }
 )
+_VERSION = matching(r"[0-9]{1,4}(?:\.[0-9]{1,4}){0,3}", "a version")
 NET: Final = {
     "net": Allowed(
         {
-            "version": matching(r"[0-9]{1,4}(?:\.[0-9]{1,4}){0,3}", "a version"),
+            "version": _VERSION,
             "junctionCornerDetail": number(0, 1000),
             "junctionLinkDetail": number(0, 1000),
             "limitTurnSpeed": number(-1, 1000),
@@ -176,8 +179,20 @@ NET: Final = {
     )
 }
 """A net: no traffic lights, types, roundabouts or parameters, which a corridor does without."""
+HOSTED_NET: Final = {
+    "net": Allowed(
+        {"version": _VERSION},
+        {
+            "edge": _EDGE,
+            "junction": _JUNCTION,
+            "connection": Allowed({**_CONNECTION.attributes, "via": _ID}),
+        },
+    )
+}
+"""A net that `hosting` made, with lanes inside of junctions."""
 
 _WHO: Final = matching("pov|vut", "pov or vut")
+_COLOUR: Final = matching(r"[0-9.]{1,20}(?:,[0-9.]{1,20}){2,3}|[a-z]{1,20}", "a colour")
 
 TYPES: Final = {
     "additional": Allowed(
@@ -186,9 +201,7 @@ TYPES: Final = {
             "vType": Allowed(
                 {
                     "id": _WHO,
-                    "color": matching(
-                        r"[0-9.]{1,20}(?:,[0-9.]{1,20}){2,3}|[a-z]{1,20}", "a colour"
-                    ),
+                    "color": _COLOUR,
                     "guiShape": matching("[a-z]{1,20}(?:/[a-z]{1,20})?", "a shape of a vehicle"),
                     "length": number(0.1, 100),
                     "minGap": number(0, 100),
@@ -202,6 +215,26 @@ TYPES: Final = {
 }
 """The types of the two vehicles; SUMO chooses what is not named."""
 
+SURROUNDINGS: Final = {
+    "additional": Allowed(
+        {},
+        {
+            "poly": Allowed(
+                {
+                    "id": _ID,
+                    "color": _COLOUR,
+                    "fill": _SWITCH,
+                    "layer": number(-1000, 1000),
+                    "lineWidth": number(0, 100),
+                    "shape": _SHAPE,
+                },
+                required=("id", "shape"),
+            )
+        },
+    )
+}
+"""What is drawn beside the road."""
+
 _MOTION: Final = {
     "id": _WHO,
     "x": _PLACE,
@@ -213,7 +246,12 @@ _RECORDED: Final = {
     **_MOTION,
     "angle": number(-360, 360),
     "type": _WHO,
-    "lane": matching("(?:main_in|main_out|ramp)_0", "main_in_0, main_out_0 or ramp_0"),
+    "lane": matching(
+        "(?:main_in|main_out|ramp)_0"
+        r"|(?::(?:M|end|(?:main|ramp|out)[0-9]{1,4}-end)\.0_(?:main|ramp|out)[0-9]{1,4}"
+        r"|(?:main|ramp|out)[0-9]{1,4}\.0)_0",
+        "a lane of a replay",
+    ),
 }
 
 
@@ -232,8 +270,8 @@ REPLAYED: Final = _fcd(_MOTION)
 """What SUMO writes of a replay, where only motion is compared."""
 
 
-def read_bytes(path: Path, what: str, *, follow_links: bool) -> bytes:
-    """Return the bytes of a plain file of at most `MAX_BYTES`.
+def read_bytes(path: Path, what: str, *, follow_links: bool, limit: int = MAX_BYTES) -> bytes:
+    """Return the bytes of a plain file of at most `limit`.
 
     Raises `UserError` for anything else that a path can be, without opening it: opening a FIFO
     waits, and opening a device may do something. `what` is what sentences call the file.
@@ -246,35 +284,45 @@ def read_bytes(path: Path, what: str, *, follow_links: bool) -> bytes:
             with open(path, "rb", opener=lambda name, _: os.open(name, flags)) as file:
                 # Asked again, because another may stand there now.
                 mode = os.fstat(file.fileno()).st_mode
-                content = file.read(MAX_BYTES + 1) if stat.S_ISREG(mode) else b""
+                content = file.read(limit + 1) if stat.S_ISREG(mode) else b""
     except OSError as error:
         raise UserError(f"cannot read {what} {path}: {error.strerror}") from error
     if stat.S_ISLNK(mode):
         raise UserError(f"cannot read {what} {path}: it is a link; put the file itself there")
     if not stat.S_ISREG(mode):
         raise UserError(f"cannot read {what} {path}: it is no plain file")
-    if len(content) > MAX_BYTES:
-        raise UserError(f"cannot read {what} {path}: it is larger than {MAX_BYTES // 2**20} MiB")
+    if len(content) > limit:
+        raise UserError(f"cannot read {what} {path}: it is larger than {limit // 2**20} MiB")
     return content
 
 
-def parse(content: bytes, allowed: Mapping[str, Allowed], name: str) -> tuple[etree._Element, bool]:
-    """Return what is allowed of an XML file as a tree, and whether that is all of it.
-
-    Where it is all, the bytes themselves mean the same to every reader as the tree does: comments
-    and spaces are the only things that are in the one and not in the other.
-
-    Raises `UserError` when it is no UTF-8, is no XML, declares a document type, has more elements
-    than `MAX_ELEMENTS`, or has a value that its attribute does not take; `name` is what the
-    sentence calls it.
-    """
+def check_text(content: bytes, name: str) -> None:
+    """Raise `UserError` for bytes that are no UTF-8, or declare what a reader could expand."""
     try:
         content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise UserError(f"{name} is not readable XML: save it as UTF-8") from error
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
         raise UserError(f"{name} declares a document type or an entity: remove the declaration")
-    cleaner = _Cleaner(allowed, name)
+
+
+def parse(
+    content: bytes,
+    allowed: Mapping[str, Allowed],
+    name: str,
+    max_elements: int = MAX_ELEMENTS,
+) -> tuple[etree._Element, bool]:
+    """Return what is allowed of an XML file as a tree, and whether that is all of it.
+
+    Where it is all, the bytes themselves mean the same to every reader as the tree does: comments
+    and spaces are the only things that are in the one and not in the other.
+
+    Raises `UserError` when it is no UTF-8, is no XML, declares a document type, has more elements
+    than `max_elements`, or has a value that its attribute does not take; `name` is what the
+    sentence calls it.
+    """
+    check_text(content, name)
+    cleaner = _Cleaner(allowed, name, max_elements)
     parser = etree.XMLParser(
         target=cleaner,  # type: ignore[arg-type] # the stubs know parsers of bytes, too
         # Whatever the file declares: another encoding could hide what is looked for above.
@@ -303,9 +351,9 @@ def serialize(root: etree._Element) -> bytes:
 class _Cleaner:
     """Builds the tree of what is allowed while the parser reads, and holds nothing else."""
 
-    def __init__(self, allowed: Mapping[str, Allowed], name: str) -> None:
+    def __init__(self, allowed: Mapping[str, Allowed], name: str, max_elements: int) -> None:
         self.intact = True
-        self._name = name
+        self._name, self._max_elements = name, max_elements
         self._elements = 0
         self._dropped = 0
         """Depth inside of an element that is dropped."""
@@ -314,8 +362,8 @@ class _Cleaner:
 
     def start(self, tag: str, attributes: Mapping[str, str]) -> None:
         self._elements += 1
-        if self._elements > MAX_ELEMENTS:
-            raise UserError(f"{self._name} has more than {MAX_ELEMENTS} elements")
+        if self._elements > self._max_elements:
+            raise UserError(f"{self._name} has more than {self._max_elements} elements")
         parent, expected = self._open[-1]
         if self._dropped or tag not in expected:
             if parent is None:

@@ -1,13 +1,20 @@
-"""A recorded episode as a folder that sumo and sumo-gui replay with nothing else running."""
+"""A recorded episode as a folder that sumo and sumo-gui replay with nothing else running.
+
+A road like the shipped one is replayed in its own net. Of any other road the folder has the net
+that hosts it (`hosting`), with a speed limit above all speeds: there lanes have ids and ends that
+every reader can check, and where the road goes on behind the end of the file, so does that net. The
+lanes beside it are polygons.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,11 +26,20 @@ from merge_sumo.scenario import DT_S, MAX_STEPS
 from merge_sumo.score import Outcome
 from merge_sumo.sumo import received
 from merge_sumo.sumo.binding import run_program, scratch_folder
+from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint
+from merge_sumo.sumo.finder import find_corridor
+from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.netfile import NetFile, Point
+from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, corridor_of
 from merge_sumo.trajectory import Trajectory
 
 CONFIG: Final = "replay.sumocfg"
 NET: Final = "us23.net.xml"
+"""The net of a road like the shipped one."""
+HOSTED_NET: Final = "road.net.xml"
+"""The net of any other road."""
+SURROUNDINGS: Final = "surroundings.add.xml"
 TYPES: Final = "vehicles.add.xml"
 RECORD: Final = "episode.fcd.xml"
 VIEW: Final = "view.settings.xml"
@@ -35,33 +51,104 @@ TOLERANCE: Final = 1e-6
 """Metres and m/s; the record is written with nine digits."""
 
 LANE_END_M: Final = 2e-3
-"""Nearer than this to M, a vehicle may be on the lane before or behind."""
+"""Nearer than this to where a lane begins, a vehicle may be on the lane before or behind."""
+SPEED_LIMIT_MPS: Final = 200.0
+"""Above every speed: SUMO lets a vehicle enter a replay no faster than its lane allows."""
 
 COLOURS: Final = {"pov": "0.90,0.25,0.15", "vut": "0.10,0.35,0.90"}
+WINDOW: Final = (1280, 800)
+SEEN_M: Final = 700.0
+"""Width of the picture on the road."""
+SURROUNDINGS_COLOUR: Final = "0.70,0.70,0.68"
+LANE_WIDTH_M: Final = 3.2
+MAX_SURROUNDINGS: Final = 2_000
 HOLD_STEPS: Final = 10
 """Steps for which the last picture stays, so that a person sees how it ended."""
 MIN_TIMESTEPS: Final = 1 + HOLD_STEPS
 MAX_TIMESTEPS: Final = MAX_STEPS + 1 + HOLD_STEPS
 
 
-def write_scenario(folder: Path, net: Net, outcome: Outcome, trajectory: Trajectory) -> Path:
+@dataclass(frozen=True, slots=True)
+class _Road:
+    """The road of a replay folder."""
+
+    net: bytes
+    corridor: Corridor
+    """Found in that net, so that its lanes have the ids that they have there."""
+    surroundings: etree._Element | None
+    """None where the net itself has all lanes."""
+
+    @property
+    def file(self) -> str:
+        """Name of the net in the folder."""
+        return NET if self.surroundings is None else HOSTED_NET
+
+    @property
+    def additional(self) -> list[str]:
+        """Names of the other files that SUMO loads at the start."""
+        return [TYPES] if self.surroundings is None else [TYPES, SURROUNDINGS]
+
+
+def write_scenario(
+    folder: Path, road: Net | Corridor, outcome: Outcome, trajectory: Trajectory
+) -> Path:
     """Write an episode as a replay folder and return the path of its configuration.
 
     Raises `UserError` when the folder exists or cannot be written; nothing is overwritten.
     """
+    written = _road(road, folder)
     with new_folder(folder) as new:
         (new / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
-        _write(new, net, _types(trajectory), _fcd(net, trajectory))
+        _write(new, written, _types(trajectory), _fcd(written.corridor, trajectory))
     return folder / CONFIG
 
 
-def _write(folder: Path, net: Net, types: etree._Element, record: etree._Element) -> None:
+def _road(road: Net | Corridor, folder: Path) -> _Road:
+    """Return a road as a folder has it."""
+    net = road if isinstance(road, Net) else _like_shipped(road)
+    if net is not None:
+        return _Road(net.text, corridor_of(net), None)
+    corridor = corridor_of(road)
+    fast = replace(corridor, mainline=_fast(corridor.mainline), ramp=_fast(corridor.ramp))
+    content = hosted_net(fast, 1)
+    drawn = _polygons(corridor.surroundings)
+    return _Road(content, _corridor_of_hosted(content, folder / HOSTED_NET), drawn)
+
+
+def _like_shipped(road: Corridor) -> Net | None:
+    """Return the net of a road if it is one with the shipped edges, in which replays are exact."""
+    if (road.mainline_edges, road.ramp_edges) != (MAINLINE_EDGES, RAMP_EDGES):
+        return None
+    try:
+        net = Net(road.path)
+    except UserError:
+        return None
+    return net if net.sha256 == road.sha256 else None
+
+
+def _fast(path: LanePath) -> LanePath:
+    return LanePath(tuple(replace(p, speed_limit_mps=SPEED_LIMIT_MPS) for p in path.pieces))
+
+
+def _corridor_of_hosted(content: bytes, path: Path) -> Corridor:
+    """Find the corridor in the net of a folder; `UserError` when it has none."""
+    edges = re.findall(rb'<edge [^>]*\bid="((main|ramp|out)([0-9]{1,4})\.0)"', content)
+    main, ramp, out = (
+        [name.decode() for name, of, _ in sorted(edges, key=lambda e: int(e[2])) if of == kind]
+        for kind in (b"main", b"ramp", b"out")
+    )
+    return find_corridor(NetFile(path, content), main + out, ramp + out, room_after_m=0.0)
+
+
+def _write(folder: Path, road: _Road, types: etree._Element, record: etree._Element) -> None:
     """Write all that SUMO reads, the configuration last."""
-    (folder / NET).write_bytes(net.text)
+    (folder / road.file).write_bytes(road.net)
     (folder / TYPES).write_bytes(received.serialize(types))
+    if road.surroundings is not None:
+        (folder / SURROUNDINGS).write_bytes(received.serialize(road.surroundings))
     (folder / RECORD).write_bytes(received.serialize(record))
-    (folder / VIEW).write_bytes(received.serialize(_view()))
-    (folder / CONFIG).write_bytes(received.serialize(_config(len(record))))
+    (folder / VIEW).write_bytes(received.serialize(_view(road)))
+    (folder / CONFIG).write_bytes(received.serialize(_config(road, len(record))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +179,7 @@ def replay(folder: Path) -> Replay:
         written = received.read_bytes(stage / REPLAYED, "the replay", follow_links=False)
     name = f"SUMO's replay of {folder}"
     replayed = _rows(received.parse(written, received.REPLAYED, name)[0], name)
-    fault = _difference(episode.rows, replayed) or _fault_of_record(episode.rows, episode.net)
+    fault = _difference(episode, replayed) or _fault_of_record(episode)
     return Replay(len(episode.rows), *(fault or (None, "")))
 
 
@@ -104,26 +191,48 @@ Rows = dict[tuple[float, str], tuple[float, ...]]
 class _Episode:
     """What is allowed of a received folder."""
 
-    net: Net
+    road: _Road
     types: etree._Element
     record: etree._Element
     rows: Rows
+    x_m: dict[tuple[float, str], float | None]
+    """Lane coordinates of the rows; None for a lane on which a vehicle does not drive."""
+
+    def path(self, who: str) -> LanePath:
+        """Return the lanes of a vehicle."""
+        return _path(self.road.corridor, who)
+
+
+def _path(road: Corridor, who: str) -> LanePath:
+    return road.ramp if who == "vut" else road.mainline
 
 
 def _received(folder: Path) -> _Episode:
     """Read net, vehicle types and record of a folder that somebody may have sent."""
-    for name in (NET, TYPES, RECORD):
+    hosted = os.path.lexists(folder / HOSTED_NET)
+    net_files = (HOSTED_NET, SURROUNDINGS) if hosted else (NET,)
+    for name in (*net_files, TYPES, RECORD):
         if not os.path.lexists(folder / name):
             raise UserError(f"{folder} is not a replay folder: it has no {name}")
-    net, types, record = (
+    types, record, net, *surroundings = (
         received.read_bytes(folder / name, "the file", follow_links=False)
-        for name in (NET, TYPES, RECORD)
+        for name in (TYPES, RECORD, *net_files)
     )
-    return _Episode(
-        Net.of_bytes(net, folder / NET),
-        _checked_types(types, folder / TYPES),
-        *_checked_record(record, folder / RECORD),
-    )
+    if surroundings:
+        road = _checked_hosted(net, surroundings[0], folder)
+    else:
+        road = _road(Net.of_bytes(net, folder / NET), folder)
+    root, rows = _checked_record(record, folder / RECORD)
+    x_m = _lane_coordinates(root, road.corridor)
+    return _Episode(road, _checked_types(types, folder / TYPES), root, rows, x_m)
+
+
+def _checked_hosted(net: bytes, surroundings: bytes, folder: Path) -> _Road:
+    root, _ = received.parse(net, received.HOSTED_NET, f"the net {folder / HOSTED_NET}")
+    content = received.serialize(root)
+    name = f"the file {folder / SURROUNDINGS}"
+    drawn, _ = received.parse(surroundings, received.SURROUNDINGS, name)
+    return _Road(content, _corridor_of_hosted(content, folder / HOSTED_NET), drawn)
 
 
 def _checked_types(content: bytes, path: Path) -> etree._Element:
@@ -152,36 +261,46 @@ def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
 def _staged(episode: _Episode) -> Iterator[Path]:
     """Yield a temporary folder that holds an episode, with nothing in it that was not checked."""
     with scratch_folder() as stage:
-        _write(stage, episode.net, episode.types, episode.record)
+        _write(stage, episode.road, episode.types, episode.record)
         yield stage
 
 
-def _difference(recorded: Rows, replayed: Rows) -> tuple[float, str] | None:
+def _difference(episode: _Episode, replayed: Rows) -> tuple[float, str] | None:
     """Return when and in what a replay first differs from the record, or None."""
-    for (time, who), values in recorded.items():
+    for (time, who), values in episode.rows.items():
         seen = replayed.get((time, who))
         if seen is None:
             return (time, f"{who} is not there")
-        # SUMO keeps a vehicle a millimetre before the end of a lane: there x and y tell.
-        at_m = math.hypot(values[0], values[1]) <= LANE_END_M
+        x_m = episode.x_m[time, who]
+        told = x_m is None or _is_told(x_m, episode.path(who))
         for name, was, now in zip(COMPARED, values, seen, strict=True):
-            if not (abs(now - was) <= TOLERANCE or (name == "pos" and at_m)):
+            if not (abs(now - was) <= TOLERANCE or (name == "pos" and not told)):
                 return (time, f"{name} of {who} is {now}, recorded {was}")
-    for time, who in replayed.keys() - recorded.keys():
+    for time, who in replayed.keys() - episode.rows.keys():
         return (time, f"{who} is not in the record")
     return None
 
 
-def _fault_of_record(rows: Rows, net: Net) -> tuple[float, str] | None:
+def _is_told(x_m: float, path: LanePath) -> bool:
+    """Return whether a replay tells the position on the lane; elsewhere x and y tell.
+
+    SUMO keeps a vehicle a millimetre before the end of a lane, and where lanes overlap inside of a
+    junction it may take the one before.
+    """
+    at_an_end = any(abs(x_m - start_m) <= LANE_END_M for start_m in path.starts_m)
+    return not (at_an_end or path.piece(x_m).is_internal)
+
+
+def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
     """Return when and why a checked record is no episode, or None when it is one."""
+    rows = episode.rows
     times = sorted({time for time, _ in rows})
     moving = set(times[: -HOLD_STEPS - 1])
     for time, after in zip(times, [*times[1:], None], strict=True):
         for who in COLOURS:
-            x, y, position, speed = rows[time, who]
-            x_m = _lane_coordinate(x, position, net, on_ramp=who == "vut")
-            _, _, x_of_lane, y_of_lane, _ = net.lane_point(x_m, on_ramp=who == "vut")
-            if not math.hypot(x - x_of_lane, y - y_of_lane) <= LANE_END_M:
+            x, y, _, speed = rows[time, who]
+            x_m = episode.x_m[time, who]
+            if x_m is None or _is_beside(episode.path(who).point(x_m), x, y):
                 return (time, f"{who} is recorded beside its lane")
             if after is None:
                 continue
@@ -189,16 +308,32 @@ def _fault_of_record(rows: Rows, net: Net) -> tuple[float, str] | None:
                 if rows[after, who] != rows[time, who]:
                     return (after, f"{who} is not held where the episode ended")
                 continue
-            x_after, _, position_after, _ = rows[after, who]
-            to_m = _lane_coordinate(x_after, position_after, net, on_ramp=who == "vut")
-            if not abs(to_m - x_m - speed * DT_S) <= TOLERANCE:
+            to_m = episode.x_m[after, who]
+            if to_m is None or not abs(to_m - x_m - speed * DT_S) <= TOLERANCE:
                 return (time, f"{who} is recorded as not moving at its speed of {speed}")
     return None
 
 
-def _lane_coordinate(x: float, position: float, net: Net, *, on_ramp: bool) -> float:
-    lane = net.ramp if on_ramp else net.main_in
-    return position if x >= 0.0 else position - lane.length_m
+def _is_beside(lane: LanePoint, x: float, y: float) -> bool:
+    return not math.hypot(x - lane.x_m, y - lane.y_m) <= LANE_END_M
+
+
+def _lane_coordinates(
+    record: etree._Element, road: Corridor
+) -> dict[tuple[float, str], float | None]:
+    """Return the lane coordinates of the rows of a record that was checked."""
+    starts_m = {
+        who: {piece.lane: piece.start_m for piece in _path(road, who).pieces} for who in COLOURS
+    }
+    found: dict[tuple[float, str], float | None] = {}
+    for timestep in record:
+        time = round(float(timestep.get("time", "")), 3)
+        for vehicle in timestep:
+            who = str(vehicle.get("id"))
+            start_m = starts_m[who].get(str(vehicle.get("lane")))
+            position_m = float(vehicle.get("pos", ""))
+            found[time, who] = None if start_m is None else start_m + position_m
+    return found
 
 
 def open_gui(folder: Path) -> int:
@@ -251,14 +386,14 @@ def _types(trajectory: Trajectory) -> etree._Element:
     return root
 
 
-def _fcd(net: Net, trajectory: Trajectory) -> etree._Element:
+def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
     root = etree.Element("fcd-export")
     motion = trajectory.motion.tolist()
     motion += [motion[-1]] * HOLD_STEPS
     for step, (x_pov, v_pov, _, x_vut, v_vut, _) in enumerate(motion):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
         for who, x_m, v_mps in (("pov", x_pov, v_pov), ("vut", x_vut, v_vut)):
-            lane, position, x, y, angle = net.lane_point(x_m, on_ramp=who == "vut")
+            lane, position, x, y, angle = road.lane_point(x_m, on_ramp=who == "vut")
             etree.SubElement(
                 timestep,
                 "vehicle",
@@ -274,7 +409,23 @@ def _fcd(net: Net, trajectory: Trajectory) -> etree._Element:
     return root
 
 
-def _view() -> etree._Element:
+def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
+    root = etree.Element("additional")
+    for number, shape in enumerate(shapes[:MAX_SURROUNDINGS]):
+        etree.SubElement(
+            root,
+            "poly",
+            id=f"lane{number}",
+            color=SURROUNDINGS_COLOUR,
+            fill="0",
+            layer="-1",
+            lineWidth=f"{LANE_WIDTH_M}",
+            shape=" ".join(f"{x:.3f},{y:.3f}" for x, y, _ in shape),
+        )
+    return root
+
+
+def _view(road: _Road) -> etree._Element:
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
     etree.SubElement(
@@ -287,15 +438,41 @@ def _view() -> etree._Element:
         vehicleName_color="0.1,0.1,0.1",
     )
     etree.SubElement(scheme, "background", backgroundColor="0.93,0.93,0.90", showGrid="0")
-    etree.SubElement(root, "viewport", zoom="440", x="-110", y="-20")
+    zoom, x, y = ("440", "-110", "-20") if road.surroundings is None else _viewport(road.corridor)
+    etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
     etree.SubElement(root, "delay", value="100")
     return root
 
 
-def _config(timesteps: int) -> etree._Element:
+def _viewport(road: Corridor) -> tuple[str, str, str]:
+    """Return zoom and centre of a picture of the last 300 m of both paths before M.
+
+    At a zoom of 100 the picture has the whole net.
+    """
+    points = [
+        point for path in (road.mainline, road.ramp) for p in path.pieces for point in p.shape
+    ]
+    width_m, height_m = (
+        max(values) - min(values)
+        for values in ([x for x, *_ in points], [y for _, y, *_ in points])
+    )
+    whole_m = max(width_m, height_m * WINDOW[0] / WINDOW[1])
+    seen = [
+        path.point(max(x_m, -path.before_m))
+        for path in (road.mainline, road.ramp)
+        for x_m in (-300.0, 50.0)
+    ]
+    x, y = (
+        (min(values) + max(values)) / 2.0
+        for values in ([at.x_m for at in seen], [at.y_m for at in seen])
+    )
+    return f"{100.0 * whole_m / SEEN_M:.0f}", f"{x:.0f}", f"{y:.0f}"
+
+
+def _config(road: _Road, timesteps: int) -> etree._Element:
     end_s = timesteps * DT_S
     sections = {
-        "input": {"net-file": NET, "additional-files": TYPES},
+        "input": {"net-file": road.file, "additional-files": ",".join(road.additional)},
         "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
         "processing": {
             "collision.action": "none",
@@ -308,7 +485,7 @@ def _config(timesteps: int) -> etree._Element:
             "gui-settings-file": VIEW,
             "start": "true",
             "delay": "100",
-            "window-size": "1280,800",
+            "window-size": ",".join(map(str, WINDOW)),
         },
     }
     root = etree.Element("configuration")

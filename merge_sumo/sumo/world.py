@@ -29,10 +29,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario import DT_S
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.finder import find_corridor
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net
-from merge_sumo.sumo.netfile import NetFile
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import corridor_of, road_of
 
 POV: Final = 0
 VUT: Final = 1
@@ -92,9 +91,7 @@ class World:
         if World._open:
             raise UserError("libsumo holds one simulation per process: close the other World first")
         self.corridors = corridors
-        road = road or Net()
-        self._net = road if isinstance(road, Net) else None
-        self.road = _corridor_of(road) if isinstance(road, Net) else road
+        self.road = road_of() if road is None else corridor_of(road)
         self.vut_type = vut_type
         self._libsumo = load_libsumo()
         self.x_m: FloatArray = np.empty((2, corridors))
@@ -113,16 +110,6 @@ class World:
         self._expected_m = self.x_m
         """Where eq. (4) leads; no number where that is not known."""
         self._start()
-
-    @property
-    def net(self) -> Net:
-        """The net with the edges main_in, main_out and ramp; `UserError` on any other road."""
-        if self._net is None:
-            raise UserError(
-                f"the VUT asks for the shipped road and {self.road.path} is another one: choose "
-                "another kind of VUT"
-            )
-        return self._net
 
     def restart(self) -> None:
         """Start SUMO afresh, with parked vehicles; what ran is gone."""
@@ -325,11 +312,6 @@ class World:
     def __exit__(self, *_: object) -> None:
         """Close the world."""
         self.close()
-
-
-def _corridor_of(net: Net) -> Corridor:
-    """Return the corridor of a net whose edges have the names of the shipped one."""
-    return find_corridor(NetFile(net.path, net.text), (MAIN_IN, MAIN_OUT), (RAMP, MAIN_OUT))
 
 
 def _types(vut_type: Mapping[str, str] | None) -> bytes:

@@ -1,0 +1,48 @@
+"""The road of a scenario: read from a net file as data, and found once in a process."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from merge_sumo.sumo import received
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.sumo.finder import find_corridor
+from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net, default_net_path
+from merge_sumo.sumo.netfile import NetFile
+
+MAINLINE_EDGES: Final = (MAIN_IN, MAIN_OUT)
+RAMP_EDGES: Final = (RAMP, MAIN_OUT)
+"""Of the shipped net."""
+
+_found: dict[tuple[Path, str, tuple[str, ...], tuple[str, ...]], Corridor] = {}
+
+
+def road_of(
+    net: Path | None = None,
+    mainline: Sequence[str] = MAINLINE_EDGES,
+    ramp: Sequence[str] = RAMP_EDGES,
+) -> Corridor:
+    """Return the merge of two sequences of edges in a net file, by default the shipped one.
+
+    What is searched once is kept until the file changes. Raises `UserError` when the file is no
+    plain file, is no SUMO net, or has no such merge.
+    """
+    path = net or default_net_path()
+    content = received.read_bytes(path, "the net", follow_links=True, limit=received.MAX_NET_BYTES)
+    key = (path, hashlib.sha256(content).hexdigest(), tuple(mainline), tuple(ramp))
+    if key not in _found:
+        received.check_text(content, f"the net {path}")
+        _found[key] = find_corridor(NetFile(path, content), *key[2:])
+    return _found[key]
+
+
+def corridor_of(road: Net | Corridor) -> Corridor:
+    """Return a road as a corridor, also that of a net whose edges have the shipped one's names."""
+    if isinstance(road, Corridor):
+        return road
+    found = find_corridor(NetFile(road.path, road.text), MAINLINE_EDGES, RAMP_EDGES)
+    return replace(found, sha256=road.sha256)
