@@ -21,16 +21,17 @@ from merge_sumo.conductor import (
     CampaignSettings,
     OnCase,
     parse_levels,
+    road_for,
     run_campaign,
 )
 from merge_sumo.errors import UserError
 from merge_sumo.folders import dated
 from merge_sumo.journal import SETTINGS, Run, failures
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB, V_VUT0_MPS
+from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario
+from merge_sumo.scenario_file import named_scenario
 from merge_sumo.score import Outcome
 from merge_sumo.summary import Summary, summarise
-from merge_sumo.sumo.net import Net
 from merge_sumo.trajectory import End, Trajectory
 from merge_sumo.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
 from merge_sumo.workers import open_workers
@@ -154,7 +155,7 @@ def campaign(
     cases: int = DEFAULT_CASES,
     batch: int | None = None,
     seed: int = 0,
-    v_vut0_mps: float = V_VUT0_MPS,
+    v_vut0_mps: float | None = None,
     vut_command: str | None = None,
     deadline_s: float = DEADLINE_S,
     vut_memory_gib: float = MEMORY_GIB,
@@ -163,6 +164,7 @@ def campaign(
     workers: int = 1,
     out: Path | str | None = None,
     net: Path | str | None = None,
+    scenario: Scenario | Path | str = US23,
     on_case: OnCase | None = None,
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
@@ -174,7 +176,7 @@ def campaign(
         cases: number of cases.
         batch: cases per batch; 40, or all if fewer, when left out.
         seed: same seed, same outcomes.
-        v_vut0_mps: initial speed of the VUT.
+        v_vut0_mps: initial speed of the VUT; the scenario's when left out.
         vut_command: command that starts the controller of `vut="traci"`.
         deadline_s: time that a VUT may take for a step before it is a VUT_ERROR.
         vut_memory_gib: memory that the process of a VUT of your own may take.
@@ -182,7 +184,8 @@ def campaign(
         stop_after_converged: stop early when less than this share of new coverage is expected.
         workers: processes that run cases; the outcomes are the same.
         out: new folder to write; `runs/<vut>-<date>` when left out.
-        net: SUMO net to use instead of the shipped one.
+        net: SUMO net to use instead of the scenario's.
+        scenario: a scenario, its name, or its TOML file.
         on_case: told of every case as it ends.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
@@ -200,9 +203,10 @@ def campaign(
         deadline_s=deadline_s,
         vut_memory_gib=vut_memory_gib,
         in_process=in_process,
+        scenario=scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario)),
     )
     folder = dated(vut) if out is None else Path(out)
-    road = Net(None if net is None else Path(net))
+    road = road_for(settings.scenario, None if net is None else Path(net))
     with open_workers(settings.vut_factory.workers(workers)) as there:
         run_campaign(settings, folder, road, on_case, workers=there)
     run = CampaignRun(folder)

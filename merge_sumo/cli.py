@@ -8,12 +8,12 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands import campaign, experiments, runs, training, vuts
+from merge_sumo.commands import campaign, experiments, runs, scenarios, training, vuts
 from merge_sumo.commands.shared import app, say
 from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Stopped
 
-__all__ = ["app", "campaign", "experiments", "main", "runs", "training", "vuts"]
+__all__ = ["app", "campaign", "experiments", "main", "runs", "scenarios", "training", "vuts"]
 
 
 @app.callback(invoke_without_command=True)

@@ -16,11 +16,12 @@ from enum import StrEnum
 from typing import Final
 
 from merge_sumo.case import Case, to_unit
-from merge_sumo.conductor import MAX_CORRIDORS, ProvingGround, settings_of
+from merge_sumo.conductor import MAX_CORRIDORS, ProvingGround, road_for, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.fmc import fmc
 from merge_sumo.journal import SETTINGS, Run, failures
 from merge_sumo.score import FAILURE_SCORE, Measures, Outcome, measure
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
 from merge_sumo.trajectory import End
 from merge_sumo.verdict import Verdict, counted, judge
@@ -169,7 +170,7 @@ def _worse(level: int, found: LevelChange, tolerance: float) -> list[str]:
 
 
 def compare_runs(
-    a: Run, b: Run, *, rerun: bool = True, net: Net | None = None, trust: bool = False
+    a: Run, b: Run, *, rerun: bool = True, net: Net | Corridor | None = None, trust: bool = False
 ) -> RunComparison:
     """Compare two campaigns level by level.
 
@@ -194,7 +195,7 @@ def compare_runs(
     )
     again_a = again_b = _Again({}, "was not run again")
     if rerun:
-        net = _common_net(a, b, net or Net())
+        net = _common_net(a, b, net or road_for(a.scenario))
         again_b = _run_again(b, telling_a, net, trust=trust)
         again_a = _run_again(a, telling_b, net, trust=trust)
     cases = [
@@ -228,6 +229,11 @@ def _common_levels(a: Run, b: Run) -> list[int]:
     common = sorted(named[0] & named[1])
     if not common:
         raise UserError(f"{a.folder} and {b.folder} have no POV level in common")
+    if a.scenario != b.scenario:
+        raise UserError(
+            f"{a.folder} is of the scenario {a.scenario.name} and {b.folder} of another or a "
+            f"changed one, {b.scenario.name}: compare campaigns of one scenario"
+        )
     speeds = [run.settings.get("v_vut0_mps") for run in (a, b)]
     if speeds[0] != speeds[1]:
         raise UserError(
@@ -237,7 +243,7 @@ def _common_levels(a: Run, b: Run) -> list[int]:
     return common
 
 
-def _common_net(a: Run, b: Run, net: Net) -> Net:
+def _common_net(a: Run, b: Run, net: Net | Corridor) -> Net | Corridor:
     for run in (a, b):
         if run.settings.get("net_sha256") != net.sha256:
             raise UserError(
@@ -255,7 +261,7 @@ class _Again:
     how: str
 
 
-def _run_again(run: Run, failing: Sequence[Outcome], net: Net, *, trust: bool) -> _Again:
+def _run_again(run: Run, failing: Sequence[Outcome], net: Net | Corridor, *, trust: bool) -> _Again:
     """Run a campaign's VUT on the other's telling cases, if it is still the same VUT."""
     told = [o for o in run.outcomes if o.measures.score is not None]
     told = sorted(told, key=lambda o: (o.measures.score, o.index))[:CHECKED]

@@ -25,21 +25,17 @@ from merge_sumo.drivers.vuts.files import Files, hashed, sha256_of
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.folders import check_new, check_own
-from merge_sumo.journal import SETTINGS, Journal, Run, failures
+from merge_sumo.journal import SETTINGS, Journal, Run, failures, scenario_of
 from merge_sumo.rollout import rollout
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.scenario import (
-    DEADLINE_S,
-    LEVELS,
-    MEMORY_GIB,
-    V_VUT0_MAX_MPS,
-    V_VUT0_MPS,
-)
+from merge_sumo.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, US23, Scenario
 from merge_sumo.score import Measures, Outcome, measure
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.replay import write_scenario
+from merge_sumo.sumo.road import corridor_of, road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.trajectory import End, Trajectory
 from merge_sumo.trust import SEAL, is_own, seal
@@ -67,15 +63,18 @@ class CampaignSettings:
     cases: int = DEFAULT_CASES
     batch: int = DEFAULT_BATCH
     seed: int = 0
-    v_vut0_mps: float = V_VUT0_MPS
+    v_vut0_mps: float | None = None
     stop_after_converged: float | None = None
     vut_command: str | None = None
     deadline_s: float = DEADLINE_S
     vut_memory_gib: float = MEMORY_GIB
     in_process: bool = False
+    scenario: Scenario = US23
 
     def __post_init__(self) -> None:
-        """Check the numbers, the names and the levels."""
+        """Check the numbers, the names and the levels; the scenario says what is left out."""
+        if self.v_vut0_mps is None:
+            object.__setattr__(self, "v_vut0_mps", self.scenario.v_vut0_mps)
         for option, text in (("--vut", self.vut), ("--vut-command", self.vut_command or "")):
             if not _is_text(text):
                 raise UserError(
@@ -98,10 +97,9 @@ class CampaignSettings:
             )
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
-        if not 0.0 <= self.v_vut0_mps <= V_VUT0_MAX_MPS:
-            raise UserError(
-                f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {V_VUT0_MAX_MPS:g} m/s"
-            )
+        most_mps = self.scenario.v_start_max_mps
+        if not 0.0 <= self.pool.v_vut0_mps <= most_mps:
+            raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
         self.stopping_rule()
 
     def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool]:
@@ -125,10 +123,15 @@ class CampaignSettings:
     @property
     def pool(self) -> Pool:
         """The cases to choose from."""
-        return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps)
+        assert self.v_vut0_mps is not None, "taken from the scenario"  # noqa: S101
+        return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps, scenario=self.scenario)
 
 
-_DEFAULTS: Final = {f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING}
+_DEFAULTS: Final = {
+    **{f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING},
+    "v_vut0_mps": US23.v_vut0_mps,
+    "scenario": asdict(US23),
+}
 """What the settings were in a campaign that does not record them."""
 
 
@@ -184,7 +187,10 @@ class ProvingGround:
     """A VUT and the POV library in a SUMO world: takes cases, gives trajectories."""
 
     def __init__(
-        self, vut: str | VutFactory, corridors: int = MAX_CORRIDORS, net: Net | None = None
+        self,
+        vut: str | VutFactory,
+        corridors: int = MAX_CORRIDORS,
+        net: Net | Corridor | None = None,
     ) -> None:
         """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
@@ -219,13 +225,15 @@ class GroundPlan:
 
     vut: VutFactory
     corridors: int
-    net: Net
+    net: Net | Corridor
     software: dict[str, str] = field(default_factory=software)
 
     def key(self) -> tuple[object, ...]:
         """Return what tells one plan from another."""
         vut = self.vut.spec, self.vut.options, self.vut.files
-        return *vut, self.corridors, self.net.sha256, *self.software.items()
+        road = corridor_of(self.net)
+        edges = road.sha256, road.mainline_edges, road.ramp_edges
+        return *vut, self.corridors, *edges, *self.software.items()
 
     def open(self) -> ProvingGround:
         """Open the proving ground; `UserError` where other software would give other outcomes."""
@@ -345,7 +353,7 @@ def conduct(
 def run_campaign(
     settings: CampaignSettings,
     folder: Path,
-    net: Net | None = None,
+    net: Net | Corridor | None = None,
     on_case: OnCase | None = None,
     *,
     workers: Workers | None = None,
@@ -366,7 +374,7 @@ def run_campaign(
     """
     check_new(folder)
     check_new(folder / SCENARIOS / case_name(settings.cases))
-    net = net or Net()
+    net = net or road_for(settings.scenario)
     with workers_or_here(workers) as there:
         run = runs_on(there, _plan(settings, net, folder))
         record = record_of(settings, net)
@@ -377,7 +385,7 @@ def run_campaign(
 
 def resume_campaign(
     folder: Path,
-    net: Net | None = None,
+    net: Net | Corridor | None = None,
     on_case: OnCase | None = None,
     *,
     given: Mapping[str, object] | None = None,
@@ -404,9 +412,9 @@ def resume_campaign(
         warn: told in a sentence what was dropped.
         trust: run the controller that the folder names although the folder may be a stranger's.
     """
-    net = net or Net()
     check_own(folder / SCENARIOS)
     journal, before, dropped = Journal.reopen(folder)
+    net = net or road_for(before.scenario)
     with journal, workers_or_here(workers) as there:
         recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, SEAL)}
         settings = settings_of(folder, before.settings, given, trust=trust)
@@ -444,7 +452,7 @@ def _files_again(recorded: Mapping[str, Any]) -> Files:
 def _go_on(
     settings: CampaignSettings,
     record: dict[str, Any],
-    net: Net,
+    net: Net | Corridor,
     journal: Journal,
     run: RunCases,
     history: Sequence[Outcome],
@@ -476,6 +484,17 @@ def _go_on(
     return done
 
 
+def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
+    """Return the road of a scenario, or another net with the same edges.
+
+    Raises `UserError` where there is no such merge, or not room enough for its vehicles.
+    """
+    file = Path(scenario.net) if net is None and scenario.net is not None else net
+    road = road_of(file, scenario.mainline, scenario.ramp)
+    road.check_room(-scenario.x_pov0_m[0], -scenario.x_vut0_m)
+    return road
+
+
 @contextmanager
 def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
     """Give the workers, which stay open, or this process as the only one."""
@@ -486,7 +505,7 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
         yield here
 
 
-def _plan(settings: CampaignSettings, net: Net, folder: Path) -> GroundPlan:
+def _plan(settings: CampaignSettings, net: Net | Corridor, folder: Path) -> GroundPlan:
     return GroundPlan(
         vut=settings.vut_factory.with_log(folder.resolve() / LOG),
         corridors=min(MAX_CORRIDORS, settings.batch),
@@ -494,7 +513,7 @@ def _plan(settings: CampaignSettings, net: Net, folder: Path) -> GroundPlan:
     )
 
 
-def record_of(settings: CampaignSettings, net: Net) -> dict[str, Any]:
+def record_of(settings: CampaignSettings, net: Net | Corridor) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
     policies = {name: entry["sha256"] for name, entry in read_manifest().items()}
     return {
@@ -531,6 +550,8 @@ def settings_of(
     values: dict[str, Any] = {}
     for spec in fields(CampaignSettings):
         value: Any = record.get(spec.name, spec.default)
+        if spec.name == "scenario" and isinstance(value, dict):
+            value = scenario_of(record, folder / SETTINGS)
         value = tuple(value) if isinstance(value, list) else value
         if not _fits(value, hints[spec.name]):
             raise UserError(f"{folder / SETTINGS} has no {spec.name}, or something else there")
@@ -571,6 +592,7 @@ def case_name(index: int) -> str:
     return f"case-{index:05d}"
 
 
-def export_case(run: Run, index: int, folder: Path, net: Net | None = None) -> Path:
+def export_case(run: Run, index: int, folder: Path, net: Net | Corridor | None = None) -> Path:
     """Write a case of a run as a replay folder; return the path of its SUMO configuration."""
-    return write_scenario(folder, net or Net(), run.outcome(index), run.trajectory(index))
+    road = net or road_for(run.scenario)
+    return write_scenario(folder, road, run.outcome(index), run.trajectory(index))

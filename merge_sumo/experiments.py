@@ -17,11 +17,12 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from merge_sumo.case import FloatArray, Pool, dimensions, from_unit, to_unit
+from merge_sumo.case import FloatArray, Pool, dimensions, to_unit
 from merge_sumo.conductor import (
     MAX_CORRIDORS,
     GroundPlan,
     conduct,
+    road_for,
     run_cases,
     versions,
     workers_or_here,
@@ -36,9 +37,8 @@ from merge_sumo.journal import UNREADABLE_NPZ
 from merge_sumo.resources import cache_folder
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.scenario import V_VUT0_MPS
+from merge_sumo.scenario import US23, Scenario
 from merge_sumo.score import FAILURE_SCORE, Outcome
-from merge_sumo.sumo.net import Net
 from merge_sumo.workers import Workers
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000}
@@ -98,6 +98,7 @@ def ground_truth(
     workers: Workers | None = None,
     cache: Path | None = None,
     on_cases: OnCases | None = None,
+    scenario: Scenario = US23,
 ) -> Truth:
     """Return the ground truth of a VUT at a level, from the cache where it is there.
 
@@ -110,9 +111,8 @@ def ground_truth(
     if count < 1:
         raise UserError(f"--cases is {count}: it must be 1 or more")
     factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
-    kept = Kept(
-        factory.spec, level, count, seed, factory.options.command, factory.options.deadline_s
-    )
+    options = factory.options
+    kept = Kept(factory.spec, level, count, seed, options.command, options.deadline_s, scenario)
     path = kept.path(cache)
     found = read_truth(path, level, count)
     if found is not None:
@@ -122,10 +122,10 @@ def ground_truth(
     points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
     scores = np.full(count, np.nan)
     files = dict(factory.files or {})
-    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=Net())
+    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road_for(scenario))
     with workers_or_here(workers) as there:
         rows = cast("Sequence[FloatArray]", points)
-        scored = there.run(partial(_scores, plan, level), rows, lambda _: (np.nan, {}))
+        scored = there.run(partial(_scores, plan, level, scenario), rows, lambda _: (np.nan, {}))
         for ended, (place, (score, loaded)) in enumerate(scored, start=1):
             scores[place] = score
             for name, sha256 in loaded.items():
@@ -150,6 +150,7 @@ class Kept:
     seed: int
     command: str | None
     deadline_s: float
+    scenario: Scenario = US23
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
@@ -163,10 +164,9 @@ class Kept:
         depends = {
             **asdict(self),
             "here": here,
-            "v_vut0_mps": V_VUT0_MPS,
             "versions": versions(),
             "sources": sources.hexdigest(),
-            "net": Net().sha256,
+            "net": road_for(self.scenario).sha256,
             "policies": {name: entry["sha256"] for name, entry in read_manifest().items()},
         }
         key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
@@ -194,9 +194,10 @@ def read_truth(path: Path, level: int, cases: int) -> Truth | None:
 
 
 def _scores(
-    plan: GroundPlan, level: int, points: Sequence[FloatArray]
+    plan: GroundPlan, level: int, scenario: Scenario, points: Sequence[FloatArray]
 ) -> Sequence[tuple[float, Files]]:
-    ran = run_cases(plan, from_unit(np.asarray(points), level))
+    pool = Pool(levels=(level,), v_vut0_mps=scenario.v_vut0_mps, scenario=scenario)
+    ran = run_cases(plan, pool.cases(np.asarray(points), level))
     return [
         (np.nan if done.measures.score is None else done.measures.score, done.files) for done in ran
     ]
@@ -225,14 +226,21 @@ Task = tuple[str, tuple[int, ...], int, int, int]
 """A search: sampler, levels, cases, batch, seed."""
 
 
-def _searches(plan: GroundPlan, tasks: Sequence[Task]) -> list[Search]:
-    return [_search(plan, *task) for task in tasks]
+def _searches(plan: GroundPlan, scenario: Scenario, tasks: Sequence[Task]) -> list[Search]:
+    return [_search(plan, scenario, *task) for task in tasks]
 
 
 def _search(
-    plan: GroundPlan, name: str, levels: tuple[int, ...], cases: int, batch: int, seed: int
+    plan: GroundPlan,
+    scenario: Scenario,
+    name: str,
+    levels: tuple[int, ...],
+    cases: int,
+    batch: int,
+    seed: int,
 ) -> Search:
-    sampler = make_sampler(name, Pool(levels=levels), seed)
+    pool = Pool(levels=levels, v_vut0_mps=scenario.v_vut0_mps, scenario=scenario)
+    sampler = make_sampler(name, pool, seed)
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
@@ -309,6 +317,7 @@ def search(
     batch: int = 20,
     workers: Workers | None = None,
     on_search: Callable[[str, int], None] | None = None,
+    scenario: Scenario = US23,
 ) -> dict[str, list[Search]]:
     """Let samplers search a pool, with the seeds 0 to `seeds` - 1 each.
 
@@ -316,10 +325,13 @@ def search(
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
     factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
-    plan = GroundPlan(vut=factory, corridors=min(MAX_CORRIDORS, batch), net=Net())
+    road = road_for(scenario)
+    plan = GroundPlan(vut=factory, corridors=min(MAX_CORRIDORS, batch), net=road)
     found: dict[int, Search] = {}
     with workers_or_here(workers) as there:
-        for place, one in there.run(partial(_searches, plan), tasks, _lost_search, chunk=1):
+        for place, one in there.run(
+            partial(_searches, plan, scenario), tasks, _lost_search, chunk=1
+        ):
             found[place] = one
             if on_search is not None:
                 name, *_, seed = tasks[place]

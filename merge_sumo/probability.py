@@ -31,13 +31,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import V_POV0, X_POV0, Case, FloatArray, dimensions, from_unit
+from merge_sumo.case import Case, FloatArray, dimensions
 from merge_sumo.conductor import (
     MAX_CORRIDORS,
     CampaignSettings,
     OnCase,
     ProvingGround,
     record_of,
+    road_for,
     settings_of,
 )
 from merge_sumo.errors import UserError
@@ -46,8 +47,9 @@ from merge_sumo.journal import Run
 from merge_sumo.samplers.base import LevelHistory
 from merge_sumo.samplers.coverage import learn_chance
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.scenario import SVO, Dimension
+from merge_sumo.scenario import US23, Dimension, Scenario
 from merge_sumo.score import Outcome, measure
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
 
 RESULT: Final = "probability.json"
@@ -66,7 +68,6 @@ STREAM: Final = 7
 """Key of the random stream, so that it is none of a sampler's."""
 WRITTEN: Final = 500
 """Cases after which outcomes are written and synced."""
-COORDINATES: Final = {d.field: d for d in (X_POV0, V_POV0, SVO)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,15 +90,17 @@ class Distribution:
     Attributes:
         levels: probability of each level; they add up to 1.
         marginals: by the name of the coordinate, the same at all levels.
+        scenario: whose pool it is over.
     """
 
     levels: dict[int, float]
     marginals: dict[str, Marginal]
+    scenario: Scenario = US23
 
     def points(self, level: int, chances: FloatArray) -> FloatArray:
         """Return points of the unit cube, (n, d), at chances, (n, d): uniform ones are a sample."""
         columns = []
-        for d, chance in zip(dimensions(level), chances.T, strict=True):
+        for d, chance in zip(self.scenario.dimensions(level), chances.T, strict=True):
             values = self.marginals[d.field].quantile(chance)
             columns.append(np.clip((values - d.low) / (d.high - d.low), 0.0, 1.0))
         return np.column_stack(columns)
@@ -108,7 +111,9 @@ class Distribution:
         return {"levels": {str(level): weight for level, weight in self.levels.items()}, **named}
 
 
-def read_distribution(path: Path | None, levels: Sequence[int]) -> Distribution:
+def read_distribution(
+    path: Path | None, levels: Sequence[int], scenario: Scenario = US23
+) -> Distribution:
     """Return the distribution that a JSON file states; without a file, uniform over the pool.
 
     The file has weights of levels and one entry for each coordinate; what is left out is uniform:
@@ -132,16 +137,17 @@ def read_distribution(path: Path | None, levels: Sequence[int]) -> Distribution:
     where = str(path)
     if not isinstance(stated, dict):
         raise UserError(f"{where} is not a JSON object")
-    unknown = sorted(set(stated) - {"levels", *COORDINATES})
+    coordinates = {d.field: d for d in scenario.dimensions(2)}
+    unknown = sorted(set(stated) - {"levels", *coordinates})
     if unknown:
-        known = ", ".join(["levels", *COORDINATES])
+        known = ", ".join(["levels", *coordinates])
         raise UserError(f"{where} has {unknown[0]!r}: it may have {known}")
     weights = _level_weights(stated.get("levels"), levels, where)
     marginals = {
         name: _marginal(stated.get(name, {"kind": "uniform"}), d, f"{where}: {name}")
-        for name, d in COORDINATES.items()
+        for name, d in coordinates.items()
     }
-    return Distribution(weights, marginals)
+    return Distribution(weights, marginals, scenario)
 
 
 def _level_weights(stated: Any, levels: Sequence[int], where: str) -> dict[int, float]:
@@ -461,7 +467,7 @@ def failure_probability(
     distribution: Path | None = None,
     confidence: float = 0.95,
     seed: int = 0,
-    net: Net | None = None,
+    net: Net | Corridor | None = None,
     trust: bool = False,
     on_case: OnCase | None = None,
 ) -> Estimate:
@@ -481,10 +487,10 @@ def failure_probability(
         raise UserError(f"--confidence is {confidence}: choose 0.5 or more, and below 1")
     if seed < 0:
         raise UserError(f"--seed is {seed}: it must be 0 or more")
-    net = net or Net()
     settings = settings_of(run.folder, run.settings, trust=trust)
+    net = net or road_for(settings.scenario)
     _same_system(run, record_of(settings, net))
-    stated = read_distribution(distribution, settings.levels)
+    stated = read_distribution(distribution, settings.levels, settings.scenario)
     check_new_file(out)
     lines = out.with_suffix(LINES)
     if lines == out:
@@ -523,7 +529,7 @@ def _same_system(run: Run, today: Mapping[str, Any]) -> None:
 
 def _run(
     settings: CampaignSettings,
-    net: Net,
+    net: Net | Corridor,
     stated: Distribution,
     draws: Draws,
     lines: Path,
@@ -534,7 +540,7 @@ def _run(
     for level in stated.levels:
         places = np.flatnonzero(draws.level == level)
         points = stated.points(level, draws.chances[places, : len(dimensions(level))])
-        drawn = from_unit(points, level, settings.v_vut0_mps)
+        drawn = settings.pool.cases(points, level)
         by_place.update(zip(places.tolist(), drawn, strict=True))
     cases = [by_place[place] for place in range(len(by_place))]
     outcomes: list[Outcome] = []

@@ -21,8 +21,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import V_POV0, X_POV0, FloatArray, dimensions, to_unit
-from merge_sumo.conductor import SCENARIOS, case_name, versions
+from merge_sumo.case import FloatArray, dimensions, to_unit
+from merge_sumo.conductor import SCENARIOS, case_name, road_for, versions
 from merge_sumo.diagnosis import CEDED_MPS, MEANING, Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.errors import UserError
@@ -30,10 +30,12 @@ from merge_sumo.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.fmc import RADIUS, fmc
 from merge_sumo.folders import cannot_write, check_own, replace_own
 from merge_sumo.journal import SETTINGS, Run, failures
-from merge_sumo.scenario import DEADLINE_S, DT_S, DX_CRASH_M, LEVELS, SVO, V_VUT0_MPS, X_VUT0_M
+from merge_sumo.scenario import DEADLINE_S, DT_S, LEVELS
 from merge_sumo.score import FAILURE_SCORE, Outcome
 from merge_sumo.summary import LevelSummary, Summary, summarise
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import LaneLine, Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.surface import FEWEST_FAILURES, PLAUSIBLE, Surface, learn_surface
 from merge_sumo.trajectory import End, Trajectory
 from merge_sumo.verdict import Trouble, Verdict, counted, in_words, judge, shortened
@@ -150,7 +152,7 @@ class _Facts:
         if not isinstance(levels, list) or any(level not in LEVELS for level in levels):
             raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
         self.run = run
-        self.net = Net()
+        self.net = _net_of(run)
         self.summary = summarise(run.outcomes, levels)
         self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
@@ -315,13 +317,13 @@ class _Facts:
         scenarios = self.run.folder / SCENARIOS
         return {
             "dt": DT_S,
-            "crash_m": DX_CRASH_M,
+            "crash_m": self.run.scenario.dx_crash_m,
             "radius": RADIUS,
-            "x_vut0_m": X_VUT0_M,
+            "x_vut0_m": self.run.scenario.x_vut0_m,
             "speed_unit_mps": SPEED_UNIT_MPS,
             "dimensions": {
                 name: [round(d.low, 4), round(d.high, 4)]
-                for name, d in (("x", X_POV0), ("v", V_POV0), ("psi", SVO))
+                for name, d in zip(("x", "v", "psi"), self.run.scenario.dimensions(2), strict=True)
             },
             "ends": [end.value for end in End],
             "kinds": [kind.value for kind in Kind],
@@ -506,13 +508,21 @@ def _motion(run: Run, index: int) -> Trajectory | None:
         return None
 
 
-def _truth(run: Run, net: Net, level: int) -> Truth | None:
+def _net_of(run: Run) -> Corridor:
+    """Return the road of a run, or the shipped one to draw on where that is not there any more."""
+    try:
+        return road_for(run.scenario)
+    except UserError:
+        return road_of()
+
+
+def _truth(run: Run, net: Corridor, level: int) -> Truth | None:
     """Return the ground truth that is cached for what this run tested, if there is one."""
     settings = run.settings
     same = (
         settings.get("net_sha256") == net.sha256
         and settings.get("versions") == versions()
-        and settings.get("v_vut0_mps") == V_VUT0_MPS
+        and settings.get("v_vut0_mps") == run.scenario.v_vut0_mps
     )
     if not same:
         return None
@@ -523,6 +533,7 @@ def _truth(run: Run, net: Net, level: int) -> Truth | None:
         0,
         settings.get("vut_command"),
         settings.get("deadline_s", DEADLINE_S),
+        run.scenario,
     )
     return read_truth(kept.path(), level, kept.cases)
 

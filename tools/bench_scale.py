@@ -35,6 +35,7 @@ from merge_sumo.fmc import fmc, regions
 from merge_sumo.journal import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.scenario import US23
 from merge_sumo.score import Outcome
 from merge_sumo.sumo.net import Net
 from merge_sumo.workers import LocalProcesses, Workers
@@ -52,7 +53,7 @@ def memory_mb() -> float:
 
 def scores_and_memory(plan: GroundPlan, points: Sequence[FloatArray]) -> list[tuple[Any, ...]]:
     """Run cases of level 0 as `truth` does; say which process did and how large it is."""
-    return [(score, os.getpid(), memory_mb()) for score in _scores(plan, 0, points)]
+    return [(score, os.getpid(), memory_mb()) for score in _scores(plan, 0, US23, points)]
 
 
 def compute(seconds: Sequence[float]) -> list[int]:

@@ -15,6 +15,7 @@ from merge_sumo.commands.shared import (
     InProcessOption,
     JsonOption,
     NetOption,
+    ScenarioOption,
     TrustOption,
     VutCommandOption,
     VutMemoryOption,
@@ -55,7 +56,11 @@ def campaign(
         int | None, typer.Option(help="Cases per batch.  [default: 40, or all if fewer]")
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same outcomes.")] = 0,
-    v_vut0: Annotated[float, typer.Option(help="Initial speed of the VUT in m/s.")] = 18.0,
+    scenario: ScenarioOption = "us23",
+    v_vut0: Annotated[
+        float | None,
+        typer.Option(help="Initial speed of the VUT in m/s.  [default: the scenario's, 18]"),
+    ] = None,
     stop_after_converged: Annotated[
         float | None,
         typer.Option(
@@ -112,7 +117,7 @@ def campaign(
     from merge_sumo.junit import check_junit
     from merge_sumo.progress import CampaignPanel
     from merge_sumo.report import check_report
-    from merge_sumo.sumo.net import Net
+    from merge_sumo.scenario_file import named_scenario
     from merge_sumo.verdict import parse_gates
     from merge_sumo.workers import open_workers
 
@@ -132,6 +137,7 @@ def campaign(
             deadline_s=deadline,
             vut_memory_gib=vut_memory,
             in_process=in_process,
+            scenario=named_scenario(scenario),
         )
         folder = out or dated(vut)
     else:
@@ -141,6 +147,7 @@ def campaign(
         check_report(folder)
     if junit is not None:
         check_junit(junit, folder)
+    road = conductor.road_for(settings.scenario, net)
     title = f"{settings.vut} v level {'/'.join(map(str, levels))}"
     try:
         with (
@@ -152,7 +159,7 @@ def campaign(
                 run = conductor.run_campaign(
                     settings,
                     folder,
-                    Net(net),
+                    road,
                     progress.case_ended,
                     workers=there,
                     check=interrupt.check,
@@ -160,7 +167,7 @@ def campaign(
             else:
                 run = conductor.resume_campaign(
                     folder,
-                    Net(net),
+                    road,
                     progress.case_ended,
                     given=given,
                     force=force,
@@ -224,6 +231,7 @@ def _conclude(
 def _given(context: typer.Context) -> dict[str, object]:
     """Return the settings that a person wrote, by their names in `CampaignSettings`."""
     from merge_sumo.conductor import parse_levels
+    from merge_sumo.scenario_file import named_scenario
 
     names = {
         name: name
@@ -236,6 +244,7 @@ def _given(context: typer.Context) -> dict[str, object]:
             "stop_after_converged",
             "vut_command",
             "in_process",
+            "scenario",
         )
     }
     names |= {"level": "levels", "v_vut0": "v_vut0_mps", "deadline": "deadline_s"}
@@ -245,7 +254,9 @@ def _given(context: typer.Context) -> dict[str, object]:
         source = context.get_parameter_source(option)
         if source is not None and source.name == "COMMANDLINE":
             value = context.params[option]
-            given[name] = parse_levels(value) if option == "level" else value
+            if option == "level":
+                value = parse_levels(value)
+            given[name] = named_scenario(value) if option == "scenario" else value
     if context.params["out"] is not None:
         raise UserError("--resume names the folder: leave --out away")
     return given

@@ -15,6 +15,7 @@ from merge_sumo.commands.shared import (
     JsonOption,
     NetOption,
     RunArgument,
+    ScenarioOption,
     TrustOption,
     VutCommandOption,
     VutMemoryOption,
@@ -29,6 +30,7 @@ from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
 if TYPE_CHECKING:
     from merge_sumo.drivers.vut import VutFactory
     from merge_sumo.experiments import Comparison, Quartiles, Truth
+    from merge_sumo.scenario import Scenario
     from merge_sumo.workers import Workers
 
 
@@ -40,6 +42,7 @@ def truth(
         int | None, typer.Option(help="Uniform cases.  [default: 10000, at level 2 20000]")
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
+    scenario: ScenarioOption = "us23",
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -57,12 +60,14 @@ def truth(
     from merge_sumo import experiments
     from merge_sumo.conductor import one_level
     from merge_sumo.fmc import fmc, regions
+    from merge_sumo.scenario_file import named_scenario
     from merge_sumo.workers import open_workers
 
     chosen = one_level(level)
     factory = _factory(vut, vut_command, deadline, vut_memory)
+    where = named_scenario(scenario)
     with open_workers(factory.workers(workers), dask) as there:
-        found = _truth(factory, chosen, cases, seed, there)
+        found = _truth(factory, chosen, cases, seed, there, where)
     if factory.vut.named_only:
         say(
             "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
@@ -102,6 +107,7 @@ def compare(
     truth_cases: Annotated[
         int | None, typer.Option(help="Cases of the truth.  [default: 10000, at level 2 20000]")
     ] = None,
+    scenario: ScenarioOption = "us23",
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -123,11 +129,13 @@ def compare(
     from merge_sumo.conductor import CampaignSettings, parse_levels
     from merge_sumo.fmc import fmc
     from merge_sumo.progress import Counter
+    from merge_sumo.scenario_file import named_scenario
     from merge_sumo.workers import open_workers
 
     levels = parse_levels(level)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
     factory = _factory(vut, vut_command, deadline, vut_memory)
+    where = named_scenario(scenario)
     for name in names:
         CampaignSettings(
             vut=vut,
@@ -136,6 +144,7 @@ def compare(
             sampler=name,
             cases=cases,
             batch=batch,
+            scenario=where,
         )
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")
@@ -146,7 +155,7 @@ def compare(
         open_workers(factory.workers(workers), dask) as there,
         Counter(title, len(names) * seeds, "runs") as counter,
     ):
-        truths = {level: _truth(factory, level, truth_cases, 0, there) for level in levels}
+        truths = {level: _truth(factory, level, truth_cases, 0, there, where) for level in levels}
         searches = experiments.search(
             factory,
             levels,
@@ -156,6 +165,7 @@ def compare(
             batch=batch,
             workers=there,
             on_search=lambda name, _: counter.ended(1, name),
+            scenario=where,
         )
     compared = {name: experiments.compare(found, truths) for name, found in searches.items()}
     truth_fmc = sum(fmc(found.failures) for found in truths.values())
@@ -283,9 +293,9 @@ def probability(
     Example:  merge-sumo probability runs/design2 --cases 4000
     """
     from merge_sumo import probability as estimates
+    from merge_sumo.conductor import road_for
     from merge_sumo.journal import Run
     from merge_sumo.progress import Counter
-    from merge_sumo.sumo.net import Net
 
     campaign = Run(run)
     target = out or run / estimates.RESULT
@@ -297,7 +307,7 @@ def probability(
             distribution=distribution,
             confidence=confidence,
             seed=seed,
-            net=Net(net),
+            net=road_for(campaign.scenario, net),
             trust=trust_vut,
             on_case=lambda _: counter.ended(1),
         )
@@ -331,7 +341,12 @@ def _factory(vut: str, command: str | None, deadline_s: float, memory_gib: float
 
 
 def _truth(
-    factory: VutFactory, level: int, cases: int | None, seed: int, workers: Workers
+    factory: VutFactory,
+    level: int,
+    cases: int | None,
+    seed: int,
+    workers: Workers,
+    scenario: Scenario,
 ) -> Truth:
     from merge_sumo import experiments
     from merge_sumo.progress import Counter
@@ -341,5 +356,11 @@ def _truth(
         raise UserError(f"--cases is {total}: it must be 1 or more")
     with Counter(f"truth of {factory.spec} at level {level}", total, "cases") as counter:
         return experiments.ground_truth(
-            factory, level, total, seed, workers=workers, on_cases=counter.ended
+            factory,
+            level,
+            total,
+            seed,
+            workers=workers,
+            on_cases=counter.ended,
+            scenario=scenario,
         )

@@ -65,7 +65,6 @@ def export(
     from merge_sumo import exports
     from merge_sumo.conductor import SCENARIOS
     from merge_sumo.journal import Run
-    from merge_sumo.sumo.net import Net
 
     loaded = Run(run)
     if out is None:
@@ -79,7 +78,7 @@ def export(
     to_sumo = file_format is Format.SUMO
     target = out or run / (SCENARIOS if to_sumo else EXPORTS)
     write = exports.write_sumo if to_sumo else exports.write_openscenario
-    for path in exports.write_folders(loaded, case, target, write, Net(net)):
+    for path in exports.write_folders(loaded, case, target, write, road_for(loaded.scenario, net)):
         show(path)
 
 
@@ -154,14 +153,15 @@ def compare_runs(
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --tolerance 0.005
     """
     from merge_sumo import comparison
+    from merge_sumo.conductor import road_for
     from merge_sumo.journal import Run
-    from merge_sumo.sumo.net import Net
     from merge_sumo.verdict import judge
 
     if not tolerance >= 0.0:
         raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
     runs = Run(a), Run(b)
-    compared = comparison.compare_runs(*runs, rerun=rerun, net=Net(net), trust=trust_vut)
+    road = road_for(runs[0].scenario, net) if rerun else None
+    compared = comparison.compare_runs(*runs, rerun=rerun, net=road, trust=trust_vut)
     why = compared.worse(tolerance)
     verdicts = {name: judge(loaded.outcomes) for name, loaded in zip("AB", runs, strict=True)}
     if as_json:

@@ -68,6 +68,13 @@ TrustOption = Annotated[
         help="Run the controller that a folder names although the folder was not made here.",
     ),
 ]
+ScenarioOption = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME|FILE",
+        help="Scenario: us23, or a TOML file of your own: `merge-sumo scenario new` writes one.",
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 

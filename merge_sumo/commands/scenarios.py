@@ -1,0 +1,86 @@
+"""Commands on scenarios: scenario list, scenario new, scenario check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from merge_sumo.commands.shared import app, show
+from merge_sumo.errors import UserError
+
+scenario = typer.Typer(help="The road and the numbers of a merge.", no_args_is_help=True)
+app.add_typer(scenario, name="scenario")
+
+
+@scenario.command("list")
+def list_scenarios() -> None:
+    """List the scenarios that the package brings.
+
+    Example:  merge-sumo scenario list
+    """
+    from merge_sumo.scenario_file import SCENARIOS
+
+    for name, found in SCENARIOS.items():
+        x, v = found.x_pov0_m, found.v_pov0_mps
+        show(f"{name}: POV from {x[0]:g} to {x[1]:g} m at {v[0]:g} to {v[1]:g} m/s")
+
+
+@scenario.command("new")
+def new_scenario(
+    file: Annotated[Path, typer.Argument(help="New TOML file to write.")],
+    net: Annotated[Path, typer.Option(help="SUMO net; netconvert makes one of OSM, OpenDRIVE.")],
+    mainline: Annotated[str, typer.Option(help='Edges of the mainline, past M: "e1 e2".')],
+    ramp: Annotated[str, typer.Option(help='Edges of the ramp, past M: "r1 e2".')],
+) -> None:
+    """Write a scenario for a merge in a net of your own: what was found, and a suggested pool.
+
+    A picture of the road is written beside it, as SVG.
+
+    Example:  merge-sumo scenario new my-ramp.toml --net my.net.xml --mainline "a b" --ramp "r b"
+    """
+    import os
+    from dataclasses import replace
+
+    from merge_sumo.drawing import road_svg
+    from merge_sumo.folders import check_new_file, write_new
+    from merge_sumo.scenario_file import SUFFIX, to_toml
+    from merge_sumo.suggestion import about, suggested
+    from merge_sumo.sumo.road import road_of
+
+    if file.suffix != SUFFIX:
+        raise UserError(f"{file} is to be a scenario: name it NAME{SUFFIX}")
+    picture = file.with_suffix(".svg")
+    for path in (file, picture):
+        check_new_file(path, "FILE")
+    road = road_of(net, tuple(mainline.split()), tuple(ramp.split()))
+    found = suggested(road, file.stem)
+    beside = os.path.relpath(net.resolve(), file.parent.resolve())
+    write_new(picture, road_svg(road, found), "FILE")
+    write_new(file, to_toml(replace(found, net=beside), about(road)).encode(), "FILE")
+    show(about(road))
+    show(f"written: {file}, and its picture {picture}")
+
+
+@scenario.command("check")
+def check_scenario(
+    name: Annotated[str, typer.Argument(metavar="NAME|FILE", help="Scenario to check.")],
+) -> None:
+    """Say whether a scenario can be hosted, and what to know before it is run.
+
+    Example:  merge-sumo scenario check us23
+    """
+    from merge_sumo.conductor import road_for
+    from merge_sumo.scenario_file import named_scenario
+    from merge_sumo.suggestion import about, unseen
+
+    found = named_scenario(name)
+    show(about(road_for(found)))
+    outside = unseen(found)
+    if outside:
+        show("the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:")
+        for sentence in outside:
+            show(f"  {sentence}")
+    else:
+        show("the learned drivers (levels 1 and 2) were trained on such starts")

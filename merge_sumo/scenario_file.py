@@ -1,0 +1,115 @@
+"""Scenarios by name or as files: TOML that says what differs from the paper's scenario.
+
+name = "my-ramp"
+net = "my-ramp.net.xml"          # beside this file
+mainline = ["e1", "e2"]          # edges in driving order, past the merge point M
+ramp = ["r1", "e2"]
+x_pov0_m = [-220, -90]
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.errors import UserError
+from merge_sumo.scenario import US23, Scenario
+
+SCENARIOS: Final = {US23.name: US23}
+"""The scenarios that the package brings, by name."""
+SUFFIX: Final = ".toml"
+MAX_BYTES: Final = 1 << 20
+
+
+def named_scenario(name: str) -> Scenario:
+    """Return the scenario of a name or of a file; `UserError` where there is none.
+
+    What is wrong in a file is told with its line.
+    """
+    if name in SCENARIOS:
+        return SCENARIOS[name]
+    if not name.endswith(SUFFIX):
+        known = ", ".join(SCENARIOS)
+        raise UserError(f"there is no scenario {name!r}: choose {known}, or a file NAME{SUFFIX}")
+    return read_scenario(Path(name))
+
+
+def read_scenario(path: Path) -> Scenario:
+    """Return the scenario that a file describes; its net is found beside the file."""
+    try:
+        if not path.is_file() or path.stat().st_size > MAX_BYTES:
+            raise UserError(f"cannot read the scenario {path}: it is no file, or a giant one")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot read the scenario {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"the scenario {path} is no text in UTF-8") from error
+    try:
+        record: dict[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"the scenario {path} is no TOML: {error}") from error
+    try:
+        scenario = Scenario.from_record({"name": path.stem, **record})
+    except UserError as error:
+        raise UserError(f"{path}{_line(text, str(error))}: {error}") from error
+    if scenario.net is None:
+        return scenario
+    return replace(scenario, net=str((path.parent / scenario.net).resolve()))
+
+
+def _line(text: str, sentence: str) -> str:
+    """Return ", line N" of the first key of a file that a sentence begins with or quotes."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        key = re.match(r"\s*([\w-]+)\s*=", line)
+        if key and re.search(rf"(^|'){re.escape(key[1])}('| is )", sentence):
+            return f", line {number}"
+    return ""
+
+
+COMMENTS: Final = {
+    "net": "the SUMO net, beside this file",
+    "mainline": "edges of the mainline in driving order, past the merge point M",
+    "ramp": "edges of the ramp in driving order, past M",
+    "x_pov0_m": "where the POV may start: low, high; metres of its front bumper before M",
+    "v_pov0_mps": "how fast it may be then",
+    "x_vut0_m": "where the VUT starts",
+    "v_vut0_mps": "how fast it is then",
+    "a_min_mps2": "hardest braking of both",
+    "a_max_mps2": "hardest acceleration of both",
+    "timeout_s": "an episode that has not ended by then is a TIMEOUT",
+    "v_hw_min_mps": "speeds between which the mainline drives",
+    "v_min_mps": "below this the VUT is slow",
+    "ttc_min_s": "a time to collision below this is short",
+    "dx_crash_m": "front bumpers nearer than this when the VUT is at M: a collision",
+    "dx_critical_m": "nearer than this is critical",
+    "level0_a_mps2": "a VUT that does not think accelerates so,",
+    "level0_v_mps": "up to this speed",
+    "reach_m": "no vehicle starts farther from M than this,",
+    "v_start_max_mps": "nor faster than this",
+}
+"""What stands beside a value in a file that we write."""
+
+
+def to_toml(scenario: Scenario, found: str) -> str:
+    """Return a scenario as a commented file; `found` is what was found out, a line each."""
+    lines = [*(f"# {line}" for line in found.splitlines()), ""]
+    for field in fields(scenario):
+        value = getattr(scenario, field.name)
+        if value is None:
+            continue
+        comment = COMMENTS.get(field.name)
+        text = f"{field.name} = {_toml(value)}"
+        lines.append(f"{text:<44}# {comment}" if comment else text)
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return f"{value:.10g}" if "." in f"{value:.10g}" else f"{value:.10g}.0"

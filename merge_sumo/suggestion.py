@@ -1,0 +1,118 @@
+"""What a road suggests for a scenario on it, and what to know of a scenario before it is run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.scenario import US23, Scenario
+from merge_sumo.sumo.corridor import Corridor, LanePath
+
+MARGIN: Final = 0.15
+"""The pool reaches this far beyond the starts from which both vehicles meet at M."""
+SLOWEST: Final = 0.7
+"""Of the speed limit: the mainline drives at least so fast."""
+ROOM: Final = 0.98
+"""Of the length of a path that is used."""
+
+
+def suggested(road: Corridor, name: str) -> Scenario:
+    """Return a scenario for a road: limits and lengths from the road, the rest as in the paper.
+
+    The VUT starts as far from M as in the paper, or as the ramp allows; the POV where, at some
+    speed that the mainline drives at, it is at M about when a VUT on the level-0 profile is.
+    """
+    limit_mps = min(limit_at(road.mainline, -1.0), US23.v_hw_max_mps)
+    ramp_mps = limit_at(road.ramp, -1.0)
+    x_vut0_m = max(US23.x_vut0_m, _down(-ROOM * road.ramp.before_m))
+    v_vut0_mps = round(min(US23.v_vut0_mps, ramp_mps, limit_mps), 1)
+    level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
+    due_s = float(
+        level0_time_to(np.array(-x_vut0_m), np.array(v_vut0_mps), v_cruise_mps=level0_v_mps)
+    )
+    slow, fast = round(SLOWEST * limit_mps, 1), round(limit_mps, 1)
+    low = max(-fast * due_s * (1.0 + MARGIN), -ROOM * road.mainline.before_m)
+    high = max(-slow * due_s * (1.0 - MARGIN), low / 2.0)
+    return replace(
+        US23,
+        name=name,
+        net=road.path.name,
+        mainline=road.mainline_edges,
+        ramp=road.ramp_edges,
+        x_pov0_m=(_down(low), _down(high)),
+        v_pov0_mps=(slow, fast),
+        x_vut0_m=x_vut0_m,
+        v_vut0_mps=v_vut0_mps,
+        v_hw_min_mps=slow,
+        v_hw_max_mps=fast,
+        v_min_mps=round(min(US23.v_min_mps, 0.5 * v_vut0_mps), 1),
+        level0_v_mps=level0_v_mps,
+        reach_m=max(US23.reach_m, float(math.ceil(-low))),
+    )
+
+
+def _down(x_m: float) -> float:
+    return math.ceil(x_m * 10.0) / 10.0
+
+
+def limit_at(path: LanePath, x_m: float) -> float:
+    """Return the speed limit at a coordinate of a path."""
+    found = [limit for start_m, limit in path.speed_limits_mps() if start_m <= x_m]
+    return found[-1] if found else path.speed_limits_mps()[0][1]
+
+
+def about(road: Corridor) -> str:
+    """Return what was found of a road, a line each."""
+    lines = [f"net: {road.path.name}"]
+    for name, path, edges in (
+        ("mainline", road.mainline, road.mainline_edges),
+        ("ramp", road.ramp, road.ramp_edges),
+    ):
+        limits = ", ".join(
+            f"{limit:g} m/s from {max(start_m, -path.before_m):.0f} m"
+            for start_m, limit in path.speed_limits_mps()
+            if start_m < 0.0
+        )
+        lines.append(f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; limits: {limits}")
+    m = road.lane_point(0.0, on_ramp=True)
+    lines.append(f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), junction {road.junction_type}")
+    first = "ramp" if road.mainline_approach.yields else "mainline"
+    yields = road.mainline_approach.yields or road.ramp_approach.yields
+    lines.append(f"right of way: the {first} goes first" if yields else "right of way: none first")
+    if road.lane_drop:
+        lines.append("one path comes to M on a lane that ends")
+    return "\n".join(lines)
+
+
+TRAINED_ON: Final = (
+    *("x_vut0_m", "v_vut0_mps", "a_min_mps2", "a_max_mps2", "level0_a_mps2", "level0_v_mps"),
+)
+"""Numbers of a scenario that had one value in training."""
+
+
+def unseen(scenario: Scenario) -> list[str]:
+    """Return in what a scenario lies outside of what the shipped learned drivers were trained on.
+
+    They were trained on the paper's pool: elsewhere levels 1 and 2 are extrapolations.
+    """
+    found = []
+    for name in ("x_pov0_m", "v_pov0_mps"):
+        (low, high), (known_low, known_high) = getattr(scenario, name), getattr(US23, name)
+        if low < known_low or high > known_high:
+            found.append(f"{name} {low:g} to {high:g} (trained on {known_low:g} to {known_high:g})")
+    for name in (
+        "x_vut0_m",
+        "v_vut0_mps",
+        "a_min_mps2",
+        "a_max_mps2",
+        "level0_a_mps2",
+        "level0_v_mps",
+    ):
+        value, known = getattr(scenario, name), getattr(US23, name)
+        if value != known:
+            found.append(f"{name} {value:g} (trained on {known:g})")
+    return found
