@@ -16,20 +16,23 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.conductor import case_name, export_case
+from merge_sumo.conductor import case_name
 from merge_sumo.errors import UserError
 from merge_sumo.folders import check_new, check_place, make_place, new_file, new_folder
 from merge_sumo.journal import Run
 from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.opendrive import opendrive
+from merge_sumo.sumo.replay import write_scenario
+from merge_sumo.sumo.road import corridor_of
 
 TABLE: Final = "trajectories"
 COLUMNS: Final = (
     *("case", "level", "time_s", "x_pov_m", "v_pov_mps", "a_pov_mps2"),
     *("x_vut_m", "v_vut_mps", "a_vut_mps2"),
 )
-ROAD: Final = "us23.xodr"
+ROAD: Final = "road.xodr"
 _EPOCH: Final = datetime(2000, 1, 1)
 MINOR_VERSION: Final = 2
 """OpenSCENARIO 1.2."""
@@ -37,12 +40,12 @@ CAR_M: Final = {"length": 5.0, "width": 1.8, "height": 1.5}
 """The car of the replay folders; it plays no part in a verdict."""
 WHEEL_M: Final = 0.7
 
-WriteCase = Callable[[Run, int, Path, Net], Path]
+WriteCase = Callable[[Run, int, Path, Net | Corridor], Path]
 """Writes a case of a run into a new folder; returns the path of the file to open."""
 
 
 def write_folders(
-    run: Run, indices: Sequence[int], target: Path, write: WriteCase, net: Net
+    run: Run, indices: Sequence[int], target: Path, write: WriteCase, road: Net | Corridor
 ) -> Iterator[Path]:
     """Write cases as folders below `target`, and yield the file to open of each.
 
@@ -54,12 +57,12 @@ def write_folders(
         run.outcome(index)
         check_new(folder)
     for index, folder in folders.items():
-        yield write(run, index, folder, net)
+        yield write(run, index, folder, road)
 
 
-def write_sumo(run: Run, index: int, folder: Path, net: Net) -> Path:
+def write_sumo(run: Run, index: int, folder: Path, road: Net | Corridor) -> Path:
     """Write a case as a folder that sumo-gui replays."""
-    return export_case(run, index, folder, net)
+    return write_scenario(folder, road, run.outcome(index), run.trajectory(index))
 
 
 def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str) -> Path:
@@ -97,21 +100,22 @@ def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float, ...]]:
     return rows
 
 
-def write_openscenario(run: Run, index: int, folder: Path, net: Net) -> Path:
+def write_openscenario(run: Run, index: int, folder: Path, road: Net | Corridor) -> Path:
     """Write a case as OpenSCENARIO, with both cars on their recorded trajectories, and OpenDRIVE.
 
     The reference point of each car is its front bumper, as in the record: x, y and heading are
     those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
     folder exists or the package scenariogeneration is missing.
     """
-    xosc = _need("scenariogeneration").xosc
+    xosc, corridor = _need("scenariogeneration").xosc, corridor_of(road)
     trajectory, name = run.trajectory(index), case_name(index)
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
     for who, column, on_ramp in (("pov", 0, False), ("vut", 3, True)):
         entities.add_scenario_object(who, _car(xosc, who))
         places = [
-            _place(xosc, net, x_m, on_ramp=on_ramp) for x_m in trajectory.motion[:, column].tolist()
+            _place(xosc, corridor, x_m, on_ramp=on_ramp)
+            for x_m in trajectory.motion[:, column].tolist()
         ]
         init.add_init_action(who, xosc.TeleportAction(places[0]))
         init.add_init_action(who, _speed(xosc, float(trajectory.motion[0, column + 1])))
@@ -133,7 +137,7 @@ def write_openscenario(run: Run, index: int, folder: Path, net: Net) -> Path:
         creation_date=_EPOCH,
     )
     with new_folder(folder) as new:
-        (new / ROAD).write_bytes(opendrive(net))
+        (new / ROAD).write_bytes(opendrive(road))
         scenario.write_xml(str(new / f"{name}.xosc"))
     return folder / f"{name}.xosc"
 
@@ -153,8 +157,8 @@ def _need(package: str) -> Any:
     return module
 
 
-def _place(xosc: Any, net: Net, x_m: float, *, on_ramp: bool) -> Any:
-    _, _, x, y, angle_deg = net.lane_point(x_m, on_ramp=on_ramp)
+def _place(xosc: Any, road: Corridor, x_m: float, *, on_ramp: bool) -> Any:
+    _, _, x, y, angle_deg = road.lane_point(x_m, on_ramp=on_ramp)
     # SUMO's angles run clockwise from north, OpenSCENARIO's the other way round from east.
     heading = math.remainder(math.radians(90.0 - angle_deg), 2.0 * math.pi)
     return xosc.WorldPosition(round(x, 9), round(y, 9), 0.0, round(heading, 9))

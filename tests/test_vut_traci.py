@@ -33,7 +33,7 @@ from merge_sumo.drivers.vuts.traci import TraciVut
 from merge_sumo.drivers.vuts.traci_session import Session
 from merge_sumo.errors import UserError
 from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.trajectory import End
 
@@ -59,7 +59,7 @@ class Played:
         thread = threading.Thread(target=self._client, args=(client,))
         thread.start()
         options = VutOptions(deadline_s=deadline_s, connect_s=10.0)
-        vut = TraciVut(1, Net(), self.port, None, options)
+        vut = TraciVut(1, road_of(), self.port, None, options)
         try:
             for _ in range(episodes):
                 self._episode(vut, steps)
@@ -873,4 +873,4 @@ class TestTheProtocol:
             tp.Reader(b"\x0f\0\0\0\1" * 50).typed()
 
 
-NET = Net()
+NET = road_of()

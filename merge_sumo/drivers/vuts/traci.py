@@ -28,7 +28,9 @@ from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reade
 from merge_sumo.drivers.vuts.traci_session import CLOSE, SIMULATION_STEP, VUT, Session
 from merge_sumo.errors import UserError
 from merge_sumo.scenario import DT_S
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import corridor_of, road_of
 from merge_sumo.sumo.world import World
 
 T = TypeVar("T")
@@ -49,8 +51,8 @@ def traci_vut(argument: str, options: VutOptions) -> Vut:
     command = None if options.command is None else split_command(options.command)
 
     def make(corridors: int, world: World | None) -> Driver:
-        net = Net() if world is None else world.net
-        return TraciVut(corridors, net, port, command, options)
+        road = road_of() if world is None else world.road
+        return TraciVut(corridors, road, port, command, options)
 
     files = [Path(word) for word in command or () if Path(word).is_file()]
     return Vut(
@@ -76,7 +78,7 @@ class TraciVut(Driver):
     def __init__(
         self,
         corridors: int,
-        net: Net,
+        road: Net | Corridor,
         port: int,
         command: list[str] | None,
         options: VutOptions,
@@ -85,7 +87,8 @@ class TraciVut(Driver):
         if corridors != 1:
             raise ValueError("a TraCI client drives in one corridor")
         super().__init__(corridors)
-        self._net, self._port, self._command, self._options = net, port, command, options
+        self._road, self._port = corridor_of(road), port
+        self._command, self._options = command, options
         self._listener: socket.socket | None = None
         self._program: Program | None = None
         self._client: _Client | None = None
@@ -191,7 +194,7 @@ class TraciVut(Driver):
                     before = f"{ended} (before it connected)" if ended else late
                     raise FaultError(before) from None
         self._patience_s = self._options.connect_s
-        session = Session(self._net)
+        session = Session(self._road)
         self._client = _Client(connection, session, self._options.deadline_s, self._program)
 
     def _disconnect(self, *, grace: bool = False) -> None:

@@ -221,9 +221,11 @@ def position(*coordinates: float) -> bytes:
 
 
 def polygon(points: Sequence[tuple[float, float]]) -> bytes:
-    """Return a typed list of fewer than 256 points."""
+    """Return a typed list of points; a count above 255 stands behind a 0."""
     items = b"".join(struct.pack("!dd", *point) for point in points)
-    return bytes((TYPE_POLYGON, len(points))) + items
+    few = len(points) < 256
+    count = bytes((len(points),)) if few else bytes((0,)) + _INT.pack(len(points))
+    return bytes((TYPE_POLYGON,)) + count + items
 
 
 def colour(red: int, green: int, blue: int) -> bytes:

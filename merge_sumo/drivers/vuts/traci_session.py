@@ -1,7 +1,8 @@
 """What a TraCI client sees and may do: a SUMO simulation of two vehicles, `pov` and `vut`.
 
 The session answers commands; it has no socket and does not decide when a step is made. Time runs
-on over the episodes. In each the vehicles depart, and when it ends they arrive.
+on over the episodes. In each the vehicles depart, and when it ends they arrive. The road has the
+lanes and edges of both paths, by their ids in the net file, and the junction at M.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
 from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
-from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, LaneLine, Net
+from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint, Piece
 
 POV: Final = "pov"
 VUT: Final = "vut"
@@ -114,7 +115,7 @@ class _Vehicle:
 class Session:
     """The simulation as one client sees it."""
 
-    net: Net
+    road: Corridor
     steps: int = 0
     expected: bool = True
     wish: SpeedWish = field(default_factory=SpeedWish)
@@ -311,17 +312,29 @@ class Session:
             raise RefusedError(f"Vehicle '{name}' is not known.")
         return found
 
-    def point(self, name: str) -> tuple[str, float, float, float, float]:
-        """Return (lane, position, x, y, angle) of a vehicle."""
-        return self.net.lane_point(self.vehicle(name).x_m, on_ramp=name == VUT)
+    def point(self, name: str) -> LanePoint:
+        """Return where a vehicle is."""
+        return self.road.lane_point(self.vehicle(name).x_m, on_ramp=name == VUT)
 
-    def lane(self, name: str) -> LaneLine:
+    def path(self, name: str) -> LanePath:
+        """Return the lanes that a vehicle drives on."""
+        return self.road.ramp if name == VUT else self.road.mainline
+
+    def lanes(self) -> dict[str, Piece]:
+        """Return the lanes of both paths by their ids: before M, then those that follow."""
+        pieces = [*self.road.mainline.pieces, *self.road.ramp.pieces]
+        return {piece.lane: piece for piece in sorted(pieces, key=lambda p: p.start_m >= 0.0)}
+
+    def lane(self, name: str) -> Piece:
         """Return a lane; raises `RefusedError` for one that there is not."""
-        edge = name.removesuffix("_0")
-        if edge == name or edge not in (MAIN_IN, MAIN_OUT, RAMP):
+        found = self.lanes().get(name)
+        if found is None:
             raise RefusedError(f"Lane '{name}' is not known.")
-        lane: LaneLine = getattr(self.net, edge)
-        return lane
+        return found
+
+    def edges(self) -> list[str]:
+        """Return the edges of all lanes."""
+        return list(dict.fromkeys(map(_edge_of, self.lanes())))
 
     def leader(self, name: str) -> tuple[str, float]:
         """Return who drives ahead on the lanes that a vehicle will use, and the gap between."""
@@ -379,8 +392,22 @@ def _follower(session: Session, name: str, reader: Reader) -> bytes:
     return tp.compound(tp.string(""), tp.double(-1.0))
 
 
-def _edges(name: str) -> tuple[str, str]:
-    return (RAMP if name == VUT else MAIN_IN, MAIN_OUT)
+def _edge_of(lane: str) -> str:
+    return lane.rpartition("_")[0]
+
+
+def _index_of(lane: str) -> int:
+    return int(lane.rpartition("_")[2])
+
+
+def _route(path: LanePath) -> list[str]:
+    return [_edge_of(piece.lane) for piece in path.pieces if not piece.is_internal]
+
+
+def _route_index(path: LanePath, x_m: float) -> int:
+    """Return the number of the edge; inside of a junction it is that of the edge before."""
+    begun = [p for p in path.pieces if p.start_m <= x_m and not p.is_internal]
+    return max(len(begun) - 1, 0)
 
 
 _VEHICLE: Final[dict[int, Getter]] = {
@@ -394,21 +421,23 @@ _VEHICLE: Final[dict[int, Getter]] = {
     0x39: _of_vehicle(lambda s, n, _v: tp.position(*s.point(n)[2:4], 0.0)),  # getPosition3D
     0x43: _of_vehicle(lambda s, n, _v: tp.double(s.point(n)[4])),  # getAngle
     0x51: _of_vehicle(lambda s, n, _v: tp.string(s.point(n)[0])),  # getLaneID
-    0x50: _of_vehicle(lambda s, n, _v: tp.string(s.point(n)[0].removesuffix("_0"))),  # getRoadID
-    0x52: _constant(tp.integer(0)),  # getLaneIndex
+    0x50: _of_vehicle(lambda s, n, _v: tp.string(_edge_of(s.point(n).lane))),  # getRoadID
+    0x52: _of_vehicle(lambda s, n, _v: tp.integer(_index_of(s.point(n).lane))),  # getLaneIndex
     0xB8: _constant(tp.double(0.0)),  # getLateralLanePosition
     0x32: _constant(tp.double(0.0)),  # getLateralSpeed
     0x36: _constant(tp.double(0.0)),  # getSlope
     0x4F: _of_vehicle(lambda _s, n, _v: tp.string(n)),  # getTypeID
     0x53: _of_vehicle(lambda _s, n, _v: tp.string(f"route.{n}")),  # getRouteID
-    0x54: _of_vehicle(lambda _s, n, _v: tp.strings(_edges(n))),  # getRoute
-    0x69: _of_vehicle(lambda _s, _n, v: tp.integer(int(v.x_m >= 0.0))),  # getRouteIndex
+    0x54: _of_vehicle(lambda s, n, _v: tp.strings(_route(s.path(n)))),  # getRoute
+    0x69: _of_vehicle(lambda s, n, v: tp.integer(_route_index(s.path(n), v.x_m))),  # getRouteIndex
     0x44: _constant(tp.double(LENGTH_M)),  # getLength
     0x4D: _constant(tp.double(WIDTH_M)),  # getWidth
     0xBC: _constant(tp.double(HEIGHT_M)),  # getHeight
     0x4C: _constant(tp.double(0.0)),  # getMinGap
-    0x41: _of_vehicle(lambda s, _n, _v: tp.double(s.net.speed_limit_mps)),  # getMaxSpeed
-    0xB7: _of_vehicle(lambda s, _n, _v: tp.double(s.net.speed_limit_mps)),  # getAllowedSpeed
+    0x41: _of_vehicle(lambda s, _n, _v: tp.double(s.road.speed_limit_mps)),  # getMaxSpeed
+    0xB7: _of_vehicle(
+        lambda s, n, v: tp.double(s.path(n).piece(v.x_m).speed_limit_mps)  # getAllowedSpeed
+    ),
     0x5E: _constant(tp.double(1.0)),  # getSpeedFactor
     0x46: _constant(tp.double(A_MAX_MPS2)),  # getAccel
     0x47: _constant(tp.double(-A_MIN_MPS2)),  # getDecel
@@ -450,38 +479,46 @@ def _on_lane(session: Session, lane: str) -> list[str]:
     return [name for name in session.vehicles if session.point(name)[0] == lane]
 
 
-def _of_lane(value: Callable[[Session, str, LaneLine], bytes]) -> Getter:
-    return lambda session, name, _: value(session, name, session.lane(name))
+def _of_lane(value: Callable[[Piece], bytes]) -> Getter:
+    return lambda session, name, _: value(session.lane(name))
 
 
-_LANES: Final = tuple(f"{edge}_0" for edge in (MAIN_IN, RAMP, MAIN_OUT))
 _LANE: Final[dict[int, Getter]] = {
-    ID_LIST: lambda _s, _n, _r: tp.strings(_LANES),
-    ID_COUNT: lambda _s, _n, _r: tp.integer(len(_LANES)),
-    0x44: _of_lane(lambda _s, _n, lane: tp.double(lane.length_m)),  # getLength
-    0x41: _of_lane(lambda s, _n, _l: tp.double(s.net.speed_limit_mps)),  # getMaxSpeed
-    0x31: _of_lane(lambda _s, n, _l: tp.string(n.removesuffix("_0"))),  # getEdgeID
-    0x4E: _of_lane(lambda _s, _n, lane: tp.polygon([lane.point(p) for p in (0, lane.length_m)])),
+    ID_LIST: lambda s, _n, _r: tp.strings(list(s.lanes())),
+    ID_COUNT: lambda s, _n, _r: tp.integer(len(s.lanes())),
+    0x44: _of_lane(lambda lane: tp.double(lane.length_m)),  # getLength
+    0x41: _of_lane(lambda lane: tp.double(lane.speed_limit_mps)),  # getMaxSpeed
+    0x31: _of_lane(lambda lane: tp.string(_edge_of(lane.lane))),  # getEdgeID
+    0x4E: _of_lane(lambda lane: tp.polygon([(x, y) for x, y, _ in lane.shape])),  # getShape
     0x10: lambda s, n, _r: tp.integer(len(_on_lane(s, n))),  # getLastStepVehicleNumber
     0x12: lambda s, n, _r: tp.strings(_on_lane(s, n)),  # getLastStepVehicleIDs
 }
-_EDGES: Final = (MAIN_IN, RAMP, MAIN_OUT)
+
+
+def _on_edge(session: Session, edge: str) -> list[str]:
+    if edge not in session.edges():
+        raise RefusedError(f"Edge '{edge}' is not known.")
+    return [name for name in session.vehicles if _edge_of(session.point(name).lane) == edge]
+
+
 _EDGE: Final[dict[int, Getter]] = {
-    ID_LIST: lambda _s, _n, _r: tp.strings(_EDGES),
-    ID_COUNT: lambda _s, _n, _r: tp.integer(len(_EDGES)),
-    0x10: lambda s, n, _r: tp.integer(len(_on_lane(s, f"{n}_0"))),
-    0x12: lambda s, n, _r: tp.strings(_on_lane(s, f"{n}_0")),
+    ID_LIST: lambda s, _n, _r: tp.strings(s.edges()),
+    ID_COUNT: lambda s, _n, _r: tp.integer(len(s.edges())),
+    0x10: lambda s, n, _r: tp.integer(len(_on_edge(s, n))),
+    0x12: lambda s, n, _r: tp.strings(_on_edge(s, n)),
 }
 
 
-def _junction(_session: Session, name: str, _reader: Reader) -> bytes:
-    if name != "M":
+def _junction(session: Session, name: str, _reader: Reader) -> bytes:
+    """Return the position of the junction at M: M itself."""
+    if name != session.road.junction_id:
         raise RefusedError(f"Junction '{name}' is not known.")
-    return tp.position(0.0, 0.0)
+    at = session.road.lane_point(0.0, on_ramp=False)
+    return tp.position(at.x_m, at.y_m)
 
 
 _JUNCTION: Final[dict[int, Getter]] = {
-    ID_LIST: lambda _s, _n, _r: tp.strings(("M",)),
+    ID_LIST: lambda s, _n, _r: tp.strings((s.road.junction_id,)),
     ID_COUNT: lambda _s, _n, _r: tp.integer(1),
     0x42: _junction,  # getPosition
 }
