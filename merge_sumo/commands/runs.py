@@ -63,7 +63,7 @@ def export(
     Example:  merge-sumo export runs/design2 17 42
     """
     from merge_sumo import exports
-    from merge_sumo.conductor import SCENARIOS
+    from merge_sumo.conductor import SCENARIOS, road_for
     from merge_sumo.journal import Run
 
     loaded = Run(run)
