@@ -11,6 +11,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -33,8 +34,7 @@ from merge_sumo.journal import SETTINGS, Run, failures
 from merge_sumo.scenario import DEADLINE_S, DT_S, LEVELS
 from merge_sumo.score import FAILURE_SCORE, Outcome
 from merge_sumo.summary import LevelSummary, Summary, summarise
-from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import LaneLine, Net
+from merge_sumo.sumo.corridor import Corridor, LanePath
 from merge_sumo.sumo.road import road_of
 from merge_sumo.surface import FEWEST_FAILURES, PLAUSIBLE, Surface, learn_surface
 from merge_sumo.trajectory import End, Trajectory
@@ -152,7 +152,7 @@ class _Facts:
         if not isinstance(levels, list) or any(level not in LEVELS for level in levels):
             raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
         self.run = run
-        self.net = _net_of(run)
+        self.road = _road_of(run)
         self.summary = summarise(run.outcomes, levels)
         self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
@@ -176,7 +176,7 @@ class _Facts:
             index: found.kind for index, found in self.diagnoses.items() if found.kind is not None
         }
         self.surfaces = {level: learn_surface(run.outcomes, level) for level in self.levels}
-        self.truths = {level: _truth(run, self.net, level) for level in self.levels}
+        self.truths = {level: _truth(run, self.road, level) for level in self.levels}
 
     def words(self) -> dict[str, Any]:
         """Return what the template needs for text and tables."""
@@ -230,7 +230,7 @@ class _Facts:
             "tables": tables,
             "settings": settings,
             "flat_settings": list(_flat(settings)),
-            "other_net": settings.get("net_sha256") != self.net.sha256,
+            "other_net": settings.get("net_sha256") != self.road.sha256,
         }
 
     def _troubles(self) -> Sequence[Trouble]:
@@ -347,7 +347,7 @@ class _Facts:
             "commands": self._commands(),
             "export": f"merge-sumo export {_quoted(self.run.folder)}",
             "replay": f"merge-sumo replay {_quoted(scenarios / 'case-NNNNN')} --gui",
-            **_road(self.net),
+            **_road(self.road),
         }
 
     def _columns(self, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
@@ -508,7 +508,7 @@ def _motion(run: Run, index: int) -> Trajectory | None:
         return None
 
 
-def _net_of(run: Run) -> Corridor:
+def _road_of(run: Run) -> Corridor:
     """Return the road of a run, or the shipped one to draw on where that is not there any more."""
     try:
         return road_for(run.scenario)
@@ -516,11 +516,11 @@ def _net_of(run: Run) -> Corridor:
         return road_of()
 
 
-def _truth(run: Run, net: Corridor, level: int) -> Truth | None:
+def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
     """Return the ground truth that is cached for what this run tested, if there is one."""
     settings = run.settings
     same = (
-        settings.get("net_sha256") == net.sha256
+        settings.get("net_sha256") == road.sha256
         and settings.get("versions") == versions()
         and settings.get("v_vut0_mps") == run.scenario.v_vut0_mps
     )
@@ -574,17 +574,32 @@ def _truth_grid(truth: Truth, level: int) -> dict[str, Any]:
     return _grid(level, (truth.score < FAILURE_SCORE)[near].mean(axis=1))
 
 
-def _road(net: Net) -> dict[str, Any]:
-    """Return the lanes of a net as lines, and the three that meet at M as [x0, y0, x1, y1]."""
+def _road(road: Corridor) -> dict[str, Any]:
+    """Return both paths as points (lane coordinate, x, y), and the lines of all lanes near M.
 
-    def ends(lane: LaneLine) -> list[float]:
-        return [lane.x0_m, lane.y0_m, lane.x1_m, lane.y1_m]
+    M is the origin of the plane, and the road goes on to the right: a net may lie anywhere.
+    """
+    at = road.lane_point(0.0, on_ramp=False)
+    ahead_x, ahead_y = math.sin(math.radians(at.angle_deg)), math.cos(math.radians(at.angle_deg))
 
+    def place(x: float, y: float) -> list[float]:
+        dx, dy = x - at.x_m, y - at.y_m
+        along, left = dx * ahead_x + dy * ahead_y, dy * ahead_x - dx * ahead_y
+        return [round(along, 2), round(left, 2)]
+
+    def points(path: LanePath) -> list[list[float]]:
+        return [
+            [round(piece.start_m + share * piece.length_m, 2), *place(x, y)]
+            for piece in path.pieces
+            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True)
+        ]
+
+    shapes = [piece.shape for path in (road.mainline, road.ramp) for piece in path.pieces]
+    lanes = [*road.surroundings, *dict.fromkeys(shapes)]
     return {
-        "main": ends(net.main_in),
-        "out": ends(net.main_out),
-        "ramp": ends(net.ramp),
-        "lanes": net.lane_shapes(),
+        "main": points(road.mainline),
+        "ramp": points(road.ramp),
+        "lanes": [[place(x, y) for x, y, _ in shape] for shape in lanes],
     }
 
 

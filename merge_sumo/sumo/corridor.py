@@ -45,21 +45,26 @@ class Piece:
     """Points in the plane from its begin to its end; drawn length and `length_m` may differ."""
 
     @property
+    def shares(self) -> list[float]:
+        """Shares of `length_m` at which the points of the shape are driven over."""
+        reach = list(accumulate((math.dist(a, b) for a, b in pairwise(self.shape)), initial=0.0))
+        whole = max(reach[-1], DRAWN_MIN_M)
+        return [along / whole for along in reach]
+
+    @property
     def is_internal(self) -> bool:
         """Whether the lane lies inside of a junction."""
         return self.lane.startswith(":")
 
     def point(self, position_m: float) -> tuple[float, float, float]:
         """Return (x, y, angle) of a position on the lane, where SUMO draws it."""
-        drawn = [math.dist(a, b) for a, b in pairwise(self.shape)]
-        *_, total = reach = list(accumulate(drawn))
-        # Shares of the lane: where it is straight, that of its length, and nothing is rounded.
-        ends = [end / total for end in reach]
-        along = min(position_m / self.length_m * (max(total, DRAWN_MIN_M) / total), 1.0)
-        segment = min(bisect.bisect_left(ends, along), len(drawn) - 1)
-        begin = ends[segment - 1] if segment else 0.0
+        # Where the lane is straight this is the share of its length, and nothing is rounded.
+        shares = self.shares
+        along = min(position_m / self.length_m, shares[-1])
+        segment = min(max(bisect.bisect_left(shares, along), 1), len(shares) - 1) - 1
+        begin, end = shares[segment : segment + 2]
         (x0, y0, _), (x1, y1, _) = self.shape[segment : segment + 2]
-        share = (along - begin) / (ends[segment] - begin)
+        share = (along - begin) / (end - begin)
         angle_deg = math.degrees(math.atan2(x1 - x0, y1 - y0)) % 360.0
         return x0 + share * (x1 - x0), y0 + share * (y1 - y0), angle_deg
 

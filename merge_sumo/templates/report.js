@@ -330,11 +330,13 @@ function drawRoad() {
     cars[who] = { group, brake, label };
   }
 }
-function pose(line, x) { // front bumper on the lane before M, or on the main road behind it
-  const [x0, y0, x1, y1] = x < 0 ? line : data.out;
-  const length = Math.hypot(x1 - x0, y1 - y0), ux = (x1 - x0) / length, uy = (y1 - y0) / length;
-  const [ox, oy] = x < 0 ? [x1, y1] : [x0, y0];
-  return { x: ox + ux * x, y: oy + uy * x, angle: Math.atan2(-uy, ux) * 180 / Math.PI };
+function pose(path, along) { // front bumper at a lane coordinate of a path
+  let k = path.findIndex(([at], i) => i > 0 && along < at);
+  if (k < 0) k = path.length - 1;
+  // Where a lane begins its point stands twice, and some lanes are as short as a point.
+  while (k > 1 && path[k][0] === path[k - 1][0]) k--;
+  const [[s0, x0, y0], [s1, x1, y1]] = [path[k - 1], path[k]], share = (along - s0) / (s1 - s0 || 1);
+  return { x: x0 + share * (x1 - x0), y: y0 + share * (y1 - y0), angle: Math.atan2(y0 - y1, x1 - x0) * 180 / Math.PI };
 }
 function at(t) {
   if (!moving) return;
@@ -343,9 +345,10 @@ function at(t) {
   const mix = (values) => (1 - share) * values[k] + share * values[next];
   const places = { pov: pose(data.main, mix(moving.xPov)), vut: pose(data.ramp, mix(moving.xVut)) };
   const low = Math.min(places.pov.x, places.vut.x), high = Math.max(places.pov.x, places.vut.x);
+  const apart = Math.abs(places.pov.y - places.vut.y);
   // The view follows both, never closer than 90 m; cars keep a size that can be seen.
   const ratio = road.clientHeight / (road.clientWidth || 1) || 0.25;
-  const width = Math.max(high - low + 50, 90), middle = (low + high) / 2;
+  const width = Math.max(high - low + 50, (apart + 10) / ratio, 90), middle = (low + high) / 2;
   const size = Math.max(1, width / 90), height = width * ratio;
   const centre = -(Math.min(places.pov.y, places.vut.y) + Math.max(places.pov.y, places.vut.y)) / 2;
   road.setAttribute("viewBox", `${middle - width / 2} ${centre - height / 2} ${width} ${height}`);
