@@ -490,7 +490,7 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
     Raises `UserError` where there is no such merge, or not room enough for its vehicles.
     """
     file = Path(scenario.net) if net is None and scenario.net is not None else net
-    road = road_of(file, scenario.mainline, scenario.ramp)
+    road = road_of(file, scenario.mainline, scenario.ramp, scenario.room_after_m)
     road.check_room(-scenario.x_pov0_m[0], -scenario.x_vut0_m)
     return road
 

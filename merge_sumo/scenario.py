@@ -26,6 +26,9 @@ MEMORY_GIB: Final = 4.0
 MAX_EPISODE_S: Final = 120.0
 """No scenario lets an episode last longer."""
 
+ROOM_AFTER_M: Final = 2000.0
+"""Length behind M that the road has at least."""
+
 Bounds = tuple[float, float]
 
 
@@ -149,6 +152,12 @@ class Scenario:
     def max_steps(self) -> int:
         """Steps after which an episode that has not ended is a TIMEOUT."""
         return round(self.timeout_s / DT_S)
+
+    @property
+    def room_after_m(self) -> float:
+        """How far behind M a POV may get until the timeout, at full acceleration."""
+        far_m = self.v_start_max_mps * self.timeout_s + 0.5 * self.a_max_mps2 * self.timeout_s**2
+        return max(far_m, ROOM_AFTER_M)
 
     def dimensions(self, level: int) -> tuple[Dimension, ...]:
         """Return the continuous coordinates of the pool at a level: two, or three at level 2."""

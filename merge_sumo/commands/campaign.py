@@ -118,6 +118,7 @@ def campaign(
     from merge_sumo.progress import CampaignPanel
     from merge_sumo.report import check_report
     from merge_sumo.scenario_file import named_scenario
+    from merge_sumo.suggestion import unseen
     from merge_sumo.verdict import parse_gates
     from merge_sumo.workers import open_workers
 
@@ -148,6 +149,11 @@ def campaign(
     if junit is not None:
         check_junit(junit, folder)
     road = conductor.road_for(settings.scenario, net)
+    if max(levels) > 0 and unseen(settings.scenario):
+        say(
+            f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
+            f"`merge-sumo scenario check {quoted(scenario)}` says in what it differs"
+        )
     title = f"{settings.vut} v level {'/'.join(map(str, levels))}"
     try:
         with (

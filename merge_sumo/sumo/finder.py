@@ -15,11 +15,10 @@ from functools import cache
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+from merge_sumo.scenario import ROOM_AFTER_M
 from merge_sumo.sumo.corridor import Approach, Corridor, LanePath, Piece
 from merge_sumo.sumo.netfile import Lane, Link, NetFile, Point
 
-ROOM_AFTER_M: Final = 2000.0
-"""Room behind M for a POV that accelerates at 2 m/s2 until the timeout."""
 SURROUNDINGS_M: Final = 500.0
 """How near to M a lane beside the paths is drawn."""
 POINT_M: Final = 1e-6

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from merge_sumo.scenario import ROOM_AFTER_M
 from merge_sumo.sumo import received
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.finder import find_corridor
@@ -18,25 +19,28 @@ MAINLINE_EDGES: Final = (MAIN_IN, MAIN_OUT)
 RAMP_EDGES: Final = (RAMP, MAIN_OUT)
 """Of the shipped net."""
 
-_found: dict[tuple[Path, str, tuple[str, ...], tuple[str, ...]], Corridor] = {}
+_found: dict[tuple[Path, str, tuple[str, ...], tuple[str, ...], float], Corridor] = {}
 
 
 def road_of(
     net: Path | None = None,
     mainline: Sequence[str] = MAINLINE_EDGES,
     ramp: Sequence[str] = RAMP_EDGES,
+    room_after_m: float = ROOM_AFTER_M,
 ) -> Corridor:
     """Return the merge of two sequences of edges in a net file, by default the shipped one.
 
-    What is searched once is kept until the file changes. Raises `UserError` when the file is no
+    Where the file ends nearer than `room_after_m` behind M, the road goes straight on. What is
+    searched once is kept until the file changes. Raises `UserError` when the file is no
     plain file, is no SUMO net, or has no such merge.
     """
     path = net or default_net_path()
     content = received.read_bytes(path, "the net", follow_links=True, limit=received.MAX_NET_BYTES)
-    key = (path, hashlib.sha256(content).hexdigest(), tuple(mainline), tuple(ramp))
+    key = (path, hashlib.sha256(content).hexdigest(), tuple(mainline), tuple(ramp), room_after_m)
     if key not in _found:
         received.check_text(content, f"the net {path}")
-        _found[key] = find_corridor(NetFile(path, content), *key[2:])
+        net_file = NetFile(path, content)
+        _found[key] = find_corridor(net_file, mainline, ramp, room_after_m=room_after_m)
     return _found[key]
 
 
