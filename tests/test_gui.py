@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import require
+from foreign_nets import corridor_of
 from lxml import etree
 from PIL import Image
 
 from merge_sumo.conductor import export_case
 from merge_sumo.journal import failures
-from merge_sumo.sumo.replay import COLOURS, VIEW
+from merge_sumo.sumo.replay import COLOURS, SURROUNDINGS_COLOUR, VIEW, write_scenario
 
 PICTURE_TIMES_S = (2.0, 7.0)
 NEAR = 40
@@ -73,10 +74,9 @@ def display() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
-    """Open an exported failure with `replay --gui`; return its pictures at two times as arrays.
+    """Return pictures of an exported failure at two times as arrays.
 
-    The view and the configuration that merge-sumo writes are made to take pictures and to end by
-    themselves. Those of the folder ask for a picture, too: it must not be taken.
+    The folder asks for a picture, too: it must not be taken.
     """
     scratch = tmp_path_factory.mktemp("gui")
     folder, hostile = scratch / "case", scratch / "hostile.png"
@@ -84,6 +84,26 @@ def pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
     view = etree.parse(folder / VIEW)
     etree.SubElement(view.getroot(), "snapshot", file=str(hostile), time="1")
     view.write(folder / VIEW)
+    taken = taken_of(folder, display, scratch)
+    assert not hostile.exists()
+    return taken
+
+
+@pytest.fixture(scope="module")
+def foreign_pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
+    """Return pictures of the same motion on a road with curves."""
+    scratch = tmp_path_factory.mktemp("gui")
+    road, outcome = corridor_of("curved", scratch), failures(run.outcomes)[0]
+    write_scenario(scratch / "case", road, outcome, run.trajectory(outcome.index))
+    return taken_of(scratch / "case", display, scratch)
+
+
+def taken_of(folder: Path, display: str, scratch: Path) -> list[np.ndarray]:
+    """Open a folder with `replay --gui` and return its pictures at two times as arrays.
+
+    The view and the configuration that merge-sumo writes are made to take pictures and to end by
+    themselves.
+    """
     files = [scratch / f"at-{time_s:g}-s.png" for time_s in PICTURE_TIMES_S]
     times = {str(file): str(time_s) for file, time_s in zip(files, PICTURE_TIMES_S, strict=True)}
     (scratch / "show.py").write_text(SHOW.format(times=times))
@@ -101,7 +121,6 @@ def pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
         if window.poll() is None:
             os.killpg(window.pid, signal.SIGKILL)
     assert window.returncode == 0, said
-    assert not hostile.exists()
     return [picture(file) for file in files]
 
 
@@ -150,3 +169,22 @@ def test_the_cars_meet(pictures):
         for image in pictures
     ]
     assert apart[1] < apart[0]
+
+
+def test_on_a_foreign_road_the_picture_has_lanes_those_beside_them_and_both_cars(foreign_pictures):
+    for image in foreign_pictures:
+        height, width, _ = image.shape
+        for colour in (
+            (0.0, 0.0, 0.0),
+            tuple(255.0 * float(part) for part in SURROUNDINGS_COLOUR.split(",")),
+        ):
+            road = places(image, colour)
+            assert np.unique(road[:, 1]).size > 0.5 * width
+            assert len(road) < 0.3 * height * width
+        for who in COLOURS:
+            assert len(car(image, who)) > 30
+    early, late = (
+        np.linalg.norm(car(image, "pov").mean(axis=0) - car(image, "vut").mean(axis=0))
+        for image in foreign_pictures
+    )
+    assert late < early

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import math
+from collections.abc import Iterator
+from itertools import groupby, pairwise
 from typing import Final
+
+from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.sumo import received
 from merge_sumo.sumo.binding import run_program, scratch_folder
-from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.sumo.corridor import Corridor, LanePath
 from merge_sumo.sumo.net import Net
 
 NET: Final = "road.net.xml"
 ROAD: Final = "road.xodr"
+SAME_M: Final = 0.5
+"""Where a lane ends in SUMO and in OpenDRIVE may be this far apart."""
 MAX_ELEMENTS: Final = 10**6
 """Of the net of a corridor, which a user chose: that of a city."""
 
@@ -34,7 +41,8 @@ def opendrive(road: Net | Corridor) -> bytes:
         ]
         ended = run_program("netconvert", arguments, stage)
         if ended.code == 0 and (stage / ROAD).is_file():
-            return (stage / ROAD).read_bytes()
+            made = (stage / ROAD).read_bytes()
+            return made if isinstance(road, Net) else _with_crossings(made, road)
     raise UserError(f"netconvert cannot write {road.path} as OpenDRIVE: {ended.reason}")
 
 
@@ -48,3 +56,98 @@ def _net_of(road: Corridor) -> bytes:
         )
     root, intact = received.parse(content, received.NET, f"the net {road.path}", MAX_ELEMENTS)
     return content if intact else received.serialize(root)
+
+
+_Place = tuple[float, float]
+
+
+def _with_crossings(made: bytes, road: Corridor) -> bytes:
+    """Return OpenDRIVE in which the ways over junctions are those of both paths.
+
+    netconvert draws a way of its own, up to a metre beside the lanes inside of a junction. Here its
+    reference line becomes the centre of the lane that is driven on.
+    """
+    crossings = {line for path in (road.mainline, road.ramp) for line in _crossings(path)}
+    if not crossings:
+        return made
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
+    root = etree.fromstring(made, parser)
+    roads = {str(element.get("id")): element for element in root.iterfind("road")}
+    for element in roads.values():
+        if element.get("junction") != "-1":
+            for lane, begin, end in _joined(element, roads):
+                for line in crossings:
+                    if max(math.dist(line[0], begin), math.dist(line[-1], end)) <= SAME_M:
+                        _draw(element, lane, line)
+    return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
+
+
+def _crossings(path: LanePath) -> Iterator[tuple[_Place, ...]]:
+    """Yield the lines on which a path goes over junctions, from road to road."""
+    for internal, pieces in groupby(path.pieces, key=lambda piece: piece.is_internal):
+        if internal:
+            points = [(x, y) for piece in pieces for x, y, _ in piece.shape]
+            yield (*(a for a, b in pairwise(points) if math.dist(a, b) > 1e-6), points[-1])
+
+
+def _joined(
+    element: etree._Element, roads: dict[str, etree._Element]
+) -> Iterator[tuple[int, _Place, _Place]]:
+    """Yield the lanes of a connecting road, each with the ends of the lanes that it joins."""
+    before, after = element.find("link/predecessor"), element.find("link/successor")
+    if before is None or after is None:
+        return
+    source, target = (roads.get(str(link.get("elementId"))) for link in (before, after))
+    for lane in element.iterfind("lanes/laneSection/right/lane"):
+        ends = lane.find("link/predecessor"), lane.find("link/successor")
+        if (
+            source is not None
+            and target is not None
+            and ends[0] is not None
+            and ends[1] is not None
+        ):
+            begin = _end_of_lane(source, int(ends[0].get("id", "")), last=True)
+            end = _end_of_lane(target, int(ends[1].get("id", "")), last=False)
+            yield int(lane.get("id", "")), begin, end
+
+
+def _end_of_lane(element: etree._Element, lane: int, *, last: bool) -> _Place:
+    """Return where the centre of a lane of a road of straight lines begins or ends."""
+    line = element.findall("planView/geometry")[-1 if last else 0]
+    x, y, heading, length_m = (float(line.get(name, "")) for name in ("x", "y", "hdg", "length"))
+    along_m = length_m if last else 0.0
+    offset = element.find("lanes/laneOffset")
+    left_m = _centre_m(element, lane) + (0.0 if offset is None else float(offset.get("a", "")))
+    cos, sin = math.cos(heading), math.sin(heading)
+    return x + along_m * cos - left_m * sin, y + along_m * sin + left_m * cos
+
+
+def _centre_m(element: etree._Element, lane: int) -> float:
+    """Return how far to the left of the reference line the centre of a lane is, without offset."""
+    widths_m = {
+        int(other.get("id", "")): float(width.get("a", ""))
+        for other in element.iterfind("lanes/laneSection/right/lane")
+        if (width := other.find("width")) is not None
+    }
+    return -sum(widths_m[other] for other in widths_m if other > lane) - widths_m[lane] / 2.0
+
+
+def _draw(element: etree._Element, lane: int, line: tuple[_Place, ...]) -> None:
+    """Make a line the reference line of a road, and the centre of one of its lanes."""
+    plan, lanes = element.find("planView"), element.find("lanes")
+    if plan is None or lanes is None:
+        return
+    plan[:] = []
+    s_m = 0.0
+    for (x0, y0), (x1, y1) in pairwise(line):
+        length_m = math.dist((x0, y0), (x1, y1))
+        values = {"s": s_m, "x": x0, "y": y0, "hdg": math.atan2(y1 - y0, x1 - x0)}
+        values["length"] = length_m
+        geometry = etree.SubElement(plan, "geometry", {k: f"{v:.8f}" for k, v in values.items()})
+        etree.SubElement(geometry, "line")
+        s_m += length_m
+    element.set("length", f"{s_m:.8f}")
+    for offset in lanes.findall("laneOffset"):
+        lanes.remove(offset)
+    polynomial = {"a": f"{-_centre_m(element, lane):.8f}", "b": "0", "c": "0", "d": "0"}
+    lanes.insert(0, etree.Element("laneOffset", {"s": "0", **polynomial}))

@@ -117,6 +117,7 @@ _EDGE: Final = Allowed(
     {
         **dict.fromkeys(("id", "from", "to", "bidi"), _ID),
         **dict.fromkeys(("function", "spreadType"), _WORD),
+        "crossingEdges": _IDS,
         **{"length": _METRES, "distance": _PLACE},
         **{"priority": number(-1000, 1000), "name": _NAME, "shape": _SHAPE},
         "type": matching(r"[\w.:#+|\-]{0,250}", "an edge type"),

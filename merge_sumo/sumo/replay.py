@@ -419,7 +419,8 @@ def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
             color=SURROUNDINGS_COLOUR,
             fill="0",
             layer="-1",
-            lineWidth=f"{LANE_WIDTH_M}",
+            # To either side.
+            lineWidth=f"{LANE_WIDTH_M / 2.0}",
             shape=" ".join(f"{x:.3f},{y:.3f}" for x, y, _ in shape),
         )
     return root
