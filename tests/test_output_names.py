@@ -21,7 +21,15 @@ import merge_sumo as ms
 from merge_sumo import cli, conductor, figures, folders, probability, reproduce
 from merge_sumo.conductor import SCENARIOS, case_name, resume_campaign
 from merge_sumo.errors import UserError
-from merge_sumo.journal import OUTCOMES, SETTINGS, TRAJECTORIES, Journal, Run, failures
+from merge_sumo.journal import (
+    OUTCOMES,
+    SETTINGS,
+    TRAJECTORIES,
+    Journal,
+    Run,
+    failures,
+    read_settings,
+)
 from merge_sumo.printable import printable, quoted
 from merge_sumo.report import REPORT, write_report
 from merge_sumo.training import helix
@@ -412,7 +420,7 @@ class TestAReceivedFolder:
         with Journal.reopen(received)[0] as journal:
             journal.rewrite_settings({"vut": "design1"})
         assert (tmp_path / "ours" / "bashrc").read_text() == "ours"
-        assert json.loads((received / SETTINGS).read_text()) == {"vut": "design1"}
+        assert read_settings(received) == {"vut": "design1"}
 
     @pytest.mark.parametrize("target", ["../ours/bashrc", "../ours/new", "../ours"])
     def test_with_a_link_for_a_report_gets_none(self, received, tmp_path, target):

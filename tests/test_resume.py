@@ -26,7 +26,15 @@ from merge_sumo.conductor import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Interrupt, Stopped
-from merge_sumo.journal import OUTCOMES, SETTINGS, TRAJECTORIES, Journal, Run
+from merge_sumo.journal import (
+    CHECKSUM,
+    OUTCOMES,
+    SETTINGS,
+    TRAJECTORIES,
+    Journal,
+    Run,
+    read_settings,
+)
 from merge_sumo.samplers.registry import SAMPLERS
 
 BATCH = 8
@@ -217,8 +225,9 @@ class TestWhatDiffers:
 
 
 def edit(folder: Path, where: tuple[str, ...], value) -> None:
-    """Change a value of campaign.json."""
+    """Change a value of campaign.json, as a person may who removes its checksum."""
     record = json.loads((folder / SETTINGS).read_text())
+    del record[CHECKSUM]
     inner = record
     for key in where[:-1]:
         inner = inner[key]
@@ -260,7 +269,7 @@ class TestTwoProcessesOnOneFolder:
         monkeypatch.setattr(folders, "_take_name", overtaken)
         with pytest.raises(UserError, match="run exists"):
             Journal.create(tmp_path / "run", {"first": False})
-        assert json.loads((tmp_path / "run" / SETTINGS).read_text()) == {"first": True}
+        assert read_settings(tmp_path / "run") == {"first": True}
         assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
