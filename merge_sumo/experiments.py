@@ -197,7 +197,8 @@ def read_truth(path: Path, level: int, cases: int) -> Truth | None:
     if not (fits and numbers):
         return None
     inside = bool(((points >= 0.0) & (points <= 1.0)).all())
-    return Truth(points, score) if inside else None
+    scores = not (np.isinf(score) | (score > 0.0)).any()
+    return Truth(points, score) if inside and scores else None
 
 
 def _scores(

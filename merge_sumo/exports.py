@@ -121,7 +121,7 @@ def write_openscenario(run: Run, index: int, folder: Path, net: Net) -> Path:
     board = xosc.StoryBoard(init, _at_time(xosc, "end", trajectory.t_end_s))
     board.add_story(story)
     scenario = xosc.Scenario(
-        f"{run.settings.get('vut')}, {name}",
+        f"{run.vut}, {name}",
         "merge-sumo",
         xosc.ParameterDeclarations(),
         entities,

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
 from merge_sumo.folders import check_own, new_folder, replace_own, sync_folder
-from merge_sumo.printable import quoted
+from merge_sumo.printable import printable, quoted
 from merge_sumo.score import Outcome
 from merge_sumo.trajectory import End, Trajectory
 
@@ -41,6 +41,8 @@ OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
 COLUMNS: Final = 6
 """Of the motion of a trajectory."""
+NAME_CHARACTERS: Final = 300
+"""Of the name of a VUT, where it is shown."""
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json`: the hash of all other keys with their values."""
 
@@ -179,6 +181,11 @@ class Run:
         _check_lines(folder, text, self.outcomes)
         self._batches: dict[int, dict[int, FloatArray]] = {}
 
+    @property
+    def vut(self) -> str:
+        """The name of the VUT, fit to be shown anywhere: it may be a stranger's."""
+        return printable(str(self.settings.get("vut"))[:NAME_CHARACTERS])
+
     def outcome(self, index: int) -> Outcome:
         """Return the outcome of a case; `UserError` when the campaign has no such case."""
         if not 0 <= index < len(self.outcomes):
@@ -264,6 +271,8 @@ def read_outcomes(text: bytes, name: str) -> tuple[list[Outcome], bool]:
     torn = not text.endswith(b"\n") and bool(text)
     for number, line in enumerate(io.BytesIO(text), start=1):
         if not line.endswith(b"\n"):
+            if _is_whole(line[:-1]):
+                raise UserError(f"line {number} of {name} does not end as it was written")
             break
         try:
             outcome = Outcome.from_record(_decode(line.decode()))
@@ -308,6 +317,15 @@ def _batch_file(folder: Path, batch: int) -> Path:
 
 def _no_campaign(folder: Path, error: OSError) -> UserError:
     return UserError(f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror})")
+
+
+def _is_whole(line: bytes) -> bool:
+    """Return whether bytes are a line: of one that was being written, no part is."""
+    try:
+        _decode(line.decode())
+    except (ValueError, RecursionError):
+        return False
+    return bool(line)
 
 
 def _no_constant(name: str) -> Any:

@@ -11,7 +11,6 @@ import os
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,6 @@ import pytest
 from attacks import SIGNALS, World, stop, wait_for
 
 from merge_sumo import folders
-from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.folders import TEMPORARY
 
 ROUNDS = 6
@@ -95,7 +93,7 @@ COMMANDS = {
     "export sumo": Command(
         ("export", "run", *map(str, range(20)), "--out", "folders"),
         ROUNDS,
-        ("folders/case-00019",),
+        ("folders",),
     ),
     "report": Command(("report", "run"), ROUNDS),
     "train": Command((str(Path(__file__).parent),), 2, script=CHILD),
@@ -111,7 +109,10 @@ def test_a_command_that_is_stopped_at_any_moment_can_be_given_again(name, run, t
     code, out, err = undisturbed.run(*command.arguments, script=command.script)
     whole_s = time.monotonic() - start
     assert code == 0, err
-    expected, made = without_times(out) if "--json" in command.arguments else out, files(undisturbed)
+    expected, made = (
+        without_times(out) if "--json" in command.arguments else out,
+        files(undisturbed),
+    )
     rng = np.random.default_rng(8)
     seen: Counter[str] = Counter()
     for how in SIGNALS:
@@ -149,7 +150,10 @@ def test_a_command_that_is_stopped_at_any_moment_can_be_given_again(name, run, t
                 again, _, err = world.run(*command.arguments, script=command.script)
                 assert again == 0, err
             shutil.rmtree(world.root)
-    print(f"\n{name}: {whole_s:.1f} s undisturbed; " + ", ".join(f"{k} {seen[k]}" for k in sorted(seen)))
+    print(
+        f"\n{name}: {whole_s:.1f} s undisturbed; "
+        + ", ".join(f"{k} {seen[k]}" for k in sorted(seen))
+    )
 
 
 def prepared(run, root: Path) -> World:
