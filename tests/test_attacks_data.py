@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from attacks import tell
 from handmade import write_run
 from lxml import etree
 
@@ -97,8 +98,10 @@ class Disk:
             "export": ("export", self.folder, 0, 7, 59, "--out", self.root / "new"),
             "export csv": ("export", self.folder, *("--format", "csv", "--out"), self.root / "new"),
             "compare-runs": ("compare-runs", self.folder, self.other, "--no-rerun", "--json"),
-            "probability": ("probability", self.folder, *("--cases", 3, "--json", "--out"))
-            + (self.root / "p.json",),
+            "probability": (
+                *("probability", self.folder, "--cases", 3, "--json", "--out"),
+                self.root / "p.json",
+            ),
         }
         code, out, err = call(*arguments[command])
         found = {"said": out.encode()}
@@ -140,11 +143,14 @@ def test_a_bit_that_flips_anywhere_in_a_run_is_harmless_or_named(half, run, tmp_
             assert "Traceback" not in err, where
             if name == LOG:  # the report quotes it
                 found.pop(f"run/{REPORT}", None)
+            if b"are missing or cannot be read" in found.get(f"run/{REPORT}", b""):
+                named = True  # by the report, which goes without
+                del found[f"run/{REPORT}"]
             same = {n: expected[command][n] for n in found if n != f"run/{name}"}
             differs = [n for n in same if found[n] != same[n]]
             assert not differs, (*where, differs)
         seen[f"{kind}: {'named' if named else 'harmless'}"] += 1
-    print("\n" + ", ".join(f"{what} {seen[what]}" for what in sorted(seen)))
+    tell(seen)
     assert sum(seen.values()) == FLIPS // 2
 
 
@@ -174,7 +180,7 @@ class TestWhatWasChanged:
         content = bytearray((copied / OUTCOMES).read_bytes())
         content[-1] ^= 1 << bit
         (copied / OUTCOMES).write_bytes(content)
-        with pytest.raises(UserError, match="line 60 of .* does not end as it was written"):
+        with pytest.raises(UserError, match=r"line 60 of .* does not end as it was written"):
             Run(copied)
 
     def test_among_the_settings_is_named(self, copied):
@@ -521,6 +527,6 @@ def test_half_a_character_is_refused_in_a_sentence(half, honest, tmp_path):
             more = {"export": (7,), "compare-runs": (honest, "--no-rerun")}.get(command, ())
             code, _, err = call(command, *first, folder, *more)
             assert code == 2, err
-            assert file in err
+            assert file in err or command == "campaign", "which asks for trust first"
             assert err.count("\n") == 1
         (folder / file).write_bytes(content)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from attacks import SIGNALS, World, stop, wait_for
+from attacks import SIGNALS, World, stop, tell, wait_for
 
 from merge_sumo import folders
 from merge_sumo.folders import TEMPORARY
@@ -65,13 +65,17 @@ class Command:
 SMALL_COMPARE = ("--seeds", "2", "--cases", "60", "--truth-cases", "400", "--workers", "2")
 COMMANDS = {
     "truth": Command(
-        ("truth", *("--vut", "design1", "--level", "0", "--cases", "3000", "--workers", "2"))
-        + ("--json",),
+        (
+            *("truth", "--vut", "design1", "--level", "0", "--cases", "3000"),
+            *("--workers", "2", "--json"),
+        ),
         ROUNDS,
     ),
     "compare": Command(
-        ("compare", *("--vut", "design1", "--level", "0", "--samplers", "uniform,gpr"))
-        + (*SMALL_COMPARE, "--figure", "curves.svg", "--json"),
+        (
+            *("compare", "--vut", "design1", "--level", "0", "--samplers", "uniform,gpr"),
+            *(*SMALL_COMPARE, "--figure", "curves.svg", "--json"),
+        ),
         3,
         ("curves.svg",),
     ),
@@ -150,10 +154,7 @@ def test_a_command_that_is_stopped_at_any_moment_can_be_given_again(name, run, t
                 again, _, err = world.run(*command.arguments, script=command.script)
                 assert again == 0, err
             shutil.rmtree(world.root)
-    print(
-        f"\n{name}: {whole_s:.1f} s undisturbed; "
-        + ", ".join(f"{k} {seen[k]}" for k in sorted(seen))
-    )
+    tell(seen, f"{name}, {whole_s:.1f} s undisturbed: ")
 
 
 def prepared(run, root: Path) -> World:
