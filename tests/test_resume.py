@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import require
 from typer.testing import CliRunner
 
 from merge_sumo import cli, folders, interrupt
@@ -38,7 +37,7 @@ from merge_sumo.journal import (
 from merge_sumo.samplers.registry import SAMPLERS
 
 BATCH = 8
-MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
+MOUNT = shutil.which("mount")
 KILLER = Path(__file__).resolve().parent.parent / "tools" / "kill_campaigns.py"
 
 
@@ -271,22 +270,6 @@ class TestTwoProcessesOnOneFolder:
             Journal.create(tmp_path / "run", {"first": False})
         assert read_settings(tmp_path / "run") == {"first": True}
         assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """Mount a file system of 256 kB."""
-    require(os.geteuid() == 0 and MOUNT is not None, "mounting needs root")
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    done = subprocess.run(
-        [MOUNT, "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)],
-        capture_output=True,
-        check=False,
-    )
-    require(done.returncode == 0, f"mount: {done.stderr.decode().strip()}")
-    yield disk
-    subprocess.run([UMOUNT, "--lazy", str(disk)], check=True)
 
 
 class TestADisk:

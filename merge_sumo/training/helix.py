@@ -30,6 +30,7 @@ from merge_sumo.training.env import MergeGame, make_opponent
 from merge_sumo.training.game import Game, Role
 from merge_sumo.training.refine import RefineProgress, RefineSettings, refine
 from merge_sumo.training.reward import RewardWeights
+from merge_sumo.workers import leave_signals_to_parent
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "pov1": ("pov", "level0"),
@@ -239,6 +240,7 @@ _told: Any = None
 def _report_into(told: Any) -> None:
     global _told  # noqa: PLW0603 (one process, one queue)
     _told = told
+    leave_signals_to_parent()
 
 
 def _train_one(task: _Task) -> _Trained:
