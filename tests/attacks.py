@@ -26,12 +26,14 @@ PATIENCE_S = 300.0
 class World:
     """A working folder, a cache and a folder for temporary files, and the processes that use them.
 
-    `python` are options of the interpreter, `environment` is what it gets besides.
+    `python` are options of the interpreter, `environment` is what it gets besides;
+    `prefix` is the program that starts it.
     """
 
     root: Path
     python: tuple[str, ...] = ()
     environment: dict[str, str] = field(default_factory=dict)
+    prefix: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self.mark = uuid.uuid4().hex
@@ -62,7 +64,7 @@ class World:
             **self.environment,
         }
         return subprocess.Popen(
-            [sys.executable, *self.python, *what, *map(str, arguments)],
+            [*self.prefix, sys.executable, *self.python, *what, *map(str, arguments)],
             cwd=self.root,
             env=environment,
             stdin=subprocess.DEVNULL,
@@ -70,6 +72,8 @@ class World:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
+            # Where the tests run in the background, a shell has them ignore it.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
         )
 
     def run(self, *arguments: object, script: str | None = None) -> tuple[int, str, str]:

@@ -76,7 +76,7 @@ COMMANDS = {
             *("compare", "--vut", "design1", "--level", "0", "--samplers", "uniform,gpr"),
             *(*SMALL_COMPARE, "--figure", "curves.svg", "--json"),
         ),
-        3,
+        2,
         ("curves.svg",),
     ),
     "reproduce": Command(
@@ -100,7 +100,7 @@ COMMANDS = {
         ("folders",),
     ),
     "report": Command(("report", "run"), ROUNDS),
-    "train": Command((str(Path(__file__).parent),), 2, script=CHILD),
+    "train": Command((str(Path(__file__).parent),), 1, script=CHILD),
 }
 
 
