@@ -138,7 +138,7 @@ class CampaignRun:
             f"<td>{found.regions}</td><td>{found.fmc:.4f}</td></tr>"
             for level, found in self.summary.levels.items()
         )
-        title = escape(f"{self.settings.get('vut')}: {self.verdict.counts}")
+        title = escape(f"{self._run.vut}: {self.verdict.counts}")
         wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in self.verdict.sentences)
         return (
             f"<p><b>{title}</b><br>{escape(str(self.folder))}</p>{wrong}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from io import TextIOWrapper
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -27,6 +28,16 @@ def _version(
         raise typer.Exit
 
 
+def _check_here() -> None:
+    """Raise `UserError` where the working folder is gone: names of files mean nothing there."""
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise UserError(
+            f"the working folder cannot be read ({error.strerror}): change to another one"
+        ) from error
+
+
 def main() -> None:
     """Run the command line; a `UserError` becomes one sentence and exit code 2.
 
@@ -37,6 +48,7 @@ def main() -> None:
             # No name of a file ends a command because a terminal has no such letter.
             stream.reconfigure(errors="backslashreplace")
     try:
+        _check_here()
         app()
     except UserError as error:
         say(f"merge-sumo: {error}")

@@ -446,7 +446,10 @@ def resume_campaign(
 def _files_again(recorded: Mapping[str, Any]) -> Files:
     """Return the files that a record names, as they are now."""
     files = recorded.get("vut_files")
-    return {name: sha256_of(Path(name)) for name in files} if isinstance(files, dict) else {}
+    try:
+        return {name: sha256_of(Path(name)) for name in files} if isinstance(files, dict) else {}
+    except ValueError as error:
+        raise UserError(f"{SETTINGS} has a file that no file can be named: {error}") from error
 
 
 def _go_on(

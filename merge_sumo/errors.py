@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Final
+
+MOST_CHARACTERS: Final = 10_000
+"""Of a sentence: it may quote a file that somebody sent, which may say anything at any length."""
+
 
 class UserError(Exception):
     """Bad input or a missing part of the installation; the command line prints it and exits 2."""
 
     def __init__(self, sentence: str) -> None:
         """Take the sentence; messages of libraries that are part of it may have several lines."""
-        super().__init__(" ".join(sentence.splitlines()))
+        super().__init__(" ".join(sentence[:MOST_CHARACTERS].splitlines()))

@@ -33,7 +33,7 @@ from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
 from merge_sumo.fmc import RADIUS, fmc, regions
 from merge_sumo.folders import check_own, check_place, make_place, replace_own
-from merge_sumo.journal import UNREADABLE_NPZ
+from merge_sumo.journal import UNREADABLE_NPZ, read_arrays
 from merge_sumo.resources import cache_folder
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
@@ -134,7 +134,13 @@ def ground_truth(
                 on_cases((ended - 1) % PROGRESS_CASES + 1)
     truth = Truth(points, scores)
     arrays = io.BytesIO()
-    np.savez(arrays, points=truth.points, score=truth.score, files=json.dumps(files))
+    np.savez(
+        arrays,
+        points=truth.points,
+        score=truth.score,
+        files=json.dumps(files),
+        of=path.stem,
+    )
     make_place(path.parent, "MERGE_SUMO_CACHE")
     replace_own(path, arrays.getvalue())
     return truth
@@ -176,21 +182,23 @@ class Kept:
 def read_truth(path: Path, level: int, cases: int) -> Truth | None:
     """Return what a file of the cache holds.
 
-    None where there is none, or it is torn or something else, or a file that the VUT loaded is not
-    what it was.
+    None where there is none, or it is torn or something else, such as another truth under this
+    name, or a file that the VUT loaded is not what it was.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
-            points, score = data["points"], data["score"]
-            files = json.loads(str(data["files"]))
+        data = read_arrays(path, "points", "score", "files", "of")
+        points, score, files = data["points"], data["score"], json.loads(str(data["files"]))
+        if str(data["of"]) != path.stem or not isinstance(files, dict) or changed(files):
+            return None
     except UNREADABLE_NPZ:
         return None
     fits = points.shape == (cases, len(dimensions(level))) and score.shape == (cases,)
     numbers = points.dtype == score.dtype == np.float64
-    if not (fits and numbers and isinstance(files, dict)) or changed(files):
+    if not (fits and numbers):
         return None
     inside = bool(((points >= 0.0) & (points <= 1.0)).all())
-    return Truth(points, score) if inside else None
+    scores = not (np.isinf(score) | (score > 0.0)).any()
+    return Truth(points, score) if inside and scores else None
 
 
 def _scores(

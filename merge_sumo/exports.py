@@ -79,7 +79,10 @@ def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str
     make_place(folder)
     with new_file(path) as file:
         if file_format == "parquet":
-            polars.DataFrame(rows, schema=list(COLUMNS), orient="row").write_parquet(file)
+            # Not into the file: where that cannot be written, polars raises an error of its own.
+            content = io.BytesIO()
+            polars.DataFrame(rows, schema=list(COLUMNS), orient="row").write_parquet(content)
+            file.write(content.getbuffer())
         else:
             text = io.TextIOWrapper(file, encoding="utf-8", newline="")
             writer = csv.writer(text)
@@ -125,7 +128,7 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Net | Corridor)
     board = xosc.StoryBoard(init, _at_time(xosc, "end", trajectory.t_end_s))
     board.add_story(story)
     scenario = xosc.Scenario(
-        f"{run.settings.get('vut')}, {name}",
+        f"{run.vut}, {name}",
         "merge-sumo",
         xosc.ParameterDeclarations(),
         entities,

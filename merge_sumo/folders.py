@@ -193,15 +193,19 @@ def _take_name(new: Path, path: Path, option: str) -> None:
 
 @contextmanager
 def new_file(path: Path, option: str = "--out", mode: int = 0o666) -> Iterator[BinaryIO]:
-    """Give a new file to write, readable as `mode` says; where that fails, it is gone again.
+    """Give a new file to write, readable as `mode` says; it is at `path` in the end, or nowhere.
 
     Raises `UserError` where something is at `path` or it cannot be written.
     """
     try:
-        with open(path, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+        if _is_there(path):
+            raise _exists(path, option)
+        with _temporary(path, mode) as (new, file):
+            yield file
+            file.flush()
+            path.touch(mode, exist_ok=False)  # the name is ours: a rename replaces anything
             try:
-                yield file
-                file.flush()
+                new.replace(path)
             except BaseException:
                 path.unlink(missing_ok=True)
                 raise
@@ -209,6 +213,17 @@ def new_file(path: Path, option: str = "--out", mode: int = 0o666) -> Iterator[B
         raise _exists(path, option) from error
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+@contextmanager
+def _temporary(path: Path, mode: int = 0o666) -> Iterator[tuple[Path, BinaryIO]]:
+    """Give a file beside `path` under a name of ours; it is gone in the end, if not renamed."""
+    new = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}")
+    with open(new, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+        try:
+            yield new, file
+        finally:
+            new.unlink(missing_ok=True)
 
 
 def write_new(path: Path, content: bytes, option: str = "--out", mode: int = 0o666) -> None:
@@ -223,17 +238,14 @@ def replace_own(path: Path, content: bytes) -> None:
     Raises `UserError` when a link is there or it cannot be written.
     """
     check_own(path)
-    new = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}")
-    with new_file(new) as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
     try:
-        new.replace(path)
+        with _temporary(path) as (new, file):
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            new.replace(path)
         sync_folder(path.parent)
     except OSError as error:
-        with suppress(OSError):
-            new.unlink(missing_ok=True)
         raise cannot_write(path, error) from error
 
 

@@ -2,12 +2,17 @@
 
 campaign.json             every resolved setting, versions, hashes
 outcomes.jsonl            one line per case, in order, synced after every batch
-trajectories/00007.npz    the motion of every case of a batch
+trajectories/00007.npz    the motion of every case of a batch, and the hash of its lines
+
+A bit that flips on a disk or on a way is found: `campaign.json` has a hash of itself, a batch's
+file that of its lines, and its zip archive a checksum of every array. Where these are missing, as
+in folders of older versions, what is there is read as it is.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import io
 import json
 import os
@@ -17,6 +22,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -26,7 +32,7 @@ from numpy.typing import NDArray
 from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
 from merge_sumo.folders import check_own, new_folder, replace_own, sync_folder
-from merge_sumo.printable import quoted
+from merge_sumo.printable import printable, quoted
 from merge_sumo.scenario import US23, Scenario
 from merge_sumo.score import Outcome
 from merge_sumo.trajectory import End, Trajectory
@@ -36,6 +42,10 @@ OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
 COLUMNS: Final = 6
 """Of the motion of a trajectory."""
+NAME_CHARACTERS: Final = 300
+"""Of the name of a VUT, where it is shown."""
+CHECKSUM: Final = "sha256"
+"""Key of `campaign.json`: the hash of all other keys with their values."""
 
 UNREADABLE_NPZ: Final = (
     *(OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError),
@@ -115,12 +125,14 @@ class Journal:
         `UserError` when they cannot be written; what was there before stays.
         """
         outcomes, trajectories = zip(*ran, strict=True)
+        lines = "".join(map(to_line, outcomes)).encode()
         arrays = io.BytesIO()
         np.savez(
             arrays,
             index=np.array([o.index for o in outcomes]),
             rows=np.array([len(t.motion) for t in trajectories]),
             motion=np.concatenate([t.motion for t in trajectories]),
+            lines_sha256=hashlib.sha256(lines).hexdigest(),
         )
         try:
             end = self._outcomes.seek(0, os.SEEK_END)
@@ -128,7 +140,7 @@ class Journal:
             _write(path, arrays.getvalue())
             sync_folder(path.parent)
             try:
-                _write_all(self._outcomes, "".join(map(to_line, outcomes)).encode())
+                _write_all(self._outcomes, lines)
             except OSError:
                 self._outcomes.truncate(end)
                 raise
@@ -154,7 +166,8 @@ class Journal:
 class Run:
     """A finished or interrupted campaign, read from its folder.
 
-    Raises `UserError` when the folder is no campaign or a line of it cannot be read.
+    Raises `UserError` when the folder is no campaign, a line of it cannot be read, or something is
+    not as it was written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -162,12 +175,18 @@ class Run:
         self.folder = folder
         self.settings = read_settings(folder)
         try:
-            text = (folder / OUTCOMES).read_bytes()
+            text = regular(folder / OUTCOMES).read_bytes()
         except OSError as error:
             raise _no_campaign(folder, error) from error
         self.scenario = scenario_of(self.settings, folder / SETTINGS)
         self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES), self.scenario)
+        _check_lines(folder, text, self.outcomes)
         self._batches: dict[int, dict[int, FloatArray]] = {}
+
+    @property
+    def vut(self) -> str:
+        """The name of the VUT, fit to be shown anywhere: it may be a stranger's."""
+        return printable(str(self.settings.get("vut"))[:NAME_CHARACTERS])
 
     def outcome(self, index: int) -> Outcome:
         """Return the outcome of a case; `UserError` when the campaign has no such case."""
@@ -208,8 +227,9 @@ class Run:
         if batch not in self._batches:
             path = _batch_file(self.folder, batch)
             try:
-                with np.load(path, allow_pickle=False) as data:
-                    self._batches[batch] = _motion_by_case(**data)
+                arrays = read_arrays(path)
+                arrays.pop("lines_sha256", None)
+                self._batches[batch] = _motion_by_case(**arrays)
             except UNREADABLE_NPZ as error:
                 raise UserError(f"cannot read the trajectories in {path}: {error}") from error
         return self._batches[batch]
@@ -219,13 +239,19 @@ def read_settings(folder: Path) -> dict[str, Any]:
     """Return what `campaign.json` says; `UserError` when it is no campaign's."""
     path = folder / SETTINGS
     try:
-        settings = _decode(path.read_text(encoding="utf-8"))
+        settings = _decode(regular(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise _no_campaign(folder, error) from error
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not readable JSON: {error}") from error
     if not isinstance(settings, dict):
         raise UserError(f"{path} is not a JSON object")
+    written = settings.pop(CHECKSUM, None)
+    if written is not None and written != _sha256(settings):
+        raise UserError(
+            f"{path} is not as it was written: take it from a copy; if it was you who changed it, "
+            f'remove its "{CHECKSUM}"'
+        )
     levels = settings.get("levels", [])
     if not (isinstance(levels, list) and all(type(level) is int for level in levels)):
         raise UserError(f"{path} is no campaign's: its levels are not a list of numbers")
@@ -259,6 +285,8 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[li
     torn = not text.endswith(b"\n") and bool(text)
     for number, line in enumerate(io.BytesIO(text), start=1):
         if not line.endswith(b"\n"):
+            if _is_whole(line[:-1]):
+                raise UserError(f"line {number} of {name} does not end as it was written")
             break
         try:
             outcome = Outcome.from_record(_decode(line.decode()), scenario)
@@ -273,6 +301,25 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[li
     return outcomes, torn
 
 
+def read_arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an .npz file of ours, or those that are named.
+
+    Raises one of `UNREADABLE_NPZ` where there is none, or what is there is something else: ours are
+    not compressed, so that no file is more than it looks.
+    """
+    with np.load(regular(path), allow_pickle=False) as data:
+        if any(member.compress_type != zipfile.ZIP_STORED for member in data.zip.infolist()):
+            raise ValueError("it is compressed")
+        return {name: data[name] for name in names or data.files}
+
+
+def regular(path: Path) -> Path:
+    """Return the path of what is to be read; OSError where it is a pipe or a device."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is no file", str(path))
+    return path
+
+
 def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Return the failing outcomes, the worst first."""
     return sorted((o for o in outcomes if o.failed), key=lambda o: (o.measures.score, o.index))
@@ -284,6 +331,15 @@ def _batch_file(folder: Path, batch: int) -> Path:
 
 def _no_campaign(folder: Path, error: OSError) -> UserError:
     return UserError(f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror})")
+
+
+def _is_whole(line: bytes) -> bool:
+    """Return whether bytes are a line: of one that was being written, no part is."""
+    try:
+        _decode(line.decode())
+    except (ValueError, RecursionError):
+        return False
+    return bool(line)
 
 
 def _no_constant(name: str) -> Any:
@@ -313,8 +369,36 @@ def _motion_by_case(
     return dict(zip(index.tolist(), parts, strict=True))
 
 
+def _check_lines(folder: Path, text: bytes, outcomes: list[Outcome]) -> None:
+    """Raise `UserError` where the lines of a batch are not those that were written with it.
+
+    Where the batch's file is gone or spoilt there is nothing to hold them against.
+    """
+    lines = list(io.BytesIO(text))
+    for batch, group in groupby(outcomes, key=lambda outcome: outcome.batch):
+        indices = [outcome.index for outcome in group]
+        first, end = indices[0], indices[-1] + 1
+        path = _batch_file(folder, batch)
+        try:
+            written = read_arrays(path, "index", "lines_sha256")
+        except UNREADABLE_NPZ:
+            continue
+        stopped = end == len(outcomes) and len(indices) < written["index"].size
+        of_batch = hashlib.sha256(b"".join(lines[first:end])).hexdigest()
+        if not stopped and of_batch != str(written["lines_sha256"]):
+            raise UserError(
+                f"lines {first + 1} to {end} of {folder / OUTCOMES} are not those that were "
+                f"written with {path.name}: take both files from a copy, or run the campaign again"
+            )
+
+
+def _sha256(settings: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+
+
 def _settings_text(settings: dict[str, Any]) -> bytes:
-    return (json.dumps(settings, indent=2, allow_nan=False) + "\n").encode()
+    record = {**settings, CHECKSUM: _sha256(settings)}
+    return (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
 
 
 def _lock(outcomes: io.FileIO, folder: Path) -> None:

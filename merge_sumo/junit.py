@@ -16,7 +16,6 @@ from lxml import etree
 from merge_sumo.errors import UserError
 from merge_sumo.folders import check_new, check_new_file, write_new
 from merge_sumo.journal import Run
-from merge_sumo.printable import printable
 from merge_sumo.score import Outcome
 from merge_sumo.trajectory import End
 from merge_sumo.verdict import (
@@ -61,8 +60,7 @@ def junit(
     run: Run, levels: Iterable[int], verdict: Verdict, gates: Sequence[GateResult]
 ) -> etree._Element:
     """Return a campaign as the element `testsuites`."""
-    name = printable(f"merge-sumo {run.settings.get('vut')}")
-    root = etree.Element("testsuites", name=name)
+    root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
     _gates(root, verdict, gates)
     for level in levels:
         suite = etree.SubElement(root, "testsuite", name=f"POV level {level}")

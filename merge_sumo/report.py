@@ -31,6 +31,7 @@ from merge_sumo.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.fmc import RADIUS, fmc
 from merge_sumo.folders import cannot_write, check_own, replace_own
 from merge_sumo.journal import SETTINGS, Run, failures
+from merge_sumo.printable import printable
 from merge_sumo.scenario import DEADLINE_S, DT_S, LEVELS
 from merge_sumo.score import FAILURE_SCORE, Outcome
 from merge_sumo.summary import LevelSummary, Summary, summarise
@@ -188,6 +189,9 @@ class _Facts:
             for box in failure_boxes(self.worst + self.near, level, self.kinds)
         ]
         described = Counter(box.level for box in boxes for _ in range(box.failures))
+        lost = [str(o.index) for o in self.shown if o.index not in self.motion]
+        if len(lost) > LISTED:
+            lost = [*lost[:LISTED], counted(len(lost) - LISTED, "other")]
         left = {n: summary.levels[n].failures - described[n] for n in self.levels}
         levels = self._levels()
         tables = [
@@ -199,12 +203,13 @@ class _Facts:
             ("Ten nearest misses", self.near[:LISTED]),
         ]
         return {
-            "vut": str(settings.get("vut")),
+            "vut": self.run.vut,
             "headline": headline(self.verdict, summary, self.worst, self.kinds),
             "counts": self.verdict.counts,
             "found": self.verdict,
             "troubles": self._troubles(),
             "more_troubles": self.verdict.troubles[LISTED:],
+            "lost": in_words(lost) if lost else "",
             "torn": self.run.torn or (isinstance(wanted, int) and summary.cases < wanted),
             "counted": summary.cases - len(self.shown),
             "summary": summary,
@@ -228,7 +233,7 @@ class _Facts:
             "ceded": f"{CEDED_MPS:g}",
             "printed": end_of(self.run.folder / LOG),
             "tables": tables,
-            "settings": settings,
+            "settings": {name: _shown(value) for name, value in settings.items() if value},
             "flat_settings": list(_flat(settings)),
             "other_net": settings.get("net_sha256") != self.road.sha256,
         }
@@ -496,8 +501,13 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> Any:
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{name} ")
         else:
-            text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-            yield f"{prefix}{name}", text
+            yield _shown(f"{prefix}{name}"), _shown(value)
+
+
+def _shown(value: object) -> str:
+    """Return a setting as a text that is fit to be shown; it may be a stranger's."""
+    text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return printable(text[:ERROR_CHARACTERS])
 
 
 def _motion(run: Run, index: int) -> Trajectory | None:

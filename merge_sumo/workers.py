@@ -280,12 +280,17 @@ def _begin_worker() -> None:
     """Set up a worker process."""
     from threadpoolctl import threadpool_limits
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    leave_signals_to_parent()
     # Processes of multiprocessing end without atexit.
     multiprocessing.util.Finalize(None, end_worker, exitpriority=100)
     # As many threads as workers keep all cores busy.
     threadpool_limits(1)
+
+
+def leave_signals_to_parent() -> None:
+    """Leave Ctrl-C to the parent of this process, and end with it however it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:

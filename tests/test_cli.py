@@ -16,7 +16,7 @@ from lxml import etree
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.journal import Run, failures
+from merge_sumo.journal import Run, failures, read_settings
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES, sumo_program
 from merge_sumo.sumo.net import default_net_path
 from merge_sumo.sumo.replay import CONFIG, RECORD
@@ -467,7 +467,7 @@ class TestReport:
         assert contents(tmp_path) == before
 
     def test_shows_no_markup_that_hides_in_the_settings(self, call, campaign):
-        settings = json.loads((campaign / "campaign.json").read_text())
+        settings = read_settings(campaign)
         settings["vut"] = "<script>alert(1)</script>"
         (campaign / "campaign.json").write_text(json.dumps(settings))
         assert call("report", campaign).code == 0

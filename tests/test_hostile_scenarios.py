@@ -587,7 +587,14 @@ def test_plain_sumo_does_what_the_attack_wants(scene, name):
         scene.listener.accept()[0].close()
 
 
-@pytest.mark.parametrize("name", ATTACKS)
+SOME = [
+    name if number % 3 == 0 or name in FILES else pytest.param(name, marks=pytest.mark.long)
+    for number, name in enumerate(ATTACKS)
+]
+"""Each third text, and all files: attacks of a kind stand beside each other."""
+
+
+@pytest.mark.parametrize("name", SOME)
 def test_a_hostile_folder_does_nothing_and_gets_a_sentence_or_a_true_verdict(scene, name):
     attack, expected = attack_of(name)
     attack(scene)

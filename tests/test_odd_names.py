@@ -30,6 +30,10 @@ TERMINALS = {
     "Latin-1": {"PYTHONIOENCODING": "latin-1"},
     "ASCII, strictly": {"PYTHONIOENCODING": "ascii:strict"},
 }
+SOME_TERMINALS = [
+    name if name in ("C", "Latin-1") else pytest.param(name, marks=pytest.mark.long)
+    for name in TERMINALS
+]
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +107,7 @@ class TestAVutFile:
 
 
 class TestATerminal:
-    @pytest.mark.parametrize("name", TERMINALS)
+    @pytest.mark.parametrize("name", SOME_TERMINALS)
     def test_of_any_encoding_shows_results_in_folders_of_any_name(self, made, tmp_path, name):
         folder = Path(shutil.copytree(made.folder, tmp_path / NASTY))
         code, out, err = in_a_process(TERMINALS[name], "compare-runs", folder, folder, "--no-rerun")
@@ -117,7 +121,7 @@ class TestATerminal:
         assert out.count("\n") == 1
         assert (folder / "scenarios" / "case-00000" / "replay.sumocfg").is_file()
 
-    @pytest.mark.parametrize("name", TERMINALS)
+    @pytest.mark.parametrize("name", SOME_TERMINALS)
     def test_of_any_encoding_shows_a_sentence_on_any_name(self, tmp_path, name):
         code, out, err = in_a_process(TERMINALS[name], "report", tmp_path / NASTY)
         assert (code, out) == (2, "")

@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import require
 from typer.testing import CliRunner
 
 from merge_sumo import cli, folders, interrupt
@@ -26,11 +25,19 @@ from merge_sumo.conductor import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Interrupt, Stopped
-from merge_sumo.journal import OUTCOMES, SETTINGS, TRAJECTORIES, Journal, Run
+from merge_sumo.journal import (
+    CHECKSUM,
+    OUTCOMES,
+    SETTINGS,
+    TRAJECTORIES,
+    Journal,
+    Run,
+    read_settings,
+)
 from merge_sumo.samplers.registry import SAMPLERS
 
 BATCH = 8
-MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
+MOUNT = shutil.which("mount")
 KILLER = Path(__file__).resolve().parent.parent / "tools" / "kill_campaigns.py"
 
 
@@ -217,8 +224,9 @@ class TestWhatDiffers:
 
 
 def edit(folder: Path, where: tuple[str, ...], value) -> None:
-    """Change a value of campaign.json."""
+    """Change a value of campaign.json, as a person may who removes its checksum."""
     record = json.loads((folder / SETTINGS).read_text())
+    del record[CHECKSUM]
     inner = record
     for key in where[:-1]:
         inner = inner[key]
@@ -260,24 +268,8 @@ class TestTwoProcessesOnOneFolder:
         monkeypatch.setattr(folders, "_take_name", overtaken)
         with pytest.raises(UserError, match="run exists"):
             Journal.create(tmp_path / "run", {"first": False})
-        assert json.loads((tmp_path / "run" / SETTINGS).read_text()) == {"first": True}
+        assert read_settings(tmp_path / "run") == {"first": True}
         assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """Mount a file system of 256 kB."""
-    require(os.geteuid() == 0 and MOUNT is not None, "mounting needs root")
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    done = subprocess.run(
-        [MOUNT, "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)],
-        capture_output=True,
-        check=False,
-    )
-    require(done.returncode == 0, f"mount: {done.stderr.decode().strip()}")
-    yield disk
-    subprocess.run([UMOUNT, "--lazy", str(disk)], check=True)
 
 
 class TestADisk:

@@ -18,7 +18,7 @@ from merge_sumo import cli
 from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
 from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Stopped
-from merge_sumo.journal import Run, failures
+from merge_sumo.journal import Run, failures, read_settings
 from merge_sumo.junit import check_junit, junit, write_junit
 from merge_sumo.printable import printable
 from merge_sumo.summary import LevelSummary, Summary, summarise
@@ -396,7 +396,7 @@ class TestACampaignOfFewCasesThatIsResumed:
         assert json.loads(said.stdout)["stopped"] == "cases"
 
     def test_that_converged_says_so_with_its_own_share(self, stopped, monkeypatch):
-        settings = json.loads((stopped / "campaign.json").read_text())
+        settings = read_settings(stopped)
         settings |= {"sampler": "coverage", "stop_after_converged": 0.25}
         (stopped / "campaign.json").write_text(json.dumps(settings))
         rule = "merge_sumo.conductor.StoppingRule.__call__"

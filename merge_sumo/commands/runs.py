@@ -170,7 +170,7 @@ def compare_runs(
         typer.echo(json.dumps({**own, **asdict(compared), **judged}))
     else:
         for (name, verdict), loaded in zip(verdicts.items(), runs, strict=True):
-            show(f"{name}: {loaded.folder} ({loaded.settings.get('vut')}): {verdict.counts}")
+            show(f"{name}: {loaded.folder} ({loaded.vut}): {verdict.counts}")
             print_troubles(verdict)
         _print_comparison(compared, {"A": a, "B": b})
         worse = "worse" if why else "not worse"

@@ -30,6 +30,7 @@ from merge_sumo.training.env import MergeGame, make_opponent
 from merge_sumo.training.game import Game, Role
 from merge_sumo.training.refine import RefineProgress, RefineSettings, refine
 from merge_sumo.training.reward import RewardWeights
+from merge_sumo.workers import leave_signals_to_parent
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "pov1": ("pov", "level0"),
@@ -209,12 +210,13 @@ def _train_beside(
         return []
     context = get_context("spawn")
     told = context.Queue()
-    logs = {t.name: (folder / f"{t.name}{LOG}").open("w", encoding="utf-8") for t in tasks}
-    try:
-        # Spawned, because libsumo's simulation must not be forked.
-        with ProcessPoolExecutor(len(tasks), context, _report_into, (told,)) as pool:
-            results = [pool.submit(_train_one, task) for task in tasks]
-            running: set[Future[_Trained]] = set(results)
+    for task in tasks:
+        _log(folder, task.name, "w")
+    # Spawned, because libsumo's simulation must not be forked.
+    with ProcessPoolExecutor(len(tasks), context, _report_into, (told,)) as pool:
+        results = [pool.submit(_train_one, task) for task in tasks]
+        running: set[Future[_Trained]] = set(results)
+        try:
             while running:
                 running = wait(running, timeout=0.2).not_done
                 while True:
@@ -222,14 +224,25 @@ def _train_beside(
                         now = told.get_nowait()
                     except queue.Empty:
                         break
-                    logs[now.network].write(json.dumps(asdict(now)) + "\n")
-                    logs[now.network].flush()
+                    _log(folder, now.network, "a", json.dumps(asdict(now)) + "\n")
                     if on_progress is not None:
                         on_progress(now)
-            return [result.result() for result in results]
-    finally:
-        for log in logs.values():
-            log.close()
+        except BaseException:
+            # Nobody waits for what they would find in an hour.
+            for process in list(pool._processes.values()):
+                process.kill()
+            raise
+        return [result.result() for result in results]
+
+
+def _log(folder: Path, name: str, mode: str, line: str = "") -> None:
+    """Begin the log of a network's training, or add to it; `UserError` when it is not written."""
+    path = folder / f"{name}{LOG}"
+    try:
+        with path.open(mode, encoding="utf-8") as log:
+            log.write(line)
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 _told: Any = None
@@ -239,6 +252,7 @@ _told: Any = None
 def _report_into(told: Any) -> None:
     global _told  # noqa: PLW0603 (one process, one queue)
     _told = told
+    leave_signals_to_parent()
 
 
 def _train_one(task: _Task) -> _Trained:
