@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from conftest import require
+from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo import report
@@ -235,3 +236,25 @@ def test_a_campaign_without_cases_opens_too(browser, made, tmp_path):
     report.write_report(Run(folder))
     with shown(browser, folder / report.REPORT) as page:
         assert "No case has run" in page.inner_text(".verdict")
+
+
+@pytest.mark.parametrize("name", [None, "curved", "left turn"])
+def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch, name):
+    if name is not None:
+        corridor = corridor_of(name, tmp_path)
+        monkeypatch.setattr(report, "road_of", lambda: corridor)
+    run = write_run(tmp_path / "run", per_level=3, error=None)
+    with shown(browser, report.write_report(run)) as page:
+        for step in ("0", "0.5 * moving.rows", "moving.rows - 1"):
+            inside = page.evaluate(
+                f"""() => {{
+                    at({step});
+                    const all = road.getBoundingClientRect();
+                    return Object.values(cars).map(({{ group }}) => {{
+                        const car = group.getBoundingClientRect();
+                        return car.left >= all.left && car.right <= all.right
+                            && car.top >= all.top && car.bottom <= all.bottom;
+                    }});
+                }}"""
+            )
+            assert inside == [True, True]

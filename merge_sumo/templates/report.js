@@ -345,10 +345,10 @@ function at(t) {
   const mix = (values) => (1 - share) * values[k] + share * values[next];
   const places = { pov: pose(data.main, mix(moving.xPov)), vut: pose(data.ramp, mix(moving.xVut)) };
   const low = Math.min(places.pov.x, places.vut.x), high = Math.max(places.pov.x, places.vut.x);
-  const apart = Math.abs(places.pov.y - places.vut.y);
+  const apart = Math.abs(places.pov.y - places.vut.y), upper = places.pov.y >= places.vut.y ? "pov" : "vut";
   // The view follows both, never closer than 90 m; cars keep a size that can be seen.
   const ratio = road.clientHeight / (road.clientWidth || 1) || 0.25;
-  const width = Math.max(high - low + 50, (apart + 10) / ratio, 90), middle = (low + high) / 2;
+  const width = Math.max(high - low + 50, (1.7 * apart + 22) / ratio, 90), middle = (low + high) / 2;
   const size = Math.max(1, width / 90), height = width * ratio;
   const centre = -(Math.min(places.pov.y, places.vut.y) + Math.max(places.pov.y, places.vut.y)) / 2;
   road.setAttribute("viewBox", `${middle - width / 2} ${centre - height / 2} ${width} ${height}`);
@@ -356,8 +356,8 @@ function at(t) {
     const { x, y, angle } = places[who], a = (v[next] - v[k]) / DT;
     cars[who].group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
     cars[who].brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
-    const label = cars[who].label, side = who === "pov" ? -1 : 1;
-    label.setAttribute("x", x - 2.5); label.setAttribute("y", -y + side * (who === "pov" ? 6.4 : 5.4) * Math.min(size, 2));
+    const label = cars[who].label, side = who === upper ? -1 : 1;
+    label.setAttribute("x", x - 2.5); label.setAttribute("y", -y + side * (side < 0 ? 6.4 : 5.4) * Math.min(size, 2));
     label.style.fontSize = `${2.6 * size}px`;
     label.textContent = `${who.toUpperCase()} ${fixed(mix(v), 1)} m/s`;
   }
