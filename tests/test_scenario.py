@@ -137,33 +137,35 @@ class TestACase:
         assert verdicts == [End.COLLISION, End.MERGED]
 
 
-class TestACampaign:
-    @pytest.fixture(scope="class")
-    def run(self, tmp_path_factory) -> Run:
-        settings = CampaignSettings(
-            vut="level0", levels=(0,), cases=30, batch=30, sampler="uniform", scenario=OTHER
-        )
-        return run_campaign(settings, tmp_path_factory.mktemp("other") / "run")
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory) -> Run:
+    """Return a campaign of another scenario on the shipped road."""
+    settings = CampaignSettings(
+        vut="level0", levels=(0,), cases=30, batch=30, sampler="uniform", scenario=OTHER
+    )
+    return run_campaign(settings, tmp_path_factory.mktemp("other") / "run")
 
-    def test_starts_where_its_scenario_says(self, run):
-        for outcome in run.outcomes:
-            motion = run.trajectory(outcome.index).motion
+
+class TestACampaign:
+    def test_starts_where_its_scenario_says(self, elsewhere):
+        for outcome in elsewhere.outcomes:
+            motion = elsewhere.trajectory(outcome.index).motion
             assert (motion[0, 3], motion[0, 4]) == (-100.0, 10.0)
             assert -300.0 <= motion[0, 0] <= -100.0
             assert 10.0 <= motion[0, 1] <= 20.0
 
-    def test_is_driven_by_the_profile_of_its_scenario(self, run):
-        motion = run.trajectory(0).motion
+    def test_is_driven_by_the_profile_of_its_scenario(self, elsewhere):
+        motion = elsewhere.trajectory(0).motion
         assert motion[:-1, 5].max() == 0.5
         assert motion[:, 4].max() == pytest.approx(14.0)
         due_s = level0_time_to(np.array(100.0), np.array(10.0), 0.5, 14.0)
-        assert run.outcomes[0].measures.t_end_s == pytest.approx(float(due_s), abs=0.11)
+        assert elsewhere.outcomes[0].measures.t_end_s == pytest.approx(float(due_s), abs=0.11)
 
-    def test_records_its_scenario_and_is_read_with_it(self, run):
-        assert run.settings["scenario"] == json.loads(json.dumps(asdict(OTHER)))
-        assert run.settings["v_vut0_mps"] == 10.0
-        assert Run(run.folder).scenario == OTHER
-        assert all(outcome.case.scenario == OTHER for outcome in Run(run.folder).outcomes)
+    def test_records_its_scenario_and_is_read_with_it(self, elsewhere):
+        assert elsewhere.settings["scenario"] == json.loads(json.dumps(asdict(OTHER)))
+        assert elsewhere.settings["v_vut0_mps"] == 10.0
+        assert Run(elsewhere.folder).scenario == OTHER
+        assert all(outcome.case.scenario == OTHER for outcome in Run(elsewhere.folder).outcomes)
 
     def test_clips_at_the_limits_of_its_scenario(self, tmp_path):
         (tmp_path / "hard.py").write_text("def vut(seen):\n    return 2.0\n")
