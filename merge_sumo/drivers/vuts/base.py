@@ -143,6 +143,10 @@ asked: Final = Asked()
 """Of this process."""
 
 
+RING_AFTER: Final = 1.02
+"""Of the deadline: when a timer rings for a call, that is too late beyond doubt."""
+
+
 @dataclass(slots=True)
 class Watch:
     """Ends calls to a VUT that take longer than the deadline, and keeps standard output ours.
@@ -162,7 +166,7 @@ class Watch:
         self._stdout, sys.stdout = sys.stdout, sys.stderr
         if hasattr(signal, "setitimer") and (threading.current_thread() is threading.main_thread()):
             handler = signal.signal(signal.SIGALRM, self._ring)
-            timer = signal.setitimer(signal.ITIMER_REAL, self.deadline_s, self.deadline_s / 10)
+            timer = signal.setitimer(signal.ITIMER_REAL, 0.0)
 
             def restore() -> None:
                 signal.setitimer(signal.ITIMER_REAL, *timer)
@@ -187,6 +191,10 @@ class Watch:
     def call(self, corridor: int, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return function(*arguments), asked for a corridor; `TooLate` when that takes too long."""
         asked.note(corridor)
+        if self._restore is not None:
+            # Anew for each call: a ring before its deadline would cut short what waits in C.
+            first_s = RING_AFTER * self.deadline_s
+            signal.setitimer(signal.ITIMER_REAL, first_s, self.deadline_s / 10)
         self._since_s = start = perf_counter()
         try:
             answer = function(*arguments)
