@@ -266,9 +266,8 @@ class TestAFolderThatVanishes:
         world = world_with(run, tmp_path / "world")
         world.cache.rename(tmp_path / "cache")
         world.environment["MERGE_SUMO_CACHE"] = str(tmp_path / "cache")
-        (world.root / "here").mkdir()
         script = (
-            "import os, sys; os.chdir('here'); os.rmdir('../here');"
+            "import os, sys; os.mkdir('here'); os.chdir('here'); os.rmdir('../here');"
             "from merge_sumo.cli import main; sys.argv[0] = 'merge-sumo'; main()"
         )
         for arguments in ((*SMALL, "--out", "new"), ("export", "run", "0"), ("report", "run")):
