@@ -559,7 +559,8 @@ def settings_of(
         if not _fits(value, hints[spec.name]):
             raise UserError(f"{folder / SETTINGS} has no {spec.name}, or something else there")
         # 18 is 18.0, and outcomes are to show it as the same number.
-        values[spec.name] = float(value) if hints[spec.name] is float else value
+        is_real = float in (hints[spec.name], *get_args(hints[spec.name]))
+        values[spec.name] = float(value) if is_real and type(value) is int else value
     return CampaignSettings(**values)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -41,6 +42,10 @@ def place(tmp_path_factory) -> Path:
         settings = CampaignSettings(vut=vut, levels=(0,), cases=60, batch=20, seed=1)
         run_campaign(settings, folder / "runs" / vut)
     shutil.copytree(ROOT / "scenarios" / "stalemate", folder / "scenarios" / "stalemate")
+    net = (ROOT / "sumo_net" / "us23.net.xml").read_text()
+    for ours, theirs in (("main_in", "a"), ("main_out", "b"), ("ramp", "r")):
+        net = re.sub(rf"\b{ours}(?=[_\"])", theirs, net)
+    (folder / "my.net.xml").write_text(net)
     return folder
 
 

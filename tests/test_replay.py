@@ -329,7 +329,7 @@ class TestARecordThatSumoPlays:
         for step, timestep in enumerate(record):
             timestep.set("time", f"{step * DT_S:.2f}")
         (folder / RECORD).write_bytes(etree.tostring(record))
-        assert "must have from 11 to 311 timesteps" in refusal(folder)
+        assert "must have from 11 to 1211 timesteps" in refusal(folder)
 
     @pytest.mark.parametrize("time", ["4.05", "3.9", "400.0"])
     def test_is_refused_when_a_row_is_off_the_grid_of_time(self, folder, time):

@@ -13,7 +13,7 @@ import pytest
 from merge_sumo import cli
 from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
 from merge_sumo.errors import UserError
-from merge_sumo.journal import SETTINGS
+from merge_sumo.journal import CHECKSUM, SETTINGS
 from merge_sumo.trust import SEAL, is_own, seal
 
 TELLTALE = """
@@ -62,6 +62,7 @@ def campaign(folder: Path, answer: float = 1.0, cases: int = 12) -> Path:
 
 def edit(run: Path, **changes: object) -> None:
     settings = json.loads((run / SETTINGS).read_text())
+    settings.pop(CHECKSUM)  # who sends a folder can compute it, too
     (run / SETTINGS).write_text(json.dumps(settings | changes))
 
 

@@ -22,7 +22,7 @@ from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.folders import new_folder
-from merge_sumo.scenario import DT_S, MAX_STEPS
+from merge_sumo.scenario import DT_S, MAX_EPISODE_S
 from merge_sumo.score import Outcome
 from merge_sumo.sumo import received
 from merge_sumo.sumo.binding import run_program, scratch_folder
@@ -65,7 +65,7 @@ MAX_SURROUNDINGS: Final = 2_000
 HOLD_STEPS: Final = 10
 """Steps for which the last picture stays, so that a person sees how it ended."""
 MIN_TIMESTEPS: Final = 1 + HOLD_STEPS
-MAX_TIMESTEPS: Final = MAX_STEPS + 1 + HOLD_STEPS
+MAX_TIMESTEPS: Final = round(MAX_EPISODE_S / DT_S) + 1 + HOLD_STEPS
 
 
 @dataclass(frozen=True, slots=True)
