@@ -231,6 +231,7 @@ class _Facts:
             ),
             "kinds": self._kinds(),
             "ceded": f"{CEDED_MPS:g}",
+            "scenario": self.run.scenario,
             "printed": end_of(self.run.folder / LOG),
             "tables": tables,
             "settings": {name: _shown(value) for name, value in settings.items() if value},

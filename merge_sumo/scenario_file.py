@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
@@ -93,9 +94,9 @@ COMMENTS: Final = {
 """What stands beside a value in a file that we write."""
 
 
-def to_toml(scenario: Scenario, found: str) -> str:
-    """Return a scenario as a commented file; `found` is what was found out, a line each."""
-    lines = [*(f"# {line}" for line in found.splitlines()), ""]
+def to_toml(scenario: Scenario, found: Sequence[str]) -> str:
+    """Return a scenario as a commented file; `found` is what was found out, in lines."""
+    lines = [*(f"# {line}" for line in found), ""]
     for field in fields(scenario):
         value = getattr(scenario, field.name)
         if value is None:

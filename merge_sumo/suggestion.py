@@ -27,9 +27,8 @@ def suggested(road: Corridor, name: str) -> Scenario:
     speed that the mainline drives at, it is at M about when a VUT on the level-0 profile is.
     """
     limit_mps = min(limit_at(road.mainline, -1.0), US23.v_hw_max_mps)
-    ramp_mps = limit_at(road.ramp, -1.0)
     x_vut0_m = max(US23.x_vut0_m, _down(-ROOM * road.ramp.before_m))
-    v_vut0_mps = round(min(US23.v_vut0_mps, ramp_mps, limit_mps), 1)
+    v_vut0_mps = round(min(US23.v_vut0_mps, limit_at(road.ramp, x_vut0_m)), 1)
     level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
     due_s = float(
         level0_time_to(np.array(-x_vut0_m), np.array(v_vut0_mps), v_cruise_mps=level0_v_mps)
@@ -65,8 +64,8 @@ def limit_at(path: LanePath, x_m: float) -> float:
     return found[-1] if found else path.speed_limits_mps()[0][1]
 
 
-def about(road: Corridor) -> str:
-    """Return what was found of a road, a line each."""
+def about(road: Corridor) -> list[str]:
+    """Return what was found of a road, in lines."""
     lines = [f"net: {road.path.name}"]
     for name, path, edges in (
         ("mainline", road.mainline, road.mainline_edges),
@@ -85,7 +84,7 @@ def about(road: Corridor) -> str:
     lines.append(f"right of way: the {first} goes first" if yields else "right of way: none first")
     if road.lane_drop:
         lines.append("one path comes to M on a lane that ends")
-    return "\n".join(lines)
+    return lines
 
 
 TRAINED_ON: Final = (

@@ -59,7 +59,8 @@ def new_scenario(
     beside = os.path.relpath(net.resolve(), file.parent.resolve())
     write_new(picture, road_svg(road, found), "FILE")
     write_new(file, to_toml(replace(found, net=beside), about(road)).encode(), "FILE")
-    show(about(road))
+    for line in about(road):
+        show(line)
     show(f"written: {file}, and its picture {picture}")
 
 
@@ -76,7 +77,8 @@ def check_scenario(
     from merge_sumo.suggestion import about, unseen
 
     found = named_scenario(name)
-    show(about(road_for(found)))
+    for line in about(road_for(found)):
+        show(line)
     outside = unseen(found)
     if outside:
         show("the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:")
