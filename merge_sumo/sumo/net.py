@@ -129,14 +129,6 @@ class Net:
             position = lane.length_m + x_m
         return f"{name}_0", position, *lane.point(position), lane.angle_deg
 
-    def lane_shapes(self) -> list[list[tuple[float, float]]]:
-        """Return the centre lines of all lanes as points (x, y) in metres."""
-        lines = []
-        for lane in self._root.iterfind("edge/lane"):
-            points = (point.split(",") for point in lane.get("shape", "").split())
-            lines.append([(float(x), float(y)) for x, y, *_ in points])
-        return lines
-
     def replicate(self, corridors: int) -> bytes:
         """Return a net of `corridors` copies, `CORRIDOR_SPACING_M` apart, ids suffixed ".k"."""
         root = copy.deepcopy(self._root)

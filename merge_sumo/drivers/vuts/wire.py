@@ -113,6 +113,7 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
 
 
 ANYTHING: Final = 1e9
+"""A bound that no start reaches: cases were checked where they were made."""
 
 
 @lru_cache(maxsize=8)
