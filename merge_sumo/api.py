@@ -15,26 +15,25 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.conductor import (
+from merge_sumo.campaigns.conductor import OnCase, run_campaign
+from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.journal import SETTINGS, Run, failures
+from merge_sumo.campaigns.settings import (
     DEFAULT_BATCH,
     DEFAULT_CASES,
     CampaignSettings,
-    OnCase,
     parse_levels,
-    road_for,
-    run_campaign,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.folders import dated
-from merge_sumo.journal import SETTINGS, Run, failures
+from merge_sumo.reports.summary import Summary, summarise
+from merge_sumo.reports.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario
-from merge_sumo.scenario_file import named_scenario
-from merge_sumo.score import Outcome
-from merge_sumo.summary import Summary, summarise
-from merge_sumo.trajectory import End, Trajectory
-from merge_sumo.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
-from merge_sumo.workers import open_workers
+from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.system.folders import dated
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import End, Trajectory
 
 MOST_ROWS: Final = 20
 """Rows that a notebook shows of a table."""
@@ -124,7 +123,7 @@ class CampaignRun:
 
     def report(self) -> Path:
         """Write the HTML report and return its path."""
-        from merge_sumo.report import write_report
+        from merge_sumo.reports.report import write_report
 
         return write_report(self._run)
 

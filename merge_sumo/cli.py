@@ -12,7 +12,7 @@ import typer
 from merge_sumo.commands import campaign, experiments, runs, scenarios, training, vuts
 from merge_sumo.commands.shared import app, say
 from merge_sumo.errors import UserError
-from merge_sumo.interrupt import Stopped
+from merge_sumo.system.interrupt import Stopped
 
 __all__ = ["app", "campaign", "experiments", "main", "runs", "scenarios", "training", "vuts"]
 

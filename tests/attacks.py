@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from merge_sumo.resources import cache_folder
-from merge_sumo.trust import KEY
+from merge_sumo.system.resources import cache_folder
+from merge_sumo.system.trust import KEY
 
 MARK = "MERGE_SUMO_ATTACK"
 """Environment variable by which the processes of a world are found."""

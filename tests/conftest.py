@@ -8,8 +8,9 @@ import subprocess
 
 import pytest
 
-from merge_sumo.conductor import CampaignSettings, run_campaign
-from merge_sumo.journal import Run
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.settings import CampaignSettings
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
 

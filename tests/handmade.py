@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.case import Case, from_unit
-from merge_sumo.conductor import versions
-from merge_sumo.journal import Journal, Run
-from merge_sumo.scenario import A_MIN_MPS2, DT_S, X_VUT0_M
-from merge_sumo.score import Outcome, measure
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.campaigns.journal import Journal, Run
+from merge_sumo.campaigns.settings import versions
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import A_MIN_MPS2, DT_S, X_VUT0_M
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
 
 BATCH = 20
 

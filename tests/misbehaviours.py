@@ -347,7 +347,7 @@ RAISES: Final = {
     "a CancelledError": acts("import asyncio; raise asyncio.CancelledError", "CancelledError"),
     "a group": acts("raise ExceptionGroup('g', [ValueError(1)] * 3)", "ExceptionGroup: g"),
     "what stops the program": acts(
-        "from merge_sumo.interrupt import Stopped; raise Stopped(2)", "Stopped: SIGINT"
+        "from merge_sumo.system.interrupt import Stopped; raise Stopped(2)", "Stopped: SIGINT"
     ),
     "what is ours": acts(
         "from merge_sumo.drivers.base import VutLostError; raise VutLostError('mine', 3)",

@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_sumo.case import Case
 from merge_sumo.samplers.allocation import (
     even_shares,
     last_failure_share,
     softmax_shares,
     whole_shares,
 )
-from merge_sumo.score import Measures, Outcome
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
 
 
 @st.composite

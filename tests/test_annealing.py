@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from merge_sumo.case import Pool
 from merge_sumo.samplers.annealing import CHAINS, AnnealingSampler
 from merge_sumo.samplers.base import LevelHistory, reflect
+from merge_sumo.values.case import Pool
 
 FloatArray = np.ndarray
 

@@ -13,7 +13,7 @@ from handmade import write_run
 from lxml import html
 
 import merge_sumo as ms
-from merge_sumo.summary import summarise
+from merge_sumo.reports.summary import summarise
 
 
 @pytest.fixture(scope="module")

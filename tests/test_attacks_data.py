@@ -26,14 +26,14 @@ from lxml import etree
 
 from merge_sumo import cli
 from merge_sumo.api import open_run
-from merge_sumo.conductor import SCENARIOS
+from merge_sumo.campaigns.conductor import SCENARIOS
+from merge_sumo.campaigns.experiments import Kept, Truth, ground_truth, read_truth
+from merge_sumo.campaigns.journal import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
+from merge_sumo.campaigns.probability import LINES
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
-from merge_sumo.experiments import Kept, Truth, ground_truth, read_truth
-from merge_sumo.journal import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
-from merge_sumo.junit import write_junit
-from merge_sumo.probability import LINES
-from merge_sumo.report import REPORT
+from merge_sumo.reports.junit import write_junit
+from merge_sumo.reports.report import REPORT
 
 FLIPS = 300
 SHOWN_SETTING = rb'<tr><th scope="row">[^\n]*</tr>\n'

@@ -16,11 +16,12 @@ import pytest
 from attacks import World, tell
 from conftest import require
 
-from merge_sumo.conductor import CampaignSettings, run_campaign
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.experiments import ground_truth
+from merge_sumo.campaigns.journal import OUTCOMES, Run
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.experiments import ground_truth
-from merge_sumo.folders import TEMPORARY
-from merge_sumo.journal import OUTCOMES, Run
+from merge_sumo.system.folders import TEMPORARY
 
 CAMPAIGN = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "uniform", "-q")
 SMALL = (*CAMPAIGN, "--cases", "60", "--batch", "20", "--seed", "1")

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from attacks import SIGNALS, World, stop, tell, wait_for
 
-from merge_sumo import folders
-from merge_sumo.folders import TEMPORARY
+from merge_sumo.system import folders
+from merge_sumo.system.folders import TEMPORARY
 
 ROUNDS = 6
 """Rounds of all signals for a command that takes seconds; those that take longer have fewer."""

@@ -14,9 +14,10 @@ from attacks import World, tell
 from test_workers import cluster, wait_until, workers_at
 
 import merge_sumo as ms
-from merge_sumo.conductor import CampaignSettings, run_campaign
-from merge_sumo.journal import OUTCOMES
-from merge_sumo.workers import dask_workers
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.journal import OUTCOMES
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.system.workers import dask_workers
 
 __all__ = ["cluster", "wait_until", "workers_at"]
 

@@ -12,8 +12,8 @@ from conftest import require
 from foreign_nets import corridor_of
 from handmade import write_run
 
-from merge_sumo import report
-from merge_sumo.journal import Run, failures
+from merge_sumo.campaigns.journal import Run, failures
+from merge_sumo.reports import report
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_sumo.case import Case, dimensions, from_unit, to_unit
 from merge_sumo.errors import UserError
+from merge_sumo.values.case import Case, dimensions, from_unit, to_unit
 
 
 def test_the_corners_of_the_unit_cube_are_the_bounds_of_the_pool():

@@ -9,16 +9,17 @@ import pytest
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.comparison import (
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.journal import Run, failures
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.reports.comparison import (
     Change,
     LevelChange,
     RunComparison,
     Untested,
     compare_runs,
 )
-from merge_sumo.conductor import CampaignSettings, run_campaign
-from merge_sumo.errors import UserError
-from merge_sumo.journal import Run, failures
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +100,7 @@ class TestTheSameVut:
 
 class TestRecordsOnly:
     def test_run_nothing_again(self, run, other_seed, monkeypatch):
-        monkeypatch.setattr("merge_sumo.comparison.ProvingGround", None)
+        monkeypatch.setattr("merge_sumo.reports.comparison.ProvingGround", None)
         compared = compare_runs(run, other_seed, rerun=False)
         found = compared.levels[0]
         assert found.changes[Change.NOT_RUN_AGAIN] == len(compared.cases)

@@ -7,13 +7,14 @@ import math
 
 import pytest
 
-from merge_sumo.case import Case, Pool
-from merge_sumo.conductor import CampaignSettings, run_campaign
-from merge_sumo.convergence import PATIENCE, StoppingRule, covered_balls, gained
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.convergence import PATIENCE, StoppingRule, covered_balls, gained
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.uniform import UniformSampler
-from merge_sumo.score import Measures, Outcome
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case, Pool
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
 
 NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
 

@@ -21,12 +21,10 @@ from foreign_nets import (
     straight,
 )
 
-from merge_sumo.case import from_unit
+from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
-from merge_sumo.rollout import rollout
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 from merge_sumo.sumo.binding import load_libsumo, sumo_program
 from merge_sumo.sumo.corridor import Piece
 from merge_sumo.sumo.finder import find_corridor
@@ -34,6 +32,8 @@ from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, default_net_path
 from merge_sumo.sumo.netfile import NetFile
 from merge_sumo.sumo.world import POV, SPEED_MODE_COMMANDED, VUT, SimulationError, World
+from merge_sumo.values.case import from_unit
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 
 EXACT = 1e-9
 SIX = list(FOREIGN)[:6]

@@ -8,8 +8,6 @@ import statistics
 import numpy as np
 import pytest
 
-from merge_sumo.case import Case, Pool, to_unit
-from merge_sumo.fmc import RADIUS, fmc
 from merge_sumo.samplers.base import LevelHistory, Sampler
 from merge_sumo.samplers.coverage import (
     CALIBRATION,
@@ -26,8 +24,10 @@ from merge_sumo.samplers.coverage import (
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin
-from merge_sumo.score import Measures, Outcome
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.fmc import RADIUS, fmc
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
 
 NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
 

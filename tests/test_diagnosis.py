@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from merge_sumo.case import Case
-from merge_sumo.diagnosis import MEANING, Diagnosis, Kind, diagnose, failure_boxes
-from merge_sumo.scenario import DT_S
-from merge_sumo.score import Outcome, measure
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.reports.diagnosis import MEANING, Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
 
 STEPS = 81
 LEVEL0 = np.ones(STEPS)

@@ -13,13 +13,21 @@ import numpy as np
 import pytest
 from vut_contract import factory
 
-from merge_sumo.case import from_unit, to_unit
+from merge_sumo.campaigns.experiments import (
+    Kept,
+    Search,
+    Truth,
+    compare,
+    ground_truth,
+    oracle,
+    search,
+)
 from merge_sumo.errors import UserError
-from merge_sumo.experiments import Kept, Search, Truth, compare, ground_truth, oracle, search
-from merge_sumo.fmc import fmc
-from merge_sumo.score import Measures, Outcome
-from merge_sumo.trajectory import End
-from merge_sumo.workers import open_workers
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.case import from_unit, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
 
 NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
 

@@ -18,12 +18,12 @@ from scenariogeneration import xosc
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.conductor import export_case
+from merge_sumo.campaigns.conductor import export_case
+from merge_sumo.campaigns.journal import failures
 from merge_sumo.errors import UserError
-from merge_sumo.exports import COLUMNS, write_folders, write_openscenario, write_table
-from merge_sumo.journal import failures
-from merge_sumo.scenario import DT_S
+from merge_sumo.reports.exports import COLUMNS, write_folders, write_openscenario, write_table
 from merge_sumo.sumo.net import Net
+from merge_sumo.values.scenario import DT_S
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +207,7 @@ def test_folders_are_checked_before_the_first_is_written(made, tmp_path):
 
 
 def test_no_export_loads_libsumo():
-    script = "import sys, merge_sumo.exports; print('libsumo' in sys.modules)"
+    script = "import sys, merge_sumo.reports.exports; print('libsumo' in sys.modules)"
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

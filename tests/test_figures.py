@@ -9,12 +9,12 @@ import pytest
 from matplotlib.collections import EllipseCollection
 from PIL import Image
 
-from merge_sumo import figures
+from merge_sumo.campaigns.experiments import Comparison, LevelShare
 from merge_sumo.errors import UserError
-from merge_sumo.experiments import Comparison, LevelShare
-from merge_sumo.figures import Levels, Panel, Surface
-from merge_sumo.fmc import RADIUS
+from merge_sumo.reports import figures
+from merge_sumo.reports.figures import Levels, Panel, Surface
 from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.values.fmc import RADIUS
 
 
 def compared(end: float) -> Comparison:

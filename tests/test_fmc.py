@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from merge_sumo import fmc as fmc_module
-from merge_sumo.fmc import RADIUS, fmc, regions
+from merge_sumo.values import fmc as fmc_module
+from merge_sumo.values.fmc import RADIUS, fmc, regions
 
 Points = NDArray[np.float64]
 

@@ -19,17 +19,14 @@ from foreign_nets import FOREIGN, corridor_of
 from handmade import write_run
 from lxml import etree
 
-from merge_sumo.case import Case, from_unit
+from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.traci import TraciVut
 from merge_sumo.errors import UserError
-from merge_sumo.exports import write_openscenario
-from merge_sumo.report import _road
-from merge_sumo.rollout import rollout
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
-from merge_sumo.score import Outcome, measure
+from merge_sumo.reports.exports import write_openscenario
+from merge_sumo.reports.report import _road
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
 from merge_sumo.sumo.net import Net, default_net_path
@@ -49,7 +46,10 @@ from merge_sumo.sumo.replay import (
 from merge_sumo.sumo.road import corridor_of as as_corridor
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
 
 SIX = list(FOREIGN)[:6]
 OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(FOREIGN)[6:]]

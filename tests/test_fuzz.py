@@ -21,10 +21,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.conductor import CampaignSettings, record_of, settings_of
-from merge_sumo.drivers.policies import load_network, read_manifest
-from merge_sumo.errors import UserError
-from merge_sumo.journal import (
+from merge_sumo.campaigns.journal import (
     OUTCOMES,
     SETTINGS,
     TRAJECTORIES,
@@ -33,11 +30,14 @@ from merge_sumo.journal import (
     read_settings,
     to_line,
 )
-from merge_sumo.report import write_report
-from merge_sumo.resources import resource
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
+from merge_sumo.drivers.policies import load_network, read_manifest
+from merge_sumo.errors import UserError
+from merge_sumo.reports.report import write_report
 from merge_sumo.sumo import replay
 from merge_sumo.sumo.net import Net, default_net_path
-from merge_sumo.trust import SEAL
+from merge_sumo.system.resources import resource
+from merge_sumo.system.trust import SEAL
 
 here = settings(
     max_examples=60,
@@ -303,7 +303,7 @@ ATHERIS = """
 import sys, atheris
 with atheris.instrument_imports(include=["merge_sumo", "json"]):
     from merge_sumo.errors import UserError
-    from merge_sumo.journal import read_outcomes, to_line
+    from merge_sumo.campaigns.journal import read_outcomes, to_line
 
 def one(data):
     try:

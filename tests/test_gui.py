@@ -17,8 +17,8 @@ from foreign_nets import corridor_of
 from lxml import etree
 from PIL import Image
 
-from merge_sumo.conductor import export_case
-from merge_sumo.journal import failures
+from merge_sumo.campaigns.conductor import export_case
+from merge_sumo.campaigns.journal import failures
 from merge_sumo.sumo.replay import COLOURS, SURROUNDINGS_COLOUR, VIEW, write_scenario
 
 PICTURE_TIMES_S = (2.0, 7.0)

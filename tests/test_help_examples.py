@@ -12,7 +12,8 @@ import typer
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.conductor import CampaignSettings, run_campaign
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.settings import CampaignSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = {"--cases": "40", "--seeds": "1"}

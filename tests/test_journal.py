@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_sumo.case import Case
+from merge_sumo.campaigns.journal import Journal, Run, failures, read_outcomes, to_line
 from merge_sumo.errors import UserError
-from merge_sumo.journal import Journal, Run, failures, read_outcomes, to_line
-from merge_sumo.score import Measures, Outcome, measure
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.values.case import Case
+from merge_sumo.values.score import Measures, Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
 
 SPEC_FIELDS = [
     *("index", "batch", "level", "x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad", "end"),

@@ -12,14 +12,17 @@ from pathlib import Path
 import pytest
 from handmade import write_run
 
-from merge_sumo import cli, conductor
-from merge_sumo.conductor import CampaignSettings, ProvingGround, export_case, run_campaign
+from merge_sumo import cli
+from merge_sumo.campaigns import conductor
+from merge_sumo.campaigns.conductor import export_case, run_campaign
+from merge_sumo.campaigns.ground import ProvingGround
+from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.journal import Run
-from merge_sumo.printable import printable, quoted
-from merge_sumo.progress import Bars
-from merge_sumo.report import write_report
+from merge_sumo.reports.progress import Bars
+from merge_sumo.reports.report import write_report
 from merge_sumo.sumo.binding import sumo_program
+from merge_sumo.system.printable import printable, quoted
 
 VUT = "def drive(seen):\n    return 1.0\n"
 NOT_UTF8 = os.fsdecode(b"vut-\xff\xfe")

@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 import merge_sumo as ms
-from merge_sumo import cli, conductor, figures, folders, probability, reproduce
-from merge_sumo.conductor import SCENARIOS, case_name, resume_campaign
-from merge_sumo.errors import UserError
-from merge_sumo.journal import (
+from merge_sumo import cli
+from merge_sumo.campaigns import conductor, probability
+from merge_sumo.campaigns.conductor import SCENARIOS, case_name, resume_campaign
+from merge_sumo.campaigns.journal import (
     OUTCOMES,
     SETTINGS,
     TRAJECTORIES,
@@ -29,8 +29,11 @@ from merge_sumo.journal import (
     failures,
     read_settings,
 )
-from merge_sumo.printable import printable, quoted
-from merge_sumo.report import REPORT, write_report
+from merge_sumo.errors import UserError
+from merge_sumo.reports import figures, reproduce
+from merge_sumo.reports.report import REPORT, write_report
+from merge_sumo.system import folders
+from merge_sumo.system.printable import printable, quoted
 from merge_sumo.training import helix
 
 NAMELESS = [
@@ -253,7 +256,7 @@ class TestAHundredNames:
         assert {"a b.svg", "-rf.html", "日本.svg"} <= set(appeared)
 
     def test_of_a_figure_are_refused_before_anything_runs(self, world, call, monkeypatch):
-        monkeypatch.setattr("merge_sumo.experiments.ground_truth", lambda *_, **__: 1 / 0)
+        monkeypatch.setattr("merge_sumo.campaigns.experiments.ground_truth", lambda *_, **__: 1 / 0)
         options = ("compare", "--vut", "design1", "--level", 0, "--workers", 1)
         for name in ("", ".", "..", "full/..", "figure.svg", "loop.svg/x.svg", "x" * 300 + ".svg"):
             code, said = call(*options, f"--figure={name}")

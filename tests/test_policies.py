@@ -10,20 +10,20 @@ import make_scenarios
 import numpy as np
 import pytest
 
-from merge_sumo.case import from_unit, to_unit
+from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import FEATURES, QNetwork, features
 from merge_sumo.drivers.policies import NETWORKS, load_network, read_manifest
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.fmc import fmc, regions
-from merge_sumo.rollout import rollout
-from merge_sumo.score import measure
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.world import World
 from merge_sumo.training import check as checking
 from merge_sumo.training.reward import RewardWeights
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import from_unit, to_unit
+from merge_sumo.values.fmc import fmc, regions
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End
 
 REGRET_BOUNDS = {
     "pov1": (0.01, 0.05),

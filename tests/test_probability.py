@@ -11,10 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest, norm, truncnorm
 
-from merge_sumo.case import V_POV0, dimensions
-from merge_sumo.conductor import CampaignSettings, run_campaign
-from merge_sumo.errors import UserError
-from merge_sumo.probability import (
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.probability import (
     CELLS,
     DEFENSIVE,
     Proposal,
@@ -25,6 +23,9 @@ from merge_sumo.probability import (
     mean_at_least,
     read_distribution,
 )
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.values.case import V_POV0, dimensions
 
 LEVELS = (0, 1, 2)
 UNIFORM = read_distribution(None, LEVELS)

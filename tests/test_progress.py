@@ -8,8 +8,8 @@ import pytest
 from handmade import write_run
 from rich.console import Console
 
-from merge_sumo.progress import CampaignPanel
-from merge_sumo.summary import summarise
+from merge_sumo.reports.progress import CampaignPanel
+from merge_sumo.reports.summary import summarise
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,9 @@ import numpy as np
 import pytest
 from lxml import etree
 
-from merge_sumo.case import Case
-from merge_sumo.conductor import export_case
+from merge_sumo.campaigns.conductor import export_case
+from merge_sumo.campaigns.journal import failures
 from merge_sumo.errors import UserError
-from merge_sumo.journal import failures
-from merge_sumo.scenario import DT_S, V_VUT0_MAX_MPS, X_VUT0_M
-from merge_sumo.score import Outcome, measure
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
 from merge_sumo.sumo.net import Net
@@ -36,7 +33,10 @@ from merge_sumo.sumo.replay import (
     replay,
     write_scenario,
 )
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S, V_VUT0_MAX_MPS, X_VUT0_M
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
 
 SHIPPED = sorted(path.parent for path in Path(__file__).parents[1].glob(f"scenarios/*/{CONFIG}"))
 FILES = {CONFIG, NET, TYPES, RECORD, VIEW, CASE}

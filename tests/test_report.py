@@ -12,19 +12,19 @@ import pytest
 from handmade import write_run
 from lxml import html
 
-from merge_sumo import report
-from merge_sumo.case import dimensions, to_unit
+from merge_sumo.campaigns.experiments import Truth
+from merge_sumo.campaigns.journal import Run, failures
 from merge_sumo.drivers.vuts.output import LINES, LOG
-from merge_sumo.experiments import Truth
-from merge_sumo.fmc import fmc
-from merge_sumo.journal import Run, failures
-from merge_sumo.report import SPEED_UNIT_MPS, headline, report_page, write_report
-from merge_sumo.scenario import DT_S, X_VUT0_M
-from merge_sumo.summary import summarise
+from merge_sumo.reports import report
+from merge_sumo.reports.report import SPEED_UNIT_MPS, headline, report_page, write_report
+from merge_sumo.reports.summary import summarise
+from merge_sumo.reports.surface import learn_surface
+from merge_sumo.reports.verdict import judge
 from merge_sumo.sumo.net import Net
-from merge_sumo.surface import learn_surface
-from merge_sumo.trajectory import REASON_CHARACTERS
-from merge_sumo.verdict import judge
+from merge_sumo.values.case import dimensions, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import DT_S, X_VUT0_M
+from merge_sumo.values.trajectory import REASON_CHARACTERS
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
 

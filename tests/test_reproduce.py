@@ -6,10 +6,10 @@ import json
 
 import pytest
 
-from merge_sumo import reproduce as paper
 from merge_sumo.errors import UserError
-from merge_sumo.reproduce import TABLE_II, Scale, reproduce
-from merge_sumo.workers import open_workers
+from merge_sumo.reports import reproduce as paper
+from merge_sumo.reports.reproduce import TABLE_II, Scale, reproduce
+from merge_sumo.system.workers import open_workers
 
 FIGURES = {
     "cases-level0.png",

@@ -15,17 +15,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from merge_sumo import cli, folders, interrupt
-from merge_sumo.conductor import (
-    SCENARIOS,
-    CampaignSettings,
-    differences,
-    resume_campaign,
-    run_campaign,
-)
-from merge_sumo.errors import UserError
-from merge_sumo.interrupt import Interrupt, Stopped
-from merge_sumo.journal import (
+from merge_sumo import cli
+from merge_sumo.campaigns.conductor import SCENARIOS, resume_campaign, run_campaign
+from merge_sumo.campaigns.journal import (
     CHECKSUM,
     OUTCOMES,
     SETTINGS,
@@ -34,7 +26,11 @@ from merge_sumo.journal import (
     Run,
     read_settings,
 )
+from merge_sumo.campaigns.settings import CampaignSettings, differences
+from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.system import folders, interrupt
+from merge_sumo.system.interrupt import Interrupt, Stopped
 
 BATCH = 8
 MOUNT = shutil.which("mount")
@@ -250,7 +246,7 @@ class TestTwoProcessesOnOneFolder:
 
     def test_leave_no_lock_behind_when_one_is_killed(self, folder):
         script = (
-            "import os, sys, pathlib; from merge_sumo.journal import Journal;"
+            "import os, sys, pathlib; from merge_sumo.campaigns.journal import Journal;"
             "kept = Journal.reopen(pathlib.Path(sys.argv[1])); os.kill(os.getpid(), 9)"
         )
         killed = subprocess.run([sys.executable, "-c", script, str(folder)], check=False)

@@ -8,13 +8,13 @@ import statistics
 import numpy as np
 import pytest
 
-from merge_sumo.case import Case, Pool, dimensions, to_unit
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.base import LevelHistory, Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.score import Measures, Outcome
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case, Pool, dimensions, to_unit
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
 
 HALF_WIDTH = 0.03
 """Of the band of failures in the unit square; about 7 % of the square."""

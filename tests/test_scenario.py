@@ -11,16 +11,18 @@ from foreign_nets import FOREIGN
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.case import Case, Pool, from_unit, to_unit
-from merge_sumo.conductor import CampaignSettings, road_for, run_campaign
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.errors import UserError
-from merge_sumo.journal import Run
-from merge_sumo.scenario import US23, Scenario
-from merge_sumo.scenario_file import named_scenario, read_scenario, to_toml
-from merge_sumo.score import measure
-from merge_sumo.suggestion import suggested, unseen
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.scenarios.scenario_file import named_scenario, read_scenario, to_toml
+from merge_sumo.scenarios.suggestion import suggested, unseen
+from merge_sumo.values.case import Case, Pool, from_unit, to_unit
+from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End, Trajectory
 
 
 def test_the_shipped_scenario_has_the_numbers_of_the_paper():

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_sumo.case import Case
-from merge_sumo.scenario import DT_S
-from merge_sumo.score import FAILURE_SCORE, Outcome, measure, time_to_collision
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.score import FAILURE_SCORE, Outcome, measure, time_to_collision
+from merge_sumo.values.trajectory import End, Trajectory
 
 CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
 

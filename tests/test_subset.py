@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from merge_sumo.case import Pool
 from merge_sumo.samplers import subset
 from merge_sumo.samplers.base import LevelHistory
 from merge_sumo.samplers.subset import (
@@ -15,6 +14,7 @@ from merge_sumo.samplers.subset import (
     failure_probability,
     replay,
 )
+from merge_sumo.values.case import Pool
 
 FloatArray = np.ndarray
 CORNER = 0.1

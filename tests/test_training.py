@@ -12,12 +12,10 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
-from merge_sumo.case import Case
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, QNetwork
 from merge_sumo.drivers.policies import MANIFEST, load_network, read_manifest
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DT_S
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
 from merge_sumo.training.check import QuickRegret, play, returns_of
 from merge_sumo.training.env import (
@@ -29,6 +27,8 @@ from merge_sumo.training.env import (
 from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S
 
 WEIGHTS = reward.RewardWeights()
 TINY = ddqn.DdqnSettings(transitions=6_000, warm_up=2_000, updates=1_000, width=16, batch=64)

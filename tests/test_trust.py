@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 
 from merge_sumo import cli
-from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
+from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
+from merge_sumo.campaigns.journal import CHECKSUM, SETTINGS
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.journal import CHECKSUM, SETTINGS
-from merge_sumo.trust import SEAL, is_own, seal
+from merge_sumo.system.trust import SEAL, is_own, seal
 
 TELLTALE = """
 import pathlib

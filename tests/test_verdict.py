@@ -15,15 +15,16 @@ from typer.testing import CliRunner
 
 import merge_sumo as ms
 from merge_sumo import cli
-from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
+from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
+from merge_sumo.campaigns.journal import Run, failures, read_settings
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.interrupt import Stopped
-from merge_sumo.journal import Run, failures, read_settings
-from merge_sumo.junit import check_junit, junit, write_junit
-from merge_sumo.printable import printable
-from merge_sumo.summary import LevelSummary, Summary, summarise
-from merge_sumo.trajectory import End
-from merge_sumo.verdict import Gate, judge, parse_gates
+from merge_sumo.reports.junit import check_junit, junit, write_junit
+from merge_sumo.reports.summary import LevelSummary, Summary, summarise
+from merge_sumo.reports.verdict import Gate, judge, parse_gates
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.printable import printable
+from merge_sumo.values.trajectory import End
 
 HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
 VUTS = {
@@ -361,7 +362,7 @@ class TestACampaignWithGates:
         def stop(self) -> None:
             raise Stopped(signal.SIGINT)
 
-        monkeypatch.setattr("merge_sumo.interrupt.Interrupt.check", stop)
+        monkeypatch.setattr("merge_sumo.system.interrupt.Interrupt.check", stop)
         said = []
         monkeypatch.setattr("merge_sumo.commands.campaign.say", said.append)
         file = tmp_path / "a file.xml"
@@ -399,7 +400,7 @@ class TestACampaignOfFewCasesThatIsResumed:
         settings = read_settings(stopped)
         settings |= {"sampler": "coverage", "stop_after_converged": 0.25}
         (stopped / "campaign.json").write_text(json.dumps(settings))
-        rule = "merge_sumo.conductor.StoppingRule.__call__"
+        rule = "merge_sumo.campaigns.settings.StoppingRule.__call__"
         monkeypatch.setattr(rule, lambda self, outcomes: True)
         text = invoke("campaign", "--resume", stopped, "-q")
         assert text.exit_code == 0, text.exception

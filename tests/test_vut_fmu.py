@@ -12,7 +12,7 @@ from conftest import require
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
 from merge_sumo.errors import UserError
-from merge_sumo.trajectory import End
+from merge_sumo.values.trajectory import End
 
 pytest.importorskip("fmpy")
 

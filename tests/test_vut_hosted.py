@@ -17,7 +17,8 @@ from misbehaviours import STUBBORN
 from processes import none_left
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
-from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
+from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.drivers.vuts import wire
 from merge_sumo.drivers.vuts.base import VutOptions
@@ -25,7 +26,7 @@ from merge_sumo.drivers.vuts.hosted import Host, HostDiedError, HostedVut
 from merge_sumo.drivers.vuts.output import KEPT_BYTES, MOST_BYTES, append
 from merge_sumo.drivers.vuts.wire import About, WireError
 from merge_sumo.errors import UserError
-from merge_sumo.trajectory import as_reason
+from merge_sumo.values.trajectory import as_reason
 
 OPTIONS = VutOptions(deadline_s=0.3)
 HANGS = f"""

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from vut_contract import cases_of, factory, run_cases
 
-from merge_sumo.case import from_unit
+from merge_sumo.campaigns.experiments import ground_truth
 from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.onnx_export import export_onnx
 from merge_sumo.drivers.policies import NETWORKS, load_network
 from merge_sumo.errors import UserError
-from merge_sumo.experiments import ground_truth
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import from_unit
+from merge_sumo.values.trajectory import End
 
 onnx = pytest.importorskip("onnx")
 ort = pytest.importorskip("onnxruntime")

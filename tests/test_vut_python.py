@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
-from merge_sumo.case import Case
-from merge_sumo.conductor import CampaignSettings, record_of, run_campaign
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import MAX_STEPS
 from merge_sumo.sumo.net import Net
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import MAX_STEPS
+from merge_sumo.values.trajectory import End
 
 
 @pytest.fixture

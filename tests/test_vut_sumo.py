@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from vut_contract import cases_of, factory, run_cases
 
-from merge_sumo.case import Case
-from merge_sumo.conductor import CampaignSettings, run_campaign
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.journal import failures
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.vuts.sumo_model import MODELS
 from merge_sumo.errors import UserError
-from merge_sumo.journal import failures
-from merge_sumo.scenario import DT_S
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.world import VUT, World
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.trajectory import End
 
 FREE = Case(level=0, x_pov0_m=0.0, v_pov0_mps=45.0)
 """The POV is gone before the VUT arrives."""

@@ -24,18 +24,19 @@ from hypothesis import strategies as st
 from raw_traci import GET_LANE, MISDEEDS, STEP, Client, GoneError, command, text
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
-from merge_sumo.case import Case
-from merge_sumo.conductor import CampaignSettings, run_campaign
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen, VutOptions
 from merge_sumo.drivers.vuts.traci import TraciVut
 from merge_sumo.drivers.vuts.traci_session import Session
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.trajectory import End
 
 TESTS = Path(__file__).parent
 CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
@@ -347,7 +348,7 @@ def test_the_speeds_that_follow_from_a_command_are_those_of_sumo(command, argume
 
 
 def measures_of(folder: Path) -> list[dict]:
-    from merge_sumo.journal import Run
+    from merge_sumo.campaigns.journal import Run
 
     return [outcome.to_record() for outcome in Run(folder).outcomes]
 

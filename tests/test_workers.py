@@ -14,23 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from merge_sumo.case import from_unit
-from merge_sumo.conductor import (
-    CampaignSettings,
-    GroundPlan,
-    lost_case,
-    run_campaign,
-    run_cases,
-    runs_on,
-    software,
-)
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.ground import GroundPlan, lost_case, run_cases, runs_on
+from merge_sumo.campaigns.journal import OUTCOMES
+from merge_sumo.campaigns.settings import CampaignSettings, software
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
-from merge_sumo.journal import OUTCOMES
 from merge_sumo.samplers.base import uniform_points
 from merge_sumo.sumo.net import Net
-from merge_sumo.trajectory import End
-from merge_sumo.workers import (
+from merge_sumo.system.workers import (
     InProcess,
     LocalProcesses,
     Workers,
@@ -39,6 +31,8 @@ from merge_sumo.workers import (
     when_worker_ends,
     workers_or_cores,
 )
+from merge_sumo.values.case import from_unit
+from merge_sumo.values.trajectory import End
 
 KINDS = [1, 2]
 SETTINGS = CampaignSettings(
@@ -168,7 +162,7 @@ class TestLocalProcesses:
         script = tmp_path / "parent.py"
         script.write_text(
             "import os, sys\n"
-            "from merge_sumo.workers import open_workers\n"
+            "from merge_sumo.system.workers import open_workers\n"
             "sys.path.insert(0, sys.argv[1])\n"
             "from test_workers import process_ids\n"
             "if __name__ == '__main__':\n"
@@ -300,7 +294,7 @@ class TestADaskCluster:
 
     def test_that_is_not_there_is_refused_in_a_sentence(self, monkeypatch):
         pytest.importorskip("distributed", reason="needs merge-sumo[dask]")
-        monkeypatch.setattr("merge_sumo.workers.DASK_TIMEOUT_S", 1.0)
+        monkeypatch.setattr("merge_sumo.system.workers.DASK_TIMEOUT_S", 1.0)
         with pytest.raises(UserError, match=r"no scheduler at tcp://127\.0\.0\.1:1"):
             dask_workers("tcp://127.0.0.1:1")
         with pytest.raises(UserError, match="no scheduler at"):

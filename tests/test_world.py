@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from merge_sumo.case import Case, from_unit
+from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
-from merge_sumo.rollout import rollout
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS
-from merge_sumo.score import measure
 from merge_sumo.sumo.world import POV, VUT, SimulationError, World
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End
 
 EXACT = 1e-9
 

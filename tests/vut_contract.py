@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from merge_sumo.case import Case, from_unit
-from merge_sumo.conductor import ProvingGround
+from merge_sumo.campaigns.ground import ProvingGround
 from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
-from merge_sumo.trajectory import Trajectory
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.trajectory import Trajectory
 
 LEVEL0_CLASS = """
 class Level0:

@@ -24,16 +24,16 @@ import libsumo
 import numpy as np
 import traci
 
-from merge_sumo.case import Case, from_unit
+from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.rollout import rollout
-from merge_sumo.scenario import DT_S, MAX_STEPS, X_VUT0_M
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net
 from merge_sumo.sumo.world import MAX_SPEED_MPS, SPEED_MODE_COMMANDED, SUMO_OPTIONS, World
-from merge_sumo.trajectory import Trajectory
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import DT_S, MAX_STEPS, X_VUT0_M
+from merge_sumo.values.trajectory import Trajectory
 
 KS = (1, 8, 32, 64)
 STEPS = 80

@@ -20,16 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.case import Case, Pool, to_unit
-from merge_sumo.conductor import GroundPlan, Ran, conduct, run_cases
+from merge_sumo.campaigns.conductor import conduct
+from merge_sumo.campaigns.experiments import Truth, ground_truth
+from merge_sumo.campaigns.ground import GroundPlan, Ran, run_cases
 from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.experiments import Truth, ground_truth
-from merge_sumo.fmc import RADIUS, fmc
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.score import Measures, Outcome
 from merge_sumo.sumo.net import Net
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.fmc import RADIUS, fmc
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
 
 CASES, BATCH = 400, 20
 SHOWN = (100, 200, 400)

@@ -27,18 +27,20 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.case import FloatArray, Pool, from_unit, to_unit
-from merge_sumo.conductor import MAX_CORRIDORS, CampaignSettings, GroundPlan, run_campaign
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.experiments import _scores
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan
+from merge_sumo.campaigns.journal import OUTCOMES, Run, failures, read_outcomes, to_line
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.experiments import _scores
-from merge_sumo.fmc import fmc, regions
-from merge_sumo.journal import OUTCOMES, Run, failures, read_outcomes, to_line
-from merge_sumo.report import write_report
+from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.scenario import US23
-from merge_sumo.score import Outcome
 from merge_sumo.sumo.net import Net
-from merge_sumo.workers import LocalProcesses, Workers
+from merge_sumo.system.workers import LocalProcesses, Workers
+from merge_sumo.values.case import FloatArray, Pool, from_unit, to_unit
+from merge_sumo.values.fmc import fmc, regions
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.score import Outcome
 
 VUT = "design1"
 ROUNDS = 5

@@ -13,9 +13,9 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from merge_sumo.folders import check_new_file, replace_own
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.net import Net
+from merge_sumo.system.folders import check_new_file, replace_own
 
 SOURCES = Path(__file__).resolve().parent.parent / "sumo_net"
 NET = SOURCES / "us23.net.xml"

@@ -26,13 +26,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray, from_unit, to_unit
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
-from merge_sumo.fmc import RADIUS, fmc, regions
-from merge_sumo.scenario import (
+from merge_sumo.values.case import Case, FloatArray, from_unit, to_unit
+from merge_sumo.values.fmc import RADIUS, fmc, regions
+from merge_sumo.values.scenario import (
     A_MAX_MPS2,
     A_MIN_MPS2,
     DT_S,

@@ -25,11 +25,12 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo import journal
-from merge_sumo.conductor import CampaignSettings, resume_campaign, run_campaign
-from merge_sumo.journal import OUTCOMES, SETTINGS
+from merge_sumo.campaigns import journal
+from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
+from merge_sumo.campaigns.journal import OUTCOMES, SETTINGS
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.sumo.binding import load_libsumo
-from merge_sumo.workers import open_workers
+from merge_sumo.system.workers import open_workers
 
 PLACES = ("moment", "sync", "torn", "worker")
 SAMPLERS = ("gpr", "coverage")

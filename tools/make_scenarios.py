@@ -12,16 +12,16 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from merge_sumo.case import Case
+from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.rollout import rollout
-from merge_sumo.scenario import DT_S
-from merge_sumo.score import Outcome, measure
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.replay import write_scenario
 from merge_sumo.sumo.world import World
-from merge_sumo.trajectory import Trajectory
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import Trajectory
 
 SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
 

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
-from merge_sumo.folders import check_new_file
-from merge_sumo.journal import Run
-from merge_sumo.report import write_report
+from merge_sumo.campaigns.journal import Run
+from merge_sumo.reports.report import write_report
+from merge_sumo.system.folders import check_new_file
 
 WIDTH_PX, HEIGHT_PX = 1280, 1880
 """Down to the case in motion."""

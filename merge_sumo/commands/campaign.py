@@ -25,16 +25,16 @@ from merge_sumo.commands.shared import (
     show,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.folders import dated
-from merge_sumo.printable import quoted
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
+from merge_sumo.system.folders import dated
+from merge_sumo.system.printable import quoted
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
-    from merge_sumo.conductor import CampaignSettings
-    from merge_sumo.journal import Run
-    from merge_sumo.summary import Summary
-    from merge_sumo.verdict import Gate, Verdict
+    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.campaigns.settings import CampaignSettings
+    from merge_sumo.reports.summary import Summary
+    from merge_sumo.reports.verdict import Gate, Verdict
 
 
 @app.command()
@@ -111,26 +111,33 @@ def campaign(
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
     """
-    from merge_sumo import conductor
-    from merge_sumo.interrupt import Interrupt, Stopped
-    from merge_sumo.journal import read_settings
-    from merge_sumo.junit import check_junit
-    from merge_sumo.progress import CampaignPanel
-    from merge_sumo.report import check_report
-    from merge_sumo.scenario_file import named_scenario
-    from merge_sumo.suggestion import unseen
-    from merge_sumo.verdict import parse_gates
-    from merge_sumo.workers import open_workers
+    from merge_sumo.campaigns import conductor
+    from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.campaigns.journal import read_settings
+    from merge_sumo.campaigns.settings import (
+        DEFAULT_BATCH,
+        CampaignSettings,
+        parse_levels,
+        settings_of,
+    )
+    from merge_sumo.reports.junit import check_junit
+    from merge_sumo.reports.progress import CampaignPanel
+    from merge_sumo.reports.report import check_report
+    from merge_sumo.reports.verdict import parse_gates
+    from merge_sumo.scenarios.scenario_file import named_scenario
+    from merge_sumo.scenarios.suggestion import unseen
+    from merge_sumo.system.interrupt import Interrupt, Stopped
+    from merge_sumo.system.workers import open_workers
 
     gates = parse_gates(gate or ())
     if resume is None:
-        levels = conductor.parse_levels(level)
-        settings = conductor.CampaignSettings(
+        levels = parse_levels(level)
+        settings = CampaignSettings(
             vut=vut,
             levels=levels,
             sampler=sampler,
             cases=cases,
-            batch=min(conductor.DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
+            batch=min(DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
             seed=seed,
             v_vut0_mps=v_vut0,
             stop_after_converged=stop_after_converged,
@@ -143,12 +150,12 @@ def campaign(
         folder = out or dated(vut)
     else:
         given = _given(context)
-        settings = conductor.settings_of(resume, read_settings(resume), given, trust=trust_vut)
+        settings = settings_of(resume, read_settings(resume), given, trust=trust_vut)
         folder, levels = resume, settings.levels
         check_report(folder)
     if junit is not None:
         check_junit(junit, folder)
-    road = conductor.road_for(settings.scenario, net)
+    road = road_for(settings.scenario, net)
     if max(levels) > 0 and unseen(settings.scenario):
         say(
             f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
@@ -195,10 +202,10 @@ def _conclude(
     run: Run, settings: CampaignSettings, gates: list[Gate], junit: Path | None, *, as_json: bool
 ) -> bool:
     """Write and print what a campaign found; return whether it passed."""
-    from merge_sumo.junit import write_junit
-    from merge_sumo.report import write_report
-    from merge_sumo.summary import summarise
-    from merge_sumo.verdict import NOTHING_TESTED, judge
+    from merge_sumo.reports.junit import write_junit
+    from merge_sumo.reports.report import write_report
+    from merge_sumo.reports.summary import summarise
+    from merge_sumo.reports.verdict import NOTHING_TESTED, judge
 
     report_file = write_report(run)
     summary = summarise(run.outcomes, settings.levels)
@@ -236,8 +243,8 @@ def _conclude(
 
 def _given(context: typer.Context) -> dict[str, object]:
     """Return the settings that a person wrote, by their names in `CampaignSettings`."""
-    from merge_sumo.conductor import parse_levels
-    from merge_sumo.scenario_file import named_scenario
+    from merge_sumo.campaigns.settings import parse_levels
+    from merge_sumo.scenarios.scenario_file import named_scenario
 
     names = {
         name: name
@@ -280,8 +287,8 @@ def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path 
 
 
 def _print_summary(run: Run, summary: Summary, verdict: Verdict, report_file: Path) -> None:
-    from merge_sumo.conductor import SCENARIOS, case_name
-    from merge_sumo.journal import failures
+    from merge_sumo.campaigns.conductor import SCENARIOS, case_name
+    from merge_sumo.campaigns.journal import failures
 
     show(verdict.counts)
     print_troubles(verdict)

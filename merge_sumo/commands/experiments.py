@@ -24,14 +24,14 @@ from merge_sumo.commands.shared import (
     show,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.folders import dated
-from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
+from merge_sumo.system.folders import dated
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
+    from merge_sumo.campaigns.experiments import Comparison, Quartiles, Truth
     from merge_sumo.drivers.vut import VutFactory
-    from merge_sumo.experiments import Comparison, Quartiles, Truth
-    from merge_sumo.scenario import Scenario
-    from merge_sumo.workers import Workers
+    from merge_sumo.system.workers import Workers
+    from merge_sumo.values.scenario import Scenario
 
 
 @app.command()
@@ -57,11 +57,11 @@ def truth(
 
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
     """
-    from merge_sumo import experiments
-    from merge_sumo.conductor import one_level
-    from merge_sumo.fmc import fmc, regions
-    from merge_sumo.scenario_file import named_scenario
-    from merge_sumo.workers import open_workers
+    from merge_sumo.campaigns import experiments
+    from merge_sumo.campaigns.settings import one_level
+    from merge_sumo.scenarios.scenario_file import named_scenario
+    from merge_sumo.system.workers import open_workers
+    from merge_sumo.values.fmc import fmc, regions
 
     chosen = one_level(level)
     factory = _factory(vut, vut_command, deadline, vut_memory)
@@ -125,12 +125,13 @@ def compare(
 
     Example:  merge-sumo compare --vut design1 --level 0 --samplers uniform,gpr --seeds 3
     """
-    from merge_sumo import experiments, figures
-    from merge_sumo.conductor import CampaignSettings, parse_levels
-    from merge_sumo.fmc import fmc
-    from merge_sumo.progress import Counter
-    from merge_sumo.scenario_file import named_scenario
-    from merge_sumo.workers import open_workers
+    from merge_sumo.campaigns import experiments
+    from merge_sumo.campaigns.settings import CampaignSettings, parse_levels
+    from merge_sumo.reports import figures
+    from merge_sumo.reports.progress import Counter
+    from merge_sumo.scenarios.scenario_file import named_scenario
+    from merge_sumo.system.workers import open_workers
+    from merge_sumo.values.fmc import fmc
 
     levels = parse_levels(level)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
@@ -240,9 +241,9 @@ def reproduce(
 
     Example:  merge-sumo reproduce --seeds 10 --out reproduction
     """
-    from merge_sumo import reproduce as paper
-    from merge_sumo.progress import Bars
-    from merge_sumo.workers import open_workers
+    from merge_sumo.reports import reproduce as paper
+    from merge_sumo.reports.progress import Bars
+    from merge_sumo.system.workers import open_workers
 
     if seeds is None:
         seeds = 2 if quick else 10
@@ -292,10 +293,10 @@ def probability(
 
     Example:  merge-sumo probability runs/design2 --cases 4000
     """
-    from merge_sumo import probability as estimates
-    from merge_sumo.conductor import road_for
-    from merge_sumo.journal import Run
-    from merge_sumo.progress import Counter
+    from merge_sumo.campaigns import probability as estimates
+    from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.reports.progress import Counter
 
     campaign = Run(run)
     target = out or run / estimates.RESULT
@@ -348,8 +349,8 @@ def _truth(
     workers: Workers,
     scenario: Scenario,
 ) -> Truth:
-    from merge_sumo import experiments
-    from merge_sumo.progress import Counter
+    from merge_sumo.campaigns import experiments
+    from merge_sumo.reports.progress import Counter
 
     total = experiments.TRUTH_CASES[level] if cases is None else cases
     if total < 1:

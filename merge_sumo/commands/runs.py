@@ -20,11 +20,11 @@ from merge_sumo.commands.shared import (
     show,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_own
-from merge_sumo.printable import quoted
+from merge_sumo.system.folders import check_own
+from merge_sumo.system.printable import quoted
 
 if TYPE_CHECKING:
-    from merge_sumo.comparison import RunComparison
+    from merge_sumo.reports.comparison import RunComparison
 
 EXPORTS: Final = "exports"
 
@@ -62,9 +62,10 @@ def export(
 
     Example:  merge-sumo export runs/design2 17 42
     """
-    from merge_sumo import exports
-    from merge_sumo.conductor import SCENARIOS, road_for
-    from merge_sumo.journal import Run
+    from merge_sumo.campaigns.conductor import SCENARIOS
+    from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.reports import exports
 
     loaded = Run(run)
     if out is None:
@@ -115,8 +116,8 @@ def report(run: RunArgument) -> None:
 
     Example:  merge-sumo report runs/design2
     """
-    from merge_sumo.journal import Run
-    from merge_sumo.report import write_report
+    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.reports.report import write_report
 
     show(write_report(Run(run)))
 
@@ -152,10 +153,10 @@ def compare_runs(
 
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --tolerance 0.005
     """
-    from merge_sumo import comparison
-    from merge_sumo.conductor import road_for
-    from merge_sumo.journal import Run
-    from merge_sumo.verdict import judge
+    from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.reports import comparison
+    from merge_sumo.reports.verdict import judge
 
     if not tolerance >= 0.0:
         raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
@@ -181,7 +182,7 @@ def compare_runs(
 
 
 def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
-    from merge_sumo.comparison import Change
+    from merge_sumo.reports.comparison import Change
 
     show(
         f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "

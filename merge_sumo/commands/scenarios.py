@@ -20,7 +20,7 @@ def list_scenarios() -> None:
 
     Example:  merge-sumo scenario list
     """
-    from merge_sumo.scenario_file import SCENARIOS
+    from merge_sumo.scenarios.scenario_file import SCENARIOS
 
     for name, found in SCENARIOS.items():
         x, v = found.x_pov0_m, found.v_pov0_mps
@@ -43,11 +43,11 @@ def new_scenario(
     import os
     from dataclasses import replace
 
-    from merge_sumo.drawing import road_svg
-    from merge_sumo.folders import check_new_file, write_new
-    from merge_sumo.scenario_file import SUFFIX, to_toml
-    from merge_sumo.suggestion import about, suggested
+    from merge_sumo.scenarios.drawing import road_svg
+    from merge_sumo.scenarios.scenario_file import SUFFIX, to_toml
+    from merge_sumo.scenarios.suggestion import about, suggested
     from merge_sumo.sumo.road import road_of
+    from merge_sumo.system.folders import check_new_file, write_new
 
     if file.suffix != SUFFIX:
         raise UserError(f"{file} is to be a scenario: name it NAME{SUFFIX}")
@@ -72,9 +72,9 @@ def check_scenario(
 
     Example:  merge-sumo scenario check us23
     """
-    from merge_sumo.conductor import road_for
-    from merge_sumo.scenario_file import named_scenario
-    from merge_sumo.suggestion import about, unseen
+    from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.scenarios.scenario_file import named_scenario
+    from merge_sumo.scenarios.suggestion import about, unseen
 
     found = named_scenario(name)
     for line in about(road_for(found)):

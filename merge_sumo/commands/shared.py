@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from merge_sumo.printable import printable
+from merge_sumo.system.printable import printable
 
 if TYPE_CHECKING:
-    from merge_sumo.verdict import Verdict
+    from merge_sumo.reports.verdict import Verdict
 
 MOST_MESSAGES: Final = 5
 """Messages of errors and timeouts that are printed; the report has the others."""

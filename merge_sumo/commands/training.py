@@ -39,7 +39,7 @@ def train(
     Example:  merge-sumo train --out my-policies --seed 1
     """
     from merge_sumo.drivers.policies import NETWORKS, read_manifest
-    from merge_sumo.resources import resource
+    from merge_sumo.system.resources import resource
 
     folder = out or resource("policies")
     unknown = set(only or ()) - set(NETWORKS)
@@ -83,7 +83,7 @@ def _need_training_packages() -> None:
 
 
 def _train(folder: Path, names: tuple[str, ...], seed: int) -> None:
-    from merge_sumo.progress import TrainingBars
+    from merge_sumo.reports.progress import TrainingBars
     from merge_sumo.training.helix import train_library
 
     with TrainingBars() as bars:

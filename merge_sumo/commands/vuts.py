@@ -18,7 +18,7 @@ from merge_sumo.commands.shared import (
     app,
     show,
 )
-from merge_sumo.scenario import DEADLINE_S, MEMORY_GIB
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
 policies = typer.Typer(help="The learned drivers as files for others.", no_args_is_help=True)
 app.add_typer(policies, name="policies")
@@ -62,7 +62,7 @@ def check_vut(
 
     Example:  merge-sumo check-vut design1
     """
-    from merge_sumo import vut_check
+    from merge_sumo.campaigns import vut_check
     from merge_sumo.drivers.vut import vut_factory
     from merge_sumo.drivers.vuts.base import VutOptions
 

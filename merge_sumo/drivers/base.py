@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import Case, FloatArray
+from merge_sumo.values.case import Case, FloatArray
 
 
 @dataclass(frozen=True, slots=True)

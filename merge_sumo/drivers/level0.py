@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.scenario import DT_S, US23
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S, US23
 
 
 def level0_acceleration(

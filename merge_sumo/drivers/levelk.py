@@ -14,10 +14,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import level0_time_to
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, LEVEL0_V_MPS, V_HW_MIN_MPS
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, LEVEL0_V_MPS, V_HW_MIN_MPS
 
 ACTIONS_MPS2: Final = np.arange(A_MIN_MPS2, A_MAX_MPS2 + 1.0)
 """The accelerations that a learned driver chooses from, -4 to +2 m/s2."""

@@ -16,8 +16,8 @@ from merge_sumo.drivers.levelk import DECISION_STEPS, features
 from merge_sumo.drivers.policies import NETWORKS, load_network
 from merge_sumo.drivers.vuts.onnx import PERIOD, STATE
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_new_file, write_new
-from merge_sumo.scenario import DT_S
+from merge_sumo.system.folders import check_new_file, write_new
+from merge_sumo.values.scenario import DT_S
 
 OPSET: Final = 17
 IR_VERSION: Final = 8

@@ -12,7 +12,7 @@ import numpy as np
 
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
 from merge_sumo.errors import UserError
-from merge_sumo.resources import resource
+from merge_sumo.system.resources import resource
 
 MANIFEST: Final = "manifest.json"
 NETWORKS: Final = ("pov1", "vut1", "pov2", "vut2")

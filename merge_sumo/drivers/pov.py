@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov
 from merge_sumo.drivers.policies import load_driver, read_manifest
+from merge_sumo.values.case import Case, FloatArray
 
 POLICIES: Final = {1: "pov1", 2: "pov2"}
 """The learned POVs by their level."""

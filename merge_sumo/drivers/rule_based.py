@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DT_S, US23
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S, US23
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -22,7 +22,7 @@ from merge_sumo.drivers.vuts.sumo_model import sumo_vut
 from merge_sumo.drivers.vuts.traci import traci_vut
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
-from merge_sumo.workers import workers_or_cores
+from merge_sumo.system.workers import workers_or_cores
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import FloatArray
 from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, reflect, uniform_points
+from merge_sumo.values.case import FloatArray
 
 CHAINS: Final = 2
 """Chains per level: a single one may spend the whole budget around a minimum of no failures."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import Case, FloatArray, Pool, dimensions, to_unit
 from merge_sumo.samplers.allocation import even_shares
-from merge_sumo.score import Outcome
+from merge_sumo.values.case import Case, FloatArray, Pool, dimensions, to_unit
+from merge_sumo.values.score import Outcome
 
 
 @dataclass(frozen=True, slots=True)

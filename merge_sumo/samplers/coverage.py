@@ -29,14 +29,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit, logit
 
-from merge_sumo.case import Case, FloatArray, dimensions
-from merge_sumo.fmc import RADIUS
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import LevelHistory, Sampler, uniform_points
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
-from merge_sumo.scenario import DX_CRASH_M
-from merge_sumo.score import FAILURE_SCORE
+from merge_sumo.values.case import Case, FloatArray, dimensions
+from merge_sumo.values.fmc import RADIUS
+from merge_sumo.values.scenario import DX_CRASH_M
+from merge_sumo.values.score import FAILURE_SCORE
 
 UNIFORM_QUERIES: Final = 1500
 LOCAL_QUERIES: Final = 600

@@ -8,12 +8,12 @@ from typing import Any, Final
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from merge_sumo.case import FloatArray
 from merge_sumo.samplers.allocation import last_failure_share, softmax_shares
 from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, uniform_points
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.surrogate import most_telling
-from merge_sumo.score import FAILURE_SCORE
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.score import FAILURE_SCORE
 
 QUERIES: Final = 4000
 """p, the uniform queries among which a batch is chosen."""

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import FloatArray
-from merge_sumo.fmc import RADIUS
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.fmc import RADIUS
 
 CELL: Final = {2: 0.01, 3: 0.0125}
 """Spacing of the grid, per dimension, on which coverage is counted."""

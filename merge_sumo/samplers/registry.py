@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from merge_sumo.case import Pool
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.annealing import AnnealingSampler
 from merge_sumo.samplers.base import Sampler
@@ -12,6 +11,7 @@ from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.gpr import GprSampler
 from merge_sumo.samplers.subset import SubsetSampler
 from merge_sumo.samplers.uniform import UniformSampler
+from merge_sumo.values.case import Pool
 
 SAMPLERS: Final[dict[str, type[Sampler]]] = {
     "uniform": UniformSampler,

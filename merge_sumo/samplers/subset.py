@@ -12,9 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import FloatArray
 from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, reflect, uniform_points
-from merge_sumo.score import FAILURE_SCORE
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.score import FAILURE_SCORE
 
 STAGE_SIZE: Final = 100
 """Samples of a stage, that is of one conditional region."""

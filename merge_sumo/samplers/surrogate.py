@@ -17,8 +17,8 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.special import log_ndtr, ndtr
 
-from merge_sumo.case import FloatArray
 from merge_sumo.samplers.base import LevelHistory
+from merge_sumo.values.case import FloatArray
 
 LEARN_FROM: Final = 150
 """Cases from which the parameters of the kernel are learned at most, and SPACING apart."""

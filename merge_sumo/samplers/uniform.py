@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from merge_sumo.case import FloatArray
 from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, uniform_points
+from merge_sumo.values.case import FloatArray
 
 
 class UniformSampler(LevelwiseSampler):

@@ -15,9 +15,9 @@ from functools import cache
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from merge_sumo.scenario import ROOM_AFTER_M
 from merge_sumo.sumo.corridor import Approach, Corridor, LanePath, Piece
 from merge_sumo.sumo.netfile import Lane, Link, NetFile, Point
+from merge_sumo.values.scenario import ROOM_AFTER_M
 
 SURROUNDINGS_M: Final = 500.0
 """How near to M a lane beside the paths is drawn."""

@@ -12,8 +12,8 @@ from typing import Any, Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.resources import resource
 from merge_sumo.sumo import received
+from merge_sumo.system.resources import resource
 
 MAIN_IN: Final = "main_in"
 MAIN_OUT: Final = "main_out"

@@ -21,9 +21,6 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.folders import new_folder
-from merge_sumo.scenario import DT_S, MAX_EPISODE_S
-from merge_sumo.score import Outcome
 from merge_sumo.sumo import received
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint
@@ -32,7 +29,10 @@ from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.netfile import NetFile, Point
 from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, corridor_of
-from merge_sumo.trajectory import Trajectory
+from merge_sumo.system.folders import new_folder
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import Trajectory
 
 CONFIG: Final = "replay.sumocfg"
 NET: Final = "us23.net.xml"

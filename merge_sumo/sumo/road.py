@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from merge_sumo.scenario import ROOM_AFTER_M
 from merge_sumo.sumo import received
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.finder import find_corridor
 from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net, default_net_path
 from merge_sumo.sumo.netfile import NetFile
+from merge_sumo.values.scenario import ROOM_AFTER_M
 
 MAINLINE_EDGES: Final = (MAIN_IN, MAIN_OUT)
 RAMP_EDGES: Final = (RAMP, MAIN_OUT)

@@ -24,14 +24,14 @@ from typing import Any, Final, Self
 import numpy as np
 from lxml import etree
 
-from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DT_S
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.road import corridor_of, road_of
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import DT_S
 
 POV: Final = 0
 VUT: Final = 1

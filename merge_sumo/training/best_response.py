@@ -16,7 +16,6 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import FloatArray
 from merge_sumo.drivers.level0 import level0_acceleration
 from merge_sumo.drivers.levelk import (
     ACTIONS_MPS2,
@@ -24,7 +23,6 @@ from merge_sumo.drivers.levelk import (
     LEVEL0_GAP_FEATURE,
     QNetwork,
 )
-from merge_sumo.scenario import DT_S, MAX_STEPS, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.training.game import MAX_DECISIONS, Game, IntArray, inputs_of
 from merge_sumo.training.reward import (
     RewardWeights,
@@ -33,6 +31,8 @@ from merge_sumo.training.reward import (
     vut_end,
     vut_step,
 )
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import DT_S, MAX_STEPS, V_VUT0_MPS, X_VUT0_M
 
 POSITION_LATTICE_M: Final = 0.05
 SPEED_LATTICE_MPS: Final = 0.5

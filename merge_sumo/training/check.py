@@ -8,13 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray, from_unit
+from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.rollout import rollout
-from merge_sumo.scenario import DX_CRASH_M, LEVEL0_A_MPS2, LEVEL0_V_MPS, SVO, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import (
     beam_search,
@@ -31,7 +29,16 @@ from merge_sumo.training.reward import (
     vut_end,
     vut_step,
 )
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.values.case import Case, FloatArray, from_unit
+from merge_sumo.values.scenario import (
+    DX_CRASH_M,
+    LEVEL0_A_MPS2,
+    LEVEL0_V_MPS,
+    SVO,
+    V_VUT0_MPS,
+    X_VUT0_M,
+)
+from merge_sumo.values.trajectory import End, Trajectory
 
 CHECK_CASES: Final = 300
 CHECK_SEED: Final = 20_201

@@ -22,11 +22,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from merge_sumo.case import FloatArray
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, QNetwork, features
-from merge_sumo.scenario import SVO
 from merge_sumo.training.env import MergeGame, exploring_starts
 from merge_sumo.training.game import MAX_DECISIONS
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import SVO
 
 SQUASH_BELOW: Final = -2.0
 

@@ -20,13 +20,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from merge_sumo.case import V_POV0, X_POV0, Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, DECISION_STEPS
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import MAX_STEPS, SVO, V_VUT0_MPS, X_VUT0_M
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.world import POV, VUT, World
 from merge_sumo.training.game import Role
@@ -38,6 +36,8 @@ from merge_sumo.training.reward import (
     vut_end,
     vut_step,
 )
+from merge_sumo.values.case import V_POV0, X_POV0, Case, FloatArray
+from merge_sumo.values.scenario import MAX_STEPS, SVO, V_VUT0_MPS, X_VUT0_M
 
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])

@@ -16,10 +16,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import FloatArray
 from merge_sumo.drivers.level0 import level0_acceleration
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, DECISION_STEPS, QNetwork, features
-from merge_sumo.scenario import DT_S, MAX_STEPS
 from merge_sumo.training.reward import (
     RewardWeights,
     pov_reward,
@@ -28,6 +26,8 @@ from merge_sumo.training.reward import (
     vut_end,
     vut_step,
 )
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import DT_S, MAX_STEPS
 
 Role = Literal["pov", "vut"]
 IntArray = NDArray[np.int64]

@@ -23,14 +23,14 @@ from safetensors.numpy import save
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import MANIFEST, NETWORKS, load_network, read_manifest
 from merge_sumo.errors import UserError
-from merge_sumo.folders import cannot_write, check_own, make_place, replace_own, write_new
+from merge_sumo.system.folders import cannot_write, check_own, make_place, replace_own, write_new
+from merge_sumo.system.workers import leave_signals_to_parent
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, QuickRegret, check_network
 from merge_sumo.training.ddqn import DdqnProgress, DdqnSettings, train
 from merge_sumo.training.env import MergeGame, make_opponent
 from merge_sumo.training.game import Game, Role
 from merge_sumo.training.refine import RefineProgress, RefineSettings, refine
 from merge_sumo.training.reward import RewardWeights
-from merge_sumo.workers import leave_signals_to_parent
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "pov1": ("pov", "level0"),

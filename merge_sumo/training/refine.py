@@ -26,13 +26,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from merge_sumo.case import FloatArray
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, QNetwork
-from merge_sumo.scenario import SVO
 from merge_sumo.training.best_response import beam_search
 from merge_sumo.training.ddqn import as_torch, export, squash
 from merge_sumo.training.env import exploring_starts
 from merge_sumo.training.game import MAX_DECISIONS, Game, IntArray, greedy, inputs_of
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import SVO
 
 COST_CAP: Final = 1.0
 """A choice that costs more is wrong enough: what a crash costs must not drown the rest."""

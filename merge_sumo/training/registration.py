@@ -7,7 +7,7 @@ from typing import Final
 from gymnasium.envs import registration
 
 from merge_sumo.drivers.levelk import DECISION_STEPS
-from merge_sumo.scenario import MAX_STEPS
+from merge_sumo.values.scenario import MAX_STEPS
 
 ENV_ID: Final = "merge_sumo/Merge-v0"
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import FloatArray
-from merge_sumo.scenario import (
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import (
     DT_S,
     DX_CRASH_M,
     DX_CRITICAL_M,

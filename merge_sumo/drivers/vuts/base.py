@@ -17,13 +17,13 @@ from typing import Any, Final, NamedTuple, Self, TextIO
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
-from merge_sumo.interrupt import Stopped
-from merge_sumo.scenario import DEADLINE_S, DT_S, MEMORY_GIB
 from merge_sumo.sumo.world import World
-from merge_sumo.trajectory import as_reason
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB
+from merge_sumo.values.trajectory import as_reason
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

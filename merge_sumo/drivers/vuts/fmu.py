@@ -12,8 +12,8 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.vuts.base import PerCorridor, Seen, Vut, VutOptions, asked
 from merge_sumo.drivers.vuts.options import split_options
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DT_S
 from merge_sumo.sumo.world import World
+from merge_sumo.values.scenario import DT_S
 
 INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 OUTPUT: Final = "acceleration_mps2"

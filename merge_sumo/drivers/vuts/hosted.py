@@ -25,7 +25,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.drivers.vuts import wire
 from merge_sumo.drivers.vuts.base import Asked, Vut, VutOptions, Watch
@@ -34,6 +33,7 @@ from merge_sumo.drivers.vuts.output import Output
 from merge_sumo.drivers.vuts.wire import About, Frame, WireError
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, FloatArray
 
 SUPPORTED: Final = os.name == "posix"
 """Elsewhere descriptors do not pass to another process, and a VUT runs in this one."""

@@ -9,7 +9,7 @@ import sysconfig
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.resources import resource
+from merge_sumo.system.resources import resource
 
 SYSTEM: Final = ("/proc", "/sys", "/dev", "/etc", "/usr/lib", "/usr/share", "/lib", "/run")
 MOST_FILES: Final = 10_000

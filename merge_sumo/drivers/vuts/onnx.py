@@ -12,8 +12,8 @@ from merge_sumo.drivers.levelk import ACTIONS_MPS2
 from merge_sumo.drivers.vuts.base import PerCorridor, Seen, Vut, VutOptions
 from merge_sumo.drivers.vuts.options import split_options
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DT_S
 from merge_sumo.sumo.world import World
+from merge_sumo.values.scenario import DT_S
 
 PERIOD: Final = "decision_period_s"
 """Metadata of a network, or option: it decides this often and holds its acceleration."""

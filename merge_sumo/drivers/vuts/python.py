@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.drivers.vuts.base import (
     EVERYBODY,
@@ -33,8 +32,9 @@ from merge_sumo.drivers.vuts.base import (
     text_of,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DT_S
 from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S
 
 GROUP: Final = "merge_sumo.vuts"
 """Entry points of this group are VUTs by their name."""

@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from merge_sumo.case import FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.vuts.base import Vut, VutOptions
 from merge_sumo.drivers.vuts.options import split_options
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, LEVEL0_V_MPS
 from merge_sumo.sumo.world import World
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, LEVEL0_V_MPS
 
 DEFAULTS: Final = {
     "maxSpeed": LEVEL0_V_MPS,

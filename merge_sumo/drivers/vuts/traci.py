@@ -19,7 +19,6 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen, Vut, VutOptions
@@ -27,11 +26,12 @@ from merge_sumo.drivers.vuts.process import GRACE_S, Program, split_command
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
 from merge_sumo.drivers.vuts.traci_session import CLOSE, SIMULATION_STEP, VUT, Session
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import DT_S
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.road import corridor_of, road_of
 from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S
 
 T = TypeVar("T")
 

@@ -16,8 +16,8 @@ from typing import Final
 from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint, Piece
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 
 POV: Final = "pov"
 VUT: Final = "vut"

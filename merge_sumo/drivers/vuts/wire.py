@@ -16,9 +16,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Scene
-from merge_sumo.scenario import US23, Scenario
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import US23, Scenario
 
 
 class About(IntEnum):

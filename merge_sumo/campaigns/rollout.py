@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
-from merge_sumo.scenario import DT_S, MAX_EPISODE_S
 from merge_sumo.sumo.world import POV, VUT, SimulationError, World
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
+from merge_sumo.values.trajectory import End, Trajectory
 
 RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
 """Rows of the record: an episode is copied out before its first row is written over."""

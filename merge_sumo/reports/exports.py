@@ -16,16 +16,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.conductor import case_name
+from merge_sumo.campaigns.conductor import case_name
+from merge_sumo.campaigns.journal import Run
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_new, check_place, make_place, new_file, new_folder
-from merge_sumo.journal import Run
-from merge_sumo.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import write_scenario
 from merge_sumo.sumo.road import corridor_of
+from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 
 TABLE: Final = "trajectories"
 COLUMNS: Final = (

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
-from merge_sumo.conductor import ProvingGround
+from merge_sumo.campaigns.ground import ProvingGround
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.drivers.vut import VutFactory
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.trajectory import End, Trajectory
 
 CORRIDORS: Final = 4
 CASES: Final = tuple(

@@ -22,24 +22,33 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import FloatArray, dimensions, to_unit
-from merge_sumo.conductor import SCENARIOS, case_name, road_for, versions
-from merge_sumo.diagnosis import CEDED_MPS, MEANING, Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.campaigns.conductor import SCENARIOS, case_name
+from merge_sumo.campaigns.experiments import TRUTH_CASES, Kept, Truth, read_truth
+from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.journal import SETTINGS, Run, failures
+from merge_sumo.campaigns.settings import versions
 from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.errors import UserError
-from merge_sumo.experiments import TRUTH_CASES, Kept, Truth, read_truth
-from merge_sumo.fmc import RADIUS, fmc
-from merge_sumo.folders import cannot_write, check_own, replace_own
-from merge_sumo.journal import SETTINGS, Run, failures
-from merge_sumo.printable import printable
-from merge_sumo.scenario import DEADLINE_S, DT_S, LEVELS
-from merge_sumo.score import FAILURE_SCORE, Outcome
-from merge_sumo.summary import LevelSummary, Summary, summarise
+from merge_sumo.reports.diagnosis import (
+    CEDED_MPS,
+    MEANING,
+    Diagnosis,
+    Kind,
+    diagnose,
+    failure_boxes,
+)
+from merge_sumo.reports.summary import LevelSummary, Summary, summarise
+from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE, Surface, learn_surface
+from merge_sumo.reports.verdict import Trouble, Verdict, counted, in_words, judge, shortened
 from merge_sumo.sumo.corridor import Corridor, LanePath
 from merge_sumo.sumo.road import road_of
-from merge_sumo.surface import FEWEST_FAILURES, PLAUSIBLE, Surface, learn_surface
-from merge_sumo.trajectory import End, Trajectory
-from merge_sumo.verdict import Trouble, Verdict, counted, in_words, judge, shortened
+from merge_sumo.system.folders import cannot_write, check_own, replace_own
+from merge_sumo.system.printable import printable
+from merge_sumo.values.case import FloatArray, dimensions, to_unit
+from merge_sumo.values.fmc import RADIUS, fmc
+from merge_sumo.values.scenario import DEADLINE_S, DT_S, LEVELS
+from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.trajectory import End, Trajectory
 
 REPORT: Final = "report.html"
 GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
@@ -95,7 +104,7 @@ def report_page(run: Run) -> str:
     from jinja2 import Environment, PackageLoader
     from markupsafe import Markup
 
-    loader = PackageLoader("merge_sumo")
+    loader = PackageLoader("merge_sumo.reports")
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
     style, script = (
         (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.drivers.level0 import level0_time_to
-from merge_sumo.scenario import US23, Scenario
 from merge_sumo.sumo.corridor import Corridor, LanePath
+from merge_sumo.values.scenario import US23, Scenario
 
 MARGIN: Final = 0.15
 """The pool reaches this far beyond the starts from which both vehicles meet at M."""

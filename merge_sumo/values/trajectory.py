@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from merge_sumo.case import Case, FloatArray
-from merge_sumo.printable import printable
-from merge_sumo.scenario import DT_S
+from merge_sumo.system.printable import printable
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S
 
 
 class End(StrEnum):

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from merge_sumo.case import FloatArray, dimensions
+from merge_sumo.campaigns.experiments import Comparison
 from merge_sumo.errors import UserError
-from merge_sumo.experiments import Comparison
-from merge_sumo.fmc import RADIUS
-from merge_sumo.folders import check_new_file, write_new
-from merge_sumo.scenario import Dimension
-from merge_sumo.score import FAILURE_SCORE
+from merge_sumo.system.folders import check_new_file, write_new
+from merge_sumo.values.case import FloatArray, dimensions
+from merge_sumo.values.fmc import RADIUS
+from merge_sumo.values.scenario import Dimension
+from merge_sumo.values.score import FAILURE_SCORE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

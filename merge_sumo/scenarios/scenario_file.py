@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import US23, Scenario
+from merge_sumo.values.scenario import US23, Scenario
 
 SCENARIOS: Final = {US23.name: US23}
 """The scenarios that the package brings, by name."""

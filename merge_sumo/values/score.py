@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.case import COORDINATES, Case, FloatArray
-from merge_sumo.scenario import DT_S, US23, Scenario
-from merge_sumo.trajectory import End, Trajectory, as_reason
+from merge_sumo.values.case import COORDINATES, Case, FloatArray
+from merge_sumo.values.scenario import DT_S, US23, Scenario
+from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
 """lambda: a case fails when its score is below."""

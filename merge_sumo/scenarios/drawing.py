@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from lxml import etree
 
-from merge_sumo.scenario import Scenario
 from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.values.scenario import Scenario
 
 WIDTH_PX = 1000
 LANE_M = 3.2

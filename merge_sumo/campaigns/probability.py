@@ -31,26 +31,20 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import Case, FloatArray, dimensions
-from merge_sumo.conductor import (
-    MAX_CORRIDORS,
-    CampaignSettings,
-    OnCase,
-    ProvingGround,
-    record_of,
-    road_for,
-    settings_of,
-)
+from merge_sumo.campaigns.conductor import OnCase
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
+from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_new_file, write_new
-from merge_sumo.journal import Run
 from merge_sumo.samplers.base import LevelHistory
 from merge_sumo.samplers.coverage import learn_chance
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.scenario import US23, Dimension, Scenario
-from merge_sumo.score import Outcome, measure
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
+from merge_sumo.system.folders import check_new_file, write_new
+from merge_sumo.values.case import Case, FloatArray, dimensions
+from merge_sumo.values.scenario import US23, Dimension, Scenario
+from merge_sumo.values.score import Outcome, measure
 
 RESULT: Final = "probability.json"
 LINES: Final = ".jsonl"

@@ -17,10 +17,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.case import Case, FloatArray
-from merge_sumo.scenario import DT_S
-from merge_sumo.score import Measures, Outcome
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End, Trajectory
 
 KEEPS_UP_MPS2: Final = 0.2
 """A vehicle that falls back by no more than this keeps up with its level-0 profile."""

@@ -13,12 +13,12 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from merge_sumo.case import dimensions, to_unit
 from merge_sumo.errors import UserError
-from merge_sumo.fmc import fmc
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.score import Outcome
+from merge_sumo.values.case import dimensions, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import Outcome
 
 PATIENCE: Final = 3
 """Batches in a row after which little must be expected: one may be luck."""

@@ -17,29 +17,23 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from merge_sumo.case import FloatArray, Pool, dimensions, to_unit
-from merge_sumo.conductor import (
-    MAX_CORRIDORS,
-    GroundPlan,
-    conduct,
-    road_for,
-    run_cases,
-    versions,
-    workers_or_here,
-)
+from merge_sumo.campaigns.conductor import conduct, workers_or_here
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
+from merge_sumo.campaigns.journal import UNREADABLE_NPZ, read_arrays
+from merge_sumo.campaigns.settings import versions
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
 from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
-from merge_sumo.fmc import RADIUS, fmc, regions
-from merge_sumo.folders import check_own, check_place, make_place, replace_own
-from merge_sumo.journal import UNREADABLE_NPZ, read_arrays
-from merge_sumo.resources import cache_folder
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.scenario import US23, Scenario
-from merge_sumo.score import FAILURE_SCORE, Outcome
-from merge_sumo.workers import Workers
+from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
+from merge_sumo.system.resources import cache_folder
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import FloatArray, Pool, dimensions, to_unit
+from merge_sumo.values.fmc import RADIUS, fmc, regions
+from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.score import FAILURE_SCORE, Outcome
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
@@ -75,11 +69,8 @@ class Truth:
 
 
 DECIDES_OUTCOMES: Final = (
-    "scenario.py",
-    "case.py",
-    "trajectory.py",
-    "score.py",
-    "rollout.py",
+    "values",
+    "campaigns/rollout.py",
     "sumo",
     "drivers",
 )
@@ -160,7 +151,7 @@ class Kept:
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
-        package = Path(__file__).resolve().parent
+        package = Path(__file__).resolve().parents[1]
         sources = hashlib.sha256()
         for part in DECIDES_OUTCOMES:
             for source in sorted((package / part).rglob("*.py")) or [package / part]:

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.printable import printable
-from merge_sumo.score import Measures, Outcome
-from merge_sumo.summary import Summary
-from merge_sumo.trajectory import End
+from merge_sumo.reports.summary import Summary
+from merge_sumo.system.printable import printable
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
 
 ERRORS: Final = {End.VUT_ERROR: "a VUT error", End.SIM_ERROR: "an error of the simulation"}
 """Ends of an episode that went wrong, in words."""

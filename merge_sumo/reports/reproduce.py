@@ -14,11 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo import figures
-from merge_sumo.case import FloatArray, Pool, to_unit
-from merge_sumo.conductor import versions
-from merge_sumo.errors import UserError
-from merge_sumo.experiments import (
+from merge_sumo.campaigns.experiments import (
     TRUTH_CASES,
     Comparison,
     Search,
@@ -28,14 +24,18 @@ from merge_sumo.experiments import (
     oracle,
     search,
 )
-from merge_sumo.figures import Levels, Panel, Surface
-from merge_sumo.fmc import fmc
-from merge_sumo.folders import make_folder, write_new
+from merge_sumo.campaigns.settings import versions
+from merge_sumo.errors import UserError
+from merge_sumo.reports import figures
+from merge_sumo.reports.figures import Levels, Panel, Surface
 from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.scenario import LEVELS
-from merge_sumo.score import FAILURE_SCORE, Outcome
-from merge_sumo.workers import Workers
+from merge_sumo.system.folders import make_folder, write_new
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import FloatArray, Pool, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import LEVELS
+from merge_sumo.values.score import FAILURE_SCORE, Outcome
 
 TABLE_JSON: Final = "table2.json"
 TABLE_MARKDOWN: Final = "table2.md"
@@ -383,7 +383,7 @@ def _table_record(table: Mapping[str, Result], scale: Scale) -> dict[str, Any]:
 def _page(table: Mapping[str, Result], scale: Scale, pictures: Mapping[str, str]) -> str:
     from jinja2 import Environment, PackageLoader
 
-    environment = Environment(loader=PackageLoader("merge_sumo"), autoescape=True, trim_blocks=True)
+    environment = Environment(loader=PackageLoader("merge_sumo.reports"), autoescape=True, trim_blocks=True)
     return environment.get_template("reproduce.html.jinja").render(
         results=list(table.values()),
         rows=dict(_rows(table)),

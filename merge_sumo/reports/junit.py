@@ -13,17 +13,17 @@ from typing import Final
 
 from lxml import etree
 
+from merge_sumo.campaigns.journal import Run
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_new, check_new_file, write_new
-from merge_sumo.journal import Run
-from merge_sumo.score import Outcome
-from merge_sumo.trajectory import End
-from merge_sumo.verdict import (
+from merge_sumo.reports.verdict import (
     NOTHING_TESTED,
     GateResult,
     Verdict,
     message_of,
 )
+from merge_sumo.system.folders import check_new, check_new_file, write_new
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import End
 
 CLASS: Final = "merge-sumo"
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.folders import make_place, write_new
-from merge_sumo.resources import cache_folder
+from merge_sumo.system.folders import make_place, write_new
+from merge_sumo.system.resources import cache_folder
 
 SEAL: Final = "seal"
 """Key of `campaign.json`."""

@@ -29,13 +29,13 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.case import FloatArray
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_own, new_folder, replace_own, sync_folder
-from merge_sumo.printable import printable, quoted
-from merge_sumo.scenario import US23, Scenario
-from merge_sumo.score import Outcome
-from merge_sumo.trajectory import End, Trajectory
+from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_folder
+from merge_sumo.system.printable import printable, quoted
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import End, Trajectory
 
 SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"

@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from merge_sumo.case import to_unit
-from merge_sumo.fmc import fmc, regions
-from merge_sumo.score import Outcome
-from merge_sumo.trajectory import End
+from merge_sumo.values.case import to_unit
+from merge_sumo.values.fmc import fmc, regions
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import End
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,12 +21,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from merge_sumo.case import Case, to_unit
-from merge_sumo.fmc import fmc
-from merge_sumo.printable import printable
-from merge_sumo.score import Outcome
-from merge_sumo.trajectory import End
-from merge_sumo.verdict import in_counts
+from merge_sumo.reports.verdict import in_counts
+from merge_sumo.system.printable import printable
+from merge_sumo.values.case import Case, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import End
 
 if TYPE_CHECKING:
     from merge_sumo.training.check import PolicyCheck

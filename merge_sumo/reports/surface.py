@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.case import FloatArray, Pool, dimensions
-from merge_sumo.fmc import fmc
 from merge_sumo.samplers.coverage import learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
-from merge_sumo.score import Outcome
+from merge_sumo.values.case import FloatArray, Pool, dimensions
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import Outcome
 
 FEWEST_FAILURES: Final = 5
 """Failures at a level from which a surrogate has something to say of others."""

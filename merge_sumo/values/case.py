@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.scenario import LEVELS, SVO, US23, Dimension, Scenario
+from merge_sumo.values.scenario import LEVELS, SVO, US23, Dimension, Scenario
 
 FloatArray = NDArray[np.float64]
 

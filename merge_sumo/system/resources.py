@@ -11,7 +11,7 @@ def resource(name: str) -> Path:
 
     A wheel carries the folders inside the package; a source tree has them beside it.
     """
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     shipped = package / "shipped" / name
     return shipped if shipped.is_dir() else package.parent / name
 

@@ -15,16 +15,17 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from merge_sumo.case import Case, to_unit
-from merge_sumo.conductor import MAX_CORRIDORS, ProvingGround, road_for, settings_of
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
+from merge_sumo.campaigns.journal import SETTINGS, Run, failures
+from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
-from merge_sumo.fmc import fmc
-from merge_sumo.journal import SETTINGS, Run, failures
-from merge_sumo.score import FAILURE_SCORE, Measures, Outcome, measure
+from merge_sumo.reports.verdict import Verdict, counted, judge
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
-from merge_sumo.trajectory import End
-from merge_sumo.verdict import Verdict, counted, judge
+from merge_sumo.values.case import Case, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import FAILURE_SCORE, Measures, Outcome, measure
+from merge_sumo.values.trajectory import End
 
 FIRST_LOOKS: Final = 10
 CHECKED: Final = 32

@@ -1,0 +1,1 @@
+"""Cases are run here: from one episode to campaigns, truths and estimates."""

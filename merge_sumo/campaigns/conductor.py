@@ -1,0 +1,243 @@
+"""The conductor: a sampler proposes, the world runs, the journal remembers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, RunCases, road_for, runs_on
+from merge_sumo.campaigns.journal import SETTINGS, Journal, Run, failures
+from merge_sumo.campaigns.settings import (
+    RECORDED_BY_DEFAULT,
+    CampaignSettings,
+    differences,
+    record_of,
+    settings_of,
+)
+from merge_sumo.drivers.vuts.files import Files, sha256_of
+from merge_sumo.drivers.vuts.output import LOG
+from merge_sumo.errors import UserError
+from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.replay import write_scenario
+from merge_sumo.system.folders import check_new, check_own
+from merge_sumo.system.trust import SEAL, seal
+from merge_sumo.system.workers import Workers, open_workers
+from merge_sumo.values.case import Case
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import Trajectory
+
+EXPORTED_FAILURES: Final = 10
+SCENARIOS: Final = "scenarios"
+FORCED: Final = "forced"
+"""Key of `campaign.json`: what differed where a campaign went on with --force."""
+
+OnCase = Callable[[Outcome], None]
+"""Told of every case as it ends, in the order in which cases end."""
+
+
+def conduct(
+    sampler: Sampler,
+    run: RunCases,
+    cases: int,
+    batch: int,
+    on_case: OnCase | None = None,
+    history: Sequence[Outcome] = (),
+    stop: Callable[[Sequence[Outcome]], bool] = lambda _: False,
+) -> Iterator[list[tuple[Outcome, Trajectory]]]:
+    """Ask, run, tell, batch by batch; yield what each batch gave, in order of the cases.
+
+    It ends after `cases`, or earlier where `stop` says so of the outcomes so far. A campaign goes
+    on after `history`, whole batches of its own outcomes: the sampler is told them, and as it is
+    pure in what it was told, it proposes what it would have proposed then.
+    """
+    sampler.tell(history)
+    batches_before = history[-1].batch + 1 if history else 0
+    for number, first in enumerate(range(len(history), cases, batch), start=batches_before):
+        if stop(sampler.told()):
+            return
+        ran: list[tuple[Outcome, Trajectory]] = []
+        for place, done in run(sampler.ask(min(batch, cases - first))):
+            outcome = Outcome(first + place, number, done.trajectory.case, done.measures)
+            ran.append((outcome, done.trajectory))
+            if on_case is not None:
+                on_case(outcome)
+        ran.sort(key=lambda pair: pair[0].index)
+        sampler.tell(outcome for outcome, _ in ran)
+        yield ran
+
+
+def run_campaign(
+    settings: CampaignSettings,
+    folder: Path,
+    net: Net | Corridor | None = None,
+    on_case: OnCase | None = None,
+    *,
+    workers: Workers | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> Run:
+    """Run a campaign into a new folder and return it as read back from there.
+
+    Same settings, same versions: same `outcomes.jsonl`, whatever the workers. The worst failures
+    are exported as folders that sumo-gui opens. Raises `UserError` when the folder exists.
+
+    Args:
+        settings: what to run.
+        folder: where to.
+        net: the road, by default the shipped one.
+        on_case: told of every case.
+        workers: where cases run, by default in this process.
+        check: called after every batch; may raise to stop there, and `resume_campaign` goes on.
+    """
+    check_new(folder)
+    check_new(folder / SCENARIOS / case_name(settings.cases))
+    net = net or road_for(settings.scenario)
+    with workers_or_here(workers) as there:
+        run = runs_on(there, _plan(settings, net, folder))
+        record = record_of(settings, net)
+        sealed = {**record, SEAL: seal(record)}
+        with Journal.create(folder, sealed) as journal:
+            return _go_on(settings, sealed, net, journal, run, (), on_case, check)
+
+
+def resume_campaign(
+    folder: Path,
+    net: Net | Corridor | None = None,
+    on_case: OnCase | None = None,
+    *,
+    given: Mapping[str, object] | None = None,
+    force: bool = False,
+    workers: Workers | None = None,
+    check: Callable[[], None] = lambda: None,
+    warn: Callable[[str], None] = lambda _: None,
+    trust: bool = False,
+) -> Run:
+    """Go on with a campaign that was stopped, however it was; return it as `run_campaign` does.
+
+    The result is the same to the last byte as if it had never been stopped. Raises `UserError`
+    with the name of the field where something differs that decides outcomes: settings that are
+    `given`, versions, net, policies. With `force` it goes on and records that they did.
+
+    Args:
+        folder: where the campaign is.
+        net: the net with which it was started, by default the shipped one.
+        on_case: told of every case, also of those that ran before.
+        given: settings that a person named again, by their names in `CampaignSettings`.
+        force: go on although something differs.
+        workers: where cases run, by default in this process.
+        check: called after every batch; may raise to stop there.
+        warn: told in a sentence what was dropped.
+        trust: run the controller that the folder names although the folder may be a stranger's.
+    """
+    check_own(folder / SCENARIOS)
+    journal, before, dropped = Journal.reopen(folder)
+    net = net or road_for(before.scenario)
+    with journal, workers_or_here(workers) as there:
+        recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, SEAL)}
+        settings = settings_of(folder, before.settings, given, trust=trust)
+        record = record_of(settings, net)
+        # What was loaded while it ran must be the same, too, although it is not loaded yet.
+        record["vut_files"] = _files_again(recorded) | (record["vut_files"] or {}) or None
+        changes = differences(RECORDED_BY_DEFAULT | recorded, record)
+        if changes and not force:
+            name, (was, now) = next(iter(changes.items()))
+            raise UserError(
+                f"{name} differs: {folder} was run with {was}, now it is {now}; make it the same, "
+                "or go on with --force, which is recorded"
+            )
+        if dropped:
+            warn(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
+        run = runs_on(there, _plan(settings, net, folder))
+        record[SEAL] = seal(record)
+        if before.settings.get(FORCED) or changes:
+            forced = {"from_case": len(before.outcomes), "differs": changes}
+            record[FORCED] = [*_forced(before), *([forced] if changes else [])]
+        if changes:
+            journal.rewrite_settings(record)
+        if on_case is not None:
+            for outcome in before.outcomes:
+                on_case(outcome)
+        return _go_on(settings, record, net, journal, run, before.outcomes, on_case, check)
+
+
+def _files_again(recorded: Mapping[str, Any]) -> Files:
+    """Return the files that a record names, as they are now."""
+    files = recorded.get("vut_files")
+    try:
+        return {name: sha256_of(Path(name)) for name in files} if isinstance(files, dict) else {}
+    except ValueError as error:
+        raise UserError(f"{SETTINGS} has a file that no file can be named: {error}") from error
+
+
+def _go_on(
+    settings: CampaignSettings,
+    record: dict[str, Any],
+    net: Net | Corridor,
+    journal: Journal,
+    run: RunCases,
+    history: Sequence[Outcome],
+    on_case: OnCase | None,
+    check: Callable[[], None],
+) -> Run:
+    sampler = make_sampler(settings.sampler, settings.pool, settings.seed)
+    stop = settings.stopping_rule()
+    files: Files = dict(record["vut_files"] or {})
+
+    def noting_files(cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
+        for place, done in run(cases):
+            for name, sha256 in done.files.items():
+                files.setdefault(name, sha256)
+            yield place, done
+
+    batches = conduct(sampler, noting_files, settings.cases, settings.batch, on_case, history, stop)
+    for ran in batches:
+        journal.append(ran)
+        if len(files) > len(record["vut_files"] or {}):
+            record["vut_files"] = dict(files)
+            journal.rewrite_settings(record)
+        check()
+    done = Run(journal.folder)
+    for outcome in failures(done.outcomes)[:EXPORTED_FAILURES]:
+        folder = journal.folder / SCENARIOS / case_name(outcome.index)
+        if not os.path.lexists(folder):  # written whole, before the campaign was stopped
+            export_case(done, outcome.index, folder, net)
+    return done
+
+
+@contextmanager
+def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
+    """Give the workers, which stay open, or this process as the only one."""
+    if workers is not None:
+        yield workers
+        return
+    with open_workers(1) as here:
+        yield here
+
+
+def _plan(settings: CampaignSettings, net: Net | Corridor, folder: Path) -> GroundPlan:
+    return GroundPlan(
+        vut=settings.vut_factory.with_log(folder.resolve() / LOG),
+        corridors=min(MAX_CORRIDORS, settings.batch),
+        net=net,
+    )
+
+
+def _forced(run: Run) -> list[Any]:
+    forced = run.settings.get(FORCED, [])
+    return forced if isinstance(forced, list) else [forced]
+
+
+def case_name(index: int) -> str:
+    """Return the name of a case's folder."""
+    return f"case-{index:05d}"
+
+
+def export_case(run: Run, index: int, folder: Path, net: Net | Corridor | None = None) -> Path:
+    """Write a case of a run as a replay folder; return the path of its SUMO configuration."""
+    road = net or road_for(run.scenario)
+    return write_scenario(folder, road, run.outcome(index), run.trajectory(index))

@@ -1,0 +1,177 @@
+"""The proving ground: a VUT, the POVs and SUMO, opened in whatever process runs the cases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from threading import RLock
+from typing import Final, Self
+
+import numpy as np
+
+from merge_sumo.campaigns.rollout import rollout
+from merge_sumo.campaigns.settings import differences, software
+from merge_sumo.drivers.pov import PovLibrary
+from merge_sumo.drivers.vut import VutFactory, vut_factory
+from merge_sumo.drivers.vuts.files import Files, hashed
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import corridor_of, road_of
+from merge_sumo.sumo.world import World
+from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import Scenario
+from merge_sumo.values.score import Measures, measure
+from merge_sumo.values.trajectory import End, Trajectory
+
+MAX_CORRIDORS: Final = 32
+
+
+class ProvingGround:
+    """A VUT and the POV library in a SUMO world: takes cases, gives trajectories."""
+
+    def __init__(
+        self,
+        vut: str | VutFactory,
+        corridors: int = MAX_CORRIDORS,
+        net: Net | Corridor | None = None,
+    ) -> None:
+        """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
+        factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
+        corridors = min(corridors, factory.vut.max_corridors or corridors)
+        self.world = World(corridors, net, factory.vut.vut_type)
+        try:
+            self.vut = factory(corridors, self.world)
+            self.pov = PovLibrary(corridors)
+        except BaseException:
+            self.world.close()
+            raise
+
+    def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
+        """Run cases; yield (place in `cases`, trajectory) as they end."""
+        return rollout(self.world, self.pov, self.vut, cases)
+
+    def __enter__(self) -> Self:
+        """Return the proving ground."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the VUT, then SUMO."""
+        try:
+            self.vut.close()
+        finally:
+            self.world.close()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GroundPlan:
+    """What it takes to open a `ProvingGround` in any process; it travels with every chunk."""
+
+    vut: VutFactory
+    corridors: int
+    net: Net | Corridor
+    software: dict[str, str] = field(default_factory=software)
+
+    def key(self) -> tuple[object, ...]:
+        """Return what tells one plan from another."""
+        vut = self.vut.spec, self.vut.options, self.vut.files
+        road = corridor_of(self.net)
+        edges = road.sha256, road.mainline_edges, road.ramp_edges
+        return *vut, self.corridors, *edges, *self.software.items()
+
+    def open(self) -> ProvingGround:
+        """Open the proving ground; `UserError` where other software would give other outcomes."""
+        for name, (there, here) in differences(self.software, software()).items():
+            raise UserError(
+                f"a worker has {name} {here}, and this process {there}: install the same there"
+            )
+        return ProvingGround(self.vut, self.corridors, self.net)
+
+
+@dataclass(frozen=True, slots=True)
+class Ran:
+    """What became of one case, and the files that had decided on the VUT's answers by then."""
+
+    measures: Measures
+    trajectory: Trajectory
+    files: Files = field(default_factory=dict)
+
+
+_kept: tuple[tuple[object, ...], ProvingGround] | None = None
+"""The proving ground of this process, with the key of its plan: it stays open between chunks."""
+_one_at_a_time = RLock()
+"""libsumo holds one simulation per process, and some clusters give a process several threads."""
+
+
+def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
+    """Run cases on the proving ground of this process and return what became of each."""
+    with _one_at_a_time:
+        ground = _opened_ground(plan)
+        try:
+            ran = dict(ground.run(cases))
+            files = hashed(ground.vut.files())
+        except BaseException:
+            _close_ground()  # it stands in the middle of episodes
+            raise
+    return [Ran(measure(ran[place]), ran[place], files) for place in range(len(cases))]
+
+
+def _opened_ground(plan: GroundPlan) -> ProvingGround:
+    global _kept  # noqa: PLW0603 (one SUMO per process)
+    if _kept is None or _kept[0] != plan.key():
+        _close_ground()
+        _kept = plan.key(), plan.open()
+        when_worker_ends(_close_ground)
+    return _kept[1]
+
+
+def _close_ground() -> None:
+    global _kept
+    with _one_at_a_time:
+        if _kept is not None:
+            ground, _kept = _kept[1], None
+            ground.__exit__(None, None, None)
+
+
+def lost_case(case: Case) -> Ran:
+    """Return what is recorded of a case that ended every worker that ran it."""
+    x_vut0_m = case.scenario.x_vut0_m
+    start = [[case.x_pov0_m, case.v_pov0_mps, 0.0, x_vut0_m, case.v_vut0_mps, 0.0]]
+    reason = f"its worker process died {MAX_DEATHS} times"
+    trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, reason)
+    return Ran(measure(trajectory), trajectory)
+
+
+RunCases = Callable[[Sequence[Case]], Iterable[tuple[int, Ran]]]
+"""Runs cases somewhere; gives (place, what became of the case) in any order."""
+
+
+def runs_on(workers: Workers, plan: GroundPlan) -> RunCases:
+    """Return what runs cases on workers; `UserError` when the plan cannot be carried out there."""
+
+    def died(_: None) -> None:
+        raise UserError(f"opening the VUT {plan.vut.spec} ended its process: look into the VUT")
+
+    for _ in workers.run(partial(_open_ground, plan), [None], died):
+        pass
+    return lambda cases: workers.run(partial(run_cases, plan), cases, lost_case)
+
+
+def _open_ground(plan: GroundPlan, nothing: Sequence[None]) -> Sequence[None]:
+    with _one_at_a_time:
+        _opened_ground(plan)
+    return nothing
+
+
+def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
+    """Return the road of a scenario, or another net with the same edges.
+
+    Raises `UserError` where there is no such merge, or not room enough for its vehicles.
+    """
+    file = Path(scenario.net) if net is None and scenario.net is not None else net
+    road = road_of(file, scenario.mainline, scenario.ramp, scenario.room_after_m)
+    road.check_room(-scenario.x_pov0_m[0], -scenario.x_vut0_m)
+    return road

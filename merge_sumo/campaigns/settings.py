@@ -1,0 +1,230 @@
+"""Everything that decides what a campaign does, and how it is written down."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, fields
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, get_args, get_origin, get_type_hints
+
+from merge_sumo.campaigns.convergence import StoppingRule
+from merge_sumo.campaigns.journal import SETTINGS, scenario_of
+from merge_sumo.drivers.policies import read_manifest
+from merge_sumo.drivers.pov import available_levels
+from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
+from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.errors import UserError
+from merge_sumo.samplers import DEFAULT_SAMPLER
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.sumo.net import Net
+from merge_sumo.system.trust import is_own
+from merge_sumo.values.case import Pool
+from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, US23, Scenario
+from merge_sumo.values.score import Outcome
+
+DEFAULT_CASES: Final = 800
+DEFAULT_BATCH: Final = 40
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CampaignSettings:
+    """Everything that decides what a campaign does; `UserError` for values that make none."""
+
+    vut: str
+    levels: tuple[int, ...]
+    sampler: str = DEFAULT_SAMPLER
+    cases: int = DEFAULT_CASES
+    batch: int = DEFAULT_BATCH
+    seed: int = 0
+    v_vut0_mps: float | None = None
+    stop_after_converged: float | None = None
+    vut_command: str | None = None
+    deadline_s: float = DEADLINE_S
+    vut_memory_gib: float = MEMORY_GIB
+    in_process: bool = False
+    scenario: Scenario = US23
+
+    def __post_init__(self) -> None:
+        """Check the numbers, the names and the levels; the scenario says what is left out."""
+        if self.v_vut0_mps is None:
+            object.__setattr__(self, "v_vut0_mps", self.scenario.v_vut0_mps)
+        for option, text in (("--vut", self.vut), ("--vut-command", self.vut_command or "")):
+            if not _is_text(text):
+                raise UserError(
+                    f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
+                    "rename the file"
+                )
+        _ = self.vut_factory
+        if not self.levels or len(set(self.levels)) < len(self.levels):
+            raise UserError(f"the levels are {list(self.levels)}: name each level once")
+        for level in self.levels:
+            check_level(level)
+        make_sampler(self.sampler, self.pool, self.seed)
+        for name in ("cases", "batch"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name} is {getattr(self, name)}: it must be 1 or more")
+        if self.batch > self.cases:
+            raise UserError(
+                f"--batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
+                "cases than the campaign"
+            )
+        if self.seed < 0:
+            raise UserError(f"--seed is {self.seed}: it must be 0 or more")
+        most_mps = self.scenario.v_start_max_mps
+        if not 0.0 <= self.pool.v_vut0_mps <= most_mps:
+            raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
+        self.stopping_rule()
+
+    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool]:
+        """Return what says of the outcomes so far whether the search is over."""
+        if self.stop_after_converged is None:
+            return lambda _: False
+        fresh = partial(make_sampler, self.sampler, self.pool, self.seed)
+        return StoppingRule(self.stop_after_converged, self.batch, fresh)
+
+    @property
+    def vut_factory(self) -> VutFactory:
+        """What makes the VUT."""
+        options = VutOptions(
+            command=self.vut_command,
+            deadline_s=self.deadline_s,
+            memory_gib=self.vut_memory_gib,
+            in_process=self.in_process,
+        )
+        return vut_factory(self.vut, options)
+
+    @property
+    def pool(self) -> Pool:
+        """The cases to choose from."""
+        assert self.v_vut0_mps is not None, "taken from the scenario"  # noqa: S101
+        return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps, scenario=self.scenario)
+
+
+RECORDED_BY_DEFAULT: Final = {
+    **{f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING},
+    "v_vut0_mps": US23.v_vut0_mps,
+    "scenario": asdict(US23),
+}
+"""What the settings were in a campaign that does not record them."""
+
+
+def _is_text(text: str) -> bool:
+    """Return whether a text from the command line is one; other bytes come as half characters."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def parse_levels(text: str) -> tuple[int, ...]:
+    """Return the levels that `--level` names: one, or all for which there is a policy."""
+    if text == "all":
+        return available_levels()
+    if text not in map(str, LEVELS):
+        raise UserError(f"there is no POV level {text!r}: choose 0, 1, 2 or all")
+    check_level(int(text))
+    return (int(text),)
+
+
+def check_level(level: int) -> None:
+    """Raise `UserError` when there is no POV of a level."""
+    if level not in LEVELS:
+        raise UserError(f"there is no POV level {level}: choose 0, 1, 2 or all")
+    if level not in available_levels():
+        raise UserError(
+            f"there is no policy for a POV of level {level}: run `merge-sumo train` to make it"
+        )
+
+
+def one_level(text: str) -> int:
+    """Return the one level that `--level` names."""
+    if text == "all":
+        raise UserError("--level all does not go here: choose 0, 1 or 2")
+    return parse_levels(text)[0]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that decide the outcome of a case."""
+    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def software() -> dict[str, str]:
+    """Return the versions, and the hashes of the policies, by name."""
+    policies = {f"policy {name}": entry["sha256"] for name, entry in read_manifest().items()}
+    return versions() | policies
+
+
+def record_of(settings: CampaignSettings, net: Net | Corridor) -> dict[str, Any]:
+    """Return what `campaign.json` holds: everything that decides the outcomes."""
+    policies = {name: entry["sha256"] for name, entry in read_manifest().items()}
+    return {
+        **asdict(settings),
+        "versions": versions(),
+        "vut_files": settings.vut_factory.files or None,
+        "net_sha256": net.sha256,
+        "policies_sha256": policies,
+    }
+
+
+def settings_of(
+    folder: Path,
+    recorded: Mapping[str, Any],
+    given: Mapping[str, object] | None = None,
+    *,
+    trust: bool = False,
+) -> CampaignSettings:
+    """Return the settings of a campaign, as its folder records them or as they are given anew.
+
+    They say whose code is run. Raises `UserError` where one is missing or something else, and where
+    the folder may be a stranger's and names a controller that nobody named here, unless we `trust`
+    it.
+    """
+    record = {**recorded, **(given or {})}
+    vut, command = record.get("vut"), record.get("vut_command")
+    named = ("vut" if command is None else "vut_command") in (given or {})
+    if not (trust or named or is_own(record)) and runs_code(str(vut), command):
+        raise UserError(
+            f"{folder} was not made here, and to go on is to run the controller that it names, "
+            f"{command or vut}: say --trust-vut if you trust it"
+        )
+    hints = get_type_hints(CampaignSettings)
+    values: dict[str, Any] = {}
+    for spec in fields(CampaignSettings):
+        value: Any = record.get(spec.name, spec.default)
+        if spec.name == "scenario" and isinstance(value, dict):
+            value = scenario_of(record, folder / SETTINGS)
+        value = tuple(value) if isinstance(value, list) else value
+        if not _fits(value, hints[spec.name]):
+            raise UserError(f"{folder / SETTINGS} has no {spec.name}, or something else there")
+        # 18 is 18.0, and outcomes are to show it as the same number.
+        is_real = float in (hints[spec.name], *get_args(hints[spec.name]))
+        values[spec.name] = float(value) if is_real and type(value) is int else value
+    return CampaignSettings(**values)
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Return whether a value read from JSON is of the type of a setting."""
+    parts = get_args(hint)
+    if get_origin(hint) is tuple:
+        return isinstance(value, tuple) and all(_fits(item, parts[0]) for item in value)
+    if parts:
+        return any(_fits(value, part) for part in parts)
+    return type(value) is hint or (hint is float and type(value) is int and abs(value) < 2**53)
+
+
+def differences(was: Any, now: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
+    """Return by name where two records differ, with both values; None where there is none."""
+    if isinstance(was, dict) and isinstance(now, dict):
+        found: dict[str, tuple[Any, Any]] = {}
+        for key in now | was:
+            inner = f"{name}.{key}" if name else key
+            found |= differences(was.get(key), now.get(key), inner)
+        return found
+    was, now = (list(value) if isinstance(value, tuple) else value for value in (was, now))
+    return {} if was == now else {name: (was, now)}

@@ -1,0 +1,1 @@
+"""What people see: verdicts, pages, figures, tables, files for other tools."""

@@ -1,0 +1,1 @@
+"""Scenarios as files, what a road suggests, and how it looks."""

@@ -1,0 +1,1 @@
+"""The machine: folders, processes, signals, and what may be trusted."""
