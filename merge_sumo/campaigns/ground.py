@@ -12,8 +12,9 @@ from typing import Final, Self
 import numpy as np
 
 from merge_sumo.campaigns.rollout import rollout
-from merge_sumo.campaigns.settings import differences, software
+from merge_sumo.campaigns.settings import POLICY, differences, software
 from merge_sumo.drivers.pov import PovLibrary
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.errors import UserError
@@ -38,6 +39,7 @@ class ProvingGround:
         vut: str | VutFactory,
         corridors: int = MAX_CORRIDORS,
         net: Net | Corridor | None = None,
+        povs: Povs | None = None,
     ) -> None:
         """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
@@ -45,7 +47,7 @@ class ProvingGround:
         self.world = World(corridors, net, factory.vut.vut_type)
         try:
             self.vut = factory(corridors, self.world)
-            self.pov = PovLibrary(corridors)
+            self.pov = PovLibrary(corridors, povs)
         except BaseException:
             self.world.close()
             raise
@@ -73,22 +75,33 @@ class GroundPlan:
     vut: VutFactory
     corridors: int
     net: Net | Corridor
-    software: dict[str, str] = field(default_factory=software)
+    povs: Povs = field(default_factory=Povs)
+    software: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Note with what software this process would carry it out, unless that is given."""
+        if not self.software:
+            object.__setattr__(self, "software", software(self.povs))
 
     def key(self) -> tuple[object, ...]:
         """Return what tells one plan from another."""
         vut = self.vut.spec, self.vut.options, self.vut.files
         road = corridor_of(self.net)
         edges = road.sha256, road.mainline_edges, road.ramp_edges
-        return *vut, self.corridors, *edges, *self.software.items()
+        return *vut, self.corridors, *edges, self.povs, *self.software.items()
 
     def open(self) -> ProvingGround:
         """Open the proving ground; `UserError` where other software would give other outcomes."""
-        for name, (there, here) in differences(self.software, software()).items():
+        for name, (there, here) in differences(self.software, software(self.povs)).items():
+            if name.startswith(POLICY):
+                raise UserError(
+                    f"a worker has another {name} in {self.povs.policies} than this process, or "
+                    "none: put the same files there"
+                )
             raise UserError(
                 f"a worker has {name} {here}, and this process {there}: install the same there"
             )
-        return ProvingGround(self.vut, self.corridors, self.net)
+        return ProvingGround(self.vut, self.corridors, self.net, self.povs)
 
 
 @dataclass(frozen=True, slots=True)
