@@ -51,7 +51,6 @@ LONGER = {
     "merge_sumo.drivers.vuts.traci_session": "TODO",
     "merge_sumo.sumo.replay": "TODO",
     "merge_sumo.campaigns.experiments": "TODO",
-    "merge_sumo.samplers.coverage": "TODO",
     "merge_sumo.campaigns.journal": "TODO",
     "merge_sumo.sumo.received": "TODO",
 }

@@ -37,7 +37,7 @@ from merge_sumo.campaigns.journal import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import LevelHistory
-from merge_sumo.samplers.coverage import learn_chance
+from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
