@@ -21,8 +21,8 @@ from merge_sumo.campaigns.conductor import OnCase
 from merge_sumo.campaigns.distribution import Distribution, read_distribution
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
 from merge_sumo.campaigns.interval import Estimate, estimate
-from merge_sumo.campaigns.journal import Run
 from merge_sumo.campaigns.proposal import DEFENSIVE, Draws, Proposal, cells, expected_chance
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
