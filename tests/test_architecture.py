@@ -50,7 +50,6 @@ LONGER = {
     "merge_sumo.drivers.vuts.traci_session": "TODO",
     "merge_sumo.sumo.replay": "TODO",
     "merge_sumo.campaigns.experiments": "TODO",
-    "merge_sumo.sumo.received": "TODO",
 }
 """Modules that are longer than others, and why."""
 
