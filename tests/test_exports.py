@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import export_case
-from merge_sumo.campaigns.journal import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import COLUMNS, write_folders, write_openscenario, write_table
 from merge_sumo.sumo.net import Net

@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_sumo.campaigns.journal import Journal, Run, failures, read_outcomes, to_line
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import Run, failures, read_outcomes, to_line
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case
 from merge_sumo.values.score import Measures, Outcome, measure

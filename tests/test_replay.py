@@ -15,7 +15,7 @@ import pytest
 from lxml import etree
 
 from merge_sumo.campaigns.conductor import export_case
-from merge_sumo.campaigns.journal import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program

@@ -13,7 +13,7 @@ from handmade import write_run
 from lxml import html
 
 from merge_sumo.campaigns.experiments import Truth
-from merge_sumo.campaigns.journal import Run, failures
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.drivers.vuts.output import LINES, LOG
 from merge_sumo.reports import report
 from merge_sumo.reports.report import SPEED_UNIT_MPS, headline, report_page, write_report

@@ -7,7 +7,7 @@ import pytest
 from vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.journal import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.vuts.sumo_model import MODELS
 from merge_sumo.errors import UserError

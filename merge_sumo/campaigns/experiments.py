@@ -19,7 +19,6 @@ import numpy as np
 
 from merge_sumo.campaigns.conductor import conduct, workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
-from merge_sumo.campaigns.journal import UNREADABLE_NPZ, read_arrays
 from merge_sumo.campaigns.settings import versions
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
@@ -27,6 +26,7 @@ from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.workers import Workers

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
 from merge_sumo.campaigns.convergence import StoppingRule
-from merge_sumo.campaigns.journal import SETTINGS, scenario_of
+from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.pov import available_levels
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory

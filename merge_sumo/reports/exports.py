@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.campaigns.conductor import case_name
-from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from merge_sumo.campaigns.conductor import SCENARIOS, case_name
 from merge_sumo.campaigns.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.journal import SETTINGS, Run, failures
+from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import versions
 from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.errors import UserError
