@@ -128,7 +128,7 @@ def to_unit(cases: Iterable[Case], level: int) -> FloatArray:
     for case in cases:
         dims = case.scenario.dimensions(level)
         rows.append([(getattr(case, d.field) - d.low) / (d.high - d.low) for d in dims])
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(dimensions(level)))
+    return np.array(rows, dtype=np.float64) if rows else np.empty((0, len(dimensions(level))))
 
 
 def from_unit(

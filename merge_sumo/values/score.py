@@ -36,8 +36,8 @@ class Measures:
     """Named measures of one episode, with the verdict first.
 
     dx, dv, TTC, DRAC, the impact speed and the order of merging are taken at t1, the first step
-    with x_VUT >= 0, and are None when the VUT never arrived. In traffic they are those of the car
-    of the mainline that is nearest to the VUT at t1: it takes the POV's place.
+    with x_VUT >= 0, and are None when the VUT never arrived. In traffic all measures are those of
+    the car of the mainline that is nearest to the VUT at the end: it takes the POV's place.
 
     Attributes:
         end: why the episode ended; COLLISION where the VUT arrived with |dx| < 6 m.
@@ -52,7 +52,7 @@ class Measures:
         drac_mps2: deceleration rate to avoid a crash that the follower needs at t1 (Cooper and
             Ferguson, 1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None in a collision.
         vut_max_brake_mps2: hardest braking of the VUT, positive.
-        pov_max_brake_mps2: hardest braking of the POV, positive; in traffic of any car.
+        pov_max_brake_mps2: hardest braking of the POV, positive.
         impact_speed_mps: |dv| in a collision, else None.
         merged_first: "VUT" or "POV".
         last_avoidable_s: in a collision, the last time from which the VUT, at full acceleration
@@ -162,7 +162,7 @@ def measure(trajectory: Trajectory) -> Measures:
         else:
             gap = abs(dx) - crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
-    hardest = -trajectory.motion[:, :, 2].min(axis=0)
+    hardest = -pair.motion[:, :, 2].min(axis=0)
     return Measures(
         end=end,
         score=None if trajectory.error is not None else _score(trajectory, end, dx, ttc),
@@ -173,7 +173,7 @@ def measure(trajectory: Trajectory) -> Measures:
         t_end_s=trajectory.t_end_s,
         drac_mps2=drac,
         vut_max_brake_mps2=max(0.0, float(hardest[VUT])),
-        pov_max_brake_mps2=max(0.0, float(np.delete(hardest, VUT).max())),
+        pov_max_brake_mps2=max(0.0, float(hardest[POV])),
         impact_speed_mps=impact,
         merged_first=first,
         last_avoidable_s=last_avoidable,
