@@ -12,7 +12,8 @@ from typing import Final, Self
 import numpy as np
 
 from merge_sumo.campaigns.rollout import rollout
-from merge_sumo.campaigns.settings import POLICY, differences, software
+from merge_sumo.campaigns.settings import POLICY, CampaignSettings, differences, software
+from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, vut_factory
@@ -24,7 +25,7 @@ from merge_sumo.sumo.road import corridor_of, road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import Scenario
+from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Measures, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -39,22 +40,24 @@ class ProvingGround:
         vut: str | VutFactory,
         corridors: int = MAX_CORRIDORS,
         net: Net | Corridor | None = None,
+        scenario: Scenario = US23,
         povs: Povs | None = None,
     ) -> None:
         """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
         corridors = min(corridors, factory.vut.max_corridors or corridors)
-        self.world = World(corridors, net, factory.vut.vut_type)
+        self.world = World(corridors, net, factory.vut.vut_type, scenario)
         try:
             self.vut = factory(corridors, self.world)
-            self.pov = PovLibrary(corridors, povs)
+            povs = povs or Povs(policies=policies_of(scenario))
+            self.cars = [PovLibrary(corridors, povs) for _ in range(scenario.vehicles - 1)]
         except BaseException:
             self.world.close()
             raise
 
     def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
         """Run cases; yield (place in `cases`, trajectory) as they end."""
-        return rollout(self.world, self.pov, self.vut, cases)
+        return rollout(self.world, self.cars, self.vut, cases)
 
     def __enter__(self) -> Self:
         """Return the proving ground."""
@@ -68,6 +71,12 @@ class ProvingGround:
             self.world.close()
 
 
+def ground_of(settings: CampaignSettings, cases: int, net: Net | Corridor) -> ProvingGround:
+    """Open the proving ground of a campaign's settings in this process, for some cases."""
+    corridors = min(MAX_CORRIDORS, cases)
+    return ProvingGround(settings.vut_factory, corridors, net, settings.scenario, settings.povs)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GroundPlan:
     """What it takes to open a `ProvingGround` in any process; it travels with every chunk."""
@@ -75,7 +84,8 @@ class GroundPlan:
     vut: VutFactory
     corridors: int
     net: Net | Corridor
-    povs: Povs = field(default_factory=Povs)
+    povs: Povs
+    scenario: Scenario = US23
     software: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -88,7 +98,7 @@ class GroundPlan:
         vut = self.vut.spec, self.vut.options, self.vut.files
         road = corridor_of(self.net)
         edges = road.sha256, road.mainline_edges, road.ramp_edges
-        return *vut, self.corridors, *edges, self.povs, *self.software.items()
+        return *vut, self.corridors, *edges, self.scenario, self.povs, *self.software.items()
 
     def open(self) -> ProvingGround:
         """Open the proving ground; `UserError` where other software would give other outcomes."""
@@ -101,7 +111,7 @@ class GroundPlan:
             raise UserError(
                 f"a worker has {name} {here}, and this process {there}: install the same there"
             )
-        return ProvingGround(self.vut, self.corridors, self.net, self.povs)
+        return ProvingGround(self.vut, self.corridors, self.net, self.scenario, self.povs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,8 +161,7 @@ def _close_ground() -> None:
 
 def lost_case(case: Case) -> Ran:
     """Return what is recorded of a case that ended every worker that ran it."""
-    x_vut0_m = case.scenario.x_vut0_m
-    start = [[case.x_pov0_m, case.v_pov0_mps, 0.0, x_vut0_m, case.v_vut0_mps, 0.0]]
+    start = [[(x, v, 0.0) for x, v in case.starts()]]
     reason = f"its worker process died {MAX_DEATHS} times"
     trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, reason)
     return Ran(measure(trajectory), trajectory)
@@ -186,5 +195,5 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
     """
     file = Path(scenario.net) if net is None and scenario.net is not None else net
     road = road_of(file, scenario.mainline, scenario.ramp, scenario.room_after_m)
-    road.check_room(-scenario.x_pov0_m[0], -scenario.x_vut0_m)
+    road.check_room(scenario.mainline_m, -scenario.x_vut0_m)
     return road

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
-from merge_sumo.campaigns.journal import SETTINGS, Run, failures
-from merge_sumo.campaigns.settings import settings_of
-from merge_sumo.drivers.povs import POLICIES
+from merge_sumo.campaigns.ground import ground_of, road_for
+from merge_sumo.campaigns.run import SETTINGS, Run, failures
+from merge_sumo.campaigns.settings import pov_of, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports.verdict import Verdict, counted, judge
 from merge_sumo.sumo.corridor import Corridor
@@ -250,19 +249,13 @@ def _common_levels(a: Run, b: Run) -> list[int]:
             f"the VUT starts at {speeds[0]} m/s in {a.folder} and at {speeds[1]} m/s in "
             f"{b.folder}: compare campaigns with the same --v-vut0"
         )
-    for level in set(common) & set(POLICIES):
-        networks = [_recorded_policy(run, POLICIES[level]) for run in (a, b)]
-        if networks[0] != networks[1]:
+    for level in common:
+        if pov_of(a.settings, level) != pov_of(b.settings, level):
             raise UserError(
                 f"the POV of level {level} is another in {a.folder} than in {b.folder}: compare "
                 "campaigns with the same --policies"
             )
     return common
-
-
-def _recorded_policy(run: Run, name: str) -> object:
-    recorded = run.settings.get("policies_sha256")
-    return recorded.get(name) if isinstance(recorded, dict) else None
 
 
 def _common_net(a: Run, b: Run, net: Net | Corridor) -> Net | Corridor:
@@ -299,8 +292,7 @@ def _run_again(
         return _Again({}, "had nothing to run")
     measures: dict[int, Measures] = {}
     settings = settings_of(run.folder, run.settings, given, trust=trust)
-    corridors = min(MAX_CORRIDORS, len(cases))
-    with ProvingGround(settings.vut_factory, corridors, net, settings.povs) as ground:
+    with ground_of(settings, len(cases), net) as ground:
         for place, trajectory in ground.run(cases):
             measures[place] = measure(trajectory)
     for place, outcome in enumerate(told):
