@@ -9,7 +9,8 @@ import sys
 import pytest
 
 from merge_sumo import cli
-from merge_sumo.reports.reproduce import TABLE_II, TABLE_JSON, Scale
+from merge_sumo.reports.reproduce import TABLE_JSON, Scale
+from merge_sumo.reports.table2 import TABLE_II
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ import numpy as np
 
 from merge_sumo.campaigns.conductor import conduct, workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
-from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.settings import check_level, versions
 from merge_sumo.drivers.policies import policies_of, policies_sha256
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
@@ -105,6 +105,7 @@ def ground_truth(
     if count < 1:
         raise UserError(f"--cases is {count}: it must be 1 or more")
     povs = povs or Povs(policies=policies_of(scenario))
+    check_level(level, povs)
     factory = _factory(vut, povs)
     options = factory.options
     kept = Kept(
@@ -342,6 +343,8 @@ def search(
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
     povs = povs or Povs(policies=policies_of(scenario))
+    for level in levels:
+        check_level(level, povs)
     plan = GroundPlan(
         vut=_factory(vut, povs),
         corridors=min(MAX_CORRIDORS, batch),

@@ -189,9 +189,8 @@ def compare_runs(
         given: settings in the place of what the folders name: policies that are elsewhere.
         trust: run the controllers that the folders name although they may be a stranger's.
 
-    Raises `UserError` where the campaigns have no level in common or no case there, differ in
-    the initial speed of the VUT or in the POV of a level, or were run on another net than the one
-    to run again on.
+    Raises `UserError` where the campaigns have no level in common or no case there, differ in the
+    VUT's initial speed or a level's POV, or were run on another net than the one to run again on.
     """
     levels = _common_levels(a, b)
     own_a, own_b = ([o for o in run.outcomes if o.case.level in levels] for run in (a, b))
@@ -300,8 +299,7 @@ def _run_again(
         if was is None or now is None or abs(was - now) > SAME_SCORE:
             return _Again(
                 {},
-                "could not be run: its VUT or its POV does not do again what case "
-                f"{outcome.index} records",
+                f"could not be run: it does not do again what case {outcome.index} records",
             )
     first = len(told)
     return _Again({o.index: measures[first + n] for n, o in enumerate(failing)}, "was run again")
