@@ -161,7 +161,7 @@ class TestACampaignOnIt:
             assert math.dist(place, (0.0, RADIUS_M)) == pytest.approx(RADIUS_M, abs=1.5)
 
 
-ANOTHER_ARM = '''
+ANOTHER_ARM = """
 net = "roundabout.net.xml"
 mainline = ["in_w", "ring_ws", "pass_s", "ring_se", "out_e"]
 ramp = ["in_s", "ring_se", "out_e"]
@@ -170,7 +170,7 @@ v_pov0_mps = [5, 10]
 x_vut0_m = -50
 v_vut0_mps = 6
 level0_v_mps = 8
-'''
+"""
 
 
 def test_a_shipped_scenario_is_one_data_file_and_no_code(tmp_path):
