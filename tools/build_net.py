@@ -14,15 +14,16 @@ import tempfile
 from pathlib import Path
 
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.sumo.road import road_of
 from merge_sumo.system.folders import check_new_file, replace_own
 
 SOURCES = Path(__file__).resolve().parent.parent / "sumo_net"
 NET = SOURCES / "us23.net.xml"
 
 
-def build(output: Path) -> Net:
-    """Build the net into `output`, ours or a new file, and return it, checked."""
+def build(output: Path) -> Corridor:
+    """Build the net into `output`, ours or a new file, and return its corridor."""
     if output != NET:
         check_new_file(output)
     with tempfile.TemporaryDirectory() as folder:
@@ -32,11 +33,11 @@ def build(output: Path) -> Net:
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
         text = (Path(folder) / "us23.net.xml").read_text(encoding="utf-8")
     replace_own(output, re.sub(r"<!--.*?-->\n*", "", text, flags=re.DOTALL).encode())
-    return Net(output)
+    return road_of(output)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=NET)
-    net = build(parser.parse_args().out)
-    print(f"{net.path.name}: sha256 {net.sha256}")
+    road = build(parser.parse_args().out)
+    print(f"{road.path.name}: sha256 {road.sha256}")
