@@ -134,7 +134,9 @@ class TestATable:
             header, *rows = csv.reader(file)
         assert tuple(header) == COLUMNS
         motion = np.concatenate([made.trajectory(i).motion for i in (0, 3)])
-        assert np.array_equal(np.array([row[3:] for row in rows], dtype=float), motion)
+        assert np.array_equal(
+            np.array([row[3:] for row in rows], dtype=float), motion.reshape(-1, 6)
+        )
         assert {row[0] for row in rows} == {"0", "3"}
         assert float(rows[5][2]) == pytest.approx(5 * DT_S)
 

@@ -55,7 +55,7 @@ def drive(case: Case, pov: Command, vut: Command, steps: int, end: End) -> Traje
         rows.append([x[0], v[0], a[0], x[1], v[1], a[1]])
         x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
     rows.append([x[0], v[0], 0.0, x[1], v[1], 0.0])
-    return Trajectory(case, np.array(rows), end)
+    return Trajectory(case, np.array(rows).reshape(-1, 2, 3), end)
 
 
 def constant(_: int) -> float:

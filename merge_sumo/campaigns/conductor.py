@@ -224,6 +224,7 @@ def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan
         vut=settings.vut_factory.with_log(folder.resolve() / LOG),
         corridors=min(MAX_CORRIDORS, settings.batch),
         net=net,
+        scenario=settings.scenario,
     )
 
 

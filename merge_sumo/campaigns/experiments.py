@@ -113,7 +113,8 @@ def ground_truth(
     points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
     scores = np.full(count, np.nan)
     files = dict(factory.files or {})
-    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road_for(scenario))
+    road = road_for(scenario)
+    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road, scenario=scenario)
     with workers_or_here(workers) as there:
         rows = cast("Sequence[FloatArray]", points)
         scored = there.run(partial(_scores, plan, level, scenario), rows, lambda _: (np.nan, {}))
@@ -195,7 +196,7 @@ def read_truth(path: Path, level: int, cases: int) -> Truth | None:
 def _scores(
     plan: GroundPlan, level: int, scenario: Scenario, points: Sequence[FloatArray]
 ) -> Sequence[tuple[float, Files]]:
-    pool = Pool(levels=(level,), v_vut0_mps=scenario.v_vut0_mps, scenario=scenario)
+    pool = Pool(levels=(level,), scenario=scenario)
     ran = run_cases(plan, pool.cases(np.asarray(points), level))
     return [
         (np.nan if done.measures.score is None else done.measures.score, done.files) for done in ran
@@ -238,7 +239,7 @@ def _search(
     batch: int,
     seed: int,
 ) -> Search:
-    pool = Pool(levels=levels, v_vut0_mps=scenario.v_vut0_mps, scenario=scenario)
+    pool = Pool(levels=levels, scenario=scenario)
     sampler = make_sampler(name, pool, seed)
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]

@@ -106,7 +106,7 @@ class Journal:
             arrays,
             index=np.array([o.index for o in outcomes]),
             rows=np.array([len(t.motion) for t in trajectories]),
-            motion=np.concatenate([t.motion for t in trajectories]),
+            motion=np.concatenate([t.motion.reshape(len(t.motion), -1) for t in trajectories]),
             lines_sha256=hashlib.sha256(lines).hexdigest(),
         )
         try:

@@ -32,8 +32,6 @@ from merge_sumo.values.trajectory import End, Trajectory
 SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
-COLUMNS: Final = 6
-"""Of the motion of a trajectory."""
 NAME_CHARACTERS: Final = 300
 """Of the name of a VUT, where it is shown."""
 CHECKSUM: Final = "sha256"
@@ -110,7 +108,7 @@ class Run:
             try:
                 arrays = read_arrays(path)
                 arrays.pop("lines_sha256", None)
-                self._batches[batch] = _motion_by_case(**arrays)
+                self._batches[batch] = _motion_by_case(self.scenario.vehicles, **arrays)
             except UNREADABLE_NPZ as error:
                 raise UserError(f"cannot read the trajectories in {path}: {error}") from error
         return self._batches[batch]
@@ -221,14 +219,17 @@ def _decode(text: str) -> Any:
 
 
 def _motion_by_case(
-    index: NDArray[np.int64], rows: NDArray[np.int64], motion: FloatArray
+    vehicles: int, index: NDArray[np.int64], rows: NDArray[np.int64], motion: FloatArray
 ) -> dict[int, FloatArray]:
-    """Return the rows of each case; ValueError or TypeError where the arrays do not fit."""
-    if motion.dtype != np.float64 or motion.ndim != 2 or motion.shape[1] != COLUMNS:
+    """Return the motion of each case, (T + 1, A, 3), which is kept as (T + 1, 3 A).
+
+    Raises ValueError or TypeError where the arrays do not fit.
+    """
+    if motion.dtype != np.float64 or motion.ndim != 2 or motion.shape[1] != 3 * vehicles:
         raise ValueError(f"the motion is {motion.dtype} of shape {motion.shape}")
     if rows.dtype.kind != "i" or rows.ndim != 1 or (rows < 1).any() or rows.sum() != len(motion):
         raise ValueError("the rows of the cases are not those of the motion")
-    parts = np.split(motion, np.cumsum(rows)[:-1])
+    parts = np.split(motion.reshape(-1, vehicles, 3), np.cumsum(rows)[:-1])
     return dict(zip(index.tolist(), parts, strict=True))
 
 

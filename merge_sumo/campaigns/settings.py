@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -49,8 +49,13 @@ class CampaignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels; the scenario says what is left out."""
-        if self.v_vut0_mps is None:
-            object.__setattr__(self, "v_vut0_mps", self.scenario.v_vut0_mps)
+        fixed = self.scenario.v_vut0_mps
+        if self.v_vut0_mps is None and isinstance(fixed, float):
+            object.__setattr__(self, "v_vut0_mps", fixed)
+        elif self.v_vut0_mps is not None and not isinstance(fixed, float):
+            # Then it is no coordinate of the pool any more.
+            narrowed = replace(self.scenario, v_vut0_mps=float(self.v_vut0_mps))
+            object.__setattr__(self, "scenario", narrowed)
         for option, text in (("--vut", self.vut), ("--vut-command", self.vut_command or "")):
             if not _is_text(text):
                 raise UserError(
@@ -74,7 +79,7 @@ class CampaignSettings:
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
         most_mps = self.scenario.v_start_max_mps
-        if not 0.0 <= self.pool.v_vut0_mps <= most_mps:
+        if self.v_vut0_mps is not None and not 0.0 <= self.v_vut0_mps <= most_mps:
             raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
         self.stopping_rule()
 
@@ -99,7 +104,6 @@ class CampaignSettings:
     @property
     def pool(self) -> Pool:
         """The cases to choose from."""
-        assert self.v_vut0_mps is not None, "taken from the scenario"  # noqa: S101
         return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps, scenario=self.scenario)
 
 

@@ -23,7 +23,7 @@ from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.sumo.netfile import NetFile, Point
 from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.system.folders import new_folder
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, VEHICLES
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -127,7 +127,7 @@ def write_files(folder: Path, road: Road, types: etree._Element, record: etree._
 
 def _types(trajectory: Trajectory) -> etree._Element:
     root = etree.Element("additional")
-    first_speeds = {"pov": trajectory.v_pov_mps[0], "vut": trajectory.v_vut_mps[0]}
+    first_speeds = dict(zip(VEHICLES, trajectory.motion[0, :, 1].tolist(), strict=False))
     for name, colour in COLOURS.items():
         etree.SubElement(
             root,
@@ -152,9 +152,9 @@ def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
     root = etree.Element("fcd-export")
     motion = trajectory.motion.tolist()
     motion += [motion[-1]] * HOLD_STEPS
-    for step, (x_pov, v_pov, _, x_vut, v_vut, _) in enumerate(motion):
+    for step, vehicles in enumerate(motion):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
-        for who, x_m, v_mps in (("pov", x_pov, v_pov), ("vut", x_vut, v_vut)):
+        for who, (x_m, v_mps, _) in zip(VEHICLES, vehicles, strict=False):
             lane, position, x, y, angle = road.lane_point(x_m, on_ramp=who == "vut")
             etree.SubElement(
                 timestep,
