@@ -20,6 +20,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
+from merge_sumo.system.resources import resource
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import US23, Scenario
@@ -170,7 +171,9 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
 
     Raises `UserError` where there is no such merge, or not room enough for its vehicles.
     """
-    file = Path(scenario.net) if net is None and scenario.net is not None else net
-    road = road_of(file, scenario.mainline, scenario.ramp, scenario.room_after_m)
+    if net is None and scenario.net is not None:
+        # Where a path says nothing of folders, the net is one that the package brings.
+        net = resource("sumo_net") / scenario.net
+    road = road_of(net, scenario.mainline, scenario.ramp, scenario.room_after_m)
     road.check_room(scenario.mainline_m, -scenario.x_vut0_m)
     return road

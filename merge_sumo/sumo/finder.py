@@ -255,7 +255,7 @@ def _placed(net: NetFile, lanes: Iterable[Lane], start_m: float) -> list[Piece]:
 def _surroundings(
     net: NetFile, paths: Sequence[LanePath], centre: Point
 ) -> tuple[tuple[Point, ...], ...]:
-    """Return the shapes of the lanes near a point that are roads and on no path."""
+    """Return the shapes of the lanes near a point that are on no path."""
     used = {piece.lane for path in paths for piece in path.pieces}
     near = net.lanes_near(centre, SURROUNDINGS_M)
     return tuple(lane.shape for lane in near if lane.id not in used)

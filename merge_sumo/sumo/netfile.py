@@ -165,10 +165,19 @@ class NetFile:
         return UserError(f"the net {self.path} cannot host a merge: {what}")
 
     def lanes_near(self, place: Point, distance_m: float) -> list[Lane]:
-        """Return the lanes of roads that begin or end within a distance of a point."""
-        roads = [item for item in self._lane_elements.items() if not item[0].startswith(":")]
+        """Return the lanes that begin or end within a distance of a point, those of roads first.
+
+        Where people walk is none of them.
+        """
+        edges = sorted(self._edges.items(), key=lambda item: item[0].startswith(":"))
+        lanes = [
+            (str(lane.get("id")), lane)
+            for _, edge in edges
+            if edge.get("function") not in ("crossing", "walkingarea")
+            for lane in edge.iterfind("lane")
+        ]
         near = []
-        for name, lane in roads:
+        for name, lane in lanes:
             points = lane.get("shape", "").split()
             try:
                 ends = [_point(text) for text in points[:1] + points[-1:]]
