@@ -29,8 +29,8 @@ from merge_sumo.sumo.binding import load_libsumo, sumo_program
 from merge_sumo.sumo.corridor import Piece
 from merge_sumo.sumo.finder import find_corridor
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, default_net_path
 from merge_sumo.sumo.netfile import NetFile
+from merge_sumo.sumo.road import default_net_path
 from merge_sumo.sumo.world import SPEED_MODE_COMMANDED, SimulationError, World
 from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, POV, VUT
@@ -261,7 +261,11 @@ def test_lanes_that_cars_may_not_use_are_left_out(tmp_path):
 def foreign_us23(folder: Path) -> NetFile:
     """Return the shipped road with other names, elsewhere and turned by a quarter."""
     text = default_net_path().read_text()
-    for ours, theirs in ((MAIN_IN, "-4711#0"), (MAIN_OUT, "east&amp;west"), (RAMP, "1/2.0@x")):
+    for ours, theirs in (
+        ("main_in", "-4711#0"),
+        ("main_out", "east&amp;west"),
+        ("ramp", "1/2.0@x"),
+    ):
         text = re.sub(rf"\b{ours}(?=[_\"])", theirs, text)
 
     def turned(found: re.Match[str]) -> str:
@@ -385,7 +389,7 @@ def edited(old: str, new: str):
     ("edit", "said"),
     [
         (lambda text: text[:500], "not readable XML"),
-        (lambda text: "<routes/>", "is no SUMO net: it begins with <routes>"),
+        (lambda text: "<routes/>", "is no SUMO net: it does not begin with <net>"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="far"'), "is no number"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="nan"'), "is no number"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="0"'), "r1_0 has no length"),

@@ -18,8 +18,7 @@ from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.road import corridor_of, road_of
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.system.resources import resource
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
@@ -38,7 +37,7 @@ class ProvingGround:
         self,
         vut: str | VutFactory,
         corridors: int = MAX_CORRIDORS,
-        net: Net | Corridor | None = None,
+        net: Corridor | None = None,
         scenario: Scenario = US23,
     ) -> None:
         """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
@@ -74,15 +73,14 @@ class GroundPlan:
 
     vut: VutFactory
     corridors: int
-    net: Net | Corridor
+    net: Corridor
     scenario: Scenario = US23
     software: dict[str, str] = field(default_factory=software)
 
     def key(self) -> tuple[object, ...]:
         """Return what tells one plan from another."""
         vut = self.vut.spec, self.vut.options, self.vut.files
-        road = corridor_of(self.net)
-        edges = road.sha256, road.mainline_edges, road.ramp_edges
+        edges = self.net.sha256, self.net.mainline_edges, self.net.ramp_edges
         return *vut, self.corridors, *edges, self.scenario, *self.software.items()
 
     def open(self) -> ProvingGround:

@@ -21,7 +21,6 @@ from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports.verdict import Verdict, counted, judge
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import FAILURE_SCORE, Measures, Outcome, measure
@@ -171,7 +170,7 @@ def _worse(level: int, found: LevelChange, tolerance: float) -> list[str]:
 
 
 def compare_runs(
-    a: Run, b: Run, *, rerun: bool = True, net: Net | Corridor | None = None, trust: bool = False
+    a: Run, b: Run, *, rerun: bool = True, net: Corridor | None = None, trust: bool = False
 ) -> RunComparison:
     """Compare two campaigns level by level.
 
@@ -244,7 +243,7 @@ def _common_levels(a: Run, b: Run) -> list[int]:
     return common
 
 
-def _common_net(a: Run, b: Run, net: Net | Corridor) -> Net | Corridor:
+def _common_net(a: Run, b: Run, net: Corridor) -> Corridor:
     for run in (a, b):
         if run.settings.get("net_sha256") != net.sha256:
             raise UserError(
@@ -262,7 +261,7 @@ class _Again:
     how: str
 
 
-def _run_again(run: Run, failing: Sequence[Outcome], net: Net | Corridor, *, trust: bool) -> _Again:
+def _run_again(run: Run, failing: Sequence[Outcome], net: Corridor, *, trust: bool) -> _Again:
     """Run a campaign's VUT on the other's telling cases, if it is still the same VUT."""
     told = [o for o in run.outcomes if o.measures.score is not None]
     told = sorted(told, key=lambda o: (o.measures.score, o.index))[:CHECKED]

@@ -138,7 +138,8 @@ def _layers(net: NetFile, edges: _Edges, common: int) -> list[_Layer]:
                 layer.setdefault(link.target.id, []).append(link)
         if not layer and number <= common:
             into = [name for name in net.edges_into(following) if name != edge]
-            hint = f"; {' and '.join(into)} do" if into else ""
+            does = "does" if len(into) == 1 else "do"
+            hint = f"; {' and '.join(into)} {does}" if into else ""
             raise net.broken(f"edge {edge} does not lead to edge {following}{hint}")
         lanes = {links[0].target.id: links[0].target for links in layer.values()}
         layers.append(layer)
