@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from merge_sumo.campaigns.conductor import OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.journal import SETTINGS, Run, failures
+from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import (
     DEFAULT_BATCH,
     DEFAULT_CASES,

@@ -9,7 +9,7 @@ import subprocess
 import pytest
 
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.journal import Journal, Run
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import versions
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.scenario import A_MIN_MPS2, DT_S, X_VUT0_M
@@ -32,7 +33,7 @@ def drive(case: Case, error: str | None = None, *, timeout: bool = False) -> Tra
         step += 1
     rows.append((x_pov, v_pov, 0.0, x_vut, v_vut, 0.0))
     end = End.TIMEOUT if timeout else End.MERGED if error is None else End.VUT_ERROR
-    return Trajectory(case, np.array(rows), end, error)
+    return Trajectory(case, np.array(rows).reshape(-1, 2, 3), end, error)
 
 
 def cases_of(level: int, count: int) -> list[Case]:

@@ -47,13 +47,9 @@ WAYS_IN = ("merge_sumo.api", "merge_sumo.cli")
 MOST_LINES = 400
 LONGER = {
     "merge_sumo.reports.report": "one page is one view of one run",
-    "merge_sumo.campaigns.probability": "TODO",
     "merge_sumo.drivers.vuts.traci_session": "TODO",
     "merge_sumo.sumo.replay": "TODO",
     "merge_sumo.campaigns.experiments": "TODO",
-    "merge_sumo.samplers.coverage": "TODO",
-    "merge_sumo.campaigns.journal": "TODO",
-    "merge_sumo.sumo.received": "TODO",
 }
 """Modules that are longer than others, and why."""
 

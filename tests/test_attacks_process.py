@@ -15,7 +15,7 @@ from test_workers import cluster, wait_until, workers_at
 
 import merge_sumo as ms
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.journal import OUTCOMES
+from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.system.workers import dask_workers
 

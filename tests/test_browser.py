@@ -12,7 +12,7 @@ from conftest import require
 from foreign_nets import corridor_of
 from handmade import write_run
 
-from merge_sumo.campaigns.journal import Run, failures
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.reports import report
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"

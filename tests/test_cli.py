@@ -16,7 +16,7 @@ from lxml import etree
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.journal import Run, failures, read_settings
+from merge_sumo.campaigns.run import Run, failures, read_settings
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES, sumo_program
 from merge_sumo.sumo.net import default_net_path
 from merge_sumo.sumo.replay import CONFIG, RECORD

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.journal import Run, failures
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison import (

@@ -31,9 +31,9 @@ from merge_sumo.sumo.finder import find_corridor
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, default_net_path
 from merge_sumo.sumo.netfile import NetFile
-from merge_sumo.sumo.world import POV, SPEED_MODE_COMMANDED, VUT, SimulationError, World
+from merge_sumo.sumo.world import SPEED_MODE_COMMANDED, SimulationError, World
 from merge_sumo.values.case import from_unit
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, POV, VUT
 
 EXACT = 1e-9
 SIX = list(FOREIGN)[:6]
@@ -77,7 +77,8 @@ class Commander:
             near, far = self.rng.uniform(-30, 60), -path.before_m * self.rng.random()
             self.x_m[row, k] = max(near if self.rng.random() < 0.3 else far, -path.before_m)
             self.v_mps[row, k] = self.rng.choice([0.0, self.rng.uniform(0, 45), 90.0])
-        self.world.place(k, *np.stack([self.x_m[:, k], self.v_mps[:, k]], 1).ravel().tolist())
+        starts = zip(self.x_m[:, k].tolist(), self.v_mps[:, k].tolist(), strict=True)
+        self.world.place(k, list(starts))
         self.left[k] = self.rng.integers(20, 120)
         self.episodes += 1
 
@@ -282,7 +283,7 @@ def test_a_straight_foreign_net_with_the_lengths_of_us23_gives_its_very_outcomes
     motions = []
     for where in (None, road):
         with World(16, where, factory.vut.vut_type) as world:
-            ran = dict(rollout(world, PovLibrary(16), factory(16, world), cases))
+            ran = dict(rollout(world, [PovLibrary(16)], factory(16, world), cases))
         motions.append([ran[place].motion for place in range(100)])
     for ours, theirs in zip(*motions, strict=True):
         assert np.array_equal(ours, theirs)
@@ -293,10 +294,10 @@ def test_sumos_own_driver_is_put_where_eq_4_has_it(corridor, name):
     factory = vut_factory("sumo:Krauss")
     cases = from_unit(np.random.default_rng(0).random((20, 2)), level=0)
     with World(4, corridor(name), factory.vut.vut_type) as world:
-        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
+        ran = dict(rollout(world, [PovLibrary(4)], factory(4, world), cases))
     for trajectory in ran.values():
         assert trajectory.x_vut_m[-1] >= 0.0
-        x, v, a = trajectory.motion[:, 3:].T
+        x, v, a = trajectory.motion[:, VUT].T
         assert x[1:] == pytest.approx(x[:-1] + v[:-1] * DT_S, abs=EXACT)
         assert v[1:] == pytest.approx(v[:-1] + a[:-1] * DT_S, abs=EXACT)
 
@@ -312,9 +313,9 @@ def test_a_world_says_when_sumo_does_not_drive_what_it_was_told(corridor):
             world.step(np.array([[0.0], [2.0]]))
 
     with World(1, corridor("priority")) as world:
-        world.place(0, -300.0, 30.0, -100.0, 12.0)
+        world.place(0, [(-300.0, 30.0), (-100.0, 12.0)])
         drive(world)
-        world.place(0, -300.0, 30.0, -100.0, 12.0)
+        world.place(0, [(-300.0, 30.0), (-100.0, 12.0)])
         world._libsumo.vehicle.setSpeedMode("vut.0", SPEED_MODE_COMMANDED - 1)
         with pytest.raises(SimulationError, match="away from where it drives"):
             drive(world)
@@ -326,7 +327,7 @@ def test_a_start_before_the_path_is_refused(corridor):
     with pytest.raises(UserError, match=r"ramp \(r0 r1 out\) begins 505.9 m before .* further up"):
         road.check_room(mainline_m=340.0, ramp_m=600.0)
     with World(1, road) as world, pytest.raises(UserError, match=r"begins 505\.94 m before"):
-        world.place(0, -340.0, 30.0, -600.0, 12.0)
+        world.place(0, [(-340.0, 30.0), (-600.0, 12.0)])
 
 
 def test_idle_vehicles_of_a_short_ramp_stand_where_it_begins(tmp_path):

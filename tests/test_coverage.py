@@ -9,18 +9,8 @@ import numpy as np
 import pytest
 
 from merge_sumo.samplers.base import LevelHistory, Sampler
-from merge_sumo.samplers.coverage import (
-    CALIBRATION,
-    NEAREST,
-    PATIENCE,
-    CoverageSampler,
-    _as_if,
-    _calibrated,
-    _limit,
-    _Search,
-    _trust,
-    margin_of,
-)
+from merge_sumo.samplers.belief import CALIBRATION, _as_if, _calibrated, margin_of
+from merge_sumo.samplers.coverage import NEAREST, PATIENCE, CoverageSampler, _limit, _Search, _trust
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin

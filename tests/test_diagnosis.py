@@ -38,7 +38,7 @@ def meeting(a_pov: np.ndarray, a_vut: np.ndarray, gap_m: float = 1.0) -> Traject
     vut[:, 0] -= vut[-1, 0]
     pov[:, 0] += gap_m - pov[-1, 0]
     case = Case(level=1, x_pov0_m=float(pov[0, 0]), v_pov0_mps=30.0)
-    return Trajectory(case, np.hstack([pov, vut]), End.MERGED)
+    return Trajectory(case, np.stack([pov, vut], axis=1), End.MERGED)
 
 
 def diagnosed(trajectory: Trajectory) -> Diagnosis:
@@ -97,7 +97,7 @@ class TestWhoYields:
 
     def test_a_fast_vut_not_for_keeping_its_speed(self):
         # Above 28 m/s a level-0 VUT holds what it has.
-        motion = np.hstack([drive(-300.0, 30.0, KEEP), drive(-182.0, 32.0, KEEP)])
+        motion = np.stack([drive(-300.0, 30.0, KEEP), drive(-182.0, 32.0, KEEP)], axis=1)
         case = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, v_vut0_mps=32.0)
         found = diagnosed(Trajectory(case, motion, End.TIMEOUT))
         assert found.vut_yields_s is None
@@ -136,7 +136,9 @@ def outcome(index: int, x: float, v: float, failed: bool, level: int = 1) -> Out
     svo = 0.5 if level == 2 else None
     case = Case(level=level, x_pov0_m=x, v_pov0_mps=v, svo_rad=svo)
     gap = 0.0 if failed else 40.0
-    motion = np.array([[gap - v * DT_S, v, 0.0, -1.8, 18.0, 0.0], [gap, v, 0.0, 0.0, 18.0, 0.0]])
+    motion = np.array(
+        [[[gap - v * DT_S, v, 0.0], [-1.8, 18.0, 0.0]], [[gap, v, 0.0], [0.0, 18.0, 0.0]]]
+    )
     return Outcome(index, 0, case, measure(Trajectory(case, motion, End.MERGED)))
 
 

@@ -20,7 +20,7 @@ def scene(x_pov=-250.0, v_pov=30.0, x_vut=-182.0, v_vut=18.0, step=0):
     columns = [np.atleast_1d(np.asarray(c, dtype=float)) for c in (x_pov, v_pov, x_vut, v_vut)]
     k = max(len(c) for c in columns)
     columns = [np.broadcast_to(c, (k,)).copy() for c in columns]
-    return Scene(np.ones(k, dtype=bool), np.full(k, step), *columns)
+    return Scene.of_pair(np.ones(k, dtype=bool), np.full(k, step), *columns)
 
 
 def seconds_to_m(distance, v):

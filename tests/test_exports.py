@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import export_case
-from merge_sumo.campaigns.journal import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import COLUMNS, write_folders, write_openscenario, write_table
 from merge_sumo.sumo.net import Net
@@ -134,7 +134,9 @@ class TestATable:
             header, *rows = csv.reader(file)
         assert tuple(header) == COLUMNS
         motion = np.concatenate([made.trajectory(i).motion for i in (0, 3)])
-        assert np.array_equal(np.array([row[3:] for row in rows], dtype=float), motion)
+        assert np.array_equal(
+            np.array([row[3:] for row in rows], dtype=float), motion.reshape(-1, 6)
+        )
         assert {row[0] for row in rows} == {"0", "3"}
         assert float(rows[5][2]) == pytest.approx(5 * DT_S)
 

@@ -98,7 +98,7 @@ def driven(road, count: int) -> list[Trajectory]:
     factory = vut_factory("design1")
     cases = from_unit(np.random.default_rng(3).random((count, 2)), level=0)
     with World(4, road) as world:
-        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
+        ran = dict(rollout(world, [PovLibrary(4)], factory(4, world), cases))
     return [ran[index] for index in range(count)]
 
 
@@ -113,7 +113,7 @@ def commanded(a_mps2: np.ndarray, road) -> Trajectory:
         rows.append([x[0], v[0], a[0], x[1], v[1], a[1]])
         x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
     rows.append([x[0], v[0], 0.0, x[1], v[1], 0.0])
-    return Trajectory(case, np.array(rows), End.TIMEOUT)
+    return Trajectory(case, np.array(rows).reshape(-1, 2, 3), End.TIMEOUT)
 
 
 STEPS = 300
@@ -182,7 +182,7 @@ class TestAReplay:
         (trajectory,) = driven(road, 1)
         record = etree.parse(folder_of(name) / RECORD).getroot()
         for timestep, row in zip(record, trajectory.motion.tolist(), strict=False):
-            for vehicle, x_m in zip(timestep, (row[0], row[3]), strict=True):
+            for vehicle, x_m in zip(timestep, (row[0][0], row[1][0]), strict=True):
                 at = road.lane_point(x_m, on_ramp=vehicle.get("id") == "vut")
                 seen = [float(vehicle.get(key)) for key in ("x", "y", "angle", "pos")]
                 assert seen == pytest.approx(
@@ -371,9 +371,9 @@ class TestAnExport:
         # Where a lane ends, OpenDRIVE has no way from it to the next lane.
         crossing_m = road.ramp.pieces[-2].length_m if road.lane_drop else 0.0
         compared = 0
-        for who, column in (("pov", 0), ("vut", 3)):
+        for who, column in (("pov", 0), ("vut", 1)):
             vertices = tree.findall(f".//Trajectory[@name='{who} recorded']//Vertex")
-            motion = made.trajectory(0).motion[:, column].tolist()
+            motion = made.trajectory(0).motion[:, column, 0].tolist()
             assert len(vertices) == len(motion)
             for vertex, x_m in zip(vertices, motion, strict=True):
                 place = vertex.find("Position/WorldPosition")
@@ -434,7 +434,7 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
     with World(1, road) as world:
         vut = TraciVut(1, world.road, port, None, VutOptions(deadline_s=5.0, connect_s=10.0))
         try:
-            ((_, trajectory),) = rollout(world, PovLibrary(1), vut, [case])
+            ((_, trajectory),) = rollout(world, [PovLibrary(1)], vut, [case])
         finally:
             vut.close()
             client.join()
@@ -444,13 +444,13 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
     pieces = {p.lane: p for path in (road.mainline, road.ramp) for p in path.pieces}
     assert junctions == (road.junction_id,)
     assert (set(edges), vehicles) == ({lane.rpartition("_")[0] for lane in pieces}, ())
-    paths = {"pov": (road.mainline, 0), "vut": (road.ramp, 3)}
+    paths = {"pov": (road.mainline, 0), "vut": (road.ramp, 1)}
     assert len(rows) >= 2 * (len(trajectory.motion) - 1)
     for number, row in enumerate(rows):
         path, column = paths[row["who"]]
-        at = path.point(float(trajectory.motion[number // 2, column]))
+        at = path.point(float(trajectory.motion[number // 2, column, 0]))
         edge, _, index = at.lane.rpartition("_")
-        piece = path.piece(float(trajectory.motion[number // 2, column]))
+        piece = path.piece(float(trajectory.motion[number // 2, column, 0]))
         assert (row["lane"], row["edge"], row["index"]) == (at.lane, (edge, edge), int(index))
         assert row["at"] == pytest.approx((at.position_m, at.x_m, at.y_m, at.angle_deg), abs=1e-9)
         assert (row["length"], row["limit"]) == (piece.length_m, (piece.speed_limit_mps,) * 2)

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.journal import (
+from merge_sumo.campaigns.run import (
     OUTCOMES,
     SETTINGS,
     TRAJECTORIES,
@@ -303,7 +303,7 @@ ATHERIS = """
 import sys, atheris
 with atheris.instrument_imports(include=["merge_sumo", "json"]):
     from merge_sumo.errors import UserError
-    from merge_sumo.campaigns.journal import read_outcomes, to_line
+    from merge_sumo.campaigns.run import read_outcomes, to_line
 
 def one(data):
     try:

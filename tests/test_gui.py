@@ -18,7 +18,7 @@ from lxml import etree
 from PIL import Image
 
 from merge_sumo.campaigns.conductor import export_case
-from merge_sumo.campaigns.journal import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.sumo.replay import COLOURS, SURROUNDINGS_COLOUR, VIEW, write_scenario
 
 PICTURE_TIMES_S = (2.0, 7.0)

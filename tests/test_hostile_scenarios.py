@@ -27,8 +27,8 @@ import pytest
 from conftest import require
 
 from merge_sumo.errors import UserError
+from merge_sumo.sumo import allowed, received
 from merge_sumo.sumo import opendrive as opendrive_module
-from merge_sumo.sumo import received
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
 from merge_sumo.sumo.net import Net, default_net_path
@@ -692,7 +692,7 @@ class TestAnHonestNet:
         ended = run_program("netgenerate", arguments, tmp_path)
         assert ended.code == 0, ended.reason
         content = (tmp_path / "made.net.xml").read_bytes()
-        root, intact = received.parse(content, received.NET, "it")
+        root, intact = received.parse(content, allowed.NET, "it")
         assert len(root.findall("edge")) == content.count(b"<edge ")
         assert not intact, "internal links go, and traffic lights"
 
@@ -752,10 +752,10 @@ def runs(pid: int) -> bool:
 
 def test_what_is_read_is_bounded_in_elements_and_in_bytes(tmp_path):
     most = b"<net>" + b"<a/>" * (received.MAX_ELEMENTS - 1) + b"</net>"
-    root, intact = received.parse(most, received.NET, "it")
+    root, intact = received.parse(most, allowed.NET, "it")
     assert (len(root), intact) == (0, False)
     with pytest.raises(UserError, match="more than 5000 elements"):
-        received.parse(most.replace(b"</net>", b"<a/></net>"), received.NET, "it")
+        received.parse(most.replace(b"</net>", b"<a/></net>"), allowed.NET, "it")
     file = tmp_path / "file"
     file.write_bytes(b"x" * received.MAX_BYTES)
     assert len(received.read_bytes(file, "it", follow_links=False)) == received.MAX_BYTES

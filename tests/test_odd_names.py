@@ -16,7 +16,7 @@ from merge_sumo import cli
 from merge_sumo.campaigns import conductor
 from merge_sumo.campaigns.conductor import export_case, run_campaign
 from merge_sumo.campaigns.ground import ProvingGround
-from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.progress import Bars

@@ -20,15 +20,8 @@ import merge_sumo as ms
 from merge_sumo import cli
 from merge_sumo.campaigns import conductor, probability
 from merge_sumo.campaigns.conductor import SCENARIOS, case_name, resume_campaign
-from merge_sumo.campaigns.journal import (
-    OUTCOMES,
-    SETTINGS,
-    TRAJECTORIES,
-    Journal,
-    Run,
-    failures,
-    read_settings,
-)
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures, reproduce
 from merge_sumo.reports.report import REPORT, write_report

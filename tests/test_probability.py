@@ -12,17 +12,10 @@ from hypothesis import strategies as st
 from scipy.stats import kstest, norm, truncnorm
 
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.probability import (
-    CELLS,
-    DEFENSIVE,
-    Proposal,
-    cells,
-    clopper_pearson,
-    estimate,
-    failure_probability,
-    mean_at_least,
-    read_distribution,
-)
+from merge_sumo.campaigns.distribution import read_distribution
+from merge_sumo.campaigns.interval import clopper_pearson, estimate, mean_at_least
+from merge_sumo.campaigns.probability import failure_probability
+from merge_sumo.campaigns.proposal import CELLS, DEFENSIVE, Proposal, cells
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import V_POV0, dimensions

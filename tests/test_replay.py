@@ -15,7 +15,7 @@ import pytest
 from lxml import etree
 
 from merge_sumo.campaigns.conductor import export_case
-from merge_sumo.campaigns.journal import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
@@ -57,7 +57,7 @@ def drive(case: Case, pov: Command, vut: Command, steps: int, end: End) -> Traje
         rows.append([x[0], v[0], a[0], x[1], v[1], a[1]])
         x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
     rows.append([x[0], v[0], 0.0, x[1], v[1], 0.0])
-    return Trajectory(case, np.array(rows), end)
+    return Trajectory(case, np.array(rows).reshape(-1, 2, 3), end)
 
 
 def constant(_: int) -> float:

@@ -13,7 +13,7 @@ from handmade import write_run
 from lxml import html
 
 from merge_sumo.campaigns.experiments import Truth
-from merge_sumo.campaigns.journal import Run, failures
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.drivers.vuts.output import LINES, LOG
 from merge_sumo.reports import report
 from merge_sumo.reports.report import SPEED_UNIT_MPS, headline, report_page, write_report
@@ -196,10 +196,10 @@ class TestTheMotion:
             motion = made.trajectory(index).motion
             assert rows == len(motion)
             speeds = packed[first : first + rows] * SPEED_UNIT_MPS
-            assert np.abs(speeds - motion[:, (1, 4)]).max() <= SPEED_UNIT_MPS / 2
+            assert np.abs(speeds - motion[:, :, 1]).max() <= SPEED_UNIT_MPS / 2
             moved = np.cumsum(speeds * DT_S, axis=0)[:-1]
-            assert np.abs(data["cases"]["x"][i] + moved[:, 0] - motion[1:, 0]).max() < 0.02
-            assert np.abs(X_VUT0_M + moved[:, 1] - motion[1:, 3]).max() < 0.02
+            assert np.abs(data["cases"]["x"][i] + moved[:, 0] - motion[1:, 0, 0]).max() < 0.02
+            assert np.abs(X_VUT0_M + moved[:, 1] - motion[1:, 1, 0]).max() < 0.02
 
 
 class TestALongCampaign:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.errors import UserError
@@ -128,7 +128,7 @@ class TestACase:
             Case(level=0, x_pov0_m=-300.0, v_pov0_mps=41.0, scenario=near)
 
     def test_is_judged_by_its_scenario(self):
-        motion = np.array([[-10.0, 20.0, 0.0, -2.0, 20.0, 0.0], [-5.0, 20.0, 0.0, 0.0, 20.0, 0.0]])
+        motion = np.array([[[x, 20.0, 0.0] for x in row] for row in ((-10.0, -2.0), (-5.0, 0.0))])
         verdicts = [
             measure(Trajectory(case, motion, End.MERGED)).end
             for case in (
@@ -152,14 +152,14 @@ class TestACampaign:
     def test_starts_where_its_scenario_says(self, elsewhere):
         for outcome in elsewhere.outcomes:
             motion = elsewhere.trajectory(outcome.index).motion
-            assert (motion[0, 3], motion[0, 4]) == (-100.0, 10.0)
-            assert -300.0 <= motion[0, 0] <= -100.0
-            assert 10.0 <= motion[0, 1] <= 20.0
+            assert tuple(motion[0, 1, :2]) == (-100.0, 10.0)
+            assert -300.0 <= motion[0, 0, 0] <= -100.0
+            assert 10.0 <= motion[0, 0, 1] <= 20.0
 
     def test_is_driven_by_the_profile_of_its_scenario(self, elsewhere):
         motion = elsewhere.trajectory(0).motion
-        assert motion[:-1, 5].max() == 0.5
-        assert motion[:, 4].max() == pytest.approx(14.0)
+        assert motion[:-1, 1, 2].max() == 0.5
+        assert motion[:, 1, 1].max() == pytest.approx(14.0)
         due_s = level0_time_to(np.array(100.0), np.array(10.0), 0.5, 14.0)
         assert elsewhere.outcomes[0].measures.t_end_s == pytest.approx(float(due_s), abs=0.11)
 
@@ -219,7 +219,7 @@ def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
         "it has a conflict"
     )
     for index in range(3):
-        x, v, a = run.trajectory(index).motion[:, 3:].T
+        x, v, a = run.trajectory(index).motion[:, 1].T
         assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
         assert v[1:] == pytest.approx(v[:-1] + a[:-1] * 0.1, abs=1e-9)
     exported = call("export", run.folder, 0, "--out", tmp_path / "exported")

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, POV, VUT
 from merge_sumo.values.score import FAILURE_SCORE, Outcome, measure, time_to_collision
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -20,10 +20,10 @@ CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
 def ending(dx, v_pov=30.0, v_vut=26.0, end=End.MERGED, steps=10, a_vut=0.0):
     """Return an episode at constant speeds in which the VUT is 1 m past M at the end."""
     t = np.arange(-steps, 1) * DT_S
-    motion = np.zeros((steps + 1, 6))
-    motion[:, 0], motion[:, 1] = 1.0 + dx + v_pov * t, v_pov
-    motion[:, 3], motion[:, 4] = 1.0 + v_vut * t, v_vut
-    motion[:-1, 5] = a_vut
+    motion = np.zeros((steps + 1, 2, 3))
+    motion[:, POV, 0], motion[:, POV, 1] = 1.0 + dx + v_pov * t, v_pov
+    motion[:, VUT, 0], motion[:, VUT, 1] = 1.0 + v_vut * t, v_vut
+    motion[:-1, VUT, 2] = a_vut
     return Trajectory(CASE, motion, end)
 
 
@@ -34,8 +34,8 @@ def eq4(x_pov, v_pov, a_pov, x_vut, v_vut, a_vut):
         xp, vp, ap, xv, vv, av = rows[-1]
         v_next = (max(vp + ap * DT_S, 0), max(vv + av * DT_S, 0))
         rows.append([xp + vp * DT_S, v_next[0], ap, xv + vv * DT_S, v_next[1], av])
-    motion = np.array(rows)
-    motion[-1, [2, 5]] = 0.0
+    motion = np.array(rows).reshape(-1, 2, 3)
+    motion[-1, :, 2] = 0.0
     return Trajectory(CASE, motion, End.MERGED if rows[-1][3] >= 0 else End.TIMEOUT)
 
 
@@ -63,7 +63,7 @@ class TestScore:
     @staticmethod
     def at(dx):
         trajectory = ending(dx)
-        trajectory.motion[-1, [0, 3]] = dx, 0.0
+        trajectory.motion[-1, :, 0] = dx, 0.0
         return trajectory
 
     def test_the_task_part_by_hand(self):
@@ -93,7 +93,7 @@ class TestScore:
         measures = measure(trajectory)
         last = trajectory.motion[-1]
         assert measures.score <= 0.0
-        assert (measures.score < FAILURE_SCORE) == (abs(last[0] - last[3]) < 6.0)
+        assert (measures.score < FAILURE_SCORE) == (abs(last[POV, 0] - last[VUT, 0]) < 6.0)
         assert (measures.end is End.COLLISION) == (measures.score < FAILURE_SCORE)
 
     def test_no_verdict_on_what_did_not_run_properly(self):

@@ -12,7 +12,7 @@ import pytest
 
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
-from merge_sumo.campaigns.journal import CHECKSUM, SETTINGS
+from merge_sumo.campaigns.run import CHECKSUM, SETTINGS
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.system.trust import SEAL, is_own, seal

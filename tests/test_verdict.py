@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import merge_sumo as ms
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
-from merge_sumo.campaigns.journal import Run, failures, read_settings
+from merge_sumo.campaigns.run import Run, failures, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import check_junit, junit, write_junit

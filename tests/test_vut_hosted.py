@@ -125,7 +125,7 @@ def test_once_killed_its_descriptors_are_nobodys_business(spec, tmp_path):
 
 def scene(corridors: int) -> Scene:
     active, step = np.ones(corridors, dtype=bool), np.zeros(corridors, dtype=np.int64)
-    return Scene(active, step, *[np.full(corridors, 20.0)] * 4)
+    return Scene.of_pair(active, step, *[np.full(corridors, 20.0)] * 4)
 
 
 def test_after_a_death_it_starts_anew_and_knows_which_files_there_were(spec, tmp_path):

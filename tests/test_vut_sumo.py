@@ -7,14 +7,14 @@ import pytest
 from vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.journal import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.vuts.sumo_model import MODELS
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.replay import replay
-from merge_sumo.sumo.world import VUT, World
+from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, VUT
 from merge_sumo.values.trajectory import End
 
 FREE = Case(level=0, x_pov0_m=0.0, v_pov0_mps=45.0)
@@ -32,7 +32,7 @@ def test_every_model_drives_the_same_in_1_and_in_8_corridors_and_by_eq_4(model):
     for one, other in zip(alone, many, strict=True):
         assert one.end is End.MERGED
         assert np.array_equal(one.motion, other.motion)
-        x, v, a = one.motion[:, 3:].T
+        x, v, a = one.motion[:, VUT].T
         assert x[1:] == pytest.approx(x[:-1] + v[:-1] * DT_S, abs=1e-9)
         assert v[1:] == pytest.approx(v[:-1] + a[:-1] * DT_S, abs=1e-9)
 
@@ -59,7 +59,7 @@ def test_a_free_driver_follows_what_sumo_drives_by_itself(model):
     """SUMO moves by the new speed and eq. (4) by the old: less than a metre apart at M."""
     (ours,) = run_cases(factory(model), [FREE], corridors=1)
     with World(1, vut_type=factory(model).vut.vut_type) as world:
-        world.place(0, 0.0, 45.0, -182.0, 18.0)
+        world.place(0, [(0.0, 45.0), (-182.0, 18.0)])
         x_m, speeds = [], []
         for _ in range(len(ours.motion) - 1):
             world._step_simulation()

@@ -81,7 +81,7 @@ class Played:
         x_pov, v_pov, x, v = -250.0, 30.0, -182.0, 18.0
         for step in range(steps):
             columns = (np.array([value]) for value in (x_pov, v_pov, x, v))
-            a = vut.act(Scene(np.array([True]), np.array([step]), *columns))[0]
+            a = vut.act(Scene.of_pair(np.array([True]), np.array([step]), *columns))[0]
             if not np.isfinite(a):
                 self.reasons.append(vut.reason(0))
                 return
@@ -330,7 +330,7 @@ class TestAStockClient:
 )
 def test_the_speeds_that_follow_from_a_command_are_those_of_sumo(command, arguments, steps):
     with World(1) as world:
-        world.place(0, -300.0, 30.0, -182.0, 18.0)
+        world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
         vehicle = world._libsumo.vehicle
         vehicle.setSpeed("vut.0", -1.0)
         getattr(vehicle, command)("vut.0", *arguments)
@@ -348,7 +348,7 @@ def test_the_speeds_that_follow_from_a_command_are_those_of_sumo(command, argume
 
 
 def measures_of(folder: Path) -> list[dict]:
-    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.campaigns.run import Run
 
     return [outcome.to_record() for outcome in Run(folder).outcomes]
 

@@ -16,7 +16,7 @@ import pytest
 
 from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.ground import GroundPlan, lost_case, run_cases, runs_on
-from merge_sumo.campaigns.journal import OUTCOMES
+from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings, software
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError

@@ -46,7 +46,7 @@ def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     """Return the seconds that the host takes for cases, and the trajectories."""
     pov, vut = PovLibrary(world.corridors), vut_factory(VUT)(world.corridors)
     start = time.perf_counter()
-    trajectories = [trajectory for _, trajectory in rollout(world, pov, vut, cases)]
+    trajectories = [trajectory for _, trajectory in rollout(world, [pov], vut, cases)]
     return time.perf_counter() - start, trajectories
 
 
@@ -66,11 +66,11 @@ def bare_s_per_pair_step(world: World, trajectories: list[Trajectory]) -> float:
     ]
     for wave in waves:
         for k, trajectory in enumerate(wave):
-            x_pov, v_pov, _, x_vut, v_vut, _ = trajectory.motion[0].tolist()
-            world.place(k, x_pov, v_pov, x_vut, v_vut)
+            (x_pov, v_pov, _), (x_vut, v_vut, _) = trajectory.motion[0].tolist()
+            world.place(k, [(x_pov, v_pov), (x_vut, v_vut)])
         motion = np.stack([trajectory.motion[: STEPS + 1] for trajectory in wave])
-        speeds = np.concatenate([motion[:, :, 1], motion[:, :, 4]]).T.tolist()
-        accelerations = np.concatenate([motion[:, :, 2], motion[:, :, 5]]).T.tolist()
+        speeds = np.concatenate([motion[:, :, 0, 1], motion[:, :, 1, 1]]).T.tolist()
+        accelerations = np.concatenate([motion[:, :, 0, 2], motion[:, :, 1, 2]]).T.tolist()
         start = time.perf_counter()
         for t in range(STEPS):
             for name, v in zip(names, speeds[t], strict=True):
@@ -92,7 +92,7 @@ def step_s_per_pair_step(world: World, cases: list[Case]) -> float:
     for wave in range(WAVES):
         for k in range(world.corridors):
             case = cases[(wave * world.corridors + k) % len(cases)]
-            world.place(k, case.x_pov0_m, case.v_pov0_mps, X_VUT0_M, case.v_vut0_mps)
+            world.place(k, case.starts())
         start = time.perf_counter()
         for _ in range(STEPS):
             step()
@@ -144,7 +144,7 @@ def _episode_by_traci(case: Case, net: Net, pov: Driver, vut: Driver) -> None:
         if x["vut.0"] >= 0.0:
             return
         columns = (x["pov.0"], v["pov.0"], x["vut.0"], v["vut.0"])
-        scene = Scene(np.array([True]), np.array([step]), *(np.array([c]) for c in columns))
+        scene = Scene.of_pair(np.array([True]), np.array([step]), *(np.array([c]) for c in columns))
         a = {"pov.0": float(pov.act(scene)[0]), "vut.0": float(vut.act(scene)[0])}
         for name in names:
             vehicle.setSpeed(name, v[name])

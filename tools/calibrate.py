@@ -62,7 +62,7 @@ def gaps_at_m(cases: list[Case], pov: Driver, vut: Driver) -> tuple[FloatArray, 
     x_vut, v_vut = np.full(n, X_VUT0_M), np.full(n, V_VUT0_MPS)
     active, dx, lowest = np.ones(n, dtype=bool), np.full(n, np.inf), np.zeros(n)
     for step in range(MAX_STEPS):
-        scene = Scene(active, np.full(n, step), x_pov, v_pov, x_vut, v_vut)
+        scene = Scene.of_pair(active, np.full(n, step), x_pov, v_pov, x_vut, v_vut)
         a_pov = pov.act(scene) * active
         a_vut = np.clip(vut.act(scene), A_MIN_MPS2, A_MAX_MPS2) * active
         lowest = np.minimum(lowest, a_vut)

@@ -27,7 +27,7 @@ import numpy as np
 
 from merge_sumo.campaigns import journal
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
-from merge_sumo.campaigns.journal import OUTCOMES, SETTINGS
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.system.workers import open_workers

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, RunCases, road_for, runs_on
-from merge_sumo.campaigns.journal import SETTINGS, Journal, Run, failures
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import (
     RECORDED_BY_DEFAULT,
     CampaignSettings,
@@ -224,6 +225,7 @@ def _plan(settings: CampaignSettings, net: Net | Corridor, folder: Path) -> Grou
         vut=settings.vut_factory.with_log(folder.resolve() / LOG),
         corridors=min(MAX_CORRIDORS, settings.batch),
         net=net,
+        scenario=settings.scenario,
     )
 
 

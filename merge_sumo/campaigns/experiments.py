@@ -19,7 +19,6 @@ import numpy as np
 
 from merge_sumo.campaigns.conductor import conduct, workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
-from merge_sumo.campaigns.journal import UNREADABLE_NPZ, read_arrays
 from merge_sumo.campaigns.settings import versions
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
@@ -27,6 +26,7 @@ from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.workers import Workers
@@ -113,7 +113,8 @@ def ground_truth(
     points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
     scores = np.full(count, np.nan)
     files = dict(factory.files or {})
-    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road_for(scenario))
+    road = road_for(scenario)
+    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road, scenario=scenario)
     with workers_or_here(workers) as there:
         rows = cast("Sequence[FloatArray]", points)
         scored = there.run(partial(_scores, plan, level, scenario), rows, lambda _: (np.nan, {}))
@@ -195,7 +196,7 @@ def read_truth(path: Path, level: int, cases: int) -> Truth | None:
 def _scores(
     plan: GroundPlan, level: int, scenario: Scenario, points: Sequence[FloatArray]
 ) -> Sequence[tuple[float, Files]]:
-    pool = Pool(levels=(level,), v_vut0_mps=scenario.v_vut0_mps, scenario=scenario)
+    pool = Pool(levels=(level,), scenario=scenario)
     ran = run_cases(plan, pool.cases(np.asarray(points), level))
     return [
         (np.nan if done.measures.score is None else done.measures.score, done.files) for done in ran
@@ -238,7 +239,7 @@ def _search(
     batch: int,
     seed: int,
 ) -> Search:
-    pool = Pool(levels=levels, v_vut0_mps=scenario.v_vut0_mps, scenario=scenario)
+    pool = Pool(levels=levels, scenario=scenario)
     sampler = make_sampler(name, pool, seed)
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]

@@ -23,7 +23,7 @@ from merge_sumo.sumo.road import corridor_of, road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import Scenario
+from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Measures, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -38,21 +38,22 @@ class ProvingGround:
         vut: str | VutFactory,
         corridors: int = MAX_CORRIDORS,
         net: Net | Corridor | None = None,
+        scenario: Scenario = US23,
     ) -> None:
         """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
         corridors = min(corridors, factory.vut.max_corridors or corridors)
-        self.world = World(corridors, net, factory.vut.vut_type)
+        self.world = World(corridors, net, factory.vut.vut_type, scenario)
         try:
             self.vut = factory(corridors, self.world)
-            self.pov = PovLibrary(corridors)
+            self.cars = [PovLibrary(corridors) for _ in range(scenario.vehicles - 1)]
         except BaseException:
             self.world.close()
             raise
 
     def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
         """Run cases; yield (place in `cases`, trajectory) as they end."""
-        return rollout(self.world, self.pov, self.vut, cases)
+        return rollout(self.world, self.cars, self.vut, cases)
 
     def __enter__(self) -> Self:
         """Return the proving ground."""
@@ -73,6 +74,7 @@ class GroundPlan:
     vut: VutFactory
     corridors: int
     net: Net | Corridor
+    scenario: Scenario = US23
     software: dict[str, str] = field(default_factory=software)
 
     def key(self) -> tuple[object, ...]:
@@ -80,7 +82,7 @@ class GroundPlan:
         vut = self.vut.spec, self.vut.options, self.vut.files
         road = corridor_of(self.net)
         edges = road.sha256, road.mainline_edges, road.ramp_edges
-        return *vut, self.corridors, *edges, *self.software.items()
+        return *vut, self.corridors, *edges, self.scenario, *self.software.items()
 
     def open(self) -> ProvingGround:
         """Open the proving ground; `UserError` where other software would give other outcomes."""
@@ -88,7 +90,7 @@ class GroundPlan:
             raise UserError(
                 f"a worker has {name} {here}, and this process {there}: install the same there"
             )
-        return ProvingGround(self.vut, self.corridors, self.net)
+        return ProvingGround(self.vut, self.corridors, self.net, self.scenario)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +140,7 @@ def _close_ground() -> None:
 
 def lost_case(case: Case) -> Ran:
     """Return what is recorded of a case that ended every worker that ran it."""
-    x_vut0_m = case.scenario.x_vut0_m
-    start = [[case.x_pov0_m, case.v_pov0_mps, 0.0, x_vut0_m, case.v_vut0_mps, 0.0]]
+    start = [[(x, v, 0.0) for x, v in case.starts()]]
     reason = f"its worker process died {MAX_DEATHS} times"
     trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, reason)
     return Ran(measure(trajectory), trajectory)
@@ -173,5 +174,5 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
     """
     file = Path(scenario.net) if net is None and scenario.net is not None else net
     road = road_of(file, scenario.mainline, scenario.ramp, scenario.room_after_m)
-    road.check_room(-scenario.x_pov0_m[0], -scenario.x_vut0_m)
+    road.check_room(scenario.mainline_m, -scenario.x_vut0_m)
     return road

@@ -1,12 +1,7 @@
-"""What a campaign remembers: a folder with settings, outcomes and trajectories.
-
-campaign.json             every resolved setting, versions, hashes
-outcomes.jsonl            one line per case, in order, synced after every batch
-trajectories/00007.npz    the motion of every case of a batch, and the hash of its lines
+"""Who writes what a campaign remembers: one process, whole batches, synced.
 
 A bit that flips on a disk or on a way is found: `campaign.json` has a hash of itself, a batch's
-file that of its lines, and its zip archive a checksum of every array. Where these are missing, as
-in folders of older versions, what is there is read as it is.
+file that of its lines, and its zip archive a checksum of every array.
 """
 
 from __future__ import annotations
@@ -16,47 +11,27 @@ import hashlib
 import io
 import json
 import os
-import struct
 import sys
-import tokenize
-import zipfile
-import zlib
-from collections.abc import Iterable, Mapping
-from itertools import groupby
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from merge_sumo.campaigns.run import (
+    CHECKSUM,
+    OUTCOMES,
+    SETTINGS,
+    TRAJECTORIES,
+    Run,
+    batch_file,
+    settings_sha256,
+    to_line,
+)
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_folder
-from merge_sumo.system.printable import printable, quoted
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.system.printable import quoted
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import End, Trajectory
-
-SETTINGS: Final = "campaign.json"
-OUTCOMES: Final = "outcomes.jsonl"
-TRAJECTORIES: Final = "trajectories"
-COLUMNS: Final = 6
-"""Of the motion of a trajectory."""
-NAME_CHARACTERS: Final = 300
-"""Of the name of a VUT, where it is shown."""
-CHECKSUM: Final = "sha256"
-"""Key of `campaign.json`: the hash of all other keys with their values."""
-
-UNREADABLE_NPZ: Final = (
-    *(OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError),
-    *(SyntaxError, RuntimeError, ArithmeticError, MemoryError),
-    *(zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error, tokenize.TokenError),
-)
-"""What numpy raises when a file is not the archive of arrays that it should be."""
-UNREADABLE_RECORD: Final = (
-    *(ValueError, TypeError, KeyError, AttributeError, RecursionError, UserError),
-)
-"""What is raised when a line is not the record of an outcome."""
+from merge_sumo.values.trajectory import Trajectory
 
 
 class Journal:
@@ -131,12 +106,12 @@ class Journal:
             arrays,
             index=np.array([o.index for o in outcomes]),
             rows=np.array([len(t.motion) for t in trajectories]),
-            motion=np.concatenate([t.motion for t in trajectories]),
+            motion=np.concatenate([t.motion.reshape(len(t.motion), -1) for t in trajectories]),
             lines_sha256=hashlib.sha256(lines).hexdigest(),
         )
         try:
             end = self._outcomes.seek(0, os.SEEK_END)
-            path = _batch_file(self.folder, outcomes[0].batch)
+            path = batch_file(self.folder, outcomes[0].batch)
             _write(path, arrays.getvalue())
             sync_folder(path.parent)
             try:
@@ -163,241 +138,8 @@ class Journal:
         self._outcomes.close()
 
 
-class Run:
-    """A finished or interrupted campaign, read from its folder.
-
-    Raises `UserError` when the folder is no campaign, a line of it cannot be read, or something is
-    not as it was written.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        """Read settings and outcomes; trajectories are read when they are asked for."""
-        self.folder = folder
-        self.settings = read_settings(folder)
-        try:
-            text = regular(folder / OUTCOMES).read_bytes()
-        except OSError as error:
-            raise _no_campaign(folder, error) from error
-        self.scenario = scenario_of(self.settings, folder / SETTINGS)
-        self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES), self.scenario)
-        _check_lines(folder, text, self.outcomes)
-        self._batches: dict[int, dict[int, FloatArray]] = {}
-
-    @property
-    def vut(self) -> str:
-        """The name of the VUT, fit to be shown anywhere: it may be a stranger's."""
-        return printable(str(self.settings.get("vut"))[:NAME_CHARACTERS])
-
-    def outcome(self, index: int) -> Outcome:
-        """Return the outcome of a case; `UserError` when the campaign has no such case."""
-        if not 0 <= index < len(self.outcomes):
-            raise UserError(
-                f"{self.folder} has no case {index}: it has cases 0 to {len(self.outcomes) - 1}"
-            )
-        return self.outcomes[index]
-
-    def trajectory(self, index: int) -> Trajectory:
-        """Return the trajectory of a case; `UserError` when it is missing or unreadable."""
-        outcome = self.outcome(index)
-        motion = self._batch(outcome.batch).get(index)
-        if motion is None:
-            path = _batch_file(self.folder, outcome.batch)
-            raise UserError(f"{path} has no trajectory of case {index}")
-        measures = outcome.measures
-        end = End.MERGED if measures.end is End.COLLISION else measures.end
-        return Trajectory(outcome.case, motion, end, measures.error, measures.clipped_steps)
-
-    def whole_batches(self) -> int:
-        """Return the number of outcomes without those of a last batch that is not complete.
-
-        The trajectories are written first: a batch is complete when it has an outcome for each.
-        """
-        if not self.outcomes:
-            return 0
-        last = self.outcomes[-1].batch
-        indices = [outcome.index for outcome in self.outcomes if outcome.batch == last]
-        try:
-            complete = sorted(self._batch(last)) == indices
-        except UserError:
-            complete = False
-        return len(self.outcomes) if complete else indices[0]
-
-    def _batch(self, batch: int) -> dict[int, FloatArray]:
-        """Return the motion of the cases of a batch by index."""
-        if batch not in self._batches:
-            path = _batch_file(self.folder, batch)
-            try:
-                arrays = read_arrays(path)
-                arrays.pop("lines_sha256", None)
-                self._batches[batch] = _motion_by_case(**arrays)
-            except UNREADABLE_NPZ as error:
-                raise UserError(f"cannot read the trajectories in {path}: {error}") from error
-        return self._batches[batch]
-
-
-def read_settings(folder: Path) -> dict[str, Any]:
-    """Return what `campaign.json` says; `UserError` when it is no campaign's."""
-    path = folder / SETTINGS
-    try:
-        settings = _decode(regular(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise _no_campaign(folder, error) from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not readable JSON: {error}") from error
-    if not isinstance(settings, dict):
-        raise UserError(f"{path} is not a JSON object")
-    written = settings.pop(CHECKSUM, None)
-    if written is not None and written != _sha256(settings):
-        raise UserError(
-            f"{path} is not as it was written: take it from a copy; if it was you who changed it, "
-            f'remove its "{CHECKSUM}"'
-        )
-    levels = settings.get("levels", [])
-    if not (isinstance(levels, list) and all(type(level) is int for level in levels)):
-        raise UserError(f"{path} is no campaign's: its levels are not a list of numbers")
-    return settings
-
-
-def to_line(outcome: Outcome) -> str:
-    """Return the line of `outcomes.jsonl` for an outcome, with its line end."""
-    return json.dumps(outcome.to_record(), allow_nan=False) + "\n"
-
-
-def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
-    """Return the scenario of a campaign; `UserError` where its settings say something else.
-
-    A campaign that names none was of the paper's.
-    """
-    recorded = settings.get("scenario")
-    try:
-        return US23 if recorded is None else Scenario.from_record(recorded)
-    except UserError as error:
-        raise UserError(f"{path} has no scenario: {error}") from error
-
-
-def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[list[Outcome], bool]:
-    """Return the outcomes in the bytes of an `outcomes.jsonl`, and whether the last was torn.
-
-    A last line without its end was being written when the campaign stopped: it is dropped. Any
-    other line that is not the outcome of its place is an error that names the line.
-    """
-    outcomes: list[Outcome] = []
-    torn = not text.endswith(b"\n") and bool(text)
-    for number, line in enumerate(io.BytesIO(text), start=1):
-        if not line.endswith(b"\n"):
-            if _is_whole(line[:-1]):
-                raise UserError(f"line {number} of {name} does not end as it was written")
-            break
-        try:
-            outcome = Outcome.from_record(_decode(line.decode()), scenario)
-            if outcome.index != number - 1:
-                raise ValueError(f"index is {outcome.index}")
-        except UNREADABLE_RECORD as error:
-            raise UserError(
-                f"line {number} of {name} is not the outcome of case {number - 1}: "
-                f"{type(error).__name__} {error}"
-            ) from error
-        outcomes.append(outcome)
-    return outcomes, torn
-
-
-def read_arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an .npz file of ours, or those that are named.
-
-    Raises one of `UNREADABLE_NPZ` where there is none, or what is there is something else: ours are
-    not compressed, so that no file is more than it looks.
-    """
-    with np.load(regular(path), allow_pickle=False) as data:
-        if any(member.compress_type != zipfile.ZIP_STORED for member in data.zip.infolist()):
-            raise ValueError("it is compressed")
-        return {name: data[name] for name in names or data.files}
-
-
-def regular(path: Path) -> Path:
-    """Return the path of what is to be read; OSError where it is a pipe or a device."""
-    if path.exists() and not path.is_file():
-        raise OSError(errno.EINVAL, "it is no file", str(path))
-    return path
-
-
-def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Return the failing outcomes, the worst first."""
-    return sorted((o for o in outcomes if o.failed), key=lambda o: (o.measures.score, o.index))
-
-
-def _batch_file(folder: Path, batch: int) -> Path:
-    return folder / TRAJECTORIES / f"{batch:05d}.npz"
-
-
-def _no_campaign(folder: Path, error: OSError) -> UserError:
-    return UserError(f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror})")
-
-
-def _is_whole(line: bytes) -> bool:
-    """Return whether bytes are a line: of one that was being written, no part is."""
-    try:
-        _decode(line.decode())
-    except (ValueError, RecursionError):
-        return False
-    return bool(line)
-
-
-def _no_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no JSON")
-
-
-_decoder: Final = json.JSONDecoder(parse_constant=_no_constant)
-
-
-def _decode(text: str) -> Any:
-    """Return what JSON says; ValueError or RecursionError for what is none, or no text."""
-    value = _decoder.decode(text)
-    if "\\u" in text:
-        json.dumps(value, ensure_ascii=False).encode()  # half a character cannot be written
-    return value
-
-
-def _motion_by_case(
-    index: NDArray[np.int64], rows: NDArray[np.int64], motion: FloatArray
-) -> dict[int, FloatArray]:
-    """Return the rows of each case; ValueError or TypeError where the arrays do not fit."""
-    if motion.dtype != np.float64 or motion.ndim != 2 or motion.shape[1] != COLUMNS:
-        raise ValueError(f"the motion is {motion.dtype} of shape {motion.shape}")
-    if rows.dtype.kind != "i" or rows.ndim != 1 or (rows < 1).any() or rows.sum() != len(motion):
-        raise ValueError("the rows of the cases are not those of the motion")
-    parts = np.split(motion, np.cumsum(rows)[:-1])
-    return dict(zip(index.tolist(), parts, strict=True))
-
-
-def _check_lines(folder: Path, text: bytes, outcomes: list[Outcome]) -> None:
-    """Raise `UserError` where the lines of a batch are not those that were written with it.
-
-    Where the batch's file is gone or spoilt there is nothing to hold them against.
-    """
-    lines = list(io.BytesIO(text))
-    for batch, group in groupby(outcomes, key=lambda outcome: outcome.batch):
-        indices = [outcome.index for outcome in group]
-        first, end = indices[0], indices[-1] + 1
-        path = _batch_file(folder, batch)
-        try:
-            written = read_arrays(path, "index", "lines_sha256")
-        except UNREADABLE_NPZ:
-            continue
-        stopped = end == len(outcomes) and len(indices) < written["index"].size
-        of_batch = hashlib.sha256(b"".join(lines[first:end])).hexdigest()
-        if not stopped and of_batch != str(written["lines_sha256"]):
-            raise UserError(
-                f"lines {first + 1} to {end} of {folder / OUTCOMES} are not those that were "
-                f"written with {path.name}: take both files from a copy, or run the campaign again"
-            )
-
-
-def _sha256(settings: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
-
-
 def _settings_text(settings: dict[str, Any]) -> bytes:
-    record = {**settings, CHECKSUM: _sha256(settings)}
+    record = {**settings, CHECKSUM: settings_sha256(settings)}
     return (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
 
 

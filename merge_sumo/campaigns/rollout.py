@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
-from merge_sumo.sumo.world import POV, VUT, SimulationError, World
+from merge_sumo.drivers.following import CARS, Following
+from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VUT
 from merge_sumo.values.trajectory import End, Trajectory
 
 RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
@@ -43,9 +44,11 @@ class _Episode:
 
 
 def rollout(
-    world: World, pov: Driver, vut: Driver, cases: Iterable[Case]
+    world: World, cars: Sequence[Driver], vut: Driver, cases: Iterable[Case]
 ) -> Iterator[tuple[int, Trajectory]]:
     """Run cases in the world; yield (place in `cases`, trajectory) as the episodes end.
+
+    `cars` drive on the mainline: the POV and, in traffic, the car ahead of it and the one behind.
 
     Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
     episode does not depend on the number of corridors nor on its neighbours. What the VUT does
@@ -53,13 +56,16 @@ def rollout(
     it, they begin anew. When SUMO fails, the episodes that were running end as SIM_ERROR, SUMO is
     started again, and the others go on.
     """
-    return _Rollout(world, pov, vut, cases).run()
+    return _Rollout(world, cars, vut, cases).run()
 
 
 class _Rollout:
-    def __init__(self, world: World, pov: Driver, vut: Driver, cases: Iterable[Case]) -> None:
-        corridors = world.corridors
-        self.world, self.pov, self.vut = world, pov, vut
+    def __init__(
+        self, world: World, cars: Sequence[Driver], vut: Driver, cases: Iterable[Case]
+    ) -> None:
+        corridors, vehicles = world.corridors, len(world.x_m)
+        self.world, self.cars, self.vut = world, cars, vut
+        self.following = Following(corridors) if len(cars) > 1 else None
         self.queue = enumerate(cases)
         self.again: deque[tuple[int, Case]] = deque()
         """Episodes that have to begin anew through no fault of theirs."""
@@ -73,12 +79,12 @@ class _Rollout:
         self.step = np.zeros(corridors, dtype=np.int64)
         self.clipped = np.zeros(corridors, dtype=np.int64)
         self.errors: dict[int, str] = {}
-        self.a_min = np.zeros((2, corridors))
-        self.a_max = np.zeros((2, corridors))
+        self.a_min = np.zeros((vehicles, corridors))
+        self.a_max = np.zeros((vehicles, corridors))
         self.left = np.full(corridors, IDLE)
         """Steps until the timeout."""
-        # One row per step of the world, shared by all corridors: x, v, a of POV and of VUT.
-        self.record = np.zeros((RING_ROWS, 2, 3, corridors))
+        # One row per step of the world, shared by all corridors: x, v, a of every vehicle.
+        self.record = np.zeros((RING_ROWS, vehicles, 3, corridors))
         self.row = 0
 
     def run(self) -> Iterator[tuple[int, Trajectory]]:
@@ -170,10 +176,11 @@ class _Rollout:
         self.a_max[:, corridor] = scenario.a_max_mps2
         self.left[corridor] = scenario.max_steps
         self.episodes[corridor] = _Episode(index, case, self.row)
-        self.world.place(
-            corridor, case.x_pov0_m, case.v_pov0_mps, scenario.x_vut0_m, case.v_vut0_mps
-        )
-        self.pov.begin(corridor, case)
+        self.world.place(corridor, case.starts())
+        for car in self.cars:
+            car.begin(corridor, case)
+        if self.following is not None:
+            self.following.begin(corridor, case)
         try:
             self.vut.begin(corridor, case)
         except WRONGS as error:
@@ -186,10 +193,18 @@ class _Rollout:
         self.row += 1
 
     def ask_drivers(self) -> FloatArray:
-        """Return the accelerations of both vehicles, (2, K), within limits; write the record."""
-        x_m, v_mps = self.world.x_m, self.world.v_mps
-        scene = Scene(self.active, self.step, x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT])
-        answer = np.array((self.pov.act(scene), self.ask_vut(scene)))
+        """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
+        x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
+        scene = Scene(self.active, self.step, x_m, v_mps)
+        answer = np.empty(x_m.shape)
+        for row, car in zip(CARS, self.cars, strict=False):
+            answer[row] = car.act(scene.seen_by(row))
+        if following is None:
+            answer[VUT] = self.ask_vut(scene)
+        else:
+            following.limit(answer, x_m, v_mps)
+            met = following.met(x_m, v_mps)
+            answer[VUT] = self.ask_vut(Scene(self.active, self.step, x_m, v_mps, met))
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
         self.clipped += np.abs(acceleration[VUT] - answer[VUT]) > ROUNDING_MPS2
         self.record[(self.row - 1) % RING_ROWS, :, 2] = acceleration
@@ -228,6 +243,5 @@ class _Rollout:
         motion[-1, :, 2] = 0.0
         # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
         motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
-        columns = motion.reshape(len(rows), 6)
         clipped = int(self.clipped[corridor])
-        return episode.index, Trajectory(episode.case, columns, end, error, clipped)
+        return episode.index, Trajectory(episode.case, motion, end, error, clipped)

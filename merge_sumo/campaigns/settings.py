@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
 from merge_sumo.campaigns.convergence import StoppingRule
-from merge_sumo.campaigns.journal import SETTINGS, scenario_of
+from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.drivers.policies import read_manifest
 from merge_sumo.drivers.pov import available_levels
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
@@ -50,8 +50,13 @@ class CampaignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels; the scenario says what is left out."""
-        if self.v_vut0_mps is None:
-            object.__setattr__(self, "v_vut0_mps", self.scenario.v_vut0_mps)
+        fixed = self.scenario.v_vut0_mps
+        if self.v_vut0_mps is None and isinstance(fixed, float):
+            object.__setattr__(self, "v_vut0_mps", fixed)
+        elif self.v_vut0_mps is not None and not isinstance(fixed, float):
+            # Then it is no coordinate of the pool any more.
+            narrowed = replace(self.scenario, v_vut0_mps=float(self.v_vut0_mps))
+            object.__setattr__(self, "scenario", narrowed)
         for option, text in (("--vut", self.vut), ("--vut-command", self.vut_command or "")):
             if not _is_text(text):
                 raise UserError(
@@ -75,7 +80,7 @@ class CampaignSettings:
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
         most_mps = self.scenario.v_start_max_mps
-        if not 0.0 <= self.pool.v_vut0_mps <= most_mps:
+        if self.v_vut0_mps is not None and not 0.0 <= self.v_vut0_mps <= most_mps:
             raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
         self.stopping_rule()
 
@@ -100,7 +105,6 @@ class CampaignSettings:
     @property
     def pool(self) -> Pool:
         """The cases to choose from."""
-        assert self.v_vut0_mps is not None, "taken from the scenario"  # noqa: S101
         return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps, scenario=self.scenario)
 
 

@@ -150,7 +150,7 @@ def _not_numbers(ground: ProvingGround) -> list[str]:
     active[0] = True
     nothing = np.full(corridors, np.nan)
     ground.vut.begin(0, CASES[0])
-    scene = Scene(active, np.zeros(corridors, dtype=np.int64), *[nothing] * 4)
+    scene = Scene.of_pair(active, np.zeros(corridors, dtype=np.int64), *[nothing] * 4)
     try:
         answer = float(ground.vut.act(scene)[0])
     except VutLostError as lost:

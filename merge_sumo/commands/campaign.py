@@ -31,7 +31,7 @@ from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
-    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.campaigns.run import Run
     from merge_sumo.campaigns.settings import CampaignSettings
     from merge_sumo.reports.summary import Summary
     from merge_sumo.reports.verdict import Gate, Verdict
@@ -113,7 +113,7 @@ def campaign(
     """
     from merge_sumo.campaigns import conductor
     from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.journal import read_settings
+    from merge_sumo.campaigns.run import read_settings
     from merge_sumo.campaigns.settings import (
         DEFAULT_BATCH,
         CampaignSettings,
@@ -288,7 +288,7 @@ def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path 
 
 def _print_summary(run: Run, summary: Summary, verdict: Verdict, report_file: Path) -> None:
     from merge_sumo.campaigns.conductor import SCENARIOS, case_name
-    from merge_sumo.campaigns.journal import failures
+    from merge_sumo.campaigns.run import failures
 
     show(verdict.counts)
     print_troubles(verdict)

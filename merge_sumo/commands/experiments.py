@@ -295,7 +295,7 @@ def probability(
     """
     from merge_sumo.campaigns import probability as estimates
     from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.campaigns.run import Run
     from merge_sumo.reports.progress import Counter
 
     campaign = Run(run)

@@ -64,7 +64,7 @@ def export(
     """
     from merge_sumo.campaigns.conductor import SCENARIOS
     from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.campaigns.run import Run
     from merge_sumo.reports import exports
 
     loaded = Run(run)
@@ -116,7 +116,7 @@ def report(run: RunArgument) -> None:
 
     Example:  merge-sumo report runs/design2
     """
-    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.campaigns.run import Run
     from merge_sumo.reports.report import write_report
 
     show(write_report(Run(run)))
@@ -154,7 +154,7 @@ def compare_runs(
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --tolerance 0.005
     """
     from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.journal import Run
+    from merge_sumo.campaigns.run import Run
     from merge_sumo.reports import comparison
     from merge_sumo.reports.verdict import judge
 

@@ -10,27 +10,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import POV, VUT
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The state of K corridors at one step, as read from SUMO; every array has shape (K,).
+    """The state of K corridors with A vehicles each at one step, as read from SUMO.
 
     Attributes:
-        active: whether an episode runs in the corridor; elsewhere the numbers mean nothing.
-        step: steps since the episode of the corridor began.
-        x_pov_m: distance of the POV's front bumper to M along its lane, negative before M.
-        v_pov_mps: speed of the POV.
-        x_vut_m: distance of the VUT's front bumper to M along its lane, negative before M.
-        v_vut_mps: speed of the VUT.
+        active: whether an episode runs in the corridor, (K,); elsewhere the numbers mean nothing.
+        step: steps since the episode of the corridor began, (K,).
+        x_m: distances of the front bumpers to M along their lanes, (A, K), negative before M.
+        v_mps: speeds, (A, K).
+        facing: row of the car that counts as POV for who knows one car only, (K,); None for the
+            POV itself everywhere.
     """
 
     active: NDArray[np.bool_]
     step: NDArray[np.int64]
-    x_pov_m: FloatArray
-    v_pov_mps: FloatArray
-    x_vut_m: FloatArray
-    v_vut_mps: FloatArray
+    x_m: FloatArray
+    v_mps: FloatArray
+    facing: NDArray[np.int64] | None = None
+
+    @classmethod
+    def of_pair(
+        cls,
+        active: NDArray[np.bool_],
+        step: NDArray[np.int64],
+        x_pov_m: FloatArray,
+        v_pov_mps: FloatArray,
+        x_vut_m: FloatArray,
+        v_vut_mps: FloatArray,
+    ) -> Scene:
+        """Return the scene of a POV and a VUT, every array of shape (K,)."""
+        return cls(active, step, np.array((x_pov_m, x_vut_m)), np.array((v_pov_mps, v_vut_mps)))
+
+    @property
+    def x_pov_m(self) -> FloatArray:
+        """Positions of the POV, (K,), or of the car that counts as POV."""
+        return self._of_pov(self.x_m)
+
+    @property
+    def v_pov_mps(self) -> FloatArray:
+        """Speeds of the same, (K,)."""
+        return self._of_pov(self.v_mps)
+
+    @property
+    def x_vut_m(self) -> FloatArray:
+        """Positions of the VUT, (K,)."""
+        x_m: FloatArray = self.x_m[VUT]
+        return x_m
+
+    @property
+    def v_vut_mps(self) -> FloatArray:
+        """Speeds of the VUT, (K,)."""
+        v_mps: FloatArray = self.v_mps[VUT]
+        return v_mps
+
+    def _of_pov(self, values: FloatArray) -> FloatArray:
+        of_pov: FloatArray = (
+            values[POV] if self.facing is None else values[self.facing, np.arange(values.shape[1])]
+        )
+        return of_pov
+
+    def seen_by(self, car: int) -> Scene:
+        """Return the scene for the driver of a car of the mainline, who is its POV."""
+        if car == POV:
+            return self
+        rows = [car, VUT]
+        return Scene(self.active, self.step, self.x_m[rows], self.v_mps[rows])
 
 
 class VutLostError(Exception):

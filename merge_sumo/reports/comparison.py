@@ -16,7 +16,7 @@ from enum import StrEnum
 from typing import Final
 
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
-from merge_sumo.campaigns.journal import SETTINGS, Run, failures
+from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports.verdict import Verdict, counted, judge

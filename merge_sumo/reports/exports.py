@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.campaigns.conductor import case_name
-from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.net import Net
@@ -25,7 +25,7 @@ from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import write_scenario
 from merge_sumo.sumo.road import corridor_of
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, VEHICLES, VUT
 
 TABLE: Final = "trajectories"
 COLUMNS: Final = (
@@ -98,8 +98,9 @@ def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float, ...]]:
     for index in indices:
         trajectory = run.trajectory(index)
         level = trajectory.case.level
-        for step, motion in enumerate(trajectory.motion.tolist()):
-            rows.append((index, level, round(step * DT_S, 1), *motion))
+        motion = trajectory.motion.reshape(len(trajectory.motion), -1)
+        for step, state in enumerate(motion.tolist()):
+            rows.append((index, level, round(step * DT_S, 1), *state))
     return rows
 
 
@@ -114,14 +115,14 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Net | Corridor)
     trajectory, name = run.trajectory(index), case_name(index)
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
-    for who, column, on_ramp in (("pov", 0, False), ("vut", 3, True)):
+    for row, who in enumerate(VEHICLES[: trajectory.motion.shape[1]]):
         entities.add_scenario_object(who, _car(xosc, who))
         places = [
-            _place(xosc, corridor, x_m, on_ramp=on_ramp)
-            for x_m in trajectory.motion[:, column].tolist()
+            _place(xosc, corridor, x_m, on_ramp=row == VUT)
+            for x_m in trajectory.motion[:, row, 0].tolist()
         ]
         init.add_init_action(who, xosc.TeleportAction(places[0]))
-        init.add_init_action(who, _speed(xosc, float(trajectory.motion[0, column + 1])))
+        init.add_init_action(who, _speed(xosc, float(trajectory.motion[0, row, 1])))
         act.add_maneuver_group(_follow(xosc, who, places))
     story = xosc.Story(name)
     story.add_act(act)

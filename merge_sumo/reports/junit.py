@@ -13,7 +13,7 @@ from typing import Final
 
 from lxml import etree
 
-from merge_sumo.campaigns.journal import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.verdict import (
     NOTHING_TESTED,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from merge_sumo.campaigns.conductor import SCENARIOS, case_name
 from merge_sumo.campaigns.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.journal import SETTINGS, Run, failures
+from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import versions
 from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.errors import UserError
@@ -46,7 +46,7 @@ from merge_sumo.system.folders import cannot_write, check_own, replace_own
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import FloatArray, dimensions, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
-from merge_sumo.values.scenario import DEADLINE_S, DT_S, LEVELS
+from merge_sumo.values.scenario import DEADLINE_S, DT_S, LEVELS, POV, VUT
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -563,7 +563,7 @@ def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:
     offsets, first = {}, 0
     parts = [np.empty((0, 2), dtype="<u2")]
     for index, trajectory in motion.items():
-        speeds = trajectory.motion[:, (1, 4)]
+        speeds = trajectory.motion[:, (POV, VUT), 1]
         parts.append(np.rint(np.clip(speeds / SPEED_UNIT_MPS, 0, 65535)).astype("<u2"))
         offsets[index] = first
         first += len(speeds)

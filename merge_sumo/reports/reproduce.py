@@ -383,7 +383,8 @@ def _table_record(table: Mapping[str, Result], scale: Scale) -> dict[str, Any]:
 def _page(table: Mapping[str, Result], scale: Scale, pictures: Mapping[str, str]) -> str:
     from jinja2 import Environment, PackageLoader
 
-    environment = Environment(loader=PackageLoader("merge_sumo.reports"), autoescape=True, trim_blocks=True)
+    loader = PackageLoader("merge_sumo.reports")
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
     return environment.get_template("reproduce.html.jinja").render(
         results=list(table.values()),
         rows=dict(_rows(table)),

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.samplers.coverage import learn_chance
+from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.values.case import FloatArray, Pool, dimensions
 from merge_sumo.values.fmc import fmc

@@ -10,7 +10,7 @@ import numpy as np
 
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.sumo.corridor import Corridor, LanePath
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario import US23, V_VUT0_MPS, Scenario
 
 MARGIN: Final = 0.15
 """The pool reaches this far beyond the starts from which both vehicles meet at M."""
@@ -28,7 +28,7 @@ def suggested(road: Corridor, name: str) -> Scenario:
     """
     limit_mps = min(limit_at(road.mainline, -1.0), US23.v_hw_max_mps)
     x_vut0_m = max(US23.x_vut0_m, _down(-ROOM * road.ramp.before_m))
-    v_vut0_mps = round(min(US23.v_vut0_mps, limit_at(road.ramp, x_vut0_m)), 1)
+    v_vut0_mps = round(min(V_VUT0_MPS, limit_at(road.ramp, x_vut0_m)), 1)
     level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
     due_s = float(
         level0_time_to(np.array(-x_vut0_m), np.array(v_vut0_mps), v_cruise_mps=level0_v_mps)

@@ -12,7 +12,7 @@ from typing import Any, Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo import received
+from merge_sumo.sumo import allowed, received
 from merge_sumo.system.resources import resource
 
 MAIN_IN: Final = "main_in"
@@ -82,7 +82,7 @@ class Net:
 
     def _parse(self, content: bytes) -> None:
         self._bytes = content
-        self._root, intact = received.parse(content, received.NET, f"the net {self.path}")
+        self._root, intact = received.parse(content, allowed.NET, f"the net {self.path}")
         self._text = content if intact else received.serialize(self._root)
         self.main_in = self._lane(MAIN_IN)
         self.main_out = self._lane(MAIN_OUT)

@@ -11,7 +11,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo import received
+from merge_sumo.sumo import allowed, received
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.corridor import Corridor, LanePath
 from merge_sumo.sumo.net import Net
@@ -54,7 +54,7 @@ def _net_of(road: Corridor) -> bytes:
         raise UserError(
             f"the net {road.path} is not the one that was driven in: it changed; put that one there"
         )
-    root, intact = received.parse(content, received.NET, f"the net {road.path}", MAX_ELEMENTS)
+    root, intact = received.parse(content, allowed.NET, f"the net {road.path}", MAX_ELEMENTS)
     return content if intact else received.serialize(root)
 
 

@@ -1,11 +1,11 @@
-"""XML that somebody sent: read as data, with nothing left of it but what this page allows.
+"""XML that somebody sent: read as data, with nothing left of it but what is allowed.
 
 SUMO's files can name other files, devices and addresses, and SUMO reads and writes all of them.
 So no file that came from outside reaches SUMO or netconvert. It is read here, without opening what
 is no plain file, without entities and within limits, and what goes on is a tree of the elements
-and attributes below. What is not below is dropped, since the scenario needs none of it; a value
-that is not what its attribute holds is refused, since dropping it would change the road or the
-record.
+and attributes that `allowed.py` lists. What is not listed is dropped, since the scenario needs none
+of it; a value that is not what its attribute holds is refused, since dropping it would change the
+road or the record.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Allowed:
 
 def number(low: float, high: float) -> Values:
     """Return the finite numbers from `low` to `high`."""
-    return Values(f"a number from {low:g} to {high:g}", lambda text: _is_number(text, low, high))
+    return Values(f"a number from {low:g} to {high:g}", lambda text: is_number(text, low, high))
 
 
 def matching(pattern: str, words: str) -> Values:
@@ -69,206 +69,10 @@ def matching(pattern: str, words: str) -> Values:
     return Values(words, lambda text: compiled.fullmatch(text) is not None)
 
 
-def _is_number(text: str, low: float, high: float) -> bool:
+def is_number(text: str, low: float, high: float) -> bool:
+    """Return whether a text is a finite number from `low` to `high`."""
     short = len(text) <= MAX_NUMBER_CHARS and _NUMBER.fullmatch(text) is not None
     return short and low <= float(text) <= high
-
-
-def _are_points(text: str) -> bool:
-    points = [point.split(",") for point in text.split(" ") if point]
-    return all(
-        len(point) in (2, 3) and all(_is_number(part, -MAX_M, MAX_M) for part in point)
-        for point in points
-    )
-
-
-MAX_M: Final = 2e7
-"""Farthest from the origin that a net may reach: half way round the earth, in metres of UTM."""
-_SWITCH = matching("0|1|true|false", "0, 1, true or false")
-_COUNT = number(0, 10_000)
-_METRES = number(0, MAX_M)
-_PLACE = number(-MAX_M, MAX_M)
-_EARTH_M = r"[+-]?[0-9]{1,12}(?:\.[0-9]{0,12})?"
-_SPEED = number(0, 1000)
-_ID = matching(r"[\w.:#+\-]{1,250}", "an id of letters, digits and . : # + - _")
-_IDS = Values("a list of ids", lambda text: all(map(_ID.include, text.split())))
-_WORD = matching(r"[A-Za-z_]{1,40}", "a word")
-_CLASSES = matching(r"[a-z_0-9 ]*", "a list of vehicle classes")
-_SHAPE = Values(f"points x,y within {MAX_M:g} m", _are_points)
-_BITS = matching("[01]{1,256}", "a row of 0 and 1")
-_NAME = Values("a name", lambda text: len(text) <= 200 and text.isprintable())
-
-_PROJECTION = matching(
-    r"[!.\-]|(?:\+(?:no_defs|south|(?:proj|zone|ellps|datum|units|lat_0|lat_1|lat_2|lat_ts|lon_0|k|k_0"
-    r"|x_0|y_0|type|towgs84)=[A-Za-z0-9.,\-]{1,80})(?: |$))+",
-    "a projection that names no file",
-)
-
-_LANE: Final = Allowed(
-    {
-        **dict.fromkeys(("id", "type"), _ID),
-        **dict.fromkeys(("allow", "disallow", "changeLeft", "changeRight"), _CLASSES),
-        **dict.fromkeys(("acceleration", "customShape"), _SWITCH),
-        **{"index": _COUNT, "speed": _SPEED, "length": _METRES, "shape": _SHAPE},
-        **{"width": number(0.01, 100), "endOffset": _METRES},
-    }
-)
-_EDGE: Final = Allowed(
-    {
-        **dict.fromkeys(("id", "from", "to", "bidi"), _ID),
-        **dict.fromkeys(("function", "spreadType"), _WORD),
-        "crossingEdges": _IDS,
-        **{"length": _METRES, "distance": _PLACE},
-        **{"priority": number(-1000, 1000), "name": _NAME, "shape": _SHAPE},
-        "type": matching(r"[\w.:#+|\-]{0,250}", "an edge type"),
-    },
-    {"lane": _LANE},
-)
-_JUNCTION: Final = Allowed(
-    {
-        **dict.fromkeys(("id",), _ID),
-        **dict.fromkeys(("type", "rightOfWay", "fringe", "roundabout"), _WORD),
-        **dict.fromkeys(("x", "y", "z"), _PLACE),
-        **dict.fromkeys(("incLanes", "intLanes"), _IDS),
-        **dict.fromkeys(("customShape", "keepClear"), _SWITCH),
-        **{"shape": _SHAPE, "radius": number(-1, 1e4), "name": _NAME},
-    },
-    {"request": Allowed({"index": _COUNT, "response": _BITS, "foes": _BITS, "cont": _SWITCH})},
-)
-_CONNECTION: Final = Allowed(
-    {
-        **dict.fromkeys(("from", "to"), _ID),
-        **dict.fromkeys(("fromLane", "toLane"), _COUNT),
-        **dict.fromkeys(("pass", "keepClear", "uncontrolled", "indirect"), _SWITCH),
-        **dict.fromkeys(("allow", "disallow", "changeLeft", "changeRight"), _CLASSES),
-        **dict.fromkeys(("contPos", "visibility", "length"), _PLACE),
-        **{"speed": number(-1, 1000), "shape": _SHAPE},
-        "dir": matching("[a-zA-Z]|invalid", "a letter"),
-        "state": matching("[a-zA-Z=-]", "a letter, = or -"),
-    }
-)
-_VERSION = matching(r"[0-9]{1,4}(?:\.[0-9]{1,4}){0,3}", "a version")
-NET: Final = {
-    "net": Allowed(
-        {
-            "version": _VERSION,
-            "junctionCornerDetail": number(0, 1000),
-            "junctionLinkDetail": number(0, 1000),
-            "limitTurnSpeed": number(-1, 1000),
-            **dict.fromkeys(("lefthand", "rectangularLaneCut", "avoidOverlap"), _SWITCH),
-            **dict.fromkeys(("walkingareas", "checkLaneFoes.all"), _SWITCH),
-            **dict.fromkeys(("checkLaneFoes.roundabout",), _SWITCH),
-            "spreadType": _WORD,
-            # A reader that validates fetches what stands here.
-            "{http://www.w3.org/2001/XMLSchema-instance}noNamespaceSchemaLocation": matching(
-                r"https?://sumo\.dlr\.de/xsd/net_file\.xsd", "the schema of SUMO's nets"
-            ),
-        },
-        {
-            "location": Allowed(
-                {
-                    "netOffset": matching(f"{_EARTH_M},{_EARTH_M}", "x,y"),
-                    "convBoundary": matching(f"(?:{_EARTH_M},){{3}}{_EARTH_M}", "four numbers"),
-                    "origBoundary": matching(f"(?:{_EARTH_M},){{3}}{_EARTH_M}", "four numbers"),
-                    "projParameter": _PROJECTION,
-                }
-            ),
-            "edge": _EDGE,
-            "junction": _JUNCTION,
-            "connection": _CONNECTION,
-        },
-    )
-}
-"""A net: no traffic lights, types, roundabouts or parameters, which a corridor does without."""
-HOSTED_NET: Final = {
-    "net": Allowed(
-        {"version": _VERSION},
-        {
-            "edge": _EDGE,
-            "junction": _JUNCTION,
-            "connection": Allowed({**_CONNECTION.attributes, "via": _ID}),
-        },
-    )
-}
-"""A net that `hosting` made, with lanes inside of junctions."""
-
-_WHO: Final = matching("pov|vut", "pov or vut")
-_COLOUR: Final = matching(r"[0-9.]{1,20}(?:,[0-9.]{1,20}){2,3}|[a-z]{1,20}", "a colour")
-
-TYPES: Final = {
-    "additional": Allowed(
-        {},
-        {
-            "vType": Allowed(
-                {
-                    "id": _WHO,
-                    "color": _COLOUR,
-                    "guiShape": matching("[a-z]{1,20}(?:/[a-z]{1,20})?", "a shape of a vehicle"),
-                    "length": number(0.1, 100),
-                    "minGap": number(0, 100),
-                    **dict.fromkeys(("maxSpeed", "speedFactor"), number(1e-9, 1000)),
-                    **dict.fromkeys(("decel", "emergencyDecel"), number(0.1, 1e4)),
-                },
-                required=("id",),
-            )
-        },
-    )
-}
-"""The types of the two vehicles; SUMO chooses what is not named."""
-
-SURROUNDINGS: Final = {
-    "additional": Allowed(
-        {},
-        {
-            "poly": Allowed(
-                {
-                    "id": _ID,
-                    "color": _COLOUR,
-                    "fill": _SWITCH,
-                    "layer": number(-1000, 1000),
-                    "lineWidth": number(0, 100),
-                    "shape": _SHAPE,
-                },
-                required=("id", "shape"),
-            )
-        },
-    )
-}
-"""What is drawn beside the road."""
-
-_MOTION: Final = {
-    "id": _WHO,
-    "x": _PLACE,
-    "y": _PLACE,
-    "pos": _METRES,
-    "speed": _SPEED,
-}
-_RECORDED: Final = {
-    **_MOTION,
-    "angle": number(-360, 360),
-    "type": _WHO,
-    "lane": matching(
-        "(?:main_in|main_out|ramp)_0"
-        r"|(?::(?:M|end|(?:main|ramp|out)[0-9]{1,4}-end)\.0_(?:main|ramp|out)[0-9]{1,4}"
-        r"|(?:main|ramp|out)[0-9]{1,4}\.0)_0",
-        "a lane of a replay",
-    ),
-}
-
-
-def _fcd(vehicle: Mapping[str, Values]) -> Mapping[str, Allowed]:
-    step = Allowed(
-        {"time": number(0, 1e4)},
-        {"vehicle": Allowed(vehicle, required=tuple(vehicle))},
-        required=("time",),
-    )
-    return {"fcd-export": Allowed({}, {"timestep": step})}
-
-
-RECORD: Final = _fcd(_RECORDED)
-"""The record that SUMO plays."""
-REPLAYED: Final = _fcd(_MOTION)
-"""What SUMO writes of a replay, where only motion is compared."""
 
 
 def read_bytes(path: Path, what: str, *, follow_links: bool, limit: int = MAX_BYTES) -> bytes:

@@ -21,7 +21,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo import received
+from merge_sumo.sumo import allowed, received
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint
 from merge_sumo.sumo.finder import find_corridor
@@ -30,7 +30,7 @@ from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.netfile import NetFile, Point
 from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, corridor_of
 from merge_sumo.system.folders import new_folder
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VEHICLES
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -178,7 +178,7 @@ def replay(folder: Path) -> Replay:
             raise UserError(f"SUMO cannot replay {folder}: {ended.reason}")
         written = received.read_bytes(stage / REPLAYED, "the replay", follow_links=False)
     name = f"SUMO's replay of {folder}"
-    replayed = _rows(received.parse(written, received.REPLAYED, name)[0], name)
+    replayed = _rows(received.parse(written, allowed.REPLAYED, name)[0], name)
     fault = _difference(episode, replayed) or _fault_of_record(episode)
     return Replay(len(episode.rows), *(fault or (None, "")))
 
@@ -228,22 +228,22 @@ def _received(folder: Path) -> _Episode:
 
 
 def _checked_hosted(net: bytes, surroundings: bytes, folder: Path) -> _Road:
-    root, _ = received.parse(net, received.HOSTED_NET, f"the net {folder / HOSTED_NET}")
+    root, _ = received.parse(net, allowed.HOSTED_NET, f"the net {folder / HOSTED_NET}")
     content = received.serialize(root)
     name = f"the file {folder / SURROUNDINGS}"
-    drawn, _ = received.parse(surroundings, received.SURROUNDINGS, name)
+    drawn, _ = received.parse(surroundings, allowed.SURROUNDINGS, name)
     return _Road(content, _corridor_of_hosted(content, folder / HOSTED_NET), drawn)
 
 
 def _checked_types(content: bytes, path: Path) -> etree._Element:
-    root, _ = received.parse(content, received.TYPES, f"the file {path}")
+    root, _ = received.parse(content, allowed.TYPES, f"the file {path}")
     if sorted(str(vtype.get("id")) for vtype in root) != sorted(COLOURS):
         raise UserError(f"the file {path} must have one vType pov and one vType vut")
     return root
 
 
 def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
-    root, _ = received.parse(content, received.RECORD, f"the record {path}")
+    root, _ = received.parse(content, allowed.RECORD, f"the record {path}")
     if not MIN_TIMESTEPS <= len(root) <= MAX_TIMESTEPS:
         raise UserError(
             f"the record {path} must have from {MIN_TIMESTEPS} to {MAX_TIMESTEPS} timesteps"
@@ -365,7 +365,7 @@ def _rows(root: etree._Element, name: str) -> Rows:
 
 def _types(trajectory: Trajectory) -> etree._Element:
     root = etree.Element("additional")
-    first_speeds = {"pov": trajectory.v_pov_mps[0], "vut": trajectory.v_vut_mps[0]}
+    first_speeds = dict(zip(VEHICLES, trajectory.motion[0, :, 1].tolist(), strict=False))
     for name, colour in COLOURS.items():
         etree.SubElement(
             root,
@@ -390,9 +390,9 @@ def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
     root = etree.Element("fcd-export")
     motion = trajectory.motion.tolist()
     motion += [motion[-1]] * HOLD_STEPS
-    for step, (x_pov, v_pov, _, x_vut, v_vut, _) in enumerate(motion):
+    for step, vehicles in enumerate(motion):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
-        for who, x_m, v_mps in (("pov", x_pov, v_pov), ("vut", x_vut, v_vut)):
+        for who, (x_m, v_mps, _) in zip(VEHICLES, vehicles, strict=False):
             lane, position, x, y, angle = road.lane_point(x_m, on_ramp=who == "vut")
             etree.SubElement(
                 timestep,

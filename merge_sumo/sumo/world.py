@@ -16,7 +16,7 @@ from __future__ import annotations
 import bisect
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Self
@@ -31,10 +31,7 @@ from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.road import corridor_of, road_of
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S
-
-POV: Final = 0
-VUT: Final = 1
+from merge_sumo.values.scenario import DT_S, US23, VEHICLES, VUT, Scenario
 
 SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
@@ -45,8 +42,11 @@ EXACT_M: Final = 1e-9
 MAX_SPEED_MPS: Final = 200.0
 """Above what a POV can reach by the timeout, so that SUMO never caps a commanded speed."""
 
+CAR: Final = "car"
+COMMANDED_VUT: Final = "commanded"
 VUT_TYPE: Final = "vut"
-"""Id of the vType of VUTs that SUMO drives."""
+"""Ids of the vTypes of the cars of the mainline, of VUTs that hold the speed that they are told,
+and of VUTs that SUMO drives."""
 
 SUMO_OPTIONS: Final = (
     *("--step-length", str(DT_S)),
@@ -68,8 +68,9 @@ class SimulationError(Exception):
 class World:
     """A libsumo simulation with `corridors` independent corridors.
 
-    State arrays have shape (2, corridors), row `POV` and row `VUT`:
-    `x_m`, lane coordinates with M = 0, and `v_mps`. They are read from SUMO.
+    State arrays have shape (A, corridors), a row for each vehicle of an episode (`POV`, `VUT` and,
+    in traffic, `AHEAD` and `BEHIND`): `x_m`, lane coordinates with M = 0, and `v_mps`. They are
+    read from SUMO.
 
     libsumo holds one simulation per process, so one world may be open at a time.
     """
@@ -81,10 +82,12 @@ class World:
         corridors: int = 32,
         road: Net | Corridor | None = None,
         vut_type: Mapping[str, str] | None = None,
+        scenario: Scenario = US23,
     ) -> None:
         """Start SUMO; raises `UserError` when it cannot start, or when a world is open already.
 
         `road` is where the merge is, by default the shipped net.
+        `scenario` says how many vehicles there are, and how long.
         `vut_type` are attributes of a SUMO vType: with them SUMO's own models decide on the speed
         of the VUTs, and `wanted_v_mps` tells what they want.
         """
@@ -93,10 +96,13 @@ class World:
         self.corridors = corridors
         self.road = road_of() if road is None else corridor_of(road)
         self.vut_type = vut_type
+        self.scenario = scenario
+        self.vehicles = scenario.vehicles
         self._libsumo = load_libsumo()
-        self.x_m: FloatArray = np.empty((2, corridors))
-        self.v_mps: FloatArray = np.empty((2, corridors))
-        self._paths = hosted_paths(self.road)
+        self.x_m: FloatArray = np.empty((self.vehicles, corridors))
+        self.v_mps: FloatArray = np.empty((self.vehicles, corridors))
+        mainline, ramp = hosted_paths(self.road)
+        self._paths = [ramp if row == VUT else mainline for row in range(self.vehicles)]
         self._parking_m = [max(-PARKING_M, path.starts_m[0]) for path in self._paths]
         self._lanes = [[path.lanes(k) for k in range(corridors)] for path in self._paths]
         self._start_m_of_lane = {
@@ -105,7 +111,7 @@ class World:
             for k in range(corridors)
             for lane, start_m in zip(path.lanes(k), path.starts_m, strict=True)
         }
-        self._start_m: FloatArray = np.zeros((2, corridors))
+        self._start_m: FloatArray = np.zeros((self.vehicles, corridors))
         """Lane coordinates at which the lanes begin on which the vehicles are."""
         self._expected_m = self.x_m
         """Where eq. (4) leads; no number where that is not known."""
@@ -122,7 +128,7 @@ class World:
             net_file = folder / "corridors.net.xml"
             net_file.write_bytes(hosted_net(self.road, self.corridors))
             types_file = folder / "types.add.xml"
-            types_file.write_bytes(_types(self.vut_type))
+            types_file.write_bytes(_types(self.vut_type, self.scenario))
             messages = folder / "messages"
             files = ("--net-file", str(net_file), "--additional-files", str(types_file))
             try:
@@ -134,15 +140,13 @@ class World:
                 raise UserError(f"SUMO cannot load the net {self.road.path}: {reason}") from error
         vehicle = libsumo.vehicle
         self._add, self._remove = vehicle.add, vehicle.remove
-        self._ids = [f"{who}.{k}" for who in ("pov", "vut") for k in range(self.corridors)]
+        names = VEHICLES[: self.vehicles]
+        self._ids = [f"{who}.{k}" for who in names for k in range(self.corridors)]
         try:
-            vtype = "DEFAULT_VEHTYPE"
-            libsumo.vehicletype.setMinGap(vtype, 0.0)
-            libsumo.vehicletype.setMaxSpeed(vtype, MAX_SPEED_MPS)
             for index, name in enumerate(self._ids):
                 row, k = divmod(index, self.corridors)
                 libsumo.route.add(f"route.{name}", self._paths[row].route(k))
-                self._enter(name, vtype)
+                self._enter(name, COMMANDED_VUT if row == VUT else CAR)
             libsumo.simulation.step()
             for name in self._ids:
                 vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
@@ -157,8 +161,9 @@ class World:
         self._set_speed, self._set_previous_speed = _raw(libsumo, "setSpeed", "setPreviousSpeed")
         self._get_position, self._get_speed = _raw(libsumo, "getLanePosition", "getSpeed")
         self._get_lane = vehicle.getLaneID
-        self._commanded = len(self._ids) if self.vut_type is None else self.corridors
-        """How many of `_ids` hold the speed that they are told."""
+        rows = np.repeat(np.arange(self.vehicles), self.corridors)
+        self._commanded = ((rows != VUT) | (self.vut_type is None)).tolist()
+        """Which of `_ids` hold the speed that they are told."""
         World._open = True
         self._expected_m = np.full_like(self.x_m, np.nan)
         self.read()
@@ -173,11 +178,12 @@ class World:
             departSpeed="0",
         )
 
-    def place(
-        self, corridor: int, x_pov_m: float, v_pov_mps: float, x_vut_m: float, v_vut_mps: float
-    ) -> None:
-        """Put both vehicles of a corridor where an episode starts, and read them back."""
-        for row, x, v in ((POV, x_pov_m, v_pov_mps), (VUT, x_vut_m, v_vut_mps)):
+    def place(self, corridor: int, starts: Sequence[tuple[float, float]]) -> None:
+        """Put the vehicles of a corridor where an episode starts, and read them back.
+
+        `starts` are (x in m, v in m/s) of the vehicles in the order of their rows.
+        """
+        for row, (x, v) in enumerate(starts):
             name = self._ids[row * self.corridors + corridor]
             lane, start_m = self._lane_at(row, corridor, x)
             driven_by_sumo = row == VUT and self.vut_type is not None
@@ -197,8 +203,8 @@ class World:
             self.v_mps[row, corridor] = self._get_speed(name)
 
     def park(self, corridor: int) -> None:
-        """Put both vehicles of a corridor aside, at a stand before M."""
-        self.place(corridor, self._parking_m[POV], 0.0, self._parking_m[VUT], 0.0)
+        """Put the vehicles of a corridor aside, at a stand before M."""
+        self.place(corridor, [(x_m, 0.0) for x_m in self._parking_m])
 
     def _lane_at(self, row: int, corridor: int, x_m: float) -> tuple[str, float]:
         """Return the lane at a coordinate of a vehicle's path, and where that lane begins."""
@@ -214,7 +220,7 @@ class World:
     def step(self, a_mps2: FloatArray) -> None:
         """Advance all corridors by one step of eq. (4) and read the state.
 
-        `a_mps2` has shape (2, corridors). Speeds do not fall below 0. Raises `SimulationError`.
+        `a_mps2` has shape (A, corridors). Speeds do not fall below 0. Raises `SimulationError`.
         """
         self.advance()
         self.command(a_mps2)
@@ -231,11 +237,14 @@ class World:
 
     def wanted_v_mps(self) -> FloatArray:
         """Return the speeds that SUMO's own models chose for the VUTs in its step, (corridors,)."""
-        names = self._ids[self.corridors :]
-        return np.fromiter(map(self._get_speed, names), float, len(names))
+        return np.fromiter(map(self._get_speed, self._vut_ids), float, self.corridors)
+
+    @property
+    def _vut_ids(self) -> list[str]:
+        return self._ids[VUT * self.corridors : (VUT + 1) * self.corridors]
 
     def command(self, a_mps2: FloatArray) -> None:
-        """Set the speeds that follow from accelerations, (2, corridors), and read the state.
+        """Set the speeds that follow from accelerations, (A, corridors), and read the state.
 
         Comes after `advance`; the two are one step. Raises `SimulationError`.
         """
@@ -253,7 +262,7 @@ class World:
             for index in np.flatnonzero(changed).tolist():
                 name, speed = ids[index], speeds[index]
                 set_previous_speed(name, speed, accelerations[index])
-                if index < commanded:
+                if commanded[index]:
                     set_speed(name, speed)
             if not self.read():
                 off_m = np.abs(self.x_m - self._expected_m).max()
@@ -263,8 +272,7 @@ class World:
 
     def _put_vuts(self, x_m: FloatArray) -> None:
         """Put the VUTs at lane coordinates, (corridors,)."""
-        names = self._ids[self.corridors :]
-        for k, (name, x) in enumerate(zip(names, x_m.tolist(), strict=True)):
+        for k, (name, x) in enumerate(zip(self._vut_ids, x_m.tolist(), strict=True)):
             lane, start_m = self._lane_at(VUT, k, x)
             self._move_to(name, lane, x - start_m)
 
@@ -295,7 +303,7 @@ class World:
         self.x_m = position_m + self._start_m
 
     def acceleration_mps2(self) -> FloatArray:
-        """Return SUMO's own accelerations, (2, corridors)."""
+        """Return SUMO's own accelerations, (A, corridors)."""
         get = self._libsumo.vehicle.getAcceleration
         return np.array([get(name) for name in self._ids]).reshape(self.x_m.shape)
 
@@ -314,11 +322,15 @@ class World:
         self.close()
 
 
-def _types(vut_type: Mapping[str, str] | None) -> bytes:
-    """Return the additional file with the vType of VUTs that SUMO drives, if there is one."""
+def _types(vut_type: Mapping[str, str] | None, scenario: Scenario) -> bytes:
+    """Return the additional file with the vTypes."""
     root = etree.Element("additional")
+    told = {"minGap": "0", "maxSpeed": repr(MAX_SPEED_MPS)}
+    for name, length_m in ((CAR, scenario.pov_length_m), (COMMANDED_VUT, scenario.vut_length_m)):
+        etree.SubElement(root, "vType", {"id": name, "length": repr(length_m), **told})
     if vut_type is not None:
-        etree.SubElement(root, "vType", {"id": VUT_TYPE, **vut_type})
+        length = {"length": repr(scenario.vut_length_m)}
+        etree.SubElement(root, "vType", {"id": VUT_TYPE, **length, **vut_type})
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
 
 

@@ -89,11 +89,12 @@ def returns_of(trajectories: list[Trajectory], weights: RewardWeights) -> Return
     parts = np.zeros((3, len(trajectories)))
     collided = np.zeros(len(trajectories), dtype=bool)
     for n, trajectory in enumerate(trajectories):
-        _, v_pov, a_pov, _, v_vut, a_vut = trajectory.motion[:-1].T
+        v_pov, a_pov = trajectory.v_pov_mps[:-1], trajectory.a_pov_mps2[:-1]
+        v_vut, a_vut = trajectory.v_vut_mps[:-1], trajectory.a_vut_mps2[:-1]
         parts[1, n] = pov_step(v_pov, a_pov, weights).sum()
         parts[2, n] = vut_step(v_vut, a_vut, weights).sum()
         if trajectory.end is End.MERGED:
-            x_pov, v_pov_end, _, x_vut, v_vut_end, _ = trajectory.motion[-1]
+            (x_pov, v_pov_end, _), (x_vut, v_vut_end, _) = trajectory.motion[-1]
             dx = np.array([x_pov - x_vut])
             parts[0, n] = safety(dx, np.array([v_pov_end - v_vut_end]), weights)[0]
             parts[2, n] += vut_end(np.array([v_vut_end]), weights)[0]
@@ -108,7 +109,7 @@ def play(
     played: list[Trajectory | None] = [None] * len(cases)
     with World(CORRIDORS) as world:
         pov, vut = _driver(make_pov), _driver(make_vut)
-        for index, trajectory in rollout(world, pov, vut, cases):
+        for index, trajectory in rollout(world, [pov], vut, cases):
             played[index] = trajectory
     return [trajectory for trajectory in played if trajectory is not None]
 

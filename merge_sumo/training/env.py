@@ -26,7 +26,7 @@ from merge_sumo.drivers.levelk import ACTIONS_MPS2, DECISION_STEPS
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.world import POV, VUT, World
+from merge_sumo.sumo.world import World
 from merge_sumo.training.game import Role
 from merge_sumo.training.reward import (
     RewardWeights,
@@ -37,7 +37,7 @@ from merge_sumo.training.reward import (
     vut_step,
 )
 from merge_sumo.values.case import V_POV0, X_POV0, Case, FloatArray
-from merge_sumo.values.scenario import MAX_STEPS, SVO, V_VUT0_MPS, X_VUT0_M
+from merge_sumo.values.scenario import MAX_STEPS, POV, SVO, V_VUT0_MPS, VUT, X_VUT0_M
 
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])
@@ -73,7 +73,7 @@ class MergeGame:
     def begin(self, corridor: int, state: FloatArray, svo_rad: float | None = None) -> None:
         """Start a game in a corridor from a state [x_POV, v_POV, x_VUT, v_VUT]."""
         x_pov, v_pov, x_vut, v_vut = state.tolist()
-        self.world.place(corridor, x_pov, v_pov, x_vut, v_vut)
+        self.world.place(corridor, [(x_pov, v_pov), (x_vut, v_vut)])
         level = 1 if svo_rad is None else 2
         case = Case(level=level, x_pov0_m=X_POV0.low, v_pov0_mps=V_POV0.low, svo_rad=svo_rad)
         self.opponent.begin(corridor, case)
@@ -99,7 +99,7 @@ class MergeGame:
         for _ in range(DECISION_STEPS):
             live = ~over
             x, v = world.x_m, world.v_mps
-            scene = Scene(live, self.step_count, x[POV], v[POV], x[VUT], v[VUT])
+            scene = Scene(live, self.step_count, x, v)
             a[agent] = a_mps2
             a[other] = self.opponent.act(scene)
             a[:, over] = 0.0

@@ -2,7 +2,8 @@
 
 A case is s = [x_POV0, v_POV0, psi, L]: where the POV starts, how fast, its social value
 orientation, and its level of reasoning. The orientation exists only at level 2, so the pool is
-three boxes: two-dimensional at levels 0 and 1, three-dimensional at level 2.
+three boxes: two-dimensional at levels 0 and 1, three-dimensional at level 2. Where a scenario has
+traffic, or a range of the VUT's speed, these are further coordinates.
 """
 
 from __future__ import annotations
@@ -16,7 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.values.scenario import LEVELS, SVO, US23, Dimension, Scenario
+from merge_sumo.values.scenario import (
+    AHEAD,
+    BEHIND,
+    LEVELS,
+    POV,
+    SVO,
+    US23,
+    V_VUT0_MPS,
+    VUT,
+    Dimension,
+    Scenario,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -41,7 +53,9 @@ class Case:
     x_pov0_m: float
     v_pov0_mps: float
     svo_rad: float | None = None
-    v_vut0_mps: float = US23.v_vut0_mps
+    v_vut0_mps: float = V_VUT0_MPS
+    headway_ahead_s: float | None = None
+    headway_behind_s: float | None = None
     scenario: Scenario = field(default=US23, repr=False)
 
     def __post_init__(self) -> None:
@@ -60,10 +74,38 @@ class Case:
                 )
         if self.svo_rad is not None and not 0.0 <= self.svo_rad < math.pi / 2:
             raise UserError(f"svo_rad is {self.svo_rad}: choose between 0 and below pi/2")
+        self._check_headways()
+
+    def _check_headways(self) -> None:
+        in_traffic, reach_m = self.scenario.vehicles > 2, self.scenario.reach_m
+        for name in ("headway_ahead_s", "headway_behind_s"):
+            headway_s = getattr(self, name)
+            if (headway_s is not None) != in_traffic:
+                raise UserError(f"{name} belongs to traffic: give it there, and only there")
+            if headway_s is None:
+                continue
+            apart_m, least_m = headway_s * self.v_pov0_mps, self.scenario.pov_length_m
+            ahead_m = apart_m if name == "headway_ahead_s" else -apart_m
+            if not (apart_m >= least_m and abs(self.x_pov0_m + ahead_m) <= reach_m):
+                raise UserError(
+                    f"{name} is {headway_s}: the cars would be {apart_m:g} m apart; choose "
+                    f"{least_m:g} m or more, and not more than {reach_m:g} m from M"
+                )
+
+    def starts(self) -> list[tuple[float, float]]:
+        """Return position and speed of every vehicle at the start, in the order of their rows."""
+        x, v = self.x_pov0_m, self.v_pov0_mps
+        rows = {POV: (x, v), VUT: (self.scenario.x_vut0_m, self.v_vut0_mps)}
+        if self.headway_ahead_s is not None and self.headway_behind_s is not None:
+            rows[AHEAD] = x + self.headway_ahead_s * v, v
+            rows[BEHIND] = x - self.headway_behind_s * v, v
+        return [rows[row] for row in range(len(rows))]
 
 
-COORDINATES: Final = ("level", "x_pov0_m", "v_pov0_mps", "svo_rad", "v_vut0_mps")
+RECORDED: Final = ("level", "x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad")
 """Fields of a case that its record has; the scenario is that of its campaign."""
+RECORDED_IN_TRAFFIC: Final = ("headway_ahead_s", "headway_behind_s")
+"""And these where there is traffic."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -71,7 +113,8 @@ class Pool:
     """The cases that a campaign may choose from: POV levels, and the VUT's observed speed."""
 
     levels: tuple[int, ...]
-    v_vut0_mps: float = US23.v_vut0_mps
+    v_vut0_mps: float | None = None
+    """None for the scenario's; where that is a range, it is a coordinate."""
     scenario: Scenario = US23
 
     def cases(self, points: FloatArray, level: int) -> list[Case]:
@@ -85,21 +128,23 @@ def to_unit(cases: Iterable[Case], level: int) -> FloatArray:
     for case in cases:
         dims = case.scenario.dimensions(level)
         rows.append([(getattr(case, d.field) - d.low) / (d.high - d.low) for d in dims])
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(dimensions(level)))
+    return np.array(rows, dtype=np.float64) if rows else np.empty((0, len(dimensions(level))))
 
 
 def from_unit(
     points: FloatArray,
     level: int,
-    v_vut0_mps: float = US23.v_vut0_mps,
+    v_vut0_mps: float | None = None,
     scenario: Scenario = US23,
 ) -> list[Case]:
     """Return the cases at points, (n, d), of the unit cube; the inverse of `to_unit`."""
     dims = scenario.dimensions(level)
+    given = scenario.bounds("v_vut0_mps")[0] if v_vut0_mps is None else v_vut0_mps
     cases = []
     for row in points.tolist():
-        values = {d.field: d.low + u * (d.high - d.low) for d, u in zip(dims, row, strict=True)}
+        values = {"v_vut0_mps": given}
+        values |= {d.field: d.low + u * (d.high - d.low) for d, u in zip(dims, row, strict=True)}
         if level == 2:
             values["svo_rad"] = min(values["svo_rad"], math.nextafter(SVO.high, 0.0))
-        cases.append(Case(level=level, v_vut0_mps=v_vut0_mps, scenario=scenario, **values))
+        cases.append(Case(level=level, scenario=scenario, **values))
     return cases

@@ -44,6 +44,23 @@ class Dimension:
 SVO: Final = Dimension("svo_rad", 0.0, math.pi / 2)
 """psi in [0, pi/2): the upper end itself is outside the pool."""
 
+POV: Final = 0
+VUT: Final = 1
+AHEAD: Final = 2
+BEHIND: Final = 3
+"""Rows of the vehicles of an episode, in every array that has one for each. The mainline is driven
+on by the POV and, in traffic, by a car ahead of it and one behind it."""
+VEHICLES: Final = ("pov", "vut", "ahead", "behind")
+"""Their names."""
+
+
+V_VUT0_MPS: Final = 18.0
+"""Speed at which the paper's VUT starts."""
+COORDINATES: Final = (
+    *("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "headway_ahead_s", "headway_behind_s"),
+)
+"""Numbers of a scenario that are coordinates of its pool where they are ranges."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Scenario:
@@ -58,7 +75,15 @@ class Scenario:
         v_pov0_mps: how fast it may be then.
         x_vut0_m: where the VUT starts.
         v_vut0_mps: how fast the VUT is then, unless a campaign says otherwise: it is observed, not
-            chosen by the tester.
+            chosen by the tester. A range makes it a coordinate of the pool.
+        headway_ahead_s: time headways at which a car drives ahead of the POV, low and high: the
+            distance of their front bumpers is the headway times the POV's speed, which is also
+            that of the car. A coordinate of the pool; None where there is no such car.
+        headway_behind_s: the same of a car behind the POV; given with the other, or not at all.
+        tau_s: reaction time with which a car of the mainline follows the one ahead of it (Krauss).
+        min_gap_m: distance that it keeps from it at a stand.
+        pov_length_m: length of the cars of the mainline.
+        vut_length_m: length of the VUT.
         a_min_mps2: hardest braking of both, negative.
         a_max_mps2: hardest acceleration of both.
         timeout_s: an episode that has not ended by then is a TIMEOUT.
@@ -81,7 +106,13 @@ class Scenario:
     x_pov0_m: Bounds = (-340.0, -180.0)
     v_pov0_mps: Bounds = (25.0, 35.0)
     x_vut0_m: float = -182.0
-    v_vut0_mps: float = 18.0
+    v_vut0_mps: float | Bounds = V_VUT0_MPS
+    headway_ahead_s: Bounds | None = None
+    headway_behind_s: Bounds | None = None
+    tau_s: float = 1.0
+    min_gap_m: float = 2.5
+    pov_length_m: float = 5.0
+    vut_length_m: float = 5.0
     a_min_mps2: float = -4.0
     a_max_mps2: float = 2.0
     timeout_s: float = 30.0
@@ -100,15 +131,27 @@ class Scenario:
         """Check the numbers one by one, then how they go together."""
         for field in fields(self):
             value = getattr(self, field.name)
-            numbers = value if field.type == "Bounds" else (value,)
-            if field.type in ("float", "Bounds") and not all(map(math.isfinite, numbers)):
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not all(math.isfinite(x) for x in numbers if isinstance(x, float)):
                 raise UserError(f"{field.name} is {value}: it must be finite")
+        v_vut0, slowest_mps = self.bounds("v_vut0_mps"), self.v_pov0_mps[0]
+        shortest_s = (self.pov_length_m + self.min_gap_m) / max(slowest_mps, 1e-9)
+        apart = f"low < high, from {shortest_s:.2f} up: else cars overlap at {slowest_mps:g} m/s"
         for name, fits, wanted in (
             ("x_pov0_m", -self.reach_m <= self.x_pov0_m[0] < self.x_pov0_m[1] <= 0.0, self._ahead),
             ("v_pov0_mps", 0.0 <= self.v_pov0_mps[0] < self.v_pov0_mps[1], "from 0 up, low < high"),
             ("v_pov0_mps", self.v_pov0_mps[1] <= self.v_start_max_mps, self._speeds),
             ("x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, self._ahead),
-            ("v_vut0_mps", 0.0 <= self.v_vut0_mps <= self.v_start_max_mps, self._speeds),
+            ("v_vut0_mps", 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps, self._speeds),
+            ("v_vut0_mps", type(self.v_vut0_mps) is float or v_vut0[0] < v_vut0[1], "low < high"),
+            ("headway_behind_s", self._has_both_headways, "both headways, or none"),
+            ("headway_ahead_s", self._apart(self.headway_ahead_s, shortest_s), apart),
+            ("headway_behind_s", self._apart(self.headway_behind_s, shortest_s), apart),
+            ("headway_behind_s", self._farthest_m <= self.reach_m, self._near_enough),
+            ("tau_s", self.tau_s >= DT_S, f"a step, {DT_S:g} s, or more"),
+            ("min_gap_m", self.min_gap_m >= 0.0, "0 or more"),
+            ("pov_length_m", self.pov_length_m > 0.0, "above 0"),
+            ("vut_length_m", self.vut_length_m > 0.0, "above 0"),
             ("a_min_mps2", self.a_min_mps2 < 0.0, "below 0"),
             ("a_max_mps2", self.a_max_mps2 > 0.0, "above 0"),
             ("timeout_s", DT_S <= self.timeout_s <= MAX_EPISODE_S, f"up to {MAX_EPISODE_S:g}"),
@@ -149,6 +192,39 @@ class Scenario:
         return f"between 0 and {self.v_start_max_mps:g}"
 
     @property
+    def _near_enough(self) -> str:
+        return f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
+
+    @property
+    def _has_both_headways(self) -> bool:
+        return (self.headway_ahead_s is None) == (self.headway_behind_s is None)
+
+    @property
+    def _farthest_m(self) -> float:
+        """Distance to M of the farthest start on the mainline."""
+        behind_s = 0.0 if self.headway_behind_s is None else self.headway_behind_s[1]
+        return behind_s * self.v_pov0_mps[1] - self.x_pov0_m[0]
+
+    @staticmethod
+    def _apart(headway_s: Bounds | None, shortest_s: float) -> bool:
+        return headway_s is None or shortest_s <= headway_s[0] < headway_s[1]
+
+    def bounds(self, name: str) -> Bounds:
+        """Return the bounds of a number that may be a range; twice the number where it is none."""
+        value = getattr(self, name)
+        return value if isinstance(value, tuple) else (value, value)
+
+    @property
+    def vehicles(self) -> int:
+        """A: how many vehicles an episode has, the VUT among them."""
+        return 2 if self.headway_ahead_s is None else len(VEHICLES)
+
+    @property
+    def mainline_m(self) -> float:
+        """Length before M that the mainline needs."""
+        return self._farthest_m
+
+    @property
     def max_steps(self) -> int:
         """Steps after which an episode that has not ended is a TIMEOUT."""
         return round(self.timeout_s / DT_S)
@@ -157,12 +233,21 @@ class Scenario:
     def room_after_m(self) -> float:
         """How far behind M a POV may get until the timeout, at full acceleration."""
         far_m = self.v_start_max_mps * self.timeout_s + 0.5 * self.a_max_mps2 * self.timeout_s**2
-        return max(far_m, ROOM_AFTER_M)
+        ahead_m = self.reach_m if self.vehicles > 2 else 0.0
+        return max(far_m, ROOM_AFTER_M) + ahead_m
 
     def dimensions(self, level: int) -> tuple[Dimension, ...]:
-        """Return the continuous coordinates of the pool at a level: two, or three at level 2."""
-        plane = (Dimension("x_pov0_m", *self.x_pov0_m), Dimension("v_pov0_mps", *self.v_pov0_mps))
-        return (*plane, SVO) if level == 2 else plane
+        """Return the continuous coordinates of the pool at a level: those that have a range.
+
+        Start and speed of the POV, then the speed of the VUT and the headways where the scenario
+        has ranges of them; at level 2 the POV's orientation is the last one.
+        """
+        found = [
+            Dimension(name, *value)
+            for name in COORDINATES
+            if isinstance(value := getattr(self, name), tuple)
+        ]
+        return (*found, SVO) if level == 2 else tuple(found)
 
 
 def _read(name: str, value: Any, kind: Any) -> Any:
@@ -171,21 +256,23 @@ def _read(name: str, value: Any, kind: Any) -> Any:
     def is_number(value: Any) -> bool:
         return type(value) in (int, float)
 
-    if kind == "float" and is_number(value):
+    if kind.startswith("float") and is_number(value):
         return float(value)
-    if kind == "Bounds" and isinstance(value, list | tuple):
+    if "Bounds" in kind and isinstance(value, list | tuple):
         if len(value) == 2 and all(map(is_number, value)):
             return tuple(map(float, value))
     elif kind == "tuple[str, ...]" and isinstance(value, list | tuple):
         if value and all(isinstance(item, str) for item in value):
             return tuple(value)
-    elif kind in ("str", "str | None") and isinstance(value, str):
+    elif kind.startswith("str") and isinstance(value, str):
         return value
-    elif kind == "str | None" and value is None:
+    elif kind.endswith("None") and value is None:
         return None
     wanted = {
         "float": "a number",
+        "float | Bounds": "a number, or two, [low, high]",
         "Bounds": "two numbers, [low, high]",
+        "Bounds | None": "two numbers, [low, high]",
         "tuple[str, ...]": 'edges, as in ["e1", "e2"]',
     }
     raise UserError(f"{name} is {value!r:.60}: it must be {wanted.get(kind, 'a text')}")
@@ -198,7 +285,6 @@ US23: Final = Scenario()
 A_MIN_MPS2: Final = US23.a_min_mps2
 A_MAX_MPS2: Final = US23.a_max_mps2
 X_VUT0_M: Final = US23.x_vut0_m
-V_VUT0_MPS: Final = US23.v_vut0_mps
 V_VUT0_MAX_MPS: Final = US23.v_start_max_mps
 MAX_STEPS: Final = US23.max_steps
 V_HW_MAX_MPS: Final = US23.v_hw_max_mps

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.values.case import COORDINATES, Case, FloatArray
-from merge_sumo.values.scenario import DT_S, US23, Scenario
+from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
+from merge_sumo.values.scenario import DT_S, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
@@ -36,7 +36,8 @@ class Measures:
     """Named measures of one episode, with the verdict first.
 
     dx, dv, TTC, DRAC, the impact speed and the order of merging are taken at t1, the first step
-    with x_VUT >= 0, and are None when the VUT never arrived.
+    with x_VUT >= 0, and are None when the VUT never arrived. In traffic all measures are those of
+    the car of the mainline that is nearest to the VUT at the end: it takes the POV's place.
 
     Attributes:
         end: why the episode ended; COLLISION where the VUT arrived with |dx| < 6 m.
@@ -55,11 +56,13 @@ class Measures:
         impact_speed_mps: |dv| in a collision, else None.
         merged_first: "VUT" or "POV".
         last_avoidable_s: in a collision, the last time from which the VUT, at full acceleration
-            or full braking, would have avoided it against the recorded motion of the POV (taken
-            on at constant speed); None when there was no such time or no collision.
+            or full braking, would have avoided it against the recorded motion of the POV and the
+            other cars (taken on at constant speed); None when there was no such time or no
+            collision.
         avoidable: in a collision, whether there was such a time; else None.
         clipped_steps: steps in which the VUT asked for more than its limits of acceleration.
         error: what the VUT or the simulation did wrong, else None.
+        nearest: name of the car that the measures are of; recorded in traffic only.
     """
 
     end: End
@@ -78,6 +81,7 @@ class Measures:
     avoidable: bool | None
     clipped_steps: int
     error: str | None
+    nearest: str = VEHICLES[POV]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,17 +100,14 @@ class Outcome:
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
-        case = self.case
-        return {
-            "index": self.index,
-            "batch": self.batch,
-            "level": case.level,
-            "x_pov0_m": case.x_pov0_m,
-            "v_pov0_mps": case.v_pov0_mps,
-            "v_vut0_mps": case.v_vut0_mps,
-            "svo_rad": case.svo_rad,
-            **asdict(self.measures),
-        }
+        case, measures = self.case, asdict(self.measures)
+        names: tuple[str, ...] = RECORDED
+        if case.scenario.vehicles > 2:
+            names += RECORDED_IN_TRAFFIC
+        else:
+            del measures["nearest"]
+        place = {"index": self.index, "batch": self.batch}
+        return place | {name: getattr(case, name) for name in names} | measures
 
     @classmethod
     def from_record(cls, record: dict[str, Any], scenario: Scenario = US23) -> Outcome:
@@ -115,8 +116,14 @@ class Outcome:
         index, batch = values.pop("index"), values.pop("batch")
         if type(index) is not int or type(batch) is not int:
             raise TypeError("index and batch must be whole numbers")
-        case = Case(**{name: values.pop(name) for name in COORDINATES}, scenario=scenario)
+        in_traffic = scenario.vehicles > 2
+        names = (*RECORDED, *RECORDED_IN_TRAFFIC) if in_traffic else RECORDED
+        case = Case(**{name: values.pop(name) for name in names}, scenario=scenario)
         values["end"] = End(values["end"])
+        if not in_traffic:
+            values["nearest"] = VEHICLES[POV]
+        if values["nearest"] not in VEHICLES:
+            raise ValueError(f"nearest is {values['nearest']!r}")
         for name, types in _TYPES.items():
             if type(value := values[name]) not in types:
                 raise TypeError(f"{name} is {value!r}")
@@ -136,15 +143,16 @@ _TYPES: Final = {
 
 def measure(trajectory: Trajectory) -> Measures:
     """Return the verdict and the measures of an episode."""
-    motion = trajectory.motion
-    x_pov, v_pov, _, x_vut, v_vut, _ = motion[-1].tolist()
+    nearest = trajectory.nearest
+    pair = trajectory.facing(nearest)
+    (x_pov, v_pov, _), (x_vut, v_vut, _) = pair.motion[-1].tolist()
     end, crash_m = trajectory.end, trajectory.case.scenario.dx_crash_m
     arrived = end is End.MERGED
     dx = dv = ttc = pet = drac = impact = first = avoidable = last_avoidable = None
     if arrived:
         dx, dv = x_pov - x_vut, v_pov - v_vut
         ttc = time_to_collision(dx, dv)
-        pet = _post_encroachment_time(trajectory)
+        pet = _post_encroachment_time(pair)
         first = "VUT" if dx < 0 else "POV"
         if abs(dx) < crash_m:
             end = End.COLLISION
@@ -154,7 +162,7 @@ def measure(trajectory: Trajectory) -> Measures:
         else:
             gap = abs(dx) - crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
-    lowest = motion.min(axis=0)
+    hardest = -pair.motion[:, :, 2].min(axis=0)
     return Measures(
         end=end,
         score=None if trajectory.error is not None else _score(trajectory, end, dx, ttc),
@@ -164,14 +172,15 @@ def measure(trajectory: Trajectory) -> Measures:
         pet_s=pet,
         t_end_s=trajectory.t_end_s,
         drac_mps2=drac,
-        vut_max_brake_mps2=max(0.0, -float(lowest[5])),
-        pov_max_brake_mps2=max(0.0, -float(lowest[2])),
+        vut_max_brake_mps2=max(0.0, float(hardest[VUT])),
+        pov_max_brake_mps2=max(0.0, float(hardest[POV])),
         impact_speed_mps=impact,
         merged_first=first,
         last_avoidable_s=last_avoidable,
         avoidable=avoidable,
         clipped_steps=trajectory.clipped_steps,
         error=None if trajectory.error is None else as_reason(trajectory.error),
+        nearest=VEHICLES[nearest],
     )
 
 
@@ -234,12 +243,14 @@ def _last_avoidable_s(trajectory: Trajectory) -> float | None:
 
     The POV never moves backwards, so of all ways to arrive at M the first and the last possible
     decide: the VUT passes in front at full acceleration, or waits at full braking. Both are
-    rolled out from every step of the record at once.
+    rolled out from every step of the record at once. In traffic every car has to be avoided, and
+    ways through gaps between them are left out.
     """
-    x_pov, scenario = trajectory.x_pov_m, trajectory.case.scenario
-    beyond = np.arange(1, scenario.max_steps + 1) * (trajectory.v_pov_mps[-1] * DT_S) + x_pov[-1]
-    x_pov_on = np.concatenate([x_pov, beyond])
-    starts = np.arange(len(x_pov) - 1)
+    cars, scenario = np.delete(trajectory.motion, VUT, axis=1), trajectory.case.scenario
+    steps = np.arange(1, scenario.max_steps + 1)[:, None]
+    beyond = steps * (cars[-1, :, 1] * DT_S) + cars[-1, :, 0]
+    x_cars = np.concatenate([cars[:, :, 0], beyond])
+    starts = np.arange(len(cars) - 1)
     way_out = np.zeros(len(starts), dtype=bool)
     for acceleration in (scenario.a_max_mps2, scenario.a_min_mps2):
         x, v = trajectory.x_vut_m[:-1].copy(), trajectory.v_vut_mps[:-1].copy()
@@ -248,13 +259,13 @@ def _last_avoidable_s(trajectory: Trajectory) -> float | None:
             x = x + v * DT_S
             v = np.maximum(v + acceleration * DT_S, 0.0)
             arrived = driving & (x >= 0.0)
-            dx = x_pov_on[starts[arrived] + ahead] - x[arrived]
-            way_out[arrived] |= np.abs(dx) >= scenario.dx_crash_m
+            dx = x_cars[starts[arrived] + ahead] - x[arrived, None]
+            way_out[arrived] |= (np.abs(dx) >= scenario.dx_crash_m).all(axis=1)
             driving &= ~arrived
             if not driving.any():
                 break
             if acceleration < 0.0 and not v[driving].any():
                 # These stop short of M and can wait there, if the POV moves on.
-                way_out[driving] |= bool(trajectory.v_pov_mps[-1] > 0.0)
+                way_out[driving] |= bool((cars[-1, :, 1] > 0.0).all())
                 break
     return float(starts[way_out][-1] * DT_S) if way_out.any() else None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, POV, VUT
 
 
 class End(StrEnum):
@@ -47,11 +47,11 @@ def as_reason(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Positions, speeds and accelerations of both vehicles in one episode.
+    """Positions, speeds and accelerations of all vehicles in one episode.
 
-    `motion` has shape (T + 1, 6): one row per step, from t = 0 to the end of the episode, with
-    the columns x_POV, v_POV, a_POV, x_VUT, v_VUT, a_VUT in m, m/s and m/s2. The acceleration in a
-    row acts from that row to the next; it is 0 in the last one.
+    `motion` has shape (T + 1, A, 3): one row per step, from t = 0 to the end of the episode; the
+    vehicles POV, VUT and, in traffic, the cars ahead of and behind the POV; their x, v and a in m,
+    m/s and m/s2. The acceleration of a step acts from it to the next; it is 0 in the last one.
 
     `end` is MERGED whenever the VUT arrived at M: whether it collided there is the verdict of the
     score. `error` says what the VUT or the simulation did wrong. `clipped_steps` counts the
@@ -67,32 +67,42 @@ class Trajectory:
     @property
     def x_pov_m(self) -> FloatArray:
         """Positions of the POV, (T + 1,)."""
-        return self.motion[:, 0]
+        return self.motion[:, POV, 0]
 
     @property
     def v_pov_mps(self) -> FloatArray:
         """Speeds of the POV, (T + 1,)."""
-        return self.motion[:, 1]
+        return self.motion[:, POV, 1]
 
     @property
     def a_pov_mps2(self) -> FloatArray:
         """Accelerations of the POV, (T + 1,), the last one 0."""
-        return self.motion[:, 2]
+        return self.motion[:, POV, 2]
 
     @property
     def x_vut_m(self) -> FloatArray:
         """Positions of the VUT, (T + 1,)."""
-        return self.motion[:, 3]
+        return self.motion[:, VUT, 0]
 
     @property
     def v_vut_mps(self) -> FloatArray:
         """Speeds of the VUT, (T + 1,)."""
-        return self.motion[:, 4]
+        return self.motion[:, VUT, 1]
 
     @property
     def a_vut_mps2(self) -> FloatArray:
         """Accelerations of the VUT, (T + 1,), the last one 0."""
-        return self.motion[:, 5]
+        return self.motion[:, VUT, 2]
+
+    @property
+    def nearest(self) -> int:
+        """Row of the car of the mainline that is nearest to the VUT at the end."""
+        cars = [row for row in range(self.motion.shape[1]) if row != VUT]
+        return min(cars, key=lambda row: abs(self.motion[-1, row, 0] - self.motion[-1, VUT, 0]))
+
+    def facing(self, car: int) -> Trajectory:
+        """Return the motion of the VUT and one car of the mainline, in the POV's row."""
+        return replace(self, motion=self.motion[:, [car, VUT]])
 
     @property
     def t_end_s(self) -> float:

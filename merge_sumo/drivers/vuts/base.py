@@ -8,7 +8,7 @@ import struct
 import sys
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -18,11 +18,12 @@ from typing import Any, Final, NamedTuple, Self, TextIO
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.following import car_met
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB
+from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT
 from merge_sumo.values.trajectory import as_reason
 
 
@@ -76,8 +77,24 @@ class Vut:
     named_only: bool = False
 
 
+class Car(NamedTuple):
+    """A car of the mainline.
+
+    Attributes:
+        x_m: distance of its front bumper to M along its lane, negative before M.
+        v_mps: its speed.
+    """
+
+    x_m: float
+    v_mps: float
+
+
 class Seen(NamedTuple):
     """What a VUT sees at a step: time and state, and nothing about who drives the POV.
+
+    In traffic the car that the VUT will meet counts as POV: the one that would be nearest to M when
+    the VUT is there, if the car kept its speed and the VUT drove the scenario's level-0 profile
+    (`drivers.following.car_met`). `others` has all cars.
 
     Attributes:
         t_s: time since the episode began.
@@ -93,10 +110,47 @@ class Seen(NamedTuple):
     x_vut_m: float
     v_vut_mps: float
 
+    @property
+    def vehicles(self) -> tuple[Car, ...]:
+        """All vehicles in the order of their rows: POV, VUT, and the cars ahead and behind."""
+        return Car(self.x_pov_m, self.v_pov_mps), Car(self.x_vut_m, self.v_vut_mps)
+
+    @property
+    def others(self) -> tuple[Car, ...]:
+        """All cars of the mainline, the one in front first."""
+        cars = (car for row, car in enumerate(self.vehicles) if row != VUT)
+        return tuple(sorted(cars, reverse=True))
+
+
+class SeenInTraffic(Seen):
+    """What a VUT sees where more than one car drives on the mainline."""
+
+    _vehicles: tuple[Car, ...] = ()
+
+    @property
+    def vehicles(self) -> tuple[Car, ...]:
+        """All vehicles in the order of their rows."""
+        return self._vehicles
+
+
+def seen_in(t_s: float, met: int, x_m: Sequence[float], v_mps: Sequence[float]) -> Seen:
+    """Return what a VUT sees of vehicles by their rows; `met` is the row that counts as POV."""
+    state = t_s, x_m[met], v_mps[met], x_m[VUT], v_mps[VUT]
+    if len(x_m) == 2:
+        return Seen(*state)
+    seen = SeenInTraffic(*state)
+    seen._vehicles = tuple(map(Car, x_m, v_mps))
+    return seen
+
 
 def seen_at_start(case: Case) -> Seen:
     """Return what a VUT sees as an episode begins; level and orientation of the POV are hidden."""
-    return Seen(0.0, case.x_pov0_m, case.v_pov0_mps, case.scenario.x_vut0_m, case.v_vut0_mps)
+    x_m, v_mps = zip(*case.starts(), strict=True)
+    met = POV
+    if len(x_m) > 2:
+        x, v = np.array([x_m, v_mps])[..., None]
+        met = int(car_met(x, v, case.scenario.level0_a_mps2, case.scenario.level0_v_mps)[0])
+    return seen_in(0.0, met, x_m, v_mps)
 
 
 class TooLate(BaseException):
@@ -287,19 +341,18 @@ class PerCorridor(Driver):
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
         answers = [0.0] * self.corridors
-        columns = (scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps)
-        states = zip(scene.step.tolist(), *(column.tolist() for column in columns), strict=True)
+        met = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
+        rows = (scene.active, scene.step, scene.x_m.T, scene.v_mps.T)
+        states = zip(*(row.tolist() for row in rows), met, strict=True)
         with self._watch as watch:
-            for k, (active, (step, *state)) in enumerate(
-                zip(scene.active.tolist(), states, strict=True)
-            ):
+            for k, (active, step, x_m, v_mps, row) in enumerate(states):
                 if not active:
                     continue
                 if self._reasons[k] is not None:
                     answers[k] = math.nan
                     continue
                 try:
-                    seen = Seen(round(step * DT_S, 1), *state)
+                    seen = seen_in(round(step * DT_S, 1), row, x_m, v_mps)
                     answers[k] = watch.call(k, self._number, k, seen)
                 except BaseException as error:
                     self._fault(k, watch.reason(error))

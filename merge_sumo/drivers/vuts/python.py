@@ -34,7 +34,7 @@ from merge_sumo.drivers.vuts.base import (
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, VUT
 
 GROUP: Final = "merge_sumo.vuts"
 """Entry points of this group are VUTs by their name."""
@@ -215,7 +215,8 @@ class BatchedVut(Driver):
 class SeenBatch:
     """What a batched VUT sees: like `Seen`, with arrays over the K corridors, (K,).
 
-    In a corridor that is not `active` the numbers mean nothing. The arrays are copies.
+    In a corridor that is not `active` the numbers mean nothing. The arrays are copies. Of all cars
+    of the mainline, the one in front first, `x_others_m` and `v_others_mps` are (cars, K).
     """
 
     active: NDArray[np.bool_]
@@ -224,12 +225,17 @@ class SeenBatch:
     v_pov_mps: FloatArray
     x_vut_m: FloatArray
     v_vut_mps: FloatArray
+    x_others_m: FloatArray
+    v_others_mps: FloatArray
 
 
 def _batch(scene: Scene) -> SeenBatch:
     columns = (scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps)
     t_s = np.round(scene.step * DT_S, 1)
-    return SeenBatch(scene.active.copy(), t_s, *(column.copy() for column in columns))
+    x_m, v_mps = np.delete(scene.x_m, VUT, axis=0), np.delete(scene.v_mps, VUT, axis=0)
+    order = np.argsort(-x_m, axis=0, kind="stable")
+    others = (np.take_along_axis(values, order, axis=0) for values in (x_m, v_mps))
+    return SeenBatch(scene.active.copy(), t_s, *(column.copy() for column in columns), *others)
 
 
 def _made(target: type, spec: str, *arguments: int) -> Any:

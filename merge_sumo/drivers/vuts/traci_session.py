@@ -17,11 +17,10 @@ from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
 from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint, Piece
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, VEHICLES
+from merge_sumo.values.scenario import VUT as ROW_OF_VUT
 
-POV: Final = "pov"
-VUT: Final = "vut"
-VEHICLES: Final = (POV, VUT)
+VUT: Final = VEHICLES[ROW_OF_VUT]
 LENGTH_M: Final = 5.0
 WIDTH_M: Final = 1.8
 HEIGHT_M: Final = 1.5
@@ -137,8 +136,7 @@ class Session:
     def show(self, seen: Seen) -> None:
         """Advance by a step, to a state with both vehicles."""
         self.steps += 1
-        states = {POV: (seen.x_pov_m, seen.v_pov_mps), VUT: (seen.x_vut_m, seen.v_vut_mps)}
-        for name, (x_m, v_mps) in states.items():
+        for name, (x_m, v_mps) in zip(VEHICLES, seen.vehicles, strict=False):
             before = self.vehicles.get(name)
             if before is None:
                 self.departed.append(name)
@@ -209,8 +207,8 @@ class Session:
 
     def _set(self, reader: Reader) -> None:
         variable, name = reader.ubyte(), reader.string()
-        if name == POV:
-            raise RefusedError("the vehicle 'pov' is not the controller's to command")
+        if name in VEHICLES and name != VUT:
+            raise RefusedError(f"the vehicle '{name}' is not the controller's to command")
         self.vehicle(name)
         value = reader.typed()
         if variable == SET_SPEED and isinstance(value, float):
@@ -339,11 +337,16 @@ class Session:
     def leader(self, name: str) -> tuple[str, float]:
         """Return who drives ahead on the lanes that a vehicle will use, and the gap between."""
         me = self.vehicle(name)
-        for other, state in self.vehicles.items():
-            # Before M they are in lanes of their own.
-            if other != name and state.x_m >= 0.0 and state.x_m > me.x_m:
-                return other, state.x_m - LENGTH_M - me.x_m
-        return "", -1.0
+        ahead = [
+            (state.x_m, other)
+            for other, state in self.vehicles.items()
+            # Before M the VUT is on a lane of its own.
+            if (state.x_m >= 0.0 or VUT not in (name, other)) and state.x_m > me.x_m
+        ]
+        if not ahead:
+            return "", -1.0
+        x_m, other = min(ahead)
+        return other, x_m - LENGTH_M - me.x_m
 
 
 def _two_doubles(value: object) -> bool:

@@ -7,6 +7,7 @@ answer with the same number.
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import replace
@@ -87,7 +88,9 @@ def from_json(content: bytes, kind: type[Any]) -> Any:
     return value
 
 
-_BEGIN: Final = struct.Struct("<I4d")
+_BEGIN: Final = struct.Struct("<I8d")
+_HEAD: Final = struct.Struct("<IIII")
+"""Episodes that begin, corridors, vehicles, and whether the cars that are met are told."""
 
 
 def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
@@ -95,53 +98,73 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
 
     Of a case only what its VUT may know travels.
     """
-    parts = [struct.pack("<II", len(begun), len(scene.active))]
-    parts += [
-        _BEGIN.pack(
-            corridor,
-            case.x_pov0_m,
-            case.v_pov0_mps,
-            case.v_vut0_mps,
-            case.scenario.x_vut0_m,
-        )
-        for corridor, case in begun
-    ]
-    parts += [scene.active.tobytes(), scene.step.tobytes()]
-    columns = (scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps)
-    parts += [np.ascontiguousarray(column).tobytes() for column in columns]
+    vehicles, corridors = scene.x_m.shape
+    parts = [_HEAD.pack(len(begun), corridors, vehicles, scene.facing is not None)]
+    for corridor, case in begun:
+        scenario = case.scenario
+        profile = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
+        headways = case.headway_ahead_s or math.nan, case.headway_behind_s or math.nan
+        state = case.x_pov0_m, case.v_pov0_mps, case.v_vut0_mps
+        parts.append(_BEGIN.pack(corridor, *state, *headways, *profile))
+    arrays = [scene.active, scene.step, scene.x_m, scene.v_mps]
+    if scene.facing is not None:
+        arrays.append(scene.facing)
+    parts += [np.ascontiguousarray(array).tobytes() for array in arrays]
     return b"".join(parts)
 
 
 ANYTHING: Final = 1e9
-"""A bound that no start reaches: cases were checked where they were made."""
+TINY_M: Final = 1e-9
+"""Bounds that no start reaches: cases were checked where they were made."""
 
 
 @lru_cache(maxsize=8)
-def _any_scenario(x_vut0_m: float) -> Scenario:
-    """Return a scenario in which the VUT starts there; the rest of it a VUT is not told."""
-    return replace(US23, x_vut0_m=x_vut0_m, reach_m=ANYTHING, v_start_max_mps=ANYTHING)
+def _any_scenario(
+    x_vut0_m: float, level0_a_mps2: float, level0_v_mps: float, *, in_traffic: bool
+) -> Scenario:
+    """Return a scenario with what a VUT is told of its own; of the rest it is told nothing."""
+    headways_s = (1.0, 2.0) if in_traffic else None
+    return replace(
+        US23,
+        x_vut0_m=x_vut0_m,
+        level0_a_mps2=level0_a_mps2,
+        level0_v_mps=level0_v_mps,
+        a_max_mps2=ANYTHING,
+        headway_ahead_s=headways_s,
+        headway_behind_s=headways_s,
+        pov_length_m=TINY_M,
+        reach_m=ANYTHING,
+        v_start_max_mps=ANYTHING,
+    )
 
 
 def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     """Return what `pack_scene` packed; level and orientation of the cases are not in it."""
-    count, k = struct.unpack_from("<II", content)
-    at = 8
+    count, k, vehicles, tells_met = _HEAD.unpack_from(content)
+    at = _HEAD.size
     begun = []
     for _ in range(count):
-        corridor, x_pov0_m, v_pov0_mps, v_vut0_mps, x_vut0_m = _BEGIN.unpack_from(content, at)
+        corridor, x_pov0_m, v_pov0_mps, v_vut0_mps, *told = _BEGIN.unpack_from(content, at)
+        ahead_s, behind_s, *profile = told
+        in_traffic = vehicles > 2
         case = Case(
             level=0,
             x_pov0_m=x_pov0_m,
             v_pov0_mps=v_pov0_mps,
             v_vut0_mps=v_vut0_mps,
-            scenario=_any_scenario(x_vut0_m),
+            headway_ahead_s=ahead_s if in_traffic else None,
+            headway_behind_s=behind_s if in_traffic else None,
+            scenario=_any_scenario(*profile, in_traffic=in_traffic),
         )
         begun.append((corridor, case))
         at += _BEGIN.size
     active = np.frombuffer(content, np.bool_, k, at)
     step = np.frombuffer(content, np.int64, k, at + k)
-    state = np.frombuffer(content, np.float64, 4 * k, at + 9 * k).reshape(4, k)
-    return begun, Scene(active, step, *state)
+    at += 9 * k
+    x_m, v_mps = np.frombuffer(content, np.float64, 2 * vehicles * k, at).reshape(2, vehicles, k)
+    at += x_m.nbytes + v_mps.nbytes
+    met = np.frombuffer(content, np.int64, k, at) if tells_met else None
+    return begun, Scene(active, step, x_m, v_mps, met)
 
 
 def pack_answers(answers: FloatArray, reasons: dict[int, str]) -> bytes:

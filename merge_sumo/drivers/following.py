@@ -1,0 +1,90 @@
+"""Cars of the mainline in traffic: how they follow each other, and which of them the VUT meets.
+
+Each of them plays its level against the VUT, but never drives faster than is safe behind the car
+ahead of it. "Safe" is the speed of Krauss (1998), SUMO's original car-following model: at it a car
+can still stop behind a leader that brakes as hard as it can, after a reaction time.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
+
+CARS: Final = (POV, AHEAD, BEHIND)
+"""Rows of the cars of the mainline."""
+FOLLOWERS: Final = [POV, BEHIND]
+LEADERS: Final = [AHEAD, POV]
+
+
+def safe_speed_mps(
+    gap_m: FloatArray,
+    v_leader_mps: FloatArray,
+    decel_mps2: FloatArray | float,
+    tau_s: FloatArray | float,
+) -> FloatArray:
+    """Return Krauss' safe speed at a distance behind a leader; arrays of one shape.
+
+    v_safe = -b tau + sqrt((b tau)^2 + v_leader^2 + 2 b gap), S. Krauss, "Microscopic modeling of
+    traffic flow", DLR-FB 98-08 (1998); a gap below 0 counts as 0.
+    """
+    lag = decel_mps2 * tau_s
+    room = 2.0 * decel_mps2 * np.maximum(gap_m, 0.0)
+    speed: FloatArray = np.sqrt(lag * lag + v_leader_mps * v_leader_mps + room) - lag
+    return speed
+
+
+class Following:
+    """Keeps the cars of the mainline in K corridors from driving into each other."""
+
+    def __init__(self, corridors: int) -> None:
+        """Prepare for a number of corridors."""
+        self._decel = np.ones(corridors)
+        self._tau = np.ones(corridors)
+        self._taken = np.zeros(corridors)
+        self._a_mps2 = np.ones(corridors)
+        self._v_mps = np.ones(corridors)
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Take the numbers of a case's scenario."""
+        scenario = case.scenario
+        self._decel[corridor] = -scenario.a_min_mps2
+        self._tau[corridor] = scenario.tau_s
+        self._taken[corridor] = scenario.pov_length_m + scenario.min_gap_m
+        self._a_mps2[corridor] = scenario.level0_a_mps2
+        self._v_mps[corridor] = scenario.level0_v_mps
+
+    def limit(self, a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray) -> None:
+        """Lower accelerations, (A, K), to what is safe in states, (A, K)."""
+        gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - self._taken
+        safe = safe_speed_mps(gap_m, v_mps[LEADERS], self._decel, self._tau)
+        most = (safe - v_mps[FOLLOWERS]) / DT_S
+        a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
+
+    def met(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.int64]:
+        """Return the row of the car that the VUT will meet, (K,), in states, (A, K)."""
+        return car_met(x_m, v_mps, self._a_mps2, self._v_mps)
+
+
+def car_met(
+    x_m: FloatArray,
+    v_mps: FloatArray,
+    a_mps2: FloatArray | float,
+    v_cruise_mps: FloatArray | float,
+) -> NDArray[np.int64]:
+    """Return the row of the car that the VUT will meet, (K,), in states, (A, K).
+
+    It is the car that would be nearest to M when the VUT is there, if the car kept its speed and
+    the VUT drove the scenario's level-0 profile; of cars as near the one with the lower row.
+    """
+    distance_m = np.maximum(-x_m[VUT], 0.0)
+    t_s = level0_time_to(distance_m, v_mps[VUT], a_mps2, v_cruise_mps)
+    cars = list(CARS)
+    gaps_m = np.abs(x_m[cars] + v_mps[cars] * t_s)
+    met: NDArray[np.int64] = np.array(cars)[gaps_m.argmin(axis=0)]
+    return met

@@ -1,0 +1,227 @@
+"""What `coverage` believes: P(fail) of a case, from the cases so far.
+
+Failing means that the signed gap dx at M is within 6 m, so failures lie where the gap changes its
+sign: where another car goes first. There the gap often jumps, and no test between the two sides
+ever fails. Three experts give P(fail):
+
+- a smooth process on the gap, and a rough one, which believe that it passes through 0;
+- a process for the gap of either side, and who goes first: the gap may come down to a failure on
+  one side and jump to the other from there, or jump over the failures.
+
+A VUT that gives no trajectory has its score learned instead, by the first two. Every expert is
+judged by how well it foretold each case from all the others. Two things that no process knows are
+learned with it. First, the odds of a case that is bracketed, the nearest safe case on either side
+being nearer than any failure, are lowered by h / (h + w): h is the width of the bracket, w the
+typical width of what fails. That bisects the curve where the order of merging flips, gives up
+where it is a jump, and goes on along it where it is a strip of failures. Then a logistic
+regression corrects the odds by the distances to the nearest failure and to that curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import expit, log_expit, logit
+
+from merge_sumo.samplers.base import LevelHistory
+from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.fmc import RADIUS
+from merge_sumo.values.scenario import DX_CRASH_M
+from merge_sumo.values.score import FAILURE_SCORE
+
+NO_GAP_M: Final = 200.0
+"""Gap of a VUT that never arrives: the POV goes first, as far ahead as one can be."""
+MAX_LEARNED: Final = 1000
+"""Cases that a process learns from; what bounds the time per batch in a long campaign."""
+BRANCH_FROM: Final = 20
+"""Cases on either side that it takes to learn the gap of each side by itself."""
+NEAR: Final = 0.005
+"""Distances below this are not told apart."""
+CALIBRATION: Final = (np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, 1.0, 0.3, 0.3]))
+"""Mean and standard deviation, before anything is known, of the weights by which the log odds, 1,
+and the log distances to the nearest failure and to the curve add up to calibrated log odds."""
+NEWTON_STEPS: Final = 6
+WIDTHS: Final = np.geomspace(0.001, 0.5, 25)
+LOG_PRIOR_WIDTH: Final = (np.log(0.02), 1.5)
+"""Widths w that are tried, and mean and standard deviation of log w before anything is known."""
+SURE: Final = 1e-3
+"""Probabilities nearer to 0 or 1 than this are not told apart, nor are weights of evidence."""
+JUDGED_FROM: Final = 3
+"""Failures, and safe cases, that it takes to tell somebody else P(fail)."""
+
+
+class Belief:
+    """P(fail) at a level.
+
+    Attributes:
+        history: what it was learned from.
+        groups: which cases failed, and which safe ones are on either side, each (N,).
+        rotation: orthonormal, (d, d); the first column is the mean slope of the margin.
+    """
+
+    def __init__(self, history: LevelHistory, limit: float | None = None) -> None:
+        """Learn from a history; with a `limit`, all cases up to that gap in m (score) failed."""
+        if limit is not None:
+            history = _as_if(history, limit)
+        learned = most_telling(history, MAX_LEARNED)
+        self.groups = _groups(history)
+        self.history = history
+        values, low, high = margin_of(learned, limit)
+        smooth, rough = (
+            Margin(learned.points, values, low, high, rough=rough) for rough in (False, True)
+        )
+        self.rotation = smooth.rotation
+        self._experts: list[Margin | Branches] = [smooth, rough]
+        positive = int((values >= 0.0).sum())
+        if has_gaps(history) and min(positive, len(values) - positive) >= BRANCH_FROM:
+            self._experts.append(Branches(learned.points, values, smooth))
+        self._judge(learned)
+
+    def of(self, cases: FloatArray) -> FloatArray:
+        """Return P(fail) of cases, (m, d)."""
+        distances = [nearest(cases, self.history.points[group]) for group in self.groups]
+        chances = [
+            expit(_evidence(_lowered(expert.at(cases), distances, width), distances) @ calibration)
+            for expert, (width, calibration) in zip(self._experts, self._judged, strict=True)
+        ]
+        return np.asarray(np.average(chances, axis=0, weights=self._weights), dtype=np.float64)
+
+    def _judge(self, learned: LevelHistory) -> None:
+        """Weigh the experts, and learn width and calibration, by how each foretold each case."""
+        distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
+        log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
+        self._judged: list[tuple[float, FloatArray]] = []
+        best = []
+        for expert in self._experts:
+            chance = expert.left_out()
+            found = []
+            for width, prior in zip(WIDTHS.tolist(), log_prior.tolist(), strict=True):
+                evidence = _evidence(_lowered(chance, distances, width), distances)
+                calibration, posterior = _calibrated(evidence, learned.failed)
+                found.append((posterior + prior, width, calibration))
+            posterior, width, calibration = max(found, key=lambda one: one[0])
+            self._judged.append((width, calibration))
+            best.append(posterior)
+        self._weights = np.exp(np.array(best) - max(best))
+
+
+def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | None:
+    """Return a function that gives P(fail), (n,), at points, (n, d), of the unit cube.
+
+    None while too few cases failed, or too few did not, to judge it by.
+    """
+    if min(history.failed.sum(), (~history.failed).sum()) < JUDGED_FROM:
+        return None
+    return Belief(history).of
+
+
+def margin_of(history: LevelHistory, limit: float | None = None) -> tuple[FloatArray, float, float]:
+    """Return what is learned, (N,), and the interval of it that means failure.
+
+    The signed gap in units of the limit (6 m), compressed like a logarithm where it is large: a
+    gap of 100 m says little more about failures than one of 50 m. Without gaps, the score in
+    units of the limit (lambda).
+    """
+    if not has_gaps(history):
+        return np.minimum(history.score / (limit or FAILURE_SCORE) - 1.0, 1.0), 0.0, np.inf
+    gap = np.nan_to_num(history.dx_m, nan=NO_GAP_M) / (limit or DX_CRASH_M)
+    return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
+
+
+def _as_if(history: LevelHistory, limit: float) -> LevelHistory:
+    """Return the history as if all cases up to a limit had failed."""
+    nearness = gap_m(history) if has_gaps(history) else history.score
+    return replace(history, failed=nearness <= limit)
+
+
+def gap_m(history: LevelHistory) -> FloatArray:
+    """Return |dx| at M, (N,); that of a VUT that never arrives is large."""
+    return np.abs(np.nan_to_num(history.dx_m, nan=NO_GAP_M))
+
+
+def has_gaps(history: LevelHistory) -> bool:
+    """Return whether the VUT gives trajectories."""
+    return not np.isnan(history.dx_m).all()
+
+
+def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
+    """Return which cases failed, and which safe ones are on either side, each (N,).
+
+    The side is who goes first; without a trajectory a safe case is on both.
+    """
+    safe = ~history.failed
+    if not has_gaps(history):
+        return [history.failed, safe, safe]
+    pov_first = np.nan_to_num(history.dx_m, nan=NO_GAP_M) >= 0.0
+    return [history.failed, safe & ~pov_first, safe & pov_first]
+
+
+def nearest(points: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the distance of each point to the nearest of the others; 1 where there is none."""
+    if not len(others):
+        return np.ones(len(points))
+    return np.asarray(cKDTree(others).query(points)[0], dtype=np.float64)
+
+
+def _nearest_other(points: FloatArray, group: NDArray[np.bool_]) -> FloatArray:
+    """Return the distance of each point to the nearest of a group but itself; at most 1."""
+    distance = nearest(points, points[group])
+    if group.sum() > 1:
+        distance[group] = cKDTree(points[group]).query(points[group], k=2)[0][:, 1]
+    else:
+        distance[group] = 1.0
+    return np.minimum(distance, 1.0)
+
+
+def _lowered(
+    probability: FloatArray, distances: list[FloatArray], typical_width: float
+) -> FloatArray:
+    """Return P(fail) with what a closed bracket of safe cases says against it.
+
+    `distances` are those to the nearest failure and to the nearest safe case on either side.
+    """
+    to_failing, before, behind = distances
+    width = before + behind
+    closed = to_failing > np.maximum(before, behind)
+    return np.where(closed, probability * width / (width + typical_width), probability)
+
+
+def _evidence(chance: FloatArray, distances: list[FloatArray]) -> FloatArray:
+    """Return what speaks for and against failures, (m, 4): see CALIBRATION."""
+    to_failing, before, behind = distances
+    odds = logit(np.clip(chance, SURE, 1.0 - SURE))
+    to_curve = np.maximum(before, behind)
+    near = [np.log((distance + NEAR) / (RADIUS + NEAR)) for distance in (to_failing, to_curve)]
+    return np.column_stack([odds, np.ones(len(chance)), *near])
+
+
+def _calibrated(evidence: FloatArray, failed: NDArray[np.bool_]) -> tuple[FloatArray, float]:
+    """Return the weights of the evidence, (4,), that foretell best, and their log posterior.
+
+    Logistic regression by Newton's method; a step that makes it worse is halved.
+    """
+    mean, deviation = CALIBRATION
+    signs = np.where(failed, 1.0, -1.0)
+
+    def posterior(weights: FloatArray) -> float:
+        prior = -0.5 * np.square((weights - mean) / deviation).sum()
+        return float(log_expit(signs * (evidence @ weights)).sum() + prior)
+
+    weights, best = mean, posterior(mean)
+    for _ in range(NEWTON_STEPS):
+        chance = expit(evidence @ weights)
+        slope = evidence.T @ (failed - chance) - (weights - mean) / deviation**2
+        spread = (evidence.T * (chance * (1.0 - chance))) @ evidence + np.diag(deviation**-2.0)
+        step = np.linalg.solve(spread, slope)
+        while (reached := posterior(weights + step)) < best and np.abs(step).max() > SURE:
+            step = 0.5 * step
+        if reached <= best:
+            break
+        weights, best = weights + step, reached
+    return weights, best
