@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from merge_sumo import cli
 from merge_sumo.campaigns.run import Run, failures, read_settings
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES, sumo_program
-from merge_sumo.sumo.net import default_net_path
-from merge_sumo.sumo.replay import CONFIG, RECORD
+from merge_sumo.sumo.replay_folder import CONFIG, RECORD
+from merge_sumo.sumo.road import default_net_path
 
 COMMANDS = [command.name or command.callback.__name__ for command in cli.app.registered_commands]
 SMALL = ("campaign", "--vut", "design1", "--level", "0")

@@ -20,7 +20,7 @@ from merge_sumo.reports.report import SPEED_UNIT_MPS, headline, report_page, wri
 from merge_sumo.reports.summary import summarise
 from merge_sumo.reports.surface import learn_surface
 from merge_sumo.reports.verdict import judge
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import dimensions, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import DT_S, X_VUT0_M
@@ -250,7 +250,7 @@ class TestTheTruth:
         return truth
 
     def test_is_drawn_where_it_is_cached(self, tmp_path, cached):
-        run = write_run(tmp_path / "run", per_level=10, net_sha256=Net().sha256)
+        run = write_run(tmp_path / "run", per_level=10, net_sha256=road_of().sha256)
         page = report_page(run)
         grid = data_of(page)["truth"]["0"]
         values = np.frombuffer(base64.b64decode(grid["data"]), dtype=np.uint8)
@@ -263,7 +263,9 @@ class TestTheTruth:
         "settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}, {"v_vut0_mps": 10.0}]
     )
     def test_of_something_else_is_not(self, tmp_path, cached, settings):
-        run = write_run(tmp_path / "run", per_level=10, **{"net_sha256": Net().sha256, **settings})
+        run = write_run(
+            tmp_path / "run", per_level=10, **{"net_sha256": road_of().sha256, **settings}
+        )
         assert set(data_of(report_page(run))["truth"].values()) == {None}
 
 

@@ -24,8 +24,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.replay import write_scenario
+from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
 from merge_sumo.system.trust import SEAL, seal
 from merge_sumo.system.workers import Workers, open_workers
@@ -76,7 +75,7 @@ def conduct(
 def run_campaign(
     settings: CampaignSettings,
     folder: Path,
-    net: Net | Corridor | None = None,
+    net: Corridor | None = None,
     on_case: OnCase | None = None,
     *,
     workers: Workers | None = None,
@@ -108,7 +107,7 @@ def run_campaign(
 
 def resume_campaign(
     folder: Path,
-    net: Net | Corridor | None = None,
+    net: Corridor | None = None,
     on_case: OnCase | None = None,
     *,
     given: Mapping[str, object] | None = None,
@@ -181,7 +180,7 @@ def _files_again(recorded: Mapping[str, Any]) -> Files:
 def _go_on(
     settings: CampaignSettings,
     record: dict[str, Any],
-    net: Net | Corridor,
+    net: Corridor,
     journal: Journal,
     run: RunCases,
     history: Sequence[Outcome],
@@ -223,7 +222,7 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
         yield here
 
 
-def _plan(settings: CampaignSettings, net: Net | Corridor, folder: Path) -> GroundPlan:
+def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan:
     return GroundPlan(
         vut=settings.vut_factory.with_log(folder.resolve() / LOG),
         corridors=min(MAX_CORRIDORS, settings.batch),
@@ -243,7 +242,7 @@ def case_name(index: int) -> str:
     return f"case-{index:05d}"
 
 
-def export_case(run: Run, index: int, folder: Path, net: Net | Corridor | None = None) -> Path:
+def export_case(run: Run, index: int, folder: Path, net: Corridor | None = None) -> Path:
     """Write a case of a run as a replay folder; return the path of its SUMO configuration."""
     road = net or road_for(run.scenario)
     return write_scenario(folder, road, run.outcome(index), run.trajectory(index))

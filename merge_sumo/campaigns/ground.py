@@ -20,9 +20,9 @@ from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.road import corridor_of, road_of
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
+from merge_sumo.system.resources import resource
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import US23, Scenario
@@ -39,7 +39,7 @@ class ProvingGround:
         self,
         vut: str | VutFactory,
         corridors: int = MAX_CORRIDORS,
-        net: Net | Corridor | None = None,
+        net: Corridor | None = None,
         scenario: Scenario = US23,
         povs: Povs | None = None,
     ) -> None:
@@ -50,14 +50,14 @@ class ProvingGround:
         try:
             self.vut = factory(corridors, self.world)
             povs = povs or Povs(policies=policies_of(scenario))
-            self.cars = [PovLibrary(corridors, povs) for _ in range(scenario.vehicles - 1)]
+            self.pov = PovLibrary(corridors * (scenario.vehicles - 1), povs)
         except BaseException:
             self.world.close()
             raise
 
     def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
         """Run cases; yield (place in `cases`, trajectory) as they end."""
-        return rollout(self.world, self.cars, self.vut, cases)
+        return rollout(self.world, self.pov, self.vut, cases)
 
     def __enter__(self) -> Self:
         """Return the proving ground."""
@@ -71,7 +71,7 @@ class ProvingGround:
             self.world.close()
 
 
-def ground_of(settings: CampaignSettings, cases: int, net: Net | Corridor) -> ProvingGround:
+def ground_of(settings: CampaignSettings, cases: int, net: Corridor) -> ProvingGround:
     """Open the proving ground of a campaign's settings in this process, for some cases."""
     corridors = min(MAX_CORRIDORS, cases)
     return ProvingGround(settings.vut_factory, corridors, net, settings.scenario, settings.povs)
@@ -83,7 +83,7 @@ class GroundPlan:
 
     vut: VutFactory
     corridors: int
-    net: Net | Corridor
+    net: Corridor
     povs: Povs
     scenario: Scenario = US23
     software: dict[str, str] = field(default_factory=dict)
@@ -96,8 +96,7 @@ class GroundPlan:
     def key(self) -> tuple[object, ...]:
         """Return what tells one plan from another."""
         vut = self.vut.spec, self.vut.options, self.vut.files
-        road = corridor_of(self.net)
-        edges = road.sha256, road.mainline_edges, road.ramp_edges
+        edges = self.net.sha256, self.net.mainline_edges, self.net.ramp_edges
         return *vut, self.corridors, *edges, self.scenario, self.povs, *self.software.items()
 
     def open(self) -> ProvingGround:
@@ -193,7 +192,9 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
 
     Raises `UserError` where there is no such merge, or not room enough for its vehicles.
     """
-    file = Path(scenario.net) if net is None and scenario.net is not None else net
-    road = road_of(file, scenario.mainline, scenario.ramp, scenario.room_after_m)
+    if net is None and scenario.net is not None:
+        # Where a path says nothing of folders, the net is one that the package brings.
+        net = resource("sumo_net") / scenario.net
+    road = road_of(net, scenario.mainline, scenario.ramp, scenario.room_after_m)
     road.check_room(scenario.mainline_m, -scenario.x_vut0_m)
     return road

@@ -27,7 +27,6 @@ from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import Case, dimensions
 from merge_sumo.values.score import Outcome, measure
@@ -50,7 +49,7 @@ def failure_probability(
     distribution: Path | None = None,
     confidence: float = 0.95,
     seed: int = 0,
-    net: Net | Corridor | None = None,
+    net: Corridor | None = None,
     given: Mapping[str, object] | None = None,
     trust: bool = False,
     on_case: OnCase | None = None,
@@ -115,7 +114,7 @@ def _same_system(run: Run, today: Mapping[str, Any]) -> None:
 
 def _run(
     settings: CampaignSettings,
-    net: Net | Corridor,
+    net: Corridor,
     stated: Distribution,
     draws: Draws,
     lines: Path,

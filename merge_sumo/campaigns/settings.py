@@ -20,7 +20,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
 from merge_sumo.system.trust import is_own
 from merge_sumo.values.case import Pool
 from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, US23, Scenario
@@ -186,7 +185,7 @@ def software(povs: Povs | None = None) -> dict[str, str]:
     return versions() | {f"{POLICY}{name}": sha256 for name, sha256 in policies.items()}
 
 
-def record_of(settings: CampaignSettings, net: Net | Corridor) -> dict[str, Any]:
+def record_of(settings: CampaignSettings, net: Corridor) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
     return {
         **asdict(settings),

@@ -72,7 +72,8 @@ ScenarioOption = Annotated[
     str,
     typer.Option(
         metavar="NAME|FILE",
-        help="Scenario: us23, or a TOML file of your own: `merge-sumo scenario new` writes one.",
+        help="Scenario that `merge-sumo scenario list` names, or a TOML file of your own: "
+        "`merge-sumo scenario new` writes one.",
     ),
 ]
 PoliciesOption = Annotated[

@@ -21,7 +21,6 @@ from merge_sumo.campaigns.settings import pov_of, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports.verdict import Verdict, counted, judge
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import FAILURE_SCORE, Measures, Outcome, measure
@@ -175,7 +174,7 @@ def compare_runs(
     b: Run,
     *,
     rerun: bool = True,
-    net: Net | Corridor | None = None,
+    net: Corridor | None = None,
     given: Mapping[str, object] | None = None,
     trust: bool = False,
 ) -> RunComparison:
@@ -257,7 +256,7 @@ def _common_levels(a: Run, b: Run) -> list[int]:
     return common
 
 
-def _common_net(a: Run, b: Run, net: Net | Corridor) -> Net | Corridor:
+def _common_net(a: Run, b: Run, net: Corridor) -> Corridor:
     for run in (a, b):
         if run.settings.get("net_sha256") != net.sha256:
             raise UserError(
@@ -278,7 +277,7 @@ class _Again:
 def _run_again(
     run: Run,
     failing: Sequence[Outcome],
-    net: Net | Corridor,
+    net: Corridor,
     given: Mapping[str, object] | None,
     *,
     trust: bool,

@@ -20,10 +20,8 @@ from merge_sumo.campaigns.conductor import case_name
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
 from merge_sumo.sumo.opendrive import opendrive
-from merge_sumo.sumo.replay import write_scenario
-from merge_sumo.sumo.road import corridor_of
+from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, VEHICLES, VUT
 
@@ -40,12 +38,12 @@ CAR_M: Final = {"length": 5.0, "width": 1.8, "height": 1.5}
 """The car of the replay folders; it plays no part in a verdict."""
 WHEEL_M: Final = 0.7
 
-WriteCase = Callable[[Run, int, Path, Net | Corridor], Path]
+WriteCase = Callable[[Run, int, Path, Corridor], Path]
 """Writes a case of a run into a new folder; returns the path of the file to open."""
 
 
 def write_folders(
-    run: Run, indices: Sequence[int], target: Path, write: WriteCase, road: Net | Corridor
+    run: Run, indices: Sequence[int], target: Path, write: WriteCase, road: Corridor
 ) -> Iterator[Path]:
     """Write cases as folders below `target`, and yield the file to open of each.
 
@@ -60,7 +58,7 @@ def write_folders(
         yield write(run, index, folder, road)
 
 
-def write_sumo(run: Run, index: int, folder: Path, road: Net | Corridor) -> Path:
+def write_sumo(run: Run, index: int, folder: Path, road: Corridor) -> Path:
     """Write a case as a folder that sumo-gui replays."""
     return write_scenario(folder, road, run.outcome(index), run.trajectory(index))
 
@@ -104,21 +102,21 @@ def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float, ...]]:
     return rows
 
 
-def write_openscenario(run: Run, index: int, folder: Path, road: Net | Corridor) -> Path:
+def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Path:
     """Write a case as OpenSCENARIO, with both cars on their recorded trajectories, and OpenDRIVE.
 
     The reference point of each car is its front bumper, as in the record: x, y and heading are
     those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
     folder exists or the package scenariogeneration is missing.
     """
-    xosc, corridor = _need("scenariogeneration").xosc, corridor_of(road)
+    xosc = _need("scenariogeneration").xosc
     trajectory, name = run.trajectory(index), case_name(index)
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
     for row, who in enumerate(VEHICLES[: trajectory.motion.shape[1]]):
         entities.add_scenario_object(who, _car(xosc, who))
         places = [
-            _place(xosc, corridor, x_m, on_ramp=row == VUT)
+            _place(xosc, road, x_m, on_ramp=row == VUT)
             for x_m in trajectory.motion[:, row, 0].tolist()
         ]
         init.add_init_action(who, xosc.TeleportAction(places[0]))

@@ -28,8 +28,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.road import corridor_of, road_of
+from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, US23, VEHICLES, VUT, Scenario
 
@@ -80,7 +79,7 @@ class World:
     def __init__(
         self,
         corridors: int = 32,
-        road: Net | Corridor | None = None,
+        road: Corridor | None = None,
         vut_type: Mapping[str, str] | None = None,
         scenario: Scenario = US23,
     ) -> None:
@@ -94,7 +93,7 @@ class World:
         if World._open:
             raise UserError("libsumo holds one simulation per process: close the other World first")
         self.corridors = corridors
-        self.road = road_of() if road is None else corridor_of(road)
+        self.road = road or road_of()
         self.vut_type = vut_type
         self.scenario = scenario
         self.vehicles = scenario.vehicles

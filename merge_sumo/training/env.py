@@ -25,7 +25,7 @@ from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.levelk import ACTIONS_MPS2, DECISION_STEPS
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.world import World
 from merge_sumo.training.game import Role
 from merge_sumo.training.reward import (
@@ -62,7 +62,7 @@ class MergeGame:
     """K games in the corridors of one SUMO world, each advanced by decisions of 0.5 s."""
 
     def __init__(
-        self, role: Role, opponent: Driver, weights: RewardWeights, net: Net | None = None
+        self, role: Role, opponent: Driver, weights: RewardWeights, net: Corridor | None = None
     ) -> None:
         """Open a world with as many corridors as the opponent drives in."""
         self.role, self.opponent, self.weights = role, opponent, weights

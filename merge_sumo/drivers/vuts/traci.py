@@ -27,8 +27,7 @@ from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reade
 from merge_sumo.drivers.vuts.traci_session import CLOSE, SIMULATION_STEP, VUT, Session
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.road import corridor_of, road_of
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S
@@ -78,7 +77,7 @@ class TraciVut(Driver):
     def __init__(
         self,
         corridors: int,
-        road: Net | Corridor,
+        road: Corridor,
         port: int,
         command: list[str] | None,
         options: VutOptions,
@@ -87,7 +86,7 @@ class TraciVut(Driver):
         if corridors != 1:
             raise ValueError("a TraCI client drives in one corridor")
         super().__init__(corridors)
-        self._road, self._port = corridor_of(road), port
+        self._road, self._port = road, port
         self._command, self._options = command, options
         self._listener: socket.socket | None = None
         self._program: Program | None = None
