@@ -46,7 +46,7 @@ from merge_sumo.system.folders import cannot_write, check_own, replace_own
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import FloatArray, dimensions, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
-from merge_sumo.values.scenario import DEADLINE_S, DT_S, LEVELS, POV, VUT
+from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, DT_S, OWN, POV, VUT, level_name
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -120,6 +120,7 @@ def report_page(run: Run) -> str:
         style_hash=_policy_hash(style),
         script_hash=_policy_hash(script),
         data=Markup(data),  # noqa: S704 (JSON without "<")
+        level_name=level_name,
     )
 
 
@@ -132,6 +133,8 @@ class _Level:
     """What the page says of a level; bars are shares of 100."""
 
     level: int
+    name: str
+    caption: str
     about: str
     cases: int
     failures: int
@@ -159,7 +162,7 @@ class _Facts:
 
     def __init__(self, run: Run) -> None:
         levels = run.settings.get("levels")
-        if not isinstance(levels, list) or any(level not in LEVELS for level in levels):
+        if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
             raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
         self.run = run
         self.road = _road_of(run)
@@ -234,7 +237,7 @@ class _Facts:
             "driven": _duration(sum(o.measures.t_end_s for o in self.run.outcomes)),
             "sentences": [box.sentence for box in boxes],
             "scattered": ", ".join(
-                f"{counted(count, 'failure')} at level {level}"
+                f"{counted(count, 'failure')} at level {level_name(level)}"
                 for level, count in left.items()
                 if count > 0
             ),
@@ -281,6 +284,8 @@ class _Facts:
             share = 100.0 / (most_share * found.cases) if most_share > 0.0 and found.cases else 0.0
             return _Level(
                 level=level,
+                name=level_name(level),
+                caption=f"own: {self.run.pov}" if level == OWN else str(level),
                 about=ABOUT.get(level, ""),
                 cases=found.cases,
                 failures=found.failures,
@@ -334,6 +339,7 @@ class _Facts:
             "dt": DT_S,
             "crash_m": self.run.scenario.dx_crash_m,
             "radius": RADIUS,
+            "level_names": {level: level_name(level) for level in ALL_LEVELS},
             "x_vut0_m": self.run.scenario.x_vut0_m,
             "speed_unit_mps": SPEED_UNIT_MPS,
             "dimensions": {
@@ -458,7 +464,7 @@ def headline(
     if verdict.tested:
         for level, found in summary.levels.items():
             if found.cases and not found.tested:
-                said.append(f"At POV level {level} nothing was tested.")
+                said.append(f"At POV level {level_name(level)} nothing was tested.")
         said.append(_collisions(verdict, summary, worst, kinds))
     return " ".join(said)
 
@@ -473,9 +479,10 @@ def _collisions(
             "search saw these cases and no others."
         )
     failing = {level: found for level, found in summary.levels.items() if found.failures}
-    never = [str(n) for n, found in summary.levels.items() if found.tested and not found.failures]
+    tested = {level: found for level, found in summary.levels.items() if found.tested}
+    never = [level_name(level) for level, found in tested.items() if not found.failures]
     parts = [
-        f"{found.failures} of {found.cases} cases at POV level {level} "
+        f"{found.failures} of {found.cases} cases at POV level {level_name(level)} "
         f"({counted(found.regions, 'region')})"
         for level, found in failing.items()
     ]
@@ -555,6 +562,7 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         settings.get("deadline_s", DEADLINE_S),
         run.scenario,
         policies=settings.get("policies_sha256", {}),
+        pov=settings.get("pov") if level == OWN else None,
     )
     return read_truth(kept.path(), level, kept.cases)
 
