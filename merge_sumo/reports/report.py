@@ -555,7 +555,7 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         settings.get("deadline_s", DEADLINE_S),
         run.scenario,
     )
-    return read_truth(kept.path(), level, kept.cases)
+    return read_truth(kept.path(), level, kept.cases, kept.scenario)
 
 
 def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:
