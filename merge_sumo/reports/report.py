@@ -556,7 +556,7 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         run.scenario,
         policies=settings.get("policies_sha256", {}),
     )
-    return read_truth(kept.path(), level, kept.cases)
+    return read_truth(kept.path(), level, kept.cases, kept.scenario)
 
 
 def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:
