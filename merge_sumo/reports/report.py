@@ -564,7 +564,7 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         policies=settings.get("policies_sha256", {}),
         pov=settings.get("pov") if level == OWN else None,
     )
-    return read_truth(kept.path(), level, kept.cases)
+    return read_truth(kept.path(), level, kept.cases, kept.scenario)
 
 
 def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:

@@ -17,11 +17,10 @@ from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
 from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint, Piece
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, VEHICLES
+from merge_sumo.values.scenario import DT_S, US23, VEHICLES, Scenario
 from merge_sumo.values.scenario import VUT as ROW_OF_VUT
 
 VUT: Final = VEHICLES[ROW_OF_VUT]
-LENGTH_M: Final = 5.0
 WIDTH_M: Final = 1.8
 HEIGHT_M: Final = 1.5
 
@@ -115,6 +114,7 @@ class Session:
     """The simulation as one client sees it."""
 
     road: Corridor
+    scenario: Scenario = US23
     steps: int = 0
     expected: bool = True
     wish: SpeedWish = field(default_factory=SpeedWish)
@@ -314,6 +314,10 @@ class Session:
         """Return where a vehicle is."""
         return self.road.lane_point(self.vehicle(name).x_m, on_ramp=name == VUT)
 
+    def length_m(self, name: str) -> float:
+        """Return the length of a vehicle."""
+        return self.scenario.vut_length_m if name == VUT else self.scenario.pov_length_m
+
     def path(self, name: str) -> LanePath:
         """Return the lanes that a vehicle drives on."""
         return self.road.ramp if name == VUT else self.road.mainline
@@ -346,7 +350,7 @@ class Session:
         if not ahead:
             return "", -1.0
         x_m, other = min(ahead)
-        return other, x_m - LENGTH_M - me.x_m
+        return other, x_m - self.length_m(other) - me.x_m
 
 
 def _two_doubles(value: object) -> bool:
@@ -433,7 +437,7 @@ _VEHICLE: Final[dict[int, Getter]] = {
     0x53: _of_vehicle(lambda _s, n, _v: tp.string(f"route.{n}")),  # getRouteID
     0x54: _of_vehicle(lambda s, n, _v: tp.strings(_route(s.path(n)))),  # getRoute
     0x69: _of_vehicle(lambda s, n, v: tp.integer(_route_index(s.path(n), v.x_m))),  # getRouteIndex
-    0x44: _constant(tp.double(LENGTH_M)),  # getLength
+    0x44: _of_vehicle(lambda s, n, _v: tp.double(s.length_m(n))),  # getLength
     0x4D: _constant(tp.double(WIDTH_M)),  # getWidth
     0xBC: _constant(tp.double(HEIGHT_M)),  # getHeight
     0x4C: _constant(tp.double(0.0)),  # getMinGap
@@ -442,10 +446,10 @@ _VEHICLE: Final[dict[int, Getter]] = {
         lambda s, n, v: tp.double(s.path(n).piece(v.x_m).speed_limit_mps)  # getAllowedSpeed
     ),
     0x5E: _constant(tp.double(1.0)),  # getSpeedFactor
-    0x46: _constant(tp.double(A_MAX_MPS2)),  # getAccel
-    0x47: _constant(tp.double(-A_MIN_MPS2)),  # getDecel
-    0x7B: _constant(tp.double(-A_MIN_MPS2)),  # getEmergencyDecel
-    0x7C: _constant(tp.double(-A_MIN_MPS2)),  # getApparentDecel
+    0x46: _of_vehicle(lambda s, _n, _v: tp.double(s.scenario.a_max_mps2)),  # getAccel
+    0x47: _of_vehicle(lambda s, _n, _v: tp.double(-s.scenario.a_min_mps2)),  # getDecel
+    0x7B: _of_vehicle(lambda s, _n, _v: tp.double(-s.scenario.a_min_mps2)),  # getEmergencyDecel
+    0x7C: _of_vehicle(lambda s, _n, _v: tp.double(-s.scenario.a_min_mps2)),  # getApparentDecel
     0x49: _constant(tp.string("passenger")),  # getVehicleClass
     0x4B: _constant(tp.string("passenger/sedan")),  # getShapeClass
     0x45: _of_vehicle(
