@@ -51,7 +51,8 @@ class ProvingGround:
         corridors = min(corridors, factory.vut.max_corridors or corridors)
         corridors = povs.corridors(corridors, cars)
         with ExitStack() as opened:
-            self.world = World(corridors, net, factory.vut.vut_type, scenario)
+            car_type = None if povs.own is None else povs.own.vut.vut_type
+            self.world = World(corridors, net, factory.vut.vut_type, scenario, car_type)
             opened.callback(self.world.close)
             self.vut = factory(corridors, self.world)
             opened.callback(self.vut.close)

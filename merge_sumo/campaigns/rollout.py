@@ -14,7 +14,7 @@ from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import Following
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VUT
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
 from merge_sumo.values.trajectory import End, Trajectory
 
 RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
@@ -177,7 +177,7 @@ class _Rollout:
         self.a_max[:, corridor] = scenario.a_max_mps2
         self.left[corridor] = scenario.max_steps
         self.episodes[corridor] = _Episode(index, case, self.row)
-        self.world.place(corridor, case.starts())
+        self.world.place(corridor, case.starts(), own=case.level == OWN)
         for car in range(len(self.mainline)):
             self.pov.begin(car * self.world.corridors + corridor, case)
         if self.following is not None:

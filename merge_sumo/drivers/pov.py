@@ -10,7 +10,7 @@ from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.drivers.povs import POLICIES, Povs
-from merge_sumo.drivers.seat import OtherSeat
+from merge_sumo.drivers.seat import in_the_povs_seat
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import OWN
@@ -29,7 +29,7 @@ class PovLibrary(Driver):
         for level in set(povs.levels) & set(POLICIES):
             self._drivers[level] = load_driver(POLICIES[level], corridors, povs.policies)
         if povs.own is not None:
-            self._drivers[OWN] = OtherSeat(povs.own(corridors, world))
+            self._drivers[OWN] = in_the_povs_seat(povs.own, corridors, world)
         self._level = np.zeros(corridors, dtype=np.int64)
         self._levels_playing = {0}
 

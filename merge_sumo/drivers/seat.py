@@ -11,11 +11,23 @@ from pathlib import Path
 from typing import Final
 
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
+from merge_sumo.drivers.vut import VutFactory
+from merge_sumo.drivers.vuts.sumo_model import SumoVut
+from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import VUT
 
 BEFORE_M: Final = -1e-9
 """A VUT starts before M; a car of the mainline may start there or past it."""
+
+
+def in_the_povs_seat(own: VutFactory, corridors: int, world: World | None) -> Driver:
+    """Return the driver of the C cars of the mainline of a world, for `corridors` = C K."""
+    driver = own(corridors, world)
+    if isinstance(driver, SumoVut):  # SUMO knows where its vehicles are
+        mainline = [row for row in range(driver.world.vehicles) if row != VUT]
+        return SumoVut(corridors, driver.world, mainline)
+    return OtherSeat(driver)
 
 
 class OtherSeat(Driver):
