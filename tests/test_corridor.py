@@ -287,7 +287,7 @@ def test_a_straight_foreign_net_with_the_lengths_of_us23_gives_its_very_outcomes
     motions = []
     for where in (None, road):
         with World(16, where, factory.vut.vut_type) as world:
-            ran = dict(rollout(world, [PovLibrary(16)], factory(16, world), cases))
+            ran = dict(rollout(world, PovLibrary(16), factory(16, world), cases))
         motions.append([ran[place].motion for place in range(100)])
     for ours, theirs in zip(*motions, strict=True):
         assert np.array_equal(ours, theirs)
@@ -298,7 +298,7 @@ def test_sumos_own_driver_is_put_where_eq_4_has_it(corridor, name):
     factory = vut_factory("sumo:Krauss")
     cases = from_unit(np.random.default_rng(0).random((20, 2)), level=0)
     with World(4, corridor(name), factory.vut.vut_type) as world:
-        ran = dict(rollout(world, [PovLibrary(4)], factory(4, world), cases))
+        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
     for trajectory in ran.values():
         assert trajectory.x_vut_m[-1] >= 0.0
         x, v, a = trajectory.motion[:, VUT].T

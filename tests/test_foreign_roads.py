@@ -97,7 +97,7 @@ def driven(road, count: int) -> list[Trajectory]:
     factory = vut_factory("design1")
     cases = from_unit(np.random.default_rng(3).random((count, 2)), level=0)
     with World(4, road) as world:
-        ran = dict(rollout(world, [PovLibrary(4)], factory(4, world), cases))
+        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
     return [ran[index] for index in range(count)]
 
 
@@ -435,7 +435,7 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
     with World(1, road) as world:
         vut = TraciVut(1, world.road, port, None, VutOptions(deadline_s=5.0, connect_s=10.0))
         try:
-            ((_, trajectory),) = rollout(world, [PovLibrary(1)], vut, [case])
+            ((_, trajectory),) = rollout(world, PovLibrary(1), vut, [case])
         finally:
             vut.close()
             client.join()

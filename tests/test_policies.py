@@ -44,7 +44,7 @@ def played(vut, cases, corridors=32):
     """Return the measures of cases, in order, and the trajectories."""
     with World(corridors) as world:
         driver = vut_factory(vut)(corridors)
-        got = dict(rollout(world, [PovLibrary(corridors)], driver, cases))
+        got = dict(rollout(world, PovLibrary(corridors), driver, cases))
     trajectories = [got[index] for index in range(len(cases))]
     return [measure(t) for t in trajectories], trajectories
 

@@ -47,7 +47,7 @@ def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     """Return the seconds that the host takes for cases, and the trajectories."""
     pov, vut = PovLibrary(world.corridors), vut_factory(VUT)(world.corridors)
     start = time.perf_counter()
-    trajectories = [trajectory for _, trajectory in rollout(world, [pov], vut, cases)]
+    trajectories = [trajectory for _, trajectory in rollout(world, pov, vut, cases)]
     return time.perf_counter() - start, trajectories
 
 

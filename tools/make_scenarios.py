@@ -49,7 +49,7 @@ EXAMPLES = {
 def play(example: Example, world: World) -> Trajectory:
     """Play one example in SUMO."""
     vut = vut_factory(example.vut)(world.corridors)
-    ((_, trajectory),) = rollout(world, [PovLibrary(world.corridors)], vut, [example.case])
+    ((_, trajectory),) = rollout(world, PovLibrary(world.corridors), vut, [example.case])
     return trajectory
 
 

@@ -46,14 +46,14 @@ class ProvingGround:
         self.world = World(corridors, net, factory.vut.vut_type, scenario)
         try:
             self.vut = factory(corridors, self.world)
-            self.cars = [PovLibrary(corridors) for _ in range(scenario.vehicles - 1)]
+            self.pov = PovLibrary(corridors * (scenario.vehicles - 1))
         except BaseException:
             self.world.close()
             raise
 
     def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
         """Run cases; yield (place in `cases`, trajectory) as they end."""
-        return rollout(self.world, self.cars, self.vut, cases)
+        return rollout(self.world, self.pov, self.vut, cases)
 
     def __enter__(self) -> Self:
         """Return the proving ground."""

@@ -109,7 +109,7 @@ def play(
     played: list[Trajectory | None] = [None] * len(cases)
     with World(CORRIDORS) as world:
         pov, vut = _driver(make_pov), _driver(make_vut)
-        for index, trajectory in rollout(world, [pov], vut, cases):
+        for index, trajectory in rollout(world, pov, vut, cases):
             played[index] = trajectory
     return [trajectory for trajectory in played if trajectory is not None]
 
