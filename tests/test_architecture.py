@@ -46,7 +46,6 @@ WAYS_IN = ("merge_sumo.api", "merge_sumo.cli")
 
 MOST_LINES = 400
 LONGER = {
-    "merge_sumo.reports.report": "one page is one view of one run",
     "merge_sumo.campaigns.experiments": "TODO",
 }
 """Modules that are longer than others, and why."""
