@@ -32,6 +32,7 @@ from merge_sumo.campaigns.experiments import _scores
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
@@ -82,7 +83,7 @@ def local(count: int) -> Workers:
 
 def truth(most: int) -> Iterator[dict[str, float]]:
     """Yield cost and memory for 100, 1,000, ... cases, all in the same worker process."""
-    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of())
+    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of(), povs=Povs())
     rng = np.random.default_rng(0)
     with local(1) as workers:
         list(workers.run(partial(scores_and_memory, plan), list(rng.random((32, 2))), never))
@@ -104,7 +105,7 @@ def truth(most: int) -> Iterator[dict[str, float]]:
 
 def two_workers() -> dict[str, list[float]]:
     """Return the rates on two workers over those on one, round by round."""
-    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of())
+    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of(), povs=Povs())
     points: Any = np.random.default_rng(1).random((PAIR_CASES, 2))
     found: dict[str, list[float]] = {"cases": [], "computing": [], "cases_per_s_on_one": []}
     with local(1) as one, local(2) as two:

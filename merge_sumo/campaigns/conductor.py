@@ -141,6 +141,9 @@ def resume_campaign(
         recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, SEAL)}
         settings = settings_of(folder, before.settings, given, trust=trust)
         record = record_of(settings, net)
+        # Where policies are decides nothing: what is in them does.
+        moved = recorded.get("policies") != record["policies"]
+        recorded["policies"] = record["policies"]
         # What was loaded while it ran must be the same, too, although it is not loaded yet.
         record["vut_files"] = _files_again(recorded) | (record["vut_files"] or {}) or None
         changes = differences(RECORDED_BY_DEFAULT | recorded, record)
@@ -157,7 +160,7 @@ def resume_campaign(
         if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
             record[FORCED] = [*_forced(before), *([forced] if changes else [])]
-        if changes:
+        if changes or moved:
             journal.rewrite_settings(record)
         if on_case is not None:
             for outcome in before.outcomes:
@@ -225,6 +228,7 @@ def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan
         corridors=min(MAX_CORRIDORS, settings.batch),
         net=net,
         scenario=settings.scenario,
+        povs=settings.povs,
     )
 
 

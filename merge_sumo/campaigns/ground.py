@@ -12,8 +12,10 @@ from typing import Final, Self
 import numpy as np
 
 from merge_sumo.campaigns.rollout import rollout
-from merge_sumo.campaigns.settings import differences, software
+from merge_sumo.campaigns.settings import POLICY, CampaignSettings, differences, software
+from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.pov import PovLibrary
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.errors import UserError
@@ -39,6 +41,7 @@ class ProvingGround:
         corridors: int = MAX_CORRIDORS,
         net: Corridor | None = None,
         scenario: Scenario = US23,
+        povs: Povs | None = None,
     ) -> None:
         """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
@@ -46,7 +49,8 @@ class ProvingGround:
         self.world = World(corridors, net, factory.vut.vut_type, scenario)
         try:
             self.vut = factory(corridors, self.world)
-            self.pov = PovLibrary(corridors * (scenario.vehicles - 1))
+            povs = povs or Povs(policies=policies_of(scenario))
+            self.pov = PovLibrary(corridors * (scenario.vehicles - 1), povs)
         except BaseException:
             self.world.close()
             raise
@@ -67,6 +71,12 @@ class ProvingGround:
             self.world.close()
 
 
+def ground_of(settings: CampaignSettings, cases: int, net: Corridor) -> ProvingGround:
+    """Open the proving ground of a campaign's settings in this process, for some cases."""
+    corridors = min(MAX_CORRIDORS, cases)
+    return ProvingGround(settings.vut_factory, corridors, net, settings.scenario, settings.povs)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GroundPlan:
     """What it takes to open a `ProvingGround` in any process; it travels with every chunk."""
@@ -74,22 +84,33 @@ class GroundPlan:
     vut: VutFactory
     corridors: int
     net: Corridor
+    povs: Povs
     scenario: Scenario = US23
-    software: dict[str, str] = field(default_factory=software)
+    software: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Note with what software this process would carry it out, unless that is given."""
+        if not self.software:
+            object.__setattr__(self, "software", software(self.povs))
 
     def key(self) -> tuple[object, ...]:
         """Return what tells one plan from another."""
         vut = self.vut.spec, self.vut.options, self.vut.files
         edges = self.net.sha256, self.net.mainline_edges, self.net.ramp_edges
-        return *vut, self.corridors, *edges, self.scenario, *self.software.items()
+        return *vut, self.corridors, *edges, self.scenario, self.povs, *self.software.items()
 
     def open(self) -> ProvingGround:
         """Open the proving ground; `UserError` where other software would give other outcomes."""
-        for name, (there, here) in differences(self.software, software()).items():
+        for name, (there, here) in differences(self.software, software(self.povs)).items():
+            if name.startswith(POLICY):
+                raise UserError(
+                    f"a worker has another {name} in {self.povs.policies} than this process, or "
+                    "none: put the same files there"
+                )
             raise UserError(
                 f"a worker has {name} {here}, and this process {there}: install the same there"
             )
-        return ProvingGround(self.vut, self.corridors, self.net, self.scenario)
+        return ProvingGround(self.vut, self.corridors, self.net, self.scenario, self.povs)
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,6 +76,14 @@ ScenarioOption = Annotated[
         "`merge-sumo scenario new` writes one.",
     ),
 ]
+PoliciesOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Folder of learned drivers, as `train --out DIR` makes it, instead of the shipped "
+        "ones.",
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 

@@ -10,14 +10,14 @@ of what is known by then.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
+from merge_sumo.campaigns.ground import ground_of, road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
-from merge_sumo.campaigns.settings import settings_of
+from merge_sumo.campaigns.settings import pov_of, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports.verdict import Verdict, counted, judge
 from merge_sumo.sumo.corridor import Corridor
@@ -170,7 +170,13 @@ def _worse(level: int, found: LevelChange, tolerance: float) -> list[str]:
 
 
 def compare_runs(
-    a: Run, b: Run, *, rerun: bool = True, net: Corridor | None = None, trust: bool = False
+    a: Run,
+    b: Run,
+    *,
+    rerun: bool = True,
+    net: Corridor | None = None,
+    given: Mapping[str, object] | None = None,
+    trust: bool = False,
 ) -> RunComparison:
     """Compare two campaigns level by level.
 
@@ -179,10 +185,12 @@ def compare_runs(
         b: campaign of the VUT after.
         rerun: run the failures, errors and timeouts of each with the VUT of the other.
         net: net for that; must be the one of the campaigns.
+        given: settings in the place of what the folders name: policies that are elsewhere.
         trust: run the controllers that the folders name although they may be a stranger's.
 
     Raises `UserError` where the campaigns have no level in common or no case there, differ in
-    the initial speed of the VUT, or were run on another net than the one to run again on.
+    the initial speed of the VUT or in the POV of a level, or were run on another net than the one
+    to run again on.
     """
     levels = _common_levels(a, b)
     own_a, own_b = ([o for o in run.outcomes if o.case.level in levels] for run in (a, b))
@@ -196,8 +204,8 @@ def compare_runs(
     again_a = again_b = _Again({}, "was not run again")
     if rerun:
         net = _common_net(a, b, net or road_for(a.scenario))
-        again_b = _run_again(b, telling_a, net, trust=trust)
-        again_a = _run_again(a, telling_b, net, trust=trust)
+        again_b = _run_again(b, telling_a, net, given, trust=trust)
+        again_a = _run_again(a, telling_b, net, given, trust=trust)
     cases = [
         *(_compared("A", o, o.measures, again_b.measures.get(o.index)) for o in telling_a),
         *(_compared("B", o, again_a.measures.get(o.index), o.measures) for o in telling_b),
@@ -240,6 +248,12 @@ def _common_levels(a: Run, b: Run) -> list[int]:
             f"the VUT starts at {speeds[0]} m/s in {a.folder} and at {speeds[1]} m/s in "
             f"{b.folder}: compare campaigns with the same --v-vut0"
         )
+    for level in common:
+        if pov_of(a.settings, level) != pov_of(b.settings, level):
+            raise UserError(
+                f"the POV of level {level} is another in {a.folder} than in {b.folder}: compare "
+                "campaigns with the same --policies"
+            )
     return common
 
 
@@ -261,7 +275,14 @@ class _Again:
     how: str
 
 
-def _run_again(run: Run, failing: Sequence[Outcome], net: Corridor, *, trust: bool) -> _Again:
+def _run_again(
+    run: Run,
+    failing: Sequence[Outcome],
+    net: Corridor,
+    given: Mapping[str, object] | None,
+    *,
+    trust: bool,
+) -> _Again:
     """Run a campaign's VUT on the other's telling cases, if it is still the same VUT."""
     told = [o for o in run.outcomes if o.measures.score is not None]
     told = sorted(told, key=lambda o: (o.measures.score, o.index))[:CHECKED]
@@ -269,8 +290,8 @@ def _run_again(run: Run, failing: Sequence[Outcome], net: Corridor, *, trust: bo
     if not failing:
         return _Again({}, "had nothing to run")
     measures: dict[int, Measures] = {}
-    vut = settings_of(run.folder, run.settings, trust=trust).vut_factory
-    with ProvingGround(vut, min(MAX_CORRIDORS, len(cases)), net) as ground:
+    settings = settings_of(run.folder, run.settings, given, trust=trust)
+    with ground_of(settings, len(cases), net) as ground:
         for place, trajectory in ground.run(cases):
             measures[place] = measure(trajectory)
     for place, outcome in enumerate(told):
@@ -278,7 +299,8 @@ def _run_again(run: Run, failing: Sequence[Outcome], net: Corridor, *, trust: bo
         if was is None or now is None or abs(was - now) > SAME_SCORE:
             return _Again(
                 {},
-                f"could not be run: its VUT does not do again what case {outcome.index} records",
+                "could not be run: its VUT or its POV does not do again what case "
+                f"{outcome.index} records",
             )
     first = len(told)
     return _Again({o.index: measures[first + n] for n, o in enumerate(failing)}, "was run again")

@@ -114,5 +114,6 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         settings.get("vut_command"),
         settings.get("deadline_s", DEADLINE_S),
         run.scenario,
+        policies=settings.get("policies_sha256", {}),
     )
     return read_truth(kept.path(), level, kept.cases)

@@ -24,7 +24,8 @@ from merge_sumo.campaigns.experiments import (
     oracle,
     search,
 )
-from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.settings import check_level, versions
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.reports.figures import Levels, Panel, Surface
@@ -117,16 +118,24 @@ OnRun = Callable[[str, int, int, str], None]
 
 
 def reproduce(
-    folder: Path, scale: Scale, *, workers: Workers | None = None, on_run: OnRun | None = None
+    folder: Path,
+    scale: Scale,
+    *,
+    povs: Povs | None = None,
+    workers: Workers | None = None,
+    on_run: OnRun | None = None,
 ) -> Path:
     """Write Table II and the figures into a new folder; return the path of its `index.html`.
 
     Each column's figures are written as soon as the column has run. Raises `UserError` when the
-    folder exists or cannot be written, or where matplotlib is missing.
+    folder exists or cannot be written, where a level has no POV, or where matplotlib is missing.
     """
     figures.require_matplotlib()
+    povs = povs or Povs()
+    for level in LEVELS:
+        check_level(level, povs)
     make_folder(folder)
-    work = _Work(folder, scale, workers, on_run or (lambda *_: None))
+    work = _Work(folder, scale, povs, workers, on_run or (lambda *_: None))
     table = {column.title: work.column(column) for column in TABLE_II}
     work.all_levels()
     _write(folder / TABLE_JSON, json.dumps(_table_record(table, scale), allow_nan=False) + "\n")
@@ -148,8 +157,11 @@ class Result:
 
 
 class _Work:
-    def __init__(self, folder: Path, scale: Scale, workers: Workers | None, on_run: OnRun) -> None:
-        self.folder, self.scale, self.workers, self.on_run = folder, scale, workers, on_run
+    def __init__(
+        self, folder: Path, scale: Scale, povs: Povs, workers: Workers | None, on_run: OnRun
+    ) -> None:
+        self.folder, self.scale, self.povs = folder, scale, povs
+        self.workers, self.on_run = workers, on_run
         self.pictures: dict[str, str] = {}
 
     def column(self, column: Column) -> Result:
@@ -195,7 +207,12 @@ class _Work:
             self.on_run(title, done, cases, "cases")
 
         count(0)
-        truth = ground_truth(column.vut, column.level, cases, workers=self.workers, on_cases=count)
+        truth = ground_truth(
+            *(column.vut, column.level, cases),
+            workers=self.workers,
+            on_cases=count,
+            povs=self.povs,
+        )
         self.on_run(title, cases, cases, "cases")
         return truth
 
@@ -216,6 +233,7 @@ class _Work:
             batch=batch,
             workers=self.workers,
             on_search=lambda *_: self.on_run(title, next(counter), runs, "runs"),
+            povs=self.povs,
         )
 
     def scatter(self, column: Column, truth: Truth, middle: Mapping[str, Search]) -> None:

@@ -8,7 +8,12 @@ the balls are not clipped to the unit cube.
 
 One dimension is a sum of gaps and two dimensions follow from the boundary arcs of the union; both
 are exact up to rounding. Three dimensions integrate the exact two-dimensional union over parallel
-slices, to within about 1e-4 of the volume.
+slices, to within about 1e-4 of the volume. More dimensions are integrated by quasi-Monte Carlo,
+with a standard error that `fmc_and_error` states.
+
+The paper has two and three dimensions, with one radius. A ball of that radius would be next to
+nothing in more of them, so there the radius is the one for which a ball has the volume of the
+three-dimensional one (`radius_for`).
 """
 
 from __future__ import annotations
@@ -22,10 +27,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-RADIUS: Final = 0.05
-"""Ball radius rho, in normalised coordinates (no unit)."""
+from merge_sumo.values.ball_union import FloatArray, ball_volume, union_volume
 
-FloatArray = NDArray[np.float64]
+RADIUS: Final = 0.05
+"""Ball radius rho of the paper, in normalised coordinates (no unit)."""
+MOST_DIMENSIONS: Final = 6
+
 IntArray = NDArray[np.int64]
 
 _TURN: Final = 2.0 * np.pi
@@ -33,6 +40,7 @@ _TURN: Final = 2.0 * np.pi
 _MAX_SPAN: Final = 1e6  # the boundary integral loses span * 1e-16 of a disc to rounding
 _MERGE: Final = 2.0**-40  # points are snapped to this grid: moves a boundary by 1e-12 at most
 _MIN_ARC_RAD: Final = 1e-14  # a shorter arc is the rounding of two angles below 2 pi
+_SLICED: Final = 1e-4  # error of three dimensions, as a share of the volume
 _FIRST_NEIGHBOURS: Final = 8
 _MORE_NEIGHBOURS: Final = 4  # factor from one round to the next
 _CHUNK: Final = 1 << 14  # disc-neighbour pairs at once: fits the cache, bounds the memory
@@ -50,45 +58,71 @@ _DISC_BUDGET: Final = 10_000
 _LINK_SLACK: Final = 1e-9
 
 
-def fmc(points: ArrayLike, radius: float = RADIUS) -> float:
+def radius_for(dimension: int) -> float:
+    """Return the radius of the balls: the paper's, or that of a ball as large as its 3-D one."""
+    if dimension <= 3:
+        return RADIUS
+    return float((RADIUS**3 * ball_volume(3) / ball_volume(dimension)) ** (1.0 / dimension))
+
+
+def fmc(points: ArrayLike, radius: float | None = None) -> float:
     """Volume of the union of equal balls: M(s, rho, lambda) of Wang et al.
 
     Args:
-        points: centres of the balls, shape (n, d) with d = 1, 2 or 3, in normalised coordinates:
+        points: centres of the balls, shape (n, d) with d from 1 to 6, in normalised coordinates:
             the cases with a score below lambda. Shape (0,) also means no points. Not modified;
             order and repeated points do not matter.
-        radius: radius rho of the balls, in the same coordinates.
+        radius: radius rho of the balls, in the same coordinates; by default `radius_for(d)`.
 
     Returns:
-        Length (d = 1), area (d = 2) or volume (d = 3) of the union, not clipped to the unit cube;
-        0.0 for no points. Exact up to rounding for d = 1 and 2. For d = 3 within about 1e-4 of
-        the volume (measured on clusters, bands, plates and lattices: mostly 3e-5, 1.3e-4 at
-        worst), so that one more point may lower the figure by as much.
+        Length (d = 1), area (d = 2) or volume of the union, not clipped to the unit cube; 0.0 for
+        no points. Exact up to rounding for d = 1 and 2. For d = 3 within about 1e-4 of the volume
+        (measured on clusters, bands, plates and lattices: mostly 3e-5, 1.3e-4 at worst), so that
+        one more point may lower the figure by as much; beyond, see `fmc_and_error`.
 
     Raises:
         ValueError: points of another shape or dimension, points that are not finite, a radius that
             is not a positive finite number, or points more than a million radii apart.
     """
-    centres = _in_radii(_checked(points, radius), radius)
-    dimension = centres.shape[1]
+    return fmc_and_error(points, radius)[0]
+
+
+def fmc_and_error(points: ArrayLike, radius: float | None = None) -> tuple[float, float]:
+    """Return `fmc` and its standard error; 0 for d = 1 and 2, and 1e-4 of the volume for d = 3.
+
+    For d > 3 it is the standard error of the mean of eight independent scramblings, 0 where no two
+    balls overlap. Measured on clouds, bands and heaps of 10 to 1,000 points it is at most 5e-4 of
+    the volume for d = 4 to 6, a fiftieth of what one of those points adds to it; for up to 100,000
+    points at most 1.5e-3 for d = 4, 4e-3 for d = 5 and 8e-3 for d = 6, in some seconds. The same
+    points have the same figure. Raises as `fmc` does.
+    """
+    cases = _checked(points, radius)
+    dimension = cases.shape[1]
+    unit = radius_for(dimension) if radius is None else radius
+    centres = _in_radii(cases, unit)
+    error = 0.0
     if len(centres) == 0:
-        return 0.0
+        return 0.0, 0.0
     if dimension == 1:
         volume = 2.0 + float(np.minimum(np.diff(centres[:, 0]), 2.0).sum())
     elif dimension == 2:
         volume = _union_area(centres)
-    else:
+    elif dimension == 3:
         volume = _union_volume(centres)
-    return float(volume * radius**dimension)
+        error = _SLICED * volume
+    else:
+        volume, error = union_volume(centres)
+    return float(volume * unit**dimension), float(error * unit**dimension)
 
 
-def regions(points: ArrayLike, radius: float = RADIUS) -> IntArray:
+def regions(points: ArrayLike, radius: float | None = None) -> IntArray:
     """Connected regions of failures: components of the graph that links points within a radius.
 
     Args:
-        points: cases, shape (n, d) with d = 1, 2 or 3, in normalised coordinates. Shape (0,) also
+        points: cases, shape (n, d) with d from 1 to 6, in normalised coordinates. Shape (0,) also
             means no points. Not modified.
-        radius: two points at this distance or less (to within 1e-9 of it) are in one region.
+        radius: two points at this distance or less (to within 1e-9 of it) are in one region; by
+            default `radius_for(d)`.
 
     Returns:
         Shape (n,): the region of each point. Region 0 has the most points, then 1 and so on;
@@ -105,7 +139,8 @@ def regions(points: ArrayLike, radius: float = RADIUS) -> IntArray:
     # Pairs grow with the square of the number of copies of a point, so link each place once.
     places, place = np.unique(cases, axis=0, return_inverse=True)
     place = place.reshape(-1)  # a column in NumPy 2.0.0
-    component = _linked(places, radius * (1.0 + _LINK_SLACK))[place]
+    limit = radius_for(cases.shape[1]) if radius is None else radius
+    component = _linked(places, limit * (1.0 + _LINK_SLACK))[place]
     _, first, size = np.unique(component, return_index=True, return_counts=True)
     rank = np.empty(len(size), dtype=np.int64)
     rank[np.lexsort((first, -size))] = np.arange(len(size))
@@ -117,46 +152,38 @@ def _linked(places: FloatArray, limit: float) -> IntArray:
     """Return the component of each of n distinct points, (n,), linked at `limit` or less.
 
     Dense points have too many links to list. Their nearest neighbours link most of them; points in
-    one cell of a grid with a diagonal of `limit` are linked anyhow; what these leave apart is
-    looked at cell by cell, where a point has more neighbours than were looked at.
+    one cell of a grid with a diagonal of `limit` are linked anyhow. What these leave apart is
+    looked at part by part, among the points that have more neighbours than were looked at.
     """
     n, dimension = places.shape
     near = min(_FIRST_NEIGHBOURS + 1, n)
     distance, other = cKDTree(places).query(places, k=np.arange(1, near + 1))
     point, column = np.nonzero(distance <= limit)
     all_looked_at = (distance[:, -1] > limit) | (near == n)
-    cells, cell = np.unique(
+    _, first, cell = np.unique(
         np.floor(places / (limit / np.sqrt(dimension))).astype(np.int64),
         axis=0,
+        return_index=True,
         return_inverse=True,
     )
     cell = cell.reshape(-1)
-    by_cell = np.argsort(cell, kind="stable")
-    members = np.split(by_cell, np.cumsum(np.bincount(cell))[:-1])
-    first = np.array([group[0] for group in members])
     links = [
         np.column_stack([point, other[point, column]]),
         np.column_stack([np.arange(n), first[cell]]),
     ]
-    crowded = np.unique(cell[~all_looked_at])
-    crowds = {tuple(cells[index]): members[index] for index in crowded.tolist()}
-    reach = int(np.ceil(np.sqrt(dimension)))
     component = _components(links, n)
-    for offset in np.ndindex(*[2 * reach + 1] * dimension):
-        step = np.array(offset) - reach
-        if tuple(step) <= (0,) * dimension:
-            continue  # each pair of cells once
-        if len({int(component[group[0]]) for group in crowds.values()}) < 2:
-            break
-        for corner, group in crowds.items():
-            beside = crowds.get(tuple(np.array(corner) + step))
-            if beside is None or component[group[0]] == component[beside[0]]:
-                continue
-            nearest, _ = cKDTree(places[beside]).query(places[group])
-            if nearest.min() <= limit:
-                links.append(np.array([[group[0], beside[0]]]))
-        component = _components(links, n)
-    return component
+    crowded = np.flatnonzero(~all_looked_at)
+    labels = component[crowded]
+    for label in np.unique(labels)[:-1].tolist():
+        own, later = crowded[labels == label], crowded[labels > label]
+        low, high = places[own].min(axis=0) - limit, places[own].max(axis=0) + limit
+        later = later[((places[later] >= low) & (places[later] <= high)).all(axis=1)]
+        if not len(later):
+            continue
+        distance, nearest = cKDTree(places[own]).query(places[later])
+        near_enough = distance <= limit
+        links.append(np.column_stack([own[nearest[near_enough]], later[near_enough]]))
+    return _components(links, n)
 
 
 def _components(links: list[IntArray], n: int) -> IntArray:
@@ -167,15 +194,15 @@ def _components(links: list[IntArray], n: int) -> IntArray:
     return component
 
 
-def _checked(points: ArrayLike, radius: float) -> FloatArray:
-    """The points as an array (n, d), d = 1 to 3, or a ValueError that says what is wrong."""
-    if not (np.isfinite(radius) and radius > 0.0):
+def _checked(points: ArrayLike, radius: float | None) -> FloatArray:
+    """The points as an array (n, d), d = 1 to 6, or a ValueError that says what is wrong."""
+    if radius is not None and not (np.isfinite(radius) and radius > 0.0):
         raise ValueError(f"radius must be a positive finite number, got {radius}")
     cases = np.asarray(points, dtype=np.float64)
     if cases.shape == (0,):
         return np.zeros((0, 1))
-    if cases.ndim != 2 or cases.shape[1] not in (1, 2, 3):
-        raise ValueError(f"points must have shape (n, d) with d = 1, 2 or 3, got {cases.shape}")
+    if cases.ndim != 2 or not 1 <= cases.shape[1] <= MOST_DIMENSIONS:
+        raise ValueError(f"points must have shape (n, d) with d from 1 to 6, got {cases.shape}")
     bad = np.flatnonzero(~np.isfinite(cases).all(axis=1))
     if len(bad):
         raise ValueError(f"points must be finite, but point {bad[0]} is {cases[bad[0]].tolist()}")
