@@ -13,13 +13,8 @@ from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.reports.comparison import (
-    Change,
-    LevelChange,
-    RunComparison,
-    Untested,
-    compare_runs,
-)
+from merge_sumo.reports.changes import Change, LevelChange, RunComparison, Untested
+from merge_sumo.reports.comparison import compare_runs
 
 
 @pytest.fixture(scope="module")

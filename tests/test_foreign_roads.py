@@ -27,7 +27,7 @@ from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.traci import TraciVut
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
-from merge_sumo.reports.report import _road
+from merge_sumo.reports.report_data import _road
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
 from merge_sumo.sumo.opendrive import opendrive

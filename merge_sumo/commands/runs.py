@@ -26,7 +26,7 @@ from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import level_name
 
 if TYPE_CHECKING:
-    from merge_sumo.reports.comparison import RunComparison
+    from merge_sumo.reports.changes import RunComparison
 
 EXPORTS: Final = "exports"
 
@@ -186,7 +186,7 @@ def compare_runs(
 
 
 def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
-    from merge_sumo.reports.comparison import Change
+    from merge_sumo.reports.changes import Change
 
     show(
         f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "

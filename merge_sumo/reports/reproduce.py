@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from merge_sumo.campaigns.experiments import (
-    TRUTH_CASES,
     Search,
     Truth,
     compare,
@@ -23,9 +21,8 @@ from merge_sumo.campaigns.experiments import (
     oracle,
     search,
 )
-from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.settings import check_level, versions
 from merge_sumo.drivers.povs import Povs
-from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.reports.figures import Levels, Panel, Surface
 from merge_sumo.reports.table2 import (
@@ -34,9 +31,10 @@ from merge_sumo.reports.table2 import (
     TABLE_II,
     Column,
     Result,
-    columns_of,
-    markdown,
-    rows_of,
+    Scale,
+    table_markdown,
+    table_record,
+    table_rows,
 )
 from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
@@ -55,33 +53,6 @@ SURFACE_POINTS: Final = 81
 """Points of a surface's grid, in each direction."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Scale:
-    """How much is run. The default is the paper's; `UserError` for numbers that make none.
-
-    Attributes:
-        seeds: runs of each sampler.
-        truth_cases: uniform cases of the truth at each level.
-        batches: k, the batches of every run.
-        batch: n, the cases per batch at one level; twice as many run where all levels do.
-    """
-
-    seeds: int = 10
-    truth_cases: tuple[int, int, int] = (TRUTH_CASES[0], TRUTH_CASES[1], TRUTH_CASES[2])
-    batches: int = 20
-    batch: int = 20
-
-    def __post_init__(self) -> None:
-        """Check the number of seeds."""
-        if self.seeds < 1:
-            raise UserError(f"--seeds is {self.seeds}: it must be 1 or more")
-
-
-def quick(seeds: int) -> Scale:
-    """Return a scale for a first look and for tests: it shows that all works, and no more."""
-    return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
-
-
 OnRun = Callable[[str, int, int, str], None]
 """Told what is going on: title, things done, things in all, and what a thing is."""
 
@@ -97,30 +68,30 @@ def reproduce(
     """Write Table II and the figures into a new folder; return the path of its `index.html`.
 
     Each column's figures are written as soon as the column has run. Raises `UserError` when the
-    folder exists or cannot be written, or where matplotlib is missing.
+    folder exists or cannot be written, where a level has no POV, or where matplotlib is missing.
     """
     figures.require_matplotlib()
+    povs = povs or Povs()
+    for level in LEVELS:
+        check_level(level, povs)
     make_folder(folder)
-    work = _Work(folder, scale, workers, on_run or (lambda *_: None), povs or Povs())
+    work = _Work(folder, scale, povs, workers, on_run or (lambda *_: None))
     table = {column.title: work.column(column) for column in TABLE_II}
     work.all_levels()
-    how = {"scale": asdict(scale), "versions": versions(), "policies_sha256": work.povs.sha256()}
-    record = {**how, "columns": columns_of(table)}
-    _write(folder / TABLE_JSON, json.dumps(record, allow_nan=False) + "\n")
-    _write(folder / TABLE_MARKDOWN, markdown(table))
+    _write(folder / TABLE_JSON, json.dumps(table_record(table, scale), allow_nan=False) + "\n")
+    _write(folder / TABLE_MARKDOWN, table_markdown(table))
     index = folder / PAGE
     _write(index, _page(table, scale, work.pictures))
     return index
 
 
-@dataclass(slots=True)
 class _Work:
-    folder: Path
-    scale: Scale
-    workers: Workers | None
-    on_run: OnRun
-    povs: Povs
-    pictures: dict[str, str] = field(default_factory=dict)
+    def __init__(
+        self, folder: Path, scale: Scale, povs: Povs, workers: Workers | None, on_run: OnRun
+    ) -> None:
+        self.folder, self.scale, self.povs = folder, scale, povs
+        self.workers, self.on_run = workers, on_run
+        self.pictures: dict[str, str] = {}
 
     def column(self, column: Column) -> Result:
         """Run one column of the table and draw its figures."""
@@ -298,7 +269,7 @@ def _page(table: Mapping[str, Result], scale: Scale, pictures: Mapping[str, str]
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
     return environment.get_template("reproduce.html.jinja").render(
         results=list(table.values()),
-        rows=dict(rows_of(table)),
+        rows=dict(table_rows(table)),
         samplers=SAMPLERS,
         scale=scale,
         pictures=pictures,

@@ -1,4 +1,7 @@
-"""Table II of the paper: its columns, and how ours is written beside the paper's."""
+"""Table II of the paper: its columns, how much is run for them, and our numbers beside the paper's.
+
+Every number is the median over seeds.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from merge_sumo.campaigns.experiments import Comparison
+from merge_sumo.campaigns.experiments import (
+    TRUTH_CASES,
+    Comparison,
+)
+from merge_sumo.campaigns.settings import versions
+from merge_sumo.errors import UserError
 
 SAMPLERS: Final = ("uniform", "annealing", "subset", "gpr", "coverage")
 ADAPTIVE: Final = ("gpr", "coverage")
@@ -50,6 +58,33 @@ TABLE_II: Final = (
 )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Scale:
+    """How much is run. The default is the paper's; `UserError` for numbers that make none.
+
+    Attributes:
+        seeds: runs of each sampler.
+        truth_cases: uniform cases of the truth at each level.
+        batches: k, the batches of every run.
+        batch: n, the cases per batch at one level; twice as many run where all levels do.
+    """
+
+    seeds: int = 10
+    truth_cases: tuple[int, int, int] = (TRUTH_CASES[0], TRUTH_CASES[1], TRUTH_CASES[2])
+    batches: int = 20
+    batch: int = 20
+
+    def __post_init__(self) -> None:
+        """Check the number of seeds."""
+        if self.seeds < 1:
+            raise UserError(f"--seeds is {self.seeds}: it must be 1 or more")
+
+
+def quick(seeds: int) -> Scale:
+    """Return a scale for a first look and for tests: it shows that all works, and no more."""
+    return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
+
+
 @dataclass(frozen=True, slots=True)
 class Result:
     """A column that has run: what the truth holds, and each sampler beside it."""
@@ -61,7 +96,9 @@ class Result:
     compared: dict[str, Comparison]
 
 
-def rows_of(table: Mapping[str, Result]) -> Iterator[tuple[str, list[tuple[float, float | None]]]]:
+def table_rows(
+    table: Mapping[str, Result],
+) -> Iterator[tuple[str, list[tuple[float, float | None]]]]:
     """Yield the rows of the table: a name, and (ours, the paper's) for each column."""
     results = table.values()
     yield "truth", [(r.truth_fmc, r.column.paper["truth"]) for r in results]
@@ -69,11 +106,11 @@ def rows_of(table: Mapping[str, Result]) -> Iterator[tuple[str, list[tuple[float
         yield name, [(r.compared[name].fmc_median, r.column.paper.get(name)) for r in results]
 
 
-def markdown(table: Mapping[str, Result]) -> str:
+def table_markdown(table: Mapping[str, Result]) -> str:
     """Return Table II as Markdown: our medians, with the paper's numbers in brackets."""
     lines = ["| FMC: ours (the paper's) | " + " | ".join(table) + " |"]
     lines.append("|---|" + "---|" * len(table))
-    for name, pairs in rows_of(table):
+    for name, pairs in table_rows(table):
         cells = [
             f"{ours:.4f} ({'-' if paper is None else f'{paper:.4f}'})" for ours, paper in pairs
         ]
@@ -105,7 +142,7 @@ def _or_dash(value: float | None, form: str) -> str:
     return "-" if value is None else f"{value:{form}}"
 
 
-def columns_of(table: Mapping[str, Result]) -> list[dict[str, Any]]:
+def table_record(table: Mapping[str, Result], scale: Scale) -> dict[str, Any]:
     """Return Table II for a program; without seconds, so that it can be compared bit by bit."""
     columns = []
     for result in table.values():
@@ -123,4 +160,4 @@ def columns_of(table: Mapping[str, Result]) -> list[dict[str, Any]]:
                 "samplers": samplers,
             }
         )
-    return columns
+    return {"scale": asdict(scale), "versions": versions(), "columns": columns}

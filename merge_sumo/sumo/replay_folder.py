@@ -245,6 +245,7 @@ def _config(road: Road, timesteps: int) -> etree._Element:
         "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
         "processing": {
             "collision.action": "none",
+            "insertion-checks": "none",
             "time-to-teleport": "-1",
             "default.speeddev": "0",
         },

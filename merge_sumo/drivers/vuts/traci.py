@@ -24,7 +24,8 @@ from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen, Vut, VutOptions, seen_in
 from merge_sumo.drivers.vuts.process import GRACE_S, Program, split_command
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
-from merge_sumo.drivers.vuts.traci_session import CLOSE, SIMULATION_STEP, VUT, Session
+from merge_sumo.drivers.vuts.traci_session import CLOSE, SIMULATION_STEP, Session
+from merge_sumo.drivers.vuts.traci_simulation import VUT
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
