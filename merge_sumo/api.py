@@ -23,6 +23,7 @@ from merge_sumo.campaigns.settings import (
     DEFAULT_CASES,
     CampaignSettings,
     parse_levels,
+    povs_of,
 )
 from merge_sumo.errors import UserError
 from merge_sumo.reports.summary import Summary, summarise
@@ -164,6 +165,7 @@ def campaign(
     out: Path | str | None = None,
     net: Path | str | None = None,
     scenario: Scenario | Path | str = US23,
+    policies: Path | str | None = None,
     on_case: OnCase | None = None,
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
@@ -185,13 +187,15 @@ def campaign(
         out: new folder to write; `runs/<vut>-<date>` when left out.
         net: SUMO net to use instead of the scenario's.
         scenario: a scenario, its name, or its TOML file.
+        policies: folder of learned drivers in the place of the shipped ones.
         on_case: told of every case as it ends.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
     """
+    where = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
     settings = CampaignSettings(
         vut=vut,
-        levels=parse_levels(str(level)),
+        levels=parse_levels(str(level), povs_of(policies, where)),
         sampler=sampler,
         cases=cases,
         batch=min(DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
@@ -202,7 +206,8 @@ def campaign(
         deadline_s=deadline_s,
         vut_memory_gib=vut_memory_gib,
         in_process=in_process,
-        scenario=scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario)),
+        policies=None if policies is None else str(policies),
+        scenario=where,
     )
     folder = dated(vut) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from merge_sumo import cli
 from merge_sumo.campaigns.run import Run, failures, read_settings
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES, sumo_program
-from merge_sumo.sumo.net import default_net_path
-from merge_sumo.sumo.replay import CONFIG, RECORD
+from merge_sumo.sumo.replay_folder import CONFIG, RECORD
+from merge_sumo.sumo.road import default_net_path
 
 COMMANDS = [command.name or command.callback.__name__ for command in cli.app.registered_commands]
 SMALL = ("campaign", "--vut", "design1", "--level", "0")
@@ -121,7 +121,7 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
 
     @pytest.mark.parametrize("level", ["1", "2"])
     def test_for_a_level_without_a_policy(self, call, tmp_path, monkeypatch, level):
-        monkeypatch.setattr("merge_sumo.campaigns.settings.available_levels", lambda: (0,))
+        monkeypatch.setattr("merge_sumo.drivers.povs.policies_sha256", lambda _: {})
         before = contents(tmp_path)
         said = call(*SMALL, "--level", level, "--out", "run")
         assert_refused(said, f"level {level}", "merge-sumo train")
@@ -314,7 +314,7 @@ class TestACampaign:
         assert call(*arguments).code == 0
 
     def test_of_all_levels_says_which_it_has_policies_for(self, call, monkeypatch):
-        monkeypatch.setattr("merge_sumo.campaigns.settings.available_levels", lambda: (0,))
+        monkeypatch.setattr("merge_sumo.drivers.povs.policies_sha256", lambda _: {})
         said = call("campaign", "--vut", "level0", "--cases", 3, "--out", "run", "--json")
         assert said.code == 0
         assert list(json.loads(said.out)["levels"]) == ["0"]

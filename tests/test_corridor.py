@@ -29,8 +29,8 @@ from merge_sumo.sumo.binding import load_libsumo, sumo_program
 from merge_sumo.sumo.corridor import Piece
 from merge_sumo.sumo.finder import find_corridor
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, default_net_path
 from merge_sumo.sumo.netfile import NetFile
+from merge_sumo.sumo.road import default_net_path
 from merge_sumo.sumo.world import SPEED_MODE_COMMANDED, SimulationError, World
 from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, POV, VUT
@@ -261,7 +261,11 @@ def test_lanes_that_cars_may_not_use_are_left_out(tmp_path):
 def foreign_us23(folder: Path) -> NetFile:
     """Return the shipped road with other names, elsewhere and turned by a quarter."""
     text = default_net_path().read_text()
-    for ours, theirs in ((MAIN_IN, "-4711#0"), (MAIN_OUT, "east&amp;west"), (RAMP, "1/2.0@x")):
+    for ours, theirs in (
+        ("main_in", "-4711#0"),
+        ("main_out", "east&amp;west"),
+        ("ramp", "1/2.0@x"),
+    ):
         text = re.sub(rf"\b{ours}(?=[_\"])", theirs, text)
 
     def turned(found: re.Match[str]) -> str:
@@ -283,7 +287,7 @@ def test_a_straight_foreign_net_with_the_lengths_of_us23_gives_its_very_outcomes
     motions = []
     for where in (None, road):
         with World(16, where, factory.vut.vut_type) as world:
-            ran = dict(rollout(world, [PovLibrary(16)], factory(16, world), cases))
+            ran = dict(rollout(world, PovLibrary(16), factory(16, world), cases))
         motions.append([ran[place].motion for place in range(100)])
     for ours, theirs in zip(*motions, strict=True):
         assert np.array_equal(ours, theirs)
@@ -294,7 +298,7 @@ def test_sumos_own_driver_is_put_where_eq_4_has_it(corridor, name):
     factory = vut_factory("sumo:Krauss")
     cases = from_unit(np.random.default_rng(0).random((20, 2)), level=0)
     with World(4, corridor(name), factory.vut.vut_type) as world:
-        ran = dict(rollout(world, [PovLibrary(4)], factory(4, world), cases))
+        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
     for trajectory in ran.values():
         assert trajectory.x_vut_m[-1] >= 0.0
         x, v, a = trajectory.motion[:, VUT].T
@@ -385,7 +389,7 @@ def edited(old: str, new: str):
     ("edit", "said"),
     [
         (lambda text: text[:500], "not readable XML"),
-        (lambda text: "<routes/>", "is no SUMO net: it begins with <routes>"),
+        (lambda text: "<routes/>", "is no SUMO net: it does not begin with <net>"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="far"'), "is no number"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="nan"'), "is no number"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="0"'), "r1_0 has no length"),

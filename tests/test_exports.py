@@ -22,7 +22,7 @@ from merge_sumo.campaigns.conductor import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import COLUMNS, write_folders, write_openscenario, write_table
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.values.scenario import DT_S
 
 
@@ -35,7 +35,7 @@ def made(tmp_path_factory):
 def scenario(made, tmp_path_factory):
     """Return the OpenSCENARIO file of the worst case."""
     index = failures(made.outcomes)[0].index
-    return write_openscenario(made, index, tmp_path_factory.mktemp("osc") / "case", Net())
+    return write_openscenario(made, index, tmp_path_factory.mktemp("osc") / "case", road_of())
 
 
 def vertices(tree: etree._ElementTree, who: str) -> list[tuple[float, ...]]:
@@ -122,7 +122,7 @@ class TestOpenScenario:
 
     def test_of_the_same_case_is_the_same_bytes(self, made, scenario, tmp_path):
         again = write_openscenario(
-            made, failures(made.outcomes)[0].index, tmp_path / "again", Net()
+            made, failures(made.outcomes)[0].index, tmp_path / "again", road_of()
         )
         assert again.read_bytes() == scenario.read_bytes()
 
@@ -204,7 +204,7 @@ class TestTheCommand:
 def test_folders_are_checked_before_the_first_is_written(made, tmp_path):
     (tmp_path / "case-00002").mkdir()
     with pytest.raises(UserError, match="case-00002 exists"):
-        list(write_folders(made, [1, 2], tmp_path, write_openscenario, Net()))
+        list(write_folders(made, [1, 2], tmp_path, write_openscenario, road_of()))
     assert not (tmp_path / "case-00001").exists()
 
 

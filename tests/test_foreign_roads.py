@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import re
@@ -26,12 +27,12 @@ from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.traci import TraciVut
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
-from merge_sumo.reports.report import _road
+from merge_sumo.reports.report_data import _road
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
-from merge_sumo.sumo.net import Net, default_net_path
 from merge_sumo.sumo.opendrive import opendrive
-from merge_sumo.sumo.replay import (
+from merge_sumo.sumo.replay import replay
+from merge_sumo.sumo.replay_folder import (
     CASE,
     CONFIG,
     HOLD_STEPS,
@@ -40,11 +41,9 @@ from merge_sumo.sumo.replay import (
     SURROUNDINGS,
     TYPES,
     VIEW,
-    replay,
     write_scenario,
 )
-from merge_sumo.sumo.road import corridor_of as as_corridor
-from merge_sumo.sumo.road import road_of
+from merge_sumo.sumo.road import default_net_path, road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
@@ -98,7 +97,7 @@ def driven(road, count: int) -> list[Trajectory]:
     factory = vut_factory("design1")
     cases = from_unit(np.random.default_rng(3).random((count, 2)), level=0)
     with World(4, road) as world:
-        ran = dict(rollout(world, [PovLibrary(4)], factory(4, world), cases))
+        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
     return [ran[index] for index in range(count)]
 
 
@@ -216,8 +215,10 @@ class TestAReplay:
 
     def test_of_the_shipped_road_has_its_own_net_as_ever(self, tmp_path):
         trajectory = commanded(RANDOM, road_of())
+        copy = Path(shutil.copy(default_net_path(), tmp_path / "copy.net.xml"))
         folders = [
-            write(tmp_path / str(n), road, trajectory) for n, road in enumerate((Net(), road_of()))
+            write(tmp_path / str(n), road, trajectory)
+            for n, road in enumerate((road_of(copy), road_of()))
         ]
         contents = [{p.name: p.read_bytes() for p in folder.iterdir()} for folder in folders]
         assert contents[0] == contents[1]
@@ -432,9 +433,11 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
     client.start()
     case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
     with World(1, road) as world:
-        vut = TraciVut(1, world.road, port, None, VutOptions(deadline_s=5.0, connect_s=10.0))
+        vut = TraciVut(
+            1, world.road, world.scenario, port, None, VutOptions(deadline_s=5.0, connect_s=10.0)
+        )
         try:
-            ((_, trajectory),) = rollout(world, [PovLibrary(1)], vut, [case])
+            ((_, trajectory),) = rollout(world, PovLibrary(1), vut, [case])
         finally:
             vut.close()
             client.join()
@@ -492,8 +495,9 @@ def test_the_report_draws_cars_where_they_are_with_m_as_origin_and_the_road_to_t
 
 class TestRoadOf:
     def test_is_the_shipped_road_when_nothing_is_named(self):
-        assert road_of() == as_corridor(Net())
-        assert road_of().sha256 == Net().sha256
+        path = default_net_path()
+        assert road_of() == road_of(path, ("main_in", "main_out"), ("ramp", "main_out"))
+        assert road_of().sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
 
     def test_finds_a_merge_once_and_again_when_the_file_was_changed(self, tmp_path, monkeypatch):
         path = FOREIGN["zipper"][0](tmp_path)

@@ -34,8 +34,9 @@ from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
-from merge_sumo.sumo import replay
-from merge_sumo.sumo.net import Net, default_net_path
+from merge_sumo.sumo import replay, replay_folder
+from merge_sumo.sumo.hosting import hosted_net
+from merge_sumo.sumo.road import default_net_path, road_of
 from merge_sumo.system.resources import resource
 from merge_sumo.system.trust import SEAL
 
@@ -189,11 +190,11 @@ class TestACampaign:
         assert Run(folder).whole_batches() in (0, 4)
 
     def test_as_it_was_written_is_read(self, run):
-        net = Net()
+        road = road_of()
         values = settings_of(run.folder, run.settings)
         assert isinstance(values, CampaignSettings)
         recorded = {name: value for name, value in run.settings.items() if name != SEAL}
-        assert json.loads(json.dumps(record_of(values, net))) == recorded
+        assert json.loads(json.dumps(record_of(values, road))) == recorded
 
 
 class TestPolicies:
@@ -222,32 +223,32 @@ class TestAScenario:
     @here
     @given(data=st.data())
     def test_with_a_spoilt_record(self, scenario, data):
-        head = (scenario / replay.RECORD).read_bytes()[:1500]
-        whole = (scenario / replay.RECORD).read_bytes()
+        head = (scenario / replay_folder.RECORD).read_bytes()[:1500]
+        whole = (scenario / replay_folder.RECORD).read_bytes()
         record = data.draw(some(head, head + b"</timestep></fcd-export>", whole))
-        (scenario / replay.RECORD).write_bytes(record)
+        (scenario / replay_folder.RECORD).write_bytes(record)
         try:
             found = answer(lambda: replay._received(scenario))
         finally:
-            (scenario / replay.RECORD).write_bytes(whole)
+            (scenario / replay_folder.RECORD).write_bytes(whole)
         if found is not None:
             replay._fault_of_record(found)
 
     @here
     @given(data=st.data())
     def test_with_spoilt_types(self, scenario, data):
-        types = data.draw(some((scenario / replay.TYPES).read_bytes()))
-        answer(lambda: replay._checked_types(types, Path(replay.TYPES)))
+        types = data.draw(some((scenario / replay_folder.TYPES).read_bytes()))
+        answer(lambda: replay._checked_types(types, Path(replay_folder.TYPES)))
 
     @here
     @given(data=st.data())
     def test_with_a_spoilt_net(self, tmp_path, data):
         path = tmp_path / "spoilt.net.xml"
         path.write_bytes(data.draw(some(default_net_path().read_bytes())))
-        net = answer(lambda: Net(path))
-        if net is not None:
-            answer(lambda: net.replicate(2))
-            answer(lambda: net.speed_limit_mps)
+        road = answer(lambda: road_of(path))
+        if road is not None:
+            answer(lambda: hosted_net(road, 2))
+            answer(lambda: road.speed_limit_mps)
 
     def test_that_is_an_entity_bomb_is_refused_quickly(self, tmp_path):
         bomb = '<!DOCTYPE l [<!ENTITY a0 "ha">'
@@ -255,7 +256,7 @@ class TestAScenario:
         path = tmp_path / "bomb.xml"
         path.write_text(f"{bomb}]><net><edge id='&a11;'/></net>")
         with pytest.raises(UserError):
-            Net(path)
+            road_of(path)
         assert answer(lambda: replay._checked_record(path.read_bytes(), path)) is None
         assert answer(lambda: replay._checked_types(path.read_bytes(), path)) is None
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from merge_sumo.campaigns.conductor import export_case
 from merge_sumo.campaigns.run import failures
-from merge_sumo.sumo.replay import COLOURS, SURROUNDINGS_COLOUR, VIEW, write_scenario
+from merge_sumo.sumo.replay_folder import COLOURS, SURROUNDINGS_COLOUR, VIEW, write_scenario
 
 PICTURE_TIMES_S = (2.0, 7.0)
 NEAR = 40
@@ -28,9 +28,9 @@ NEAR = 40
 SHOW = """
 from lxml import etree
 from merge_sumo.cli import main
-from merge_sumo.sumo import replay
+from merge_sumo.sumo import replay_folder
 
-view, config = replay._view, replay._config
+view, config = replay_folder._view, replay_folder._config
 
 def with_pictures(*arguments):
     root = view(*arguments)
@@ -45,7 +45,7 @@ def that_ends(*arguments):
     etree.SubElement(root.find("gui_only"), "quit-on-end", value="true")
     return root
 
-replay._view, replay._config = with_pictures, that_ends
+replay_folder._view, replay_folder._config = with_pictures, that_ends
 main()
 """
 

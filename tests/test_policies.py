@@ -16,7 +16,7 @@ from merge_sumo.drivers.levelk import FEATURES, QNetwork, features
 from merge_sumo.drivers.policies import NETWORKS, load_network, read_manifest
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.training import check as checking
 from merge_sumo.training.reward import RewardWeights
@@ -44,7 +44,7 @@ def played(vut, cases, corridors=32):
     """Return the measures of cases, in order, and the trajectories."""
     with World(corridors) as world:
         driver = vut_factory(vut)(corridors)
-        got = dict(rollout(world, [PovLibrary(corridors)], driver, cases))
+        got = dict(rollout(world, PovLibrary(corridors), driver, cases))
     trajectories = [got[index] for index in range(len(cases))]
     return [measure(t) for t in trajectories], trajectories
 
@@ -112,7 +112,7 @@ class TestTheExampleRuns:
     @pytest.fixture(scope="class")
     @classmethod
     def examples(cls):
-        with World(1, Net()) as world:
+        with World(1, road_of()) as world:
             return {
                 name: make_scenarios.play(e, world) for name, e in make_scenarios.EXAMPLES.items()
             }

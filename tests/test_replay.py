@@ -19,20 +19,18 @@ from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.replay import (
+from merge_sumo.sumo.replay import MAX_TIMESTEPS, open_gui, replay
+from merge_sumo.sumo.replay_folder import (
     CASE,
     CONFIG,
     HOLD_STEPS,
-    MAX_TIMESTEPS,
     NET,
     RECORD,
     TYPES,
     VIEW,
-    open_gui,
-    replay,
     write_scenario,
 )
+from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S, V_VUT0_MAX_MPS, X_VUT0_M
 from merge_sumo.values.score import Outcome, measure
@@ -74,7 +72,9 @@ def at_level_0(x_pov0_m: float, v_pov0_mps: float, v_vut0_mps: float = 18.0) -> 
 
 
 def write(folder: Path, trajectory: Trajectory) -> Path:
-    write_scenario(folder, Net(), Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory)
+    write_scenario(
+        folder, road_of(), Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory
+    )
     return folder
 
 
@@ -372,7 +372,7 @@ class TestARecordThatSumoPlays:
         for vehicle in record.xpath(f"//vehicle[@id='{who}']"):
             vehicle.getparent().remove(vehicle)
         record.write(folder / RECORD)
-        assert "must have both vehicles in every timestep" in refusal(folder)
+        assert "must have every vehicle in every timestep" in refusal(folder)
 
     def test_is_not_identical_when_its_end_is_missing(self, folder):
         record = etree.parse(folder / RECORD)
@@ -428,7 +428,7 @@ class TestAFolderThatCannotBeReplayed:
     def test_has_types_that_its_record_does_not_use(self, folder):
         text = (folder / TYPES).read_text()
         (folder / TYPES).write_text(text.replace('id="vut"', 'id="tuv"'))
-        assert "vType whose id is not pov or vut" in refusal(folder)
+        assert "vType whose id is not one of pov, vut, ahead, behind" in refusal(folder)
         (folder / TYPES).write_text(text.replace('id="vut"', 'id="pov"'))
         assert "one vType pov and one vType vut" in refusal(folder)
 

@@ -17,7 +17,7 @@ from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import MAX_STEPS
 from merge_sumo.values.trajectory import End
@@ -309,7 +309,7 @@ def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
     hashes = []
     for source in (FUNCTION, FUNCTION + "# changed"):
         settings = CampaignSettings(vut=vut(source), levels=(0,), cases=2, batch=2)
-        (sha256,) = record_of(settings, Net())["vut_files"].values()
+        (sha256,) = record_of(settings, road_of())["vut_files"].values()
         hashes.append(sha256)
     assert hashes[0] != hashes[1]
-    assert record_of(CampaignSettings(vut="level0", levels=(0,)), Net())["vut_files"] is None
+    assert record_of(CampaignSettings(vut="level0", levels=(0,)), road_of())["vut_files"] is None

@@ -18,10 +18,11 @@ from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.ground import GroundPlan, lost_case, run_cases, runs_on
 from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings, software
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import uniform_points
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import (
     InProcess,
     LocalProcesses,
@@ -131,7 +132,7 @@ class TestAWorkerThatDies:
 
     def test_at_a_case_makes_it_a_sim_error_with_a_reason(self):
         cases = from_unit(uniform_points(4, 0, np.random.default_rng(0)), 0)
-        plan = GroundPlan(vut=vut_factory("design1"), corridors=4, net=Net())
+        plan = GroundPlan(vut=vut_factory("design1"), corridors=4, net=road_of(), povs=Povs())
         with open_workers(2) as workers:
             work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
             ran = dict(workers.run(work, cases, lost_case, chunk=1))
@@ -217,7 +218,9 @@ class TestACampaign:
 
     def test_is_refused_by_workers_with_other_software(self):
         other = {**software(), "libsumo": "1.0"}
-        plan = GroundPlan(vut=vut_factory("design1"), corridors=2, net=Net(), software=other)
+        plan = GroundPlan(
+            vut=vut_factory("design1"), corridors=2, net=road_of(), povs=Povs(), software=other
+        )
         with open_workers(1) as workers, pytest.raises(UserError, match="a worker has libsumo"):
             runs_on(workers, plan)
 

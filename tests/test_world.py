@@ -48,7 +48,7 @@ class RandomDriver(Driver):
 
 def run_all(world, pov, vut, cases):
     trajectories = [None] * len(cases)
-    for index, trajectory in rollout(world, [pov], vut, cases):
+    for index, trajectory in rollout(world, pov, vut, cases):
         assert trajectories[index] is None
         trajectories[index] = trajectory
     return trajectories

@@ -29,7 +29,8 @@ from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net
+from merge_sumo.sumo.hosting import HostedPath, hosted_net, hosted_paths
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import MAX_SPEED_MPS, SPEED_MODE_COMMANDED, SUMO_OPTIONS, World
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.scenario import DT_S, MAX_STEPS, X_VUT0_M
@@ -46,7 +47,7 @@ def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     """Return the seconds that the host takes for cases, and the trajectories."""
     pov, vut = PovLibrary(world.corridors), vut_factory(VUT)(world.corridors)
     start = time.perf_counter()
-    trajectories = [trajectory for _, trajectory in rollout(world, [pov], vut, cases)]
+    trajectories = [trajectory for _, trajectory in rollout(world, pov, vut, cases)]
     return time.perf_counter() - start, trajectories
 
 
@@ -105,41 +106,51 @@ def process_s(cases: list[Case]) -> list[float]:
     seconds = []
     with tempfile.TemporaryDirectory() as folder:
         net_file = Path(folder) / "one.net.xml"
-        net = Net()
-        net_file.write_bytes(net.replicate(1))
+        road = road_of()
+        net_file.write_bytes(hosted_net(road, 1))
         command = [sumo_program("sumo"), "--net-file", str(net_file), *SUMO_OPTIONS]
         for case in cases:
             start = time.perf_counter()
             traci.start(command, numRetries=100)
             try:
-                _episode_by_traci(case, net, PovLibrary(1), vut_factory(VUT)(1))
+                _episode_by_traci(case, hosted_paths(road), PovLibrary(1), vut_factory(VUT)(1))
             finally:
                 traci.close()
             seconds.append(time.perf_counter() - start)
     return seconds
 
 
-def _episode_by_traci(case: Case, net: Net, pov: Driver, vut: Driver) -> None:
+def _episode_by_traci(
+    case: Case, paths: tuple[HostedPath, HostedPath], pov: Driver, vut: Driver
+) -> None:
     vehicle = traci.vehicle
-    names = {"pov.0": MAIN_IN, "vut.0": RAMP}
+    names = dict(zip(("pov.0", "vut.0"), paths, strict=True))
+    begins_m = {
+        lane: start_m
+        for path in paths
+        for lane, start_m in zip(path.lanes(0), path.starts_m, strict=True)
+    }
     traci.vehicletype.setMaxSpeed("DEFAULT_VEHTYPE", MAX_SPEED_MPS)
     starts = {
-        "pov.0": (net.main_in.length_m + case.x_pov0_m, case.v_pov0_mps),
-        "vut.0": (net.ramp.length_m + X_VUT0_M, case.v_vut0_mps),
+        "pov.0": (case.x_pov0_m, case.v_pov0_mps),
+        "vut.0": (X_VUT0_M, case.v_vut0_mps),
     }
-    for name, edge in names.items():
-        traci.route.add(f"route.{name}", [f"{edge}.0", f"{MAIN_OUT}.0"])
+    for name, path in names.items():
+        traci.route.add(f"route.{name}", path.route(0))
         vehicle.add(name, f"route.{name}", departPos="10", departSpeed="0")
     traci.simulationStep()
-    for name, edge in names.items():
-        position, speed = starts[name]
+    for name, path in names.items():
+        x_m, speed = starts[name]
         vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
-        vehicle.moveTo(name, f"{edge}.0_0", position)
+        vehicle.moveTo(name, path.lanes(0)[0], x_m - path.starts_m[0])
         vehicle.setPreviousSpeed(name, speed, 0.0)
     pov.begin(0, case)
     vut.begin(0, case)
     for step in range(MAX_STEPS):
-        x = {name: _lane_coordinate(name, net) for name in names}
+        x = {
+            name: begins_m[vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
+            for name in names
+        }
         v = {name: vehicle.getSpeed(name) for name in names}
         if x["vut.0"] >= 0.0:
             return
@@ -151,13 +162,6 @@ def _episode_by_traci(case: Case, net: Net, pov: Driver, vut: Driver) -> None:
         traci.simulationStep()
         for name in names:
             vehicle.setPreviousSpeed(name, max(v[name] + a[name] * DT_S, 0.0), a[name])
-
-
-def _lane_coordinate(name: str, net: Net) -> float:
-    position = float(traci.vehicle.getLanePosition(name))
-    road = traci.vehicle.getRoadID(name)
-    lengths = {f"{MAIN_IN}.0": net.main_in.length_m, f"{RAMP}.0": net.ramp.length_m}
-    return position - lengths.get(road, 0.0)
 
 
 def main() -> None:

@@ -23,10 +23,11 @@ import numpy as np
 from merge_sumo.campaigns.conductor import conduct
 from merge_sumo.campaigns.experiments import Truth, ground_truth
 from merge_sumo.campaigns.ground import GroundPlan, Ran, run_cases
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
 from merge_sumo.values.score import Measures, Outcome
@@ -158,7 +159,7 @@ def main() -> None:
     print(
         f"{'FMC / truth':30s}" + " ".join(f"{h:>7s}" for h in heads) + "   all regions   sampler s"
     )
-    plan = GroundPlan(vut=vut_factory(options.vut), corridors=BATCH, net=Net())
+    plan = GroundPlan(vut=vut_factory(options.vut), corridors=BATCH, net=road_of(), povs=Povs())
     if options.ablate:
         for label, constants in ABLATIONS.items():
             with changed(constants):

@@ -32,10 +32,11 @@ from merge_sumo.campaigns.experiments import _scores
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.sumo.net import Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import LocalProcesses, Workers
 from merge_sumo.values.case import FloatArray, Pool, from_unit, to_unit
 from merge_sumo.values.fmc import fmc, regions
@@ -82,7 +83,7 @@ def local(count: int) -> Workers:
 
 def truth(most: int) -> Iterator[dict[str, float]]:
     """Yield cost and memory for 100, 1,000, ... cases, all in the same worker process."""
-    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=Net())
+    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of(), povs=Povs())
     rng = np.random.default_rng(0)
     with local(1) as workers:
         list(workers.run(partial(scores_and_memory, plan), list(rng.random((32, 2))), never))
@@ -104,7 +105,7 @@ def truth(most: int) -> Iterator[dict[str, float]]:
 
 def two_workers() -> dict[str, list[float]]:
     """Return the rates on two workers over those on one, round by round."""
-    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=Net())
+    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of(), povs=Povs())
     points: Any = np.random.default_rng(1).random((PAIR_CASES, 2))
     found: dict[str, list[float]] = {"cases": [], "computing": [], "cases_per_s_on_one": []}
     with local(1) as one, local(2) as two:

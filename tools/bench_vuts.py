@@ -35,7 +35,7 @@ from merge_sumo.drivers.onnx_export import export_onnx
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import SUMO_OPTIONS
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S
@@ -113,8 +113,8 @@ def us_per_step(driver: Driver, episodes: int) -> float:
 def us_of_peer(client: Path, folder: Path, episodes: int) -> float:
     """Return microseconds per step with SUMO's own server for two clients."""
     net_file = folder / "peer.net.xml"
-    net = Net()
-    net_file.write_bytes(net.text)
+    road = road_of()
+    net_file.write_bytes(road.path.read_bytes())
     port = traci.main.getFreeSocketPort()
     options = ["--net-file", str(net_file), "--remote-port", str(port), "--num-clients", "2"]
     server = subprocess.Popen([sumo_program("sumo"), *options, *SUMO_OPTIONS])
@@ -126,24 +126,26 @@ def us_of_peer(client: Path, folder: Path, episodes: int) -> float:
             host = traci.connect(port, numRetries=200, waitBetweenRetries=0.2)
         host.setOrder(1)
         vehicle, spent = host.vehicle, 0.0
-        starts = {"pov": (MAIN_IN, net.main_in.length_m), "vut": (RAMP, net.ramp.length_m)}
-        for name, (edge, _) in starts.items():
-            host.route.add(name, [edge, MAIN_OUT])
+        paths = {"pov": road.mainline, "vut": road.ramp}
+        edges = {"pov": road.mainline_edges, "vut": road.ramp_edges}
+        for name in paths:
+            host.route.add(name, edges[name])
             vehicle.add(name, name, departPos="10", departSpeed="0")
         host.simulationStep()
-        for name in starts:
+        for name in paths:
             vehicle.setSpeedMode(name, 32)
         for _ in range(episodes):
             x_and_v = {"pov": (-300.0, 30.0), "vut": (-182.0, 18.0)}
-            for name, (edge, length_m) in starts.items():
+            for name, path in paths.items():
                 x_m, v_mps = x_and_v[name]
-                vehicle.moveTo(name, f"{edge}_0", length_m + x_m)
+                at = path.point(x_m)
+                vehicle.moveTo(name, at.lane, at.position_m)
                 vehicle.setPreviousSpeed(name, v_mps, 0.0)
                 vehicle.setSpeed(name, v_mps)
             for _ in range(STEPS - 1):
                 start = time.perf_counter()
                 host.simulationStep()
-                for name in starts:
+                for name in paths:
                     vehicle.getLanePosition(name)
                     vehicle.getSpeed(name)
                 vehicle.setSpeed("pov", 30.0)

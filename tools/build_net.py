@@ -1,12 +1,13 @@
-"""Build sumo_net/us23.net.xml from the plain XML beside it: `python tools/build_net.py`.
+"""Build the nets of sumo_net/ from the plain XML beside them: `python tools/build_net.py`.
 
-Runs `netconvert -c us23.netccfg` and drops the header, which holds the time of the build, so that
-the same sources give the same bytes.
+Runs `netconvert -c` on every .netccfg and drops the header, which holds the time of the build, so
+that the same sources give the same bytes.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import re
 import shutil
 import subprocess
@@ -14,29 +15,30 @@ import tempfile
 from pathlib import Path
 
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.net import Net
 from merge_sumo.system.folders import check_new_file, replace_own
 
 SOURCES = Path(__file__).resolve().parent.parent / "sumo_net"
-NET = SOURCES / "us23.net.xml"
 
 
-def build(output: Path) -> Net:
-    """Build the net into `output`, ours or a new file, and return it, checked."""
-    if output != NET:
+def build(configuration: Path, output: Path) -> bytes:
+    """Build the net of a configuration into `output`, ours or a new file; return its bytes."""
+    if output.parent != SOURCES:
         check_new_file(output)
     with tempfile.TemporaryDirectory() as folder:
-        for source in SOURCES.glob("us23.*"):
+        for source in SOURCES.glob(f"{configuration.stem}.*"):
             shutil.copy(source, folder)
-        command = [sumo_program("netconvert"), "-c", "us23.netccfg"]
+        command = [sumo_program("netconvert"), "-c", configuration.name]
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
-        text = (Path(folder) / "us23.net.xml").read_text(encoding="utf-8")
-    replace_own(output, re.sub(r"<!--.*?-->\n*", "", text, flags=re.DOTALL).encode())
-    return Net(output)
+        text = (Path(folder) / output.name).read_text(encoding="utf-8")
+    content = re.sub(r"<!--.*?-->\n*", "", text, flags=re.DOTALL).encode()
+    replace_own(output, content)
+    return content
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--out", type=Path, default=NET)
-    net = build(parser.parse_args().out)
-    print(f"{net.path.name}: sha256 {net.sha256}")
+    parser.add_argument("--out", type=Path, default=SOURCES, help="folder to build them into")
+    out = parser.parse_args().out
+    for configuration in sorted(SOURCES.glob("*.netccfg")):
+        net = out / f"{configuration.stem}.net.xml"
+        print(f"{net.name}: sha256 {hashlib.sha256(build(configuration, net)).hexdigest()}")

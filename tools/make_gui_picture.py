@@ -17,7 +17,7 @@ from pathlib import Path
 from lxml import etree
 
 from merge_sumo.sumo.binding import run_program
-from merge_sumo.sumo.replay import CONFIG, VIEW
+from merge_sumo.sumo.replay_folder import CONFIG, VIEW
 from merge_sumo.system.folders import check_new_file
 
 

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.replay import write_scenario
+from merge_sumo.sumo.replay_folder import write_scenario
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S
@@ -49,7 +49,7 @@ EXAMPLES = {
 def play(example: Example, world: World) -> Trajectory:
     """Play one example in SUMO."""
     vut = vut_factory(example.vut)(world.corridors)
-    ((_, trajectory),) = rollout(world, [PovLibrary(world.corridors)], vut, [example.case])
+    ((_, trajectory),) = rollout(world, PovLibrary(world.corridors), vut, [example.case])
     return trajectory
 
 
@@ -78,13 +78,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=SCENARIOS)
     out = parser.parse_args().out
-    net = Net()
-    with World(1, net) as world:
+    road = road_of()
+    with World(1, road) as world:
         for name, example in EXAMPLES.items():
             trajectory = play(example, world)
             measures = measure(trajectory)
             folder = out / name
-            write_scenario(folder, net, Outcome(0, 0, example.case, measures), trajectory)
+            write_scenario(folder, road, Outcome(0, 0, example.case, measures), trajectory)
             case = example.case
             pov = f"POV level {case.level}" + (
                 "" if case.svo_rad is None else f" psi {case.svo_rad}"

@@ -24,8 +24,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.replay import write_scenario
+from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
 from merge_sumo.system.trust import SEAL, seal
 from merge_sumo.system.workers import Workers, open_workers
@@ -76,7 +75,7 @@ def conduct(
 def run_campaign(
     settings: CampaignSettings,
     folder: Path,
-    net: Net | Corridor | None = None,
+    net: Corridor | None = None,
     on_case: OnCase | None = None,
     *,
     workers: Workers | None = None,
@@ -108,7 +107,7 @@ def run_campaign(
 
 def resume_campaign(
     folder: Path,
-    net: Net | Corridor | None = None,
+    net: Corridor | None = None,
     on_case: OnCase | None = None,
     *,
     given: Mapping[str, object] | None = None,
@@ -142,6 +141,9 @@ def resume_campaign(
         recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, SEAL)}
         settings = settings_of(folder, before.settings, given, trust=trust)
         record = record_of(settings, net)
+        # Where policies are decides nothing: what is in them does.
+        moved = recorded.get("policies") != record["policies"]
+        recorded["policies"] = record["policies"]
         # What was loaded while it ran must be the same, too, although it is not loaded yet.
         record["vut_files"] = _files_again(recorded) | (record["vut_files"] or {}) or None
         changes = differences(RECORDED_BY_DEFAULT | recorded, record)
@@ -158,7 +160,7 @@ def resume_campaign(
         if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
             record[FORCED] = [*_forced(before), *([forced] if changes else [])]
-        if changes:
+        if changes or moved:
             journal.rewrite_settings(record)
         if on_case is not None:
             for outcome in before.outcomes:
@@ -178,7 +180,7 @@ def _files_again(recorded: Mapping[str, Any]) -> Files:
 def _go_on(
     settings: CampaignSettings,
     record: dict[str, Any],
-    net: Net | Corridor,
+    net: Corridor,
     journal: Journal,
     run: RunCases,
     history: Sequence[Outcome],
@@ -220,12 +222,13 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
         yield here
 
 
-def _plan(settings: CampaignSettings, net: Net | Corridor, folder: Path) -> GroundPlan:
+def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan:
     return GroundPlan(
         vut=settings.vut_factory.with_log(folder.resolve() / LOG),
         corridors=min(MAX_CORRIDORS, settings.batch),
         net=net,
         scenario=settings.scenario,
+        povs=settings.povs,
     )
 
 
@@ -239,7 +242,7 @@ def case_name(index: int) -> str:
     return f"case-{index:05d}"
 
 
-def export_case(run: Run, index: int, folder: Path, net: Net | Corridor | None = None) -> Path:
+def export_case(run: Run, index: int, folder: Path, net: Corridor | None = None) -> Path:
     """Write a case of a run as a replay folder; return the path of its SUMO configuration."""
     road = net or road_for(run.scenario)
     return write_scenario(folder, road, run.outcome(index), run.trajectory(index))

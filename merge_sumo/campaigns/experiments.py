@@ -9,7 +9,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from heapq import heappop, heapreplace
 from itertools import accumulate
@@ -22,8 +22,10 @@ from scipy.spatial import cKDTree
 from merge_sumo.campaigns.conductor import conduct, workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
 from merge_sumo.campaigns.settings import versions
-from merge_sumo.drivers.policies import read_manifest
+from merge_sumo.drivers.policies import policies_of, policies_sha256
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
+from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.ground import Ground
@@ -92,6 +94,7 @@ def ground_truth(
     cache: Path | None = None,
     on_cases: OnCases | None = None,
     scenario: Scenario = US23,
+    povs: Povs | None = None,
 ) -> Truth:
     """Return the ground truth of a VUT at a level, from the cache where it is there.
 
@@ -103,9 +106,13 @@ def ground_truth(
     count = cases or TRUTH_CASES[level]
     if count < 1:
         raise UserError(f"--cases is {count}: it must be 1 or more")
-    factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
+    povs = povs or Povs(policies=policies_of(scenario))
+    factory = _factory(vut, povs)
     options = factory.options
-    kept = Kept(factory.spec, level, count, seed, options.command, options.deadline_s, scenario)
+    kept = Kept(
+        *(factory.spec, level, count, seed, options.command, options.deadline_s, scenario),
+        policies=povs.sha256(),
+    )
     path = kept.path(cache)
     found = read_truth(path, level, count, scenario)
     if found is not None:
@@ -116,7 +123,7 @@ def ground_truth(
     scores = np.full(count, np.nan)
     files = dict(factory.files or {})
     road = road_for(scenario)
-    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road, scenario=scenario)
+    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road, scenario=scenario, povs=povs)
     with workers_or_here(workers) as there:
         rows = cast("Sequence[FloatArray]", points)
         scored = there.run(partial(_scores, plan, level, scenario), rows, lambda _: (np.nan, {}))
@@ -140,9 +147,18 @@ def ground_truth(
     return truth
 
 
+def _factory(vut: str | VutFactory, povs: Povs) -> VutFactory:
+    return (
+        vut if isinstance(vut, VutFactory) else vut_factory(vut, VutOptions(policies=povs.policies))
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What a truth in the cache is of; nothing of the VUT is loaded to look for it."""
+    """What a truth in the cache is of; nothing of the VUT is loaded to look for it.
+
+    Of the learned drivers the hashes count, and not where they are.
+    """
 
     vut: str
     level: int
@@ -151,6 +167,7 @@ class Kept:
     command: str | None
     deadline_s: float
     scenario: Scenario = US23
+    policies: Mapping[str, str] = field(default_factory=lambda: policies_sha256(policies_of()))
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
@@ -167,7 +184,6 @@ class Kept:
             "versions": versions(),
             "sources": sources.hexdigest(),
             "net": road_for(self.scenario).sha256,
-            "policies": {name: entry["sha256"] for name, entry in read_manifest().items()},
         }
         key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
         return (cache or cache_folder()) / f"truth-{key}.npz"
@@ -321,15 +337,20 @@ def search(
     workers: Workers | None = None,
     on_search: Callable[[str, int], None] | None = None,
     scenario: Scenario = US23,
+    povs: Povs | None = None,
 ) -> dict[str, list[Search]]:
     """Let samplers search a pool, with the seeds 0 to `seeds` - 1 each.
 
     A search runs on one of the `workers`, by default in this process.
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
-    factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
-    road = road_for(scenario)
-    plan = GroundPlan(vut=factory, corridors=min(MAX_CORRIDORS, batch), net=road)
+    povs = povs or Povs(policies=policies_of(scenario))
+    plan = GroundPlan(
+        vut=_factory(vut, povs),
+        corridors=min(MAX_CORRIDORS, batch),
+        net=road_for(scenario),
+        povs=povs,
+    )
     found: dict[int, Search] = {}
     with workers_or_here(workers) as there:
         for place, one in there.run(

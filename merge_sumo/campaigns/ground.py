@@ -12,15 +12,17 @@ from typing import Final, Self
 import numpy as np
 
 from merge_sumo.campaigns.rollout import rollout
-from merge_sumo.campaigns.settings import differences, software
+from merge_sumo.campaigns.settings import POLICY, CampaignSettings, differences, software
+from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.pov import PovLibrary
+from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.road import corridor_of, road_of
+from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
+from merge_sumo.system.resources import resource
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import US23, Scenario
@@ -37,8 +39,9 @@ class ProvingGround:
         self,
         vut: str | VutFactory,
         corridors: int = MAX_CORRIDORS,
-        net: Net | Corridor | None = None,
+        net: Corridor | None = None,
         scenario: Scenario = US23,
+        povs: Povs | None = None,
     ) -> None:
         """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
@@ -46,14 +49,15 @@ class ProvingGround:
         self.world = World(corridors, net, factory.vut.vut_type, scenario)
         try:
             self.vut = factory(corridors, self.world)
-            self.cars = [PovLibrary(corridors) for _ in range(scenario.vehicles - 1)]
+            povs = povs or Povs(policies=policies_of(scenario))
+            self.pov = PovLibrary(corridors * (scenario.vehicles - 1), povs)
         except BaseException:
             self.world.close()
             raise
 
     def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
         """Run cases; yield (place in `cases`, trajectory) as they end."""
-        return rollout(self.world, self.cars, self.vut, cases)
+        return rollout(self.world, self.pov, self.vut, cases)
 
     def __enter__(self) -> Self:
         """Return the proving ground."""
@@ -67,30 +71,46 @@ class ProvingGround:
             self.world.close()
 
 
+def ground_of(settings: CampaignSettings, cases: int, net: Corridor) -> ProvingGround:
+    """Open the proving ground of a campaign's settings in this process, for some cases."""
+    corridors = min(MAX_CORRIDORS, cases)
+    return ProvingGround(settings.vut_factory, corridors, net, settings.scenario, settings.povs)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GroundPlan:
     """What it takes to open a `ProvingGround` in any process; it travels with every chunk."""
 
     vut: VutFactory
     corridors: int
-    net: Net | Corridor
+    net: Corridor
+    povs: Povs
     scenario: Scenario = US23
-    software: dict[str, str] = field(default_factory=software)
+    software: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Note with what software this process would carry it out, unless that is given."""
+        if not self.software:
+            object.__setattr__(self, "software", software(self.povs))
 
     def key(self) -> tuple[object, ...]:
         """Return what tells one plan from another."""
         vut = self.vut.spec, self.vut.options, self.vut.files
-        road = corridor_of(self.net)
-        edges = road.sha256, road.mainline_edges, road.ramp_edges
-        return *vut, self.corridors, *edges, self.scenario, *self.software.items()
+        edges = self.net.sha256, self.net.mainline_edges, self.net.ramp_edges
+        return *vut, self.corridors, *edges, self.scenario, self.povs, *self.software.items()
 
     def open(self) -> ProvingGround:
         """Open the proving ground; `UserError` where other software would give other outcomes."""
-        for name, (there, here) in differences(self.software, software()).items():
+        for name, (there, here) in differences(self.software, software(self.povs)).items():
+            if name.startswith(POLICY):
+                raise UserError(
+                    f"a worker has another {name} in {self.povs.policies} than this process, or "
+                    "none: put the same files there"
+                )
             raise UserError(
                 f"a worker has {name} {here}, and this process {there}: install the same there"
             )
-        return ProvingGround(self.vut, self.corridors, self.net, self.scenario)
+        return ProvingGround(self.vut, self.corridors, self.net, self.scenario, self.povs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +192,9 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
 
     Raises `UserError` where there is no such merge, or not room enough for its vehicles.
     """
-    file = Path(scenario.net) if net is None and scenario.net is not None else net
-    road = road_of(file, scenario.mainline, scenario.ramp, scenario.room_after_m)
+    if net is None and scenario.net is not None:
+        # Where a path says nothing of folders, the net is one that the package brings.
+        net = resource("sumo_net") / scenario.net
+    road = road_of(net, scenario.mainline, scenario.ramp, scenario.room_after_m)
     road.check_room(scenario.mainline_m, -scenario.x_vut0_m)
     return road

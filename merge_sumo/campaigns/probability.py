@@ -19,7 +19,7 @@ import numpy as np
 
 from merge_sumo.campaigns.conductor import OnCase
 from merge_sumo.campaigns.distribution import Distribution, read_distribution
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
+from merge_sumo.campaigns.ground import ground_of, road_for
 from merge_sumo.campaigns.interval import Estimate, estimate
 from merge_sumo.campaigns.proposal import DEFENSIVE, Draws, Proposal, cells, expected_chance
 from merge_sumo.campaigns.run import Run
@@ -27,7 +27,6 @@ from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import Case
 from merge_sumo.values.score import Outcome, measure
@@ -50,7 +49,8 @@ def failure_probability(
     distribution: Path | None = None,
     confidence: float = 0.95,
     seed: int = 0,
-    net: Net | Corridor | None = None,
+    net: Corridor | None = None,
+    given: Mapping[str, object] | None = None,
     trust: bool = False,
     on_case: OnCase | None = None,
 ) -> Estimate:
@@ -60,6 +60,7 @@ def failure_probability(
     weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
 
     The controller that a folder names runs only where the folder was made here, or with `trust`.
+    What is `given` is taken in the place of what the folder names: policies that are elsewhere.
 
     Raises `UserError` for a distribution or numbers that make no sense, a run whose net or policies
     are not those of today, or files that exist or cannot be written.
@@ -70,7 +71,7 @@ def failure_probability(
         raise UserError(f"--confidence is {confidence}: choose 0.5 or more, and below 1")
     if seed < 0:
         raise UserError(f"--seed is {seed}: it must be 0 or more")
-    settings = settings_of(run.folder, run.settings, trust=trust)
+    settings = settings_of(run.folder, run.settings, given, trust=trust)
     net = net or road_for(settings.scenario)
     _same_system(run, record_of(settings, net))
     stated = read_distribution(distribution, settings.levels, settings.scenario)
@@ -105,14 +106,15 @@ def failure_probability(
 def _same_system(run: Run, today: Mapping[str, Any]) -> None:
     for name in ("net_sha256", "policies_sha256"):
         if run.settings.get(name) != today[name]:
-            what = name.removesuffix("_sha256")
-            hint = "name it with --net" if what == "net" else "run the campaign again"
-            raise UserError(f"{run.folder} was run with another {what}: {hint}")
+            what, others = ("net", "another") if name == "net_sha256" else ("policies", "other")
+            raise UserError(
+                f"{run.folder} was run with {others} {what}: name what it was run with, --{what}"
+            )
 
 
 def _run(
     settings: CampaignSettings,
-    net: Net | Corridor,
+    net: Corridor,
     stated: Distribution,
     draws: Draws,
     lines: Path,
@@ -128,7 +130,7 @@ def _run(
         by_place.update(zip(places.tolist(), drawn, strict=True))
     cases = [by_place[place] for place in range(len(by_place))]
     outcomes: list[Outcome] = []
-    with ProvingGround(settings.vut_factory, min(MAX_CORRIDORS, len(cases)), net) as ground:
+    with ground_of(settings, len(cases), net) as ground:
         for first in range(0, len(cases), WRITTEN):
             ran = []
             for place, trajectory in ground.run(cases[first : first + WRITTEN]):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
-from merge_sumo.drivers.following import CARS, Following
+from merge_sumo.drivers.following import Following
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VUT
@@ -44,11 +44,11 @@ class _Episode:
 
 
 def rollout(
-    world: World, cars: Sequence[Driver], vut: Driver, cases: Iterable[Case]
+    world: World, pov: Driver, vut: Driver, cases: Iterable[Case]
 ) -> Iterator[tuple[int, Trajectory]]:
     """Run cases in the world; yield (place in `cases`, trajectory) as the episodes end.
 
-    `cars` drive on the mainline: the POV and, in traffic, the car ahead of it and the one behind.
+    `pov` drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
 
     Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
     episode does not depend on the number of corridors nor on its neighbours. What the VUT does
@@ -56,16 +56,15 @@ def rollout(
     it, they begin anew. When SUMO fails, the episodes that were running end as SIM_ERROR, SUMO is
     started again, and the others go on.
     """
-    return _Rollout(world, cars, vut, cases).run()
+    return _Rollout(world, pov, vut, cases).run()
 
 
 class _Rollout:
-    def __init__(
-        self, world: World, cars: Sequence[Driver], vut: Driver, cases: Iterable[Case]
-    ) -> None:
+    def __init__(self, world: World, pov: Driver, vut: Driver, cases: Iterable[Case]) -> None:
         corridors, vehicles = world.corridors, len(world.x_m)
-        self.world, self.cars, self.vut = world, cars, vut
-        self.following = Following(corridors) if len(cars) > 1 else None
+        self.world, self.pov, self.vut = world, pov, vut
+        self.mainline = [row for row in range(vehicles) if row != VUT]
+        self.following = Following(corridors) if len(self.mainline) > 1 else None
         self.queue = enumerate(cases)
         self.again: deque[tuple[int, Case]] = deque()
         """Episodes that have to begin anew through no fault of theirs."""
@@ -177,8 +176,8 @@ class _Rollout:
         self.left[corridor] = scenario.max_steps
         self.episodes[corridor] = _Episode(index, case, self.row)
         self.world.place(corridor, case.starts())
-        for car in self.cars:
-            car.begin(corridor, case)
+        for car in range(len(self.mainline)):
+            self.pov.begin(car * self.world.corridors + corridor, case)
         if self.following is not None:
             self.following.begin(corridor, case)
         try:
@@ -197,8 +196,7 @@ class _Rollout:
         x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
         scene = Scene(self.active, self.step, x_m, v_mps)
         answer = np.empty(x_m.shape)
-        for row, car in zip(CARS, self.cars, strict=False):
-            answer[row] = car.act(scene.seen_by(row))
+        answer[self.mainline] = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
         if following is None:
             answer[VUT] = self.ask_vut(scene)
         else:

@@ -12,15 +12,14 @@ from typing import Any, Final, get_args, get_origin, get_type_hints
 
 from merge_sumo.campaigns.convergence import StoppingRule
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
-from merge_sumo.drivers.policies import read_manifest
-from merge_sumo.drivers.pov import available_levels
+from merge_sumo.drivers.policies import how_to_train, policies_in, policies_of
+from merge_sumo.drivers.povs import POLICIES, Povs
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
 from merge_sumo.system.trust import is_own
 from merge_sumo.values.case import Pool
 from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, US23, Scenario
@@ -46,10 +45,13 @@ class CampaignSettings:
     deadline_s: float = DEADLINE_S
     vut_memory_gib: float = MEMORY_GIB
     in_process: bool = False
+    policies: str | None = None
     scenario: Scenario = US23
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels; the scenario says what is left out."""
+        if self.policies is not None:
+            object.__setattr__(self, "policies", str(policies_in(self.policies)))
         fixed = self.scenario.v_vut0_mps
         if self.v_vut0_mps is None and isinstance(fixed, float):
             object.__setattr__(self, "v_vut0_mps", fixed)
@@ -57,17 +59,21 @@ class CampaignSettings:
             # Then it is no coordinate of the pool any more.
             narrowed = replace(self.scenario, v_vut0_mps=float(self.v_vut0_mps))
             object.__setattr__(self, "scenario", narrowed)
-        for option, text in (("--vut", self.vut), ("--vut-command", self.vut_command or "")):
-            if not _is_text(text):
+        for option, text in (
+            ("--vut", self.vut),
+            ("--vut-command", self.vut_command),
+            ("--policies", self.policies),
+        ):
+            if text is not None and not _is_text(text):
                 raise UserError(
                     f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
-                    "rename the file"
+                    "rename it"
                 )
         _ = self.vut_factory
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
         for level in self.levels:
-            check_level(level)
+            check_level(level, self.povs)
         make_sampler(self.sampler, self.pool, self.seed)
         for name in ("cases", "batch"):
             if getattr(self, name) < 1:
@@ -99,8 +105,14 @@ class CampaignSettings:
             deadline_s=self.deadline_s,
             memory_gib=self.vut_memory_gib,
             in_process=self.in_process,
+            policies=self.povs.policies,
         )
         return vut_factory(self.vut, options)
+
+    @property
+    def povs(self) -> Povs:
+        """Who drives the POV."""
+        return Povs(policies=Path(self.policies) if self.policies else policies_of(self.scenario))
 
     @property
     def pool(self) -> Pool:
@@ -125,31 +137,36 @@ def _is_text(text: str) -> bool:
     return True
 
 
-def parse_levels(text: str) -> tuple[int, ...]:
-    """Return the levels that `--level` names: one, or all for which there is a policy."""
+def povs_of(policies: str | Path | None, scenario: Scenario) -> Povs:
+    """Return the POVs with the policies that a person names, else with those of a scenario."""
+    return Povs(policies=policies_of(scenario) if policies is None else policies_in(policies))
+
+
+def parse_levels(text: str, povs: Povs) -> tuple[int, ...]:
+    """Return the levels that `--level` names: one, or all for which there is a POV."""
     if text == "all":
-        return available_levels()
+        return povs.levels
     if text not in map(str, LEVELS):
         raise UserError(f"there is no POV level {text!r}: choose 0, 1, 2 or all")
-    check_level(int(text))
+    check_level(int(text), povs)
     return (int(text),)
 
 
-def check_level(level: int) -> None:
+def check_level(level: int, povs: Povs) -> None:
     """Raise `UserError` when there is no POV of a level."""
     if level not in LEVELS:
         raise UserError(f"there is no POV level {level}: choose 0, 1, 2 or all")
-    if level not in available_levels():
+    if level not in povs.levels:
         raise UserError(
-            f"there is no policy for a POV of level {level}: run `merge-sumo train` to make it"
+            f"there is no policy for a POV of level {level}{how_to_train(povs.policies)}"
         )
 
 
-def one_level(text: str) -> int:
+def one_level(text: str, povs: Povs) -> int:
     """Return the one level that `--level` names."""
     if text == "all":
         raise UserError("--level all does not go here: choose 0, 1 or 2")
-    return parse_levels(text)[0]
+    return parse_levels(text, povs)[0]
 
 
 def versions() -> dict[str, str]:
@@ -158,22 +175,31 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
-def software() -> dict[str, str]:
+POLICY: Final = "policy "
+"""Begins the name of a policy among the software."""
+
+
+def software(povs: Povs | None = None) -> dict[str, str]:
     """Return the versions, and the hashes of the policies, by name."""
-    policies = {f"policy {name}": entry["sha256"] for name, entry in read_manifest().items()}
-    return versions() | policies
+    policies = (povs or Povs()).sha256()
+    return versions() | {f"{POLICY}{name}": sha256 for name, sha256 in policies.items()}
 
 
-def record_of(settings: CampaignSettings, net: Net | Corridor) -> dict[str, Any]:
+def record_of(settings: CampaignSettings, net: Corridor) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
-    policies = {name: entry["sha256"] for name, entry in read_manifest().items()}
     return {
         **asdict(settings),
         "versions": versions(),
         "vut_files": settings.vut_factory.files or None,
         "net_sha256": net.sha256,
-        "policies_sha256": policies,
+        "policies_sha256": settings.povs.sha256(),
     }
+
+
+def pov_of(recorded: Mapping[str, Any], level: int) -> object:
+    """Return what decided on the POV of a level where a campaign was recorded."""
+    hashes = recorded.get("policies_sha256")
+    return hashes.get(POLICIES.get(level)) if isinstance(hashes, dict) else None
 
 
 def settings_of(
@@ -209,7 +235,19 @@ def settings_of(
         # 18 is 18.0, and outcomes are to show it as the same number.
         is_real = float in (hints[spec.name], *get_args(hints[spec.name]))
         values[spec.name] = float(value) if is_real and type(value) is int else value
+    if values["policies"] is not None and "policies" not in (given or {}):
+        _check_still_there(folder, values["policies"])
     return CampaignSettings(**values)
+
+
+def _check_still_there(folder: Path, policies: str) -> None:
+    try:
+        policies_in(policies)
+    except UserError:
+        raise UserError(
+            f"{folder} was run with the policies in {policies}, and there are none any more: name "
+            "the folder where they are now with --policies"
+        ) from None
 
 
 def _fits(value: object, hint: Any) -> bool:

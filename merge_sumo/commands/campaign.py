@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +15,7 @@ from merge_sumo.commands.shared import (
     InProcessOption,
     JsonOption,
     NetOption,
+    PoliciesOption,
     ScenarioOption,
     TrustOption,
     VutCommandOption,
@@ -57,6 +58,7 @@ def campaign(
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same outcomes.")] = 0,
     scenario: ScenarioOption = "us23",
+    policies: PoliciesOption = None,
     v_vut0: Annotated[
         float | None,
         typer.Option(help="Initial speed of the VUT in m/s.  [default: the scenario's, 18]"),
@@ -118,6 +120,7 @@ def campaign(
         DEFAULT_BATCH,
         CampaignSettings,
         parse_levels,
+        povs_of,
         settings_of,
     )
     from merge_sumo.reports.junit import check_junit
@@ -131,7 +134,8 @@ def campaign(
 
     gates = parse_gates(gate or ())
     if resume is None:
-        levels = parse_levels(level)
+        where = named_scenario(scenario)
+        levels = parse_levels(level, povs_of(policies, where))
         settings = CampaignSettings(
             vut=vut,
             levels=levels,
@@ -145,12 +149,16 @@ def campaign(
             deadline_s=deadline,
             vut_memory_gib=vut_memory,
             in_process=in_process,
-            scenario=named_scenario(scenario),
+            policies=None if policies is None else str(policies),
+            scenario=where,
         )
         folder = out or dated(vut)
     else:
         given = _given(context)
         settings = settings_of(resume, read_settings(resume), given, trust=trust_vut)
+        if _is_written(context, "level"):
+            settings = replace(settings, levels=parse_levels(level, settings.povs))
+            given["levels"] = settings.levels
         folder, levels = resume, settings.levels
         check_report(folder)
     if junit is not None:
@@ -241,9 +249,16 @@ def _conclude(
     return passed
 
 
+def _is_written(context: typer.Context, option: str) -> bool:
+    source = context.get_parameter_source(option)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 def _given(context: typer.Context) -> dict[str, object]:
-    """Return the settings that a person wrote, by their names in `CampaignSettings`."""
-    from merge_sumo.campaigns.settings import parse_levels
+    """Return the settings that a person wrote, by their names in `CampaignSettings`.
+
+    Levels are not among them: which there are, the other settings say.
+    """
     from merge_sumo.scenarios.scenario_file import named_scenario
 
     names = {
@@ -257,19 +272,20 @@ def _given(context: typer.Context) -> dict[str, object]:
             "stop_after_converged",
             "vut_command",
             "in_process",
+            "policies",
             "scenario",
         )
     }
-    names |= {"level": "levels", "v_vut0": "v_vut0_mps", "deadline": "deadline_s"}
-    names |= {"vut_memory": "vut_memory_gib"}
-    given: dict[str, object] = {}
-    for option, name in names.items():
-        source = context.get_parameter_source(option)
-        if source is not None and source.name == "COMMANDLINE":
-            value = context.params[option]
-            if option == "level":
-                value = parse_levels(value)
-            given[name] = named_scenario(value) if option == "scenario" else value
+    names |= {"v_vut0": "v_vut0_mps", "deadline": "deadline_s", "vut_memory": "vut_memory_gib"}
+    given = {
+        name: context.params[option]
+        for option, name in names.items()
+        if _is_written(context, option)
+    }
+    if "policies" in given:
+        given["policies"] = str(given["policies"])
+    if "scenario" in given:
+        given["scenario"] = named_scenario(given["scenario"])
     if context.params["out"] is not None:
         raise UserError("--resume names the folder: leave --out away")
     return given

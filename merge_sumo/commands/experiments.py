@@ -14,6 +14,7 @@ from merge_sumo.commands.shared import (
     DeadlineOption,
     JsonOption,
     NetOption,
+    PoliciesOption,
     RunArgument,
     ScenarioOption,
     TrustOption,
@@ -25,10 +26,11 @@ from merge_sumo.commands.shared import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import dated
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23
 
 if TYPE_CHECKING:
     from merge_sumo.campaigns.experiments import Comparison, Quartiles, Truth
+    from merge_sumo.drivers.povs import Povs
     from merge_sumo.drivers.vut import VutFactory
     from merge_sumo.system.workers import Workers
     from merge_sumo.values.scenario import Scenario
@@ -43,6 +45,7 @@ def truth(
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
     scenario: ScenarioOption = "us23",
+    policies: PoliciesOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -58,16 +61,17 @@ def truth(
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
     """
     from merge_sumo.campaigns import experiments
-    from merge_sumo.campaigns.settings import one_level
+    from merge_sumo.campaigns.settings import one_level, povs_of
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.system.workers import open_workers
     from merge_sumo.values.fmc import fmc, regions
 
-    chosen = one_level(level)
-    factory = _factory(vut, vut_command, deadline, vut_memory)
     where = named_scenario(scenario)
+    povs = povs_of(policies, where)
+    chosen = one_level(level, povs)
+    factory = _factory(vut, povs, vut_command, deadline, vut_memory)
     with open_workers(factory.workers(workers), dask) as there:
-        found = _truth(factory, chosen, cases, seed, there, where)
+        found = _truth(factory, povs, chosen, cases, seed, there, where)
     if factory.vut.named_only:
         say(
             "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
@@ -108,6 +112,7 @@ def compare(
         int | None, typer.Option(help="Cases of the truth.  [default: 10000, at level 2 20000]")
     ] = None,
     scenario: ScenarioOption = "us23",
+    policies: PoliciesOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -126,17 +131,18 @@ def compare(
     Example:  merge-sumo compare --vut design1 --level 0 --samplers uniform,gpr --seeds 3
     """
     from merge_sumo.campaigns import experiments
-    from merge_sumo.campaigns.settings import CampaignSettings, parse_levels
+    from merge_sumo.campaigns.settings import CampaignSettings, parse_levels, povs_of
     from merge_sumo.reports import figures
     from merge_sumo.reports.progress import Counter
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.system.workers import open_workers
     from merge_sumo.values.fmc import fmc
 
-    levels = parse_levels(level)
-    names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
-    factory = _factory(vut, vut_command, deadline, vut_memory)
     where = named_scenario(scenario)
+    povs = povs_of(policies, where)
+    levels = parse_levels(level, povs)
+    names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
+    factory = _factory(vut, povs, vut_command, deadline, vut_memory)
     for name in names:
         CampaignSettings(
             vut=vut,
@@ -145,6 +151,7 @@ def compare(
             sampler=name,
             cases=cases,
             batch=batch,
+            policies=None if policies is None else str(policies),
             scenario=where,
         )
     if seeds < 1:
@@ -156,7 +163,9 @@ def compare(
         open_workers(factory.workers(workers), dask) as there,
         Counter(title, len(names) * seeds, "runs") as counter,
     ):
-        truths = {level: _truth(factory, level, truth_cases, 0, there, where) for level in levels}
+        truths = {
+            level: _truth(factory, povs, level, truth_cases, 0, there, where) for level in levels
+        }
         searches = experiments.search(
             factory,
             levels,
@@ -167,6 +176,7 @@ def compare(
             workers=there,
             on_search=lambda name, _: counter.ended(1, name),
             scenario=where,
+            povs=povs,
         )
     compared = {name: experiments.compare(found, truths) for name, found in searches.items()}
     truth_fmc = sum(fmc(found.failures) for found in truths.values())
@@ -231,6 +241,7 @@ def reproduce(
     quick: Annotated[
         bool, typer.Option("--quick", help="Few and short runs and a small truth: a first look.")
     ] = False,
+    policies: PoliciesOption = None,
     workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
@@ -241,13 +252,16 @@ def reproduce(
 
     Example:  merge-sumo reproduce --seeds 10 --out reproduction
     """
+    from merge_sumo.campaigns.settings import povs_of
     from merge_sumo.reports import reproduce as paper
+    from merge_sumo.reports import table2
     from merge_sumo.reports.progress import Bars
     from merge_sumo.system.workers import open_workers
 
     if seeds is None:
         seeds = 2 if quick else 10
-    scale = paper.quick(seeds) if quick else paper.Scale(seeds=seeds)
+    scale = table2.quick(seeds) if quick else table2.Scale(seeds=seeds)
+    povs = povs_of(policies, US23)
     folder = out or dated("reproduce")
     with open_workers(workers, dask) as there, Bars() as bars:
 
@@ -256,7 +270,7 @@ def reproduce(
             rate = f"{done / elapsed_s:.3g}" if elapsed_s > 0.0 else "-"
             bars.show(title, done, total, f"{rate} {unit}/s")
 
-        index = paper.reproduce(folder, scale, workers=there, on_run=ran)
+        index = paper.reproduce(folder, scale, povs=povs, workers=there, on_run=ran)
     if as_json:
         typer.echo((folder / paper.TABLE_JSON).read_text(encoding="utf-8").strip())
         say(f"all of it: {index}")
@@ -282,6 +296,7 @@ def probability(
         typer.Option(metavar="FILE", help="New file to write.  [default: RUN/probability.json]"),
     ] = None,
     net: NetOption = None,
+    policies: PoliciesOption = None,
     trust_vut: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -309,6 +324,7 @@ def probability(
             confidence=confidence,
             seed=seed,
             net=road_for(campaign.scenario, net),
+            given={} if policies is None else {"policies": str(policies)},
             trust=trust_vut,
             on_case=lambda _: counter.ended(1),
         )
@@ -333,16 +349,24 @@ def probability(
     show(f"written: {target}")
 
 
-def _factory(vut: str, command: str | None, deadline_s: float, memory_gib: float) -> VutFactory:
+def _factory(
+    vut: str, povs: Povs, command: str | None, deadline_s: float, memory_gib: float
+) -> VutFactory:
     from merge_sumo.drivers.vut import vut_factory
     from merge_sumo.drivers.vuts.base import VutOptions
 
-    options = VutOptions(command=command, deadline_s=deadline_s, memory_gib=memory_gib)
+    options = VutOptions(
+        command=command,
+        deadline_s=deadline_s,
+        memory_gib=memory_gib,
+        policies=povs.policies,
+    )
     return vut_factory(vut, options)
 
 
 def _truth(
     factory: VutFactory,
+    povs: Povs,
     level: int,
     cases: int | None,
     seed: int,
@@ -364,4 +388,5 @@ def _truth(
             workers=workers,
             on_cases=counter.ended,
             scenario=scenario,
+            povs=povs,
         )

@@ -13,6 +13,7 @@ import typer
 from merge_sumo.commands.shared import (
     JsonOption,
     NetOption,
+    PoliciesOption,
     RunArgument,
     TrustOption,
     app,
@@ -24,7 +25,7 @@ from merge_sumo.system.folders import check_own
 from merge_sumo.system.printable import quoted
 
 if TYPE_CHECKING:
-    from merge_sumo.reports.comparison import RunComparison
+    from merge_sumo.reports.changes import RunComparison
 
 EXPORTS: Final = "exports"
 
@@ -141,6 +142,7 @@ def compare_runs(
         ),
     ] = True,
     net: NetOption = None,
+    policies: PoliciesOption = None,
     trust_vut: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -162,7 +164,8 @@ def compare_runs(
         raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
     runs = Run(a), Run(b)
     road = road_for(runs[0].scenario, net) if rerun else None
-    compared = comparison.compare_runs(*runs, rerun=rerun, net=road, trust=trust_vut)
+    given = {} if policies is None else {"policies": str(policies)}
+    compared = comparison.compare_runs(*runs, rerun=rerun, net=road, given=given, trust=trust_vut)
     why = compared.worse(tolerance)
     verdicts = {name: judge(loaded.outcomes) for name, loaded in zip("AB", runs, strict=True)}
     if as_json:
@@ -182,7 +185,7 @@ def compare_runs(
 
 
 def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
-    from merge_sumo.reports.comparison import Change
+    from merge_sumo.reports.changes import Change
 
     show(
         f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "

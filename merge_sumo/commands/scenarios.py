@@ -20,9 +20,10 @@ def list_scenarios() -> None:
 
     Example:  merge-sumo scenario list
     """
-    from merge_sumo.scenarios.scenario_file import SCENARIOS
+    from merge_sumo.scenarios.scenario_file import named_scenario, shipped_scenarios
 
-    for name, found in SCENARIOS.items():
+    for name in shipped_scenarios():
+        found = named_scenario(name)
         x, v = found.x_pov0_m, found.v_pov0_mps
         show(f"{name}: POV from {x[0]:g} to {x[1]:g} m at {v[0]:g} to {v[1]:g} m/s")
 

@@ -72,7 +72,16 @@ ScenarioOption = Annotated[
     str,
     typer.Option(
         metavar="NAME|FILE",
-        help="Scenario: us23, or a TOML file of your own: `merge-sumo scenario new` writes one.",
+        help="Scenario that `merge-sumo scenario list` names, or a TOML file of your own: "
+        "`merge-sumo scenario new` writes one.",
+    ),
+]
+PoliciesOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Folder of learned drivers, as `train --out DIR` makes it, instead of the shipped "
+        "ones.",
     ),
 ]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]

@@ -13,6 +13,7 @@ from merge_sumo.commands.shared import (
     DeadlineOption,
     InProcessOption,
     JsonOption,
+    PoliciesOption,
     VutCommandOption,
     VutMemoryOption,
     app,
@@ -25,15 +26,18 @@ app.add_typer(policies, name="policies")
 
 
 @app.command()
-def vuts(as_json: JsonOption = False) -> None:
+def vuts(policies: PoliciesOption = None, as_json: JsonOption = False) -> None:
     """List the vehicles that can be tested: by name, and the kinds that you can bring.
 
     Example:  merge-sumo vuts
     """
-    from merge_sumo.drivers.vut import KINDS, PYTHON, built_in_vuts
+    from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
+    from merge_sumo.drivers.vut import KINDS, LEARNED, PYTHON, built_in_vuts
     from merge_sumo.drivers.vuts.python import installed_vuts
 
-    names = {"built in": list(built_in_vuts()), "installed": list(installed_vuts())}
+    trained = read_manifest(policies_of() if policies is None else policies_in(policies))
+    built_in = [name for name in built_in_vuts() if LEARNED.get(name, name) in (name, *trained)]
+    names = {"built in": built_in, "installed": list(installed_vuts())}
     kinds = [PYTHON, *KINDS.values()]
     if as_json:
         listed = [{"form": kind.form, "what": kind.what, "example": kind.example} for kind in kinds]
@@ -54,6 +58,7 @@ def check_vut(
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
     in_process: InProcessOption = False,
+    policies: PoliciesOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Let a VUT drive a few cases and say what is wrong with it, and what a step of it costs.
@@ -63,11 +68,16 @@ def check_vut(
     Example:  merge-sumo check-vut design1
     """
     from merge_sumo.campaigns import vut_check
+    from merge_sumo.drivers.policies import policies_in
     from merge_sumo.drivers.vut import vut_factory
     from merge_sumo.drivers.vuts.base import VutOptions
 
     options = VutOptions(
-        command=vut_command, deadline_s=deadline, memory_gib=vut_memory, in_process=in_process
+        command=vut_command,
+        deadline_s=deadline,
+        memory_gib=vut_memory,
+        in_process=in_process,
+        policies=None if policies is None else policies_in(policies),
     )
     found = vut_check.check_vut(vut_factory(vut, options))
     if as_json:
@@ -88,12 +98,14 @@ def check_vut(
 def export_policy(
     name: Annotated[str, typer.Argument(help="pov1, vut1, pov2 or vut2.")],
     out: Annotated[Path, typer.Option(help="ONNX file to write.")],
+    policies: PoliciesOption = None,
 ) -> None:
     """Write a learned driver as an ONNX network, from the state to the action values.
 
     Example:  merge-sumo policies export vut1 --out vut1.onnx
     """
     from merge_sumo.drivers.onnx_export import export_onnx
+    from merge_sumo.drivers.policies import policies_in
 
-    export_onnx(name, out)
+    export_onnx(name, out, None if policies is None else policies_in(policies))
     show(out)

@@ -73,12 +73,20 @@ class Scene:
         )
         return of_pov
 
-    def seen_by(self, car: int) -> Scene:
-        """Return the scene for the driver of a car of the mainline, who is its POV."""
-        if car == POV:
+    def of_mainline(self) -> Scene:
+        """Return the scene for who drives all C cars of the mainline, each as the POV of its own.
+
+        It has C K corridors: those of the POVs, then those of the cars ahead, of those behind.
+        """
+        vehicles = len(self.x_m)
+        if vehicles == 2:
             return self
-        rows = [car, VUT]
-        return Scene(self.active, self.step, self.x_m[rows], self.v_mps[rows])
+        cars = [row for row in range(vehicles) if row != VUT]
+        state = (
+            np.array((values[cars].ravel(), np.tile(values[VUT], len(cars))))
+            for values in (self.x_m, self.v_mps)
+        )
+        return Scene(np.tile(self.active, len(cars)), np.tile(self.step, len(cars)), *state)
 
 
 class VutLostError(Exception):

@@ -1,22 +1,63 @@
-"""The shipped policies: safetensors with a manifest that says what they are."""
+"""Policies, shipped or a person's own: safetensors with a manifest that says what they are."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import stat
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
+from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
 from merge_sumo.errors import UserError
+from merge_sumo.system.printable import quoted
 from merge_sumo.system.resources import resource
+from merge_sumo.values.scenario import US23, Scenario
 
 MANIFEST: Final = "manifest.json"
 NETWORKS: Final = ("pov1", "vut1", "pov2", "vut2")
 """In the order of the helix: each is trained against an earlier one, or against level 0."""
+PLAYED: Final = (
+    *("x_pov0_m", "v_pov0_mps", "x_vut0_m", "v_vut0_mps", "a_min_mps2", "a_max_mps2"),
+    *("v_hw_min_mps", "v_hw_max_mps", "v_min_mps", "ttc_min_s", "dx_crash_m", "dx_critical_m"),
+    *("level0_a_mps2", "level0_v_mps", "timeout_s"),
+)
+"""Numbers of a scenario that decide what a driver learns; the road and other cars do not."""
+MOST_BYTES: Final = 1 << 26
+"""No network and no manifest is larger."""
+
+
+def policies_of(scenario: Scenario = US23) -> Path:
+    """Return the shipped policies for a scenario: those of its name, else those of the paper's."""
+    shipped = resource("policies")
+    by_name = {manifest.parent.name: manifest.parent for manifest in shipped.glob(f"*/{MANIFEST}")}
+    return by_name.get(scenario.name, shipped)
+
+
+def policies_in(folder: str | Path) -> Path:
+    """Return where the policies are that a person or a record names, as a whole path.
+
+    Raises `UserError` where there are none.
+    """
+    try:
+        if (Path(folder) / MANIFEST).is_file():
+            return Path(folder).resolve()
+        what = "has no manifest" if Path(folder).is_dir() else "is no folder"
+    except (OSError, ValueError, RuntimeError) as error:
+        what = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+    raise UserError(
+        f"--policies: {folder} {what}: name a folder of policies, such as `merge-sumo train --out "
+        "DIR` makes"
+    )
+
+
+def policies_sha256(folder: Path) -> dict[str, str]:
+    """Return the hashes of the networks of a folder by name: they decide what its drivers do."""
+    return {name: entry["sha256"] for name, entry in read_manifest(folder).items()}
 
 
 def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
@@ -25,14 +66,40 @@ def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
     if not path.is_file():
         return {}
     try:
-        networks = json.loads(path.read_text(encoding="utf-8"))["networks"]
+        networks = json.loads(_content(path))["networks"]
         found = {name: dict(networks[name]) for name in NETWORKS if name in networks}
         for name, entry in found.items():
             if not isinstance(entry["sha256"], str):
                 raise TypeError(f"the sha256 of {name} is no text")
+            scenario_of(entry)
         return found
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, UserError) as error:
         raise UserError(f"{path} is not a readable manifest of policies: {error}") from error
+
+
+def scenario_record(scenario: Scenario) -> dict[str, Any]:
+    """Return what a manifest says of the scenario that a network was trained for."""
+    values = {name: getattr(scenario, name) for name in PLAYED}
+    return {
+        "name": scenario.name,
+        **{k: list(v) if isinstance(v, tuple) else v for k, v in values.items()},
+    }
+
+
+def scenario_of(entry: dict[str, Any]) -> Scenario:
+    """Return the scenario that a network was trained for, on no road; the paper's if none is said.
+
+    Raises `UserError` when the manifest describes none.
+    """
+    record = entry.get("scenario", scenario_record(US23))
+    if not isinstance(record, dict) or not set(record) <= {"name", *PLAYED}:
+        raise UserError("the scenario of a policy is a table of its numbers")
+    return Scenario.from_record(record)
+
+
+def plays_as(one: Scenario, other: Scenario) -> bool:
+    """Return whether a driver learns the same in two scenarios."""
+    return all(getattr(one, name) == getattr(other, name) for name in PLAYED)
 
 
 def load_network(name: str, folder: Path | None = None) -> QNetwork:
@@ -40,13 +107,28 @@ def load_network(name: str, folder: Path | None = None) -> QNetwork:
     folder = folder or resource("policies")
     entry = read_manifest(folder).get(name)
     if entry is None:
-        raise UserError(f"there is no policy {name!r}: run `merge-sumo train` to make it")
+        raise UserError(f"there is no policy {name!r}{how_to_train(folder)}")
     path = folder / f"{name}.safetensors"
     try:
-        content = path.read_bytes()
+        content = _content(path)
     except OSError as error:
         raise UserError(f"cannot read the policy {path}: {error.strerror}") from error
     return _parse(content, str(path), str(entry.get("sha256")), name)
+
+
+def _content(path: Path) -> bytes:
+    """Return what is in a file; OSError where it is none, or a giant one: others name folders."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode) or found.st_size > MOST_BYTES:
+        raise OSError(errno.EINVAL, "it is no file, or a giant one", str(path))
+    return path.read_bytes()
+
+
+def how_to_train(folder: Path) -> str:
+    """Return the end of a sentence on a network that is not there."""
+    if folder == resource("policies"):
+        return ": run `merge-sumo train` to make it"
+    return f" in {folder}: run `merge-sumo train --out {quoted(folder)}` to make it"
 
 
 @cache
@@ -66,7 +148,7 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
     except (SafetensorError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise UserError(f"{path} holds no action-value network: {error}") from error
     expected = FEATURES + (SVO_FEATURES if name == "pov2" else 0)
-    if (inputs, outputs) != (expected, len(ACTIONS_MPS2)):
+    if (inputs, outputs) != (expected, ACTIONS):
         raise UserError(f"{path} has {inputs} inputs and {outputs} actions: train it again")
     return network
 

@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov
-from merge_sumo.drivers.policies import load_driver, read_manifest
+from merge_sumo.drivers.policies import load_driver
+from merge_sumo.drivers.povs import POLICIES, Povs
 from merge_sumo.values.case import Case, FloatArray
-
-POLICIES: Final = {1: "pov1", 2: "pov2"}
-"""The learned POVs by their level."""
-
-
-def available_levels() -> tuple[int, ...]:
-    """Return the levels for which a policy is there; level 0 needs none."""
-    trained = read_manifest()
-    return (0, *(level for level, name in POLICIES.items() if name in trained))
 
 
 class PovLibrary(Driver):
     """Plays a POV of level 0, 1 or 2, corridor by corridor."""
 
-    def __init__(self, corridors: int) -> None:
-        """Prepare the drivers of all available levels."""
+    def __init__(self, corridors: int, povs: Povs | None = None) -> None:
+        """Prepare the drivers of all available levels, by default of the paper's scenario."""
         super().__init__(corridors)
+        povs = povs or Povs()
         self._drivers: dict[int, Driver] = {0: Level0Pov(corridors)}
-        for level in available_levels()[1:]:
-            self._drivers[level] = load_driver(POLICIES[level], corridors)
+        for level in povs.levels[1:]:
+            self._drivers[level] = load_driver(POLICIES[level], corridors, povs.policies)
         self._level = np.zeros(corridors, dtype=np.int64)
         self._levels_playing = {0}
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut
-from merge_sumo.drivers.policies import load_driver, read_manifest
+from merge_sumo.drivers.policies import load_driver
 from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.drivers.vuts.base import Vut, VutOptions
 from merge_sumo.drivers.vuts.files import Files, hashed
@@ -76,14 +76,14 @@ KINDS: Final[dict[str, Kind]] = {
 """The kinds that have a name of their own before the colon."""
 
 
-def built_in_vuts() -> dict[str, Callable[[int], Driver]]:
-    """Return the VUTs that the package brings, by name."""
+LEARNED: Final = {"level1": "vut1", "level2": "vut2"}
+"""The network of each learned VUT."""
+
+
+def built_in_vuts(policies: Path | None = None) -> dict[str, Callable[[int], Driver]]:
+    """Return the VUTs that the package brings, by name; the learned ones act by `policies`."""
     designs = {name: partial(RuleBasedVut, design=design) for name, design in DESIGNS.items()}
-    learned = {
-        f"level{name[-1]}": partial(load_driver, name)
-        for name in read_manifest()
-        if name.startswith("vut")
-    }
+    learned = {vut: partial(load_driver, name, folder=policies) for vut, name in LEARNED.items()}
     return {"level0": Level0Vut, **learned, **designs}
 
 
@@ -165,7 +165,7 @@ def find_vut(spec: str, options: VutOptions) -> Vut:
         return _prepared(KINDS[prefix], argument, spec, options)
     if options.command is not None:
         raise UserError(f"--vut-command goes with --vut traci, not with {spec}")
-    built_in = built_in_vuts()
+    built_in = built_in_vuts(options.policies)
     if spec in built_in:
         make = built_in[spec]
         return Vut(make=lambda corridors, _world: make(corridors))

@@ -3,175 +3,41 @@
 Two campaigns have different cases, so the failures, errors and timeouts of each are run again with
 the VUT of the other: then both VUTs have been tried on the same cases, those with which at least
 one of them was seen to fail or to give no verdict. That a VUT is still the one of its campaign is
-checked first: it must give again the scores that were recorded. Volumes are failure mode coverages
-of what is known by then.
+checked first: it must give again the scores that were recorded.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
+from merge_sumo.campaigns.ground import ground_of, road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
-from merge_sumo.campaigns.settings import settings_of
+from merge_sumo.campaigns.settings import pov_of, settings_of
 from merge_sumo.errors import UserError
+from merge_sumo.reports.changes import Change, ComparedCase, LevelChange, RunComparison, Untested
 from merge_sumo.reports.verdict import Verdict, counted, judge
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.net import Net
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import FAILURE_SCORE, Measures, Outcome, measure
 from merge_sumo.values.trajectory import End
 
-FIRST_LOOKS: Final = 10
 CHECKED: Final = 32
 """Cases of a campaign, the worst, that its VUT must reproduce."""
 SAME_SCORE: Final = 1e-6
-VOLUME_NOISE: Final = 2e-4
-"""Share of a volume in three dimensions that is rounding of the integral (see `fmc`)."""
-SHARE_ROUNDING: Final = 1e-9
-
-
-class Change(StrEnum):
-    """What became of a case from A to B; an error or a timeout is no verdict."""
-
-    FIXED = "fixed"
-    BROKE = "broke"
-    BOTH_FAIL = "both fail"
-    NO_VERDICT_OF_A = "no verdict of A"
-    NO_VERDICT_OF_B = "no verdict of B"
-    NO_VERDICT = "no verdict"
-    NOT_RUN_AGAIN = "not run again"
-
-
-@dataclass(frozen=True, slots=True)
-class ComparedCase:
-    """A case in which at least one of the two VUTs failed or gave no verdict.
-
-    Attributes:
-        run: "A" or "B", the campaign that has the case.
-        index: its index there.
-        case: the case.
-        score_a: P of A; None where an error ended it or A was not run.
-        score_b: P of B.
-        end_a: how it ended with A; None where A was not run.
-        end_b: how it ended with B.
-        change: what became of it.
-    """
-
-    run: str
-    index: int
-    case: Case
-    score_a: float | None
-    score_b: float | None
-    end_a: End | None
-    end_b: End | None
-    change: Change
-
-
-@dataclass(frozen=True, slots=True)
-class Untested:
-    """Cases at a level in which a VUT did not reach the merge point.
-
-    Attributes:
-        cases: cases that were looked at: those of both campaigns where both VUTs were run again,
-            else those of its own.
-        errors: that ended in an error.
-        timeouts: in which it never reached the merge point.
-        nothing_tested: whether its own campaign has cases at this level, and none was tested.
-    """
-
-    cases: int
-    errors: int
-    timeouts: int
-    nothing_tested: bool = False
-
-    def share(self, number: int) -> float:
-        """Return a number of the cases as a share of them."""
-        return number / self.cases if self.cases else 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class LevelChange:
-    """What changed at a POV level; volumes in the level's unit cube.
-
-    Attributes:
-        untested_a: cases without a verdict of A.
-        untested_b: the same of B.
-        fmc_a: coverage of the cases in which A is known to fail.
-        fmc_b: the same of B.
-        fmc_fixed: volume that A's failures cover and B's do not; failures on which B gives no
-            verdict are not fixed.
-        fmc_broke: volume that B's failures cover and A's do not, in the same way.
-        changes: number of cases by what became of them.
-    """
-
-    untested_a: Untested
-    untested_b: Untested
-    fmc_a: float
-    fmc_b: float
-    fmc_fixed: float
-    fmc_broke: float
-    changes: dict[str, int]
-
-
-@dataclass(frozen=True, slots=True)
-class RunComparison:
-    """What changed from campaign A to campaign B.
-
-    Attributes:
-        levels: by POV level.
-        cases: every case in which one failed or gave no verdict; what broke comes first, the
-            worst of B first.
-        evidence: how the verdicts of the other VUT came about, as a sentence.
-    """
-
-    levels: dict[int, LevelChange]
-    cases: list[ComparedCase]
-    evidence: str
-
-    def worse(self, tolerance: float) -> list[str]:
-        """Return in sentences why B is worse than A; empty where it is not.
-
-        At some level B reached the merge point in no case of its campaign, or one of these grew by
-        more than the tolerance: the share of cases with an error, the share of cases with an error
-        or a timeout, FMC.
-        """
-        return [
-            why for level, found in self.levels.items() for why in _worse(level, found, tolerance)
-        ]
-
-    def look_first(self) -> list[ComparedCase]:
-        """Return the cases to look at first: those that broke, then those without a verdict."""
-        telling = (Change.BROKE, Change.NO_VERDICT_OF_B, Change.NOT_RUN_AGAIN)
-        return [case for case in self.cases if case.change in telling][:FIRST_LOOKS]
-
-
-def _worse(level: int, found: LevelChange, tolerance: float) -> list[str]:
-    at, a, b = f"at POV level {level}", found.untested_a, found.untested_b
-    why = []
-    if b.nothing_tested:
-        why.append(f"{at} B reached the merge point in no case of its campaign")
-    for what, number_a, number_b in (
-        ("error", a.errors, b.errors),
-        ("error or timeout", a.errors + a.timeouts, b.errors + b.timeouts),
-    ):
-        if b.share(number_b) - a.share(number_a) > tolerance + SHARE_ROUNDING:
-            why.append(
-                f"{at} B has an {what} in {number_b} of {counted(b.cases, 'case')}, "
-                f"A in {number_a} of {a.cases}"
-            )
-    if found.fmc_b - found.fmc_a > tolerance + VOLUME_NOISE * found.fmc_b:
-        why.append(f"{at} FMC is {found.fmc_b:.4f} with B, {found.fmc_a:.4f} with A")
-    return why
 
 
 def compare_runs(
-    a: Run, b: Run, *, rerun: bool = True, net: Net | Corridor | None = None, trust: bool = False
+    a: Run,
+    b: Run,
+    *,
+    rerun: bool = True,
+    net: Corridor | None = None,
+    given: Mapping[str, object] | None = None,
+    trust: bool = False,
 ) -> RunComparison:
     """Compare two campaigns level by level.
 
@@ -180,10 +46,12 @@ def compare_runs(
         b: campaign of the VUT after.
         rerun: run the failures, errors and timeouts of each with the VUT of the other.
         net: net for that; must be the one of the campaigns.
+        given: settings in the place of what the folders name: policies that are elsewhere.
         trust: run the controllers that the folders name although they may be a stranger's.
 
     Raises `UserError` where the campaigns have no level in common or no case there, differ in
-    the initial speed of the VUT, or were run on another net than the one to run again on.
+    the initial speed of the VUT or in the POV of a level, or were run on another net than the one
+    to run again on.
     """
     levels = _common_levels(a, b)
     own_a, own_b = ([o for o in run.outcomes if o.case.level in levels] for run in (a, b))
@@ -197,8 +65,8 @@ def compare_runs(
     again_a = again_b = _Again({}, "was not run again")
     if rerun:
         net = _common_net(a, b, net or road_for(a.scenario))
-        again_b = _run_again(b, telling_a, net, trust=trust)
-        again_a = _run_again(a, telling_b, net, trust=trust)
+        again_b = _run_again(b, telling_a, net, given, trust=trust)
+        again_a = _run_again(a, telling_b, net, given, trust=trust)
     cases = [
         *(_compared("A", o, o.measures, again_b.measures.get(o.index)) for o in telling_a),
         *(_compared("B", o, again_a.measures.get(o.index), o.measures) for o in telling_b),
@@ -241,10 +109,16 @@ def _common_levels(a: Run, b: Run) -> list[int]:
             f"the VUT starts at {speeds[0]} m/s in {a.folder} and at {speeds[1]} m/s in "
             f"{b.folder}: compare campaigns with the same --v-vut0"
         )
+    for level in common:
+        if pov_of(a.settings, level) != pov_of(b.settings, level):
+            raise UserError(
+                f"the POV of level {level} is another in {a.folder} than in {b.folder}: compare "
+                "campaigns with the same --policies"
+            )
     return common
 
 
-def _common_net(a: Run, b: Run, net: Net | Corridor) -> Net | Corridor:
+def _common_net(a: Run, b: Run, net: Corridor) -> Corridor:
     for run in (a, b):
         if run.settings.get("net_sha256") != net.sha256:
             raise UserError(
@@ -262,7 +136,14 @@ class _Again:
     how: str
 
 
-def _run_again(run: Run, failing: Sequence[Outcome], net: Net | Corridor, *, trust: bool) -> _Again:
+def _run_again(
+    run: Run,
+    failing: Sequence[Outcome],
+    net: Corridor,
+    given: Mapping[str, object] | None,
+    *,
+    trust: bool,
+) -> _Again:
     """Run a campaign's VUT on the other's telling cases, if it is still the same VUT."""
     told = [o for o in run.outcomes if o.measures.score is not None]
     told = sorted(told, key=lambda o: (o.measures.score, o.index))[:CHECKED]
@@ -270,8 +151,8 @@ def _run_again(run: Run, failing: Sequence[Outcome], net: Net | Corridor, *, tru
     if not failing:
         return _Again({}, "had nothing to run")
     measures: dict[int, Measures] = {}
-    vut = settings_of(run.folder, run.settings, trust=trust).vut_factory
-    with ProvingGround(vut, min(MAX_CORRIDORS, len(cases)), net) as ground:
+    settings = settings_of(run.folder, run.settings, given, trust=trust)
+    with ground_of(settings, len(cases), net) as ground:
         for place, trajectory in ground.run(cases):
             measures[place] = measure(trajectory)
     for place, outcome in enumerate(told):
@@ -279,7 +160,8 @@ def _run_again(run: Run, failing: Sequence[Outcome], net: Net | Corridor, *, tru
         if was is None or now is None or abs(was - now) > SAME_SCORE:
             return _Again(
                 {},
-                f"could not be run: its VUT does not do again what case {outcome.index} records",
+                "could not be run: its VUT or its POV does not do again what case "
+                f"{outcome.index} records",
             )
     first = len(told)
     return _Again({o.index: measures[first + n] for n, o in enumerate(failing)}, "was run again")

@@ -17,12 +17,17 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.resources import resource
 from merge_sumo.values.scenario import US23, Scenario
 
-SCENARIOS: Final = {US23.name: US23}
-"""The scenarios that the package brings, by name."""
 SUFFIX: Final = ".toml"
 MAX_BYTES: Final = 1 << 20
+
+
+def shipped_scenarios() -> list[str]:
+    """Return the names of the scenarios that the package brings: its files, and the paper's."""
+    files = sorted(resource("sumo_net").glob(f"*{SUFFIX}"))
+    return [US23.name, *(path.stem for path in files)]
 
 
 def named_scenario(name: str) -> Scenario:
@@ -30,16 +35,26 @@ def named_scenario(name: str) -> Scenario:
 
     What is wrong in a file is told with its line.
     """
-    if name in SCENARIOS:
-        return SCENARIOS[name]
+    if name == US23.name:
+        return US23
+    if name in shipped_scenarios():
+        return _read(resource("sumo_net") / f"{name}{SUFFIX}")
     if not name.endswith(SUFFIX):
-        known = ", ".join(SCENARIOS)
+        known = ", ".join(shipped_scenarios())
         raise UserError(f"there is no scenario {name!r}: choose {known}, or a file NAME{SUFFIX}")
     return read_scenario(Path(name))
 
 
 def read_scenario(path: Path) -> Scenario:
     """Return the scenario that a file describes; its net is found beside the file."""
+    scenario = _read(path)
+    if scenario.net is None:
+        return scenario
+    return replace(scenario, net=str((path.parent / scenario.net).resolve()))
+
+
+def _read(path: Path) -> Scenario:
+    """Return the scenario of a file, with its net as the file names it."""
     try:
         if not path.is_file() or path.stat().st_size > MAX_BYTES:
             raise UserError(f"cannot read the scenario {path}: it is no file, or a giant one")
@@ -53,12 +68,9 @@ def read_scenario(path: Path) -> Scenario:
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"the scenario {path} is no TOML: {error}") from error
     try:
-        scenario = Scenario.from_record({"name": path.stem, **record})
+        return Scenario.from_record({"name": path.stem, **record})
     except UserError as error:
         raise UserError(f"{path}{_line(text, str(error))}: {error}") from error
-    if scenario.net is None:
-        return scenario
-    return replace(scenario, net=str((path.parent / scenario.net).resolve()))
 
 
 def _line(text: str, sentence: str) -> str:
@@ -77,7 +89,11 @@ COMMENTS: Final = {
     "x_pov0_m": "where the POV may start: low, high; metres of its front bumper before M",
     "v_pov0_mps": "how fast it may be then",
     "x_vut0_m": "where the VUT starts",
-    "v_vut0_mps": "how fast it is then",
+    "v_vut0_mps": "how fast it is then; a range, as in [14.0, 22.0], is tested as a whole",
+    "tau_s": "a car of the mainline follows the one ahead of it with this reaction time,",
+    "min_gap_m": "and this distance at a stand",
+    "pov_length_m": "length of the cars of the mainline",
+    "vut_length_m": "length of the VUT",
     "a_min_mps2": "hardest braking of both",
     "a_max_mps2": "hardest acceleration of both",
     "timeout_s": "an episode that has not ended by then is a TIMEOUT",

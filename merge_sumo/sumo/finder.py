@@ -138,7 +138,8 @@ def _layers(net: NetFile, edges: _Edges, common: int) -> list[_Layer]:
                 layer.setdefault(link.target.id, []).append(link)
         if not layer and number <= common:
             into = [name for name in net.edges_into(following) if name != edge]
-            hint = f"; {' and '.join(into)} do" if into else ""
+            does = "does" if len(into) == 1 else "do"
+            hint = f"; {' and '.join(into)} {does}" if into else ""
             raise net.broken(f"edge {edge} does not lead to edge {following}{hint}")
         lanes = {links[0].target.id: links[0].target for links in layer.values()}
         layers.append(layer)
@@ -254,7 +255,7 @@ def _placed(net: NetFile, lanes: Iterable[Lane], start_m: float) -> list[Piece]:
 def _surroundings(
     net: NetFile, paths: Sequence[LanePath], centre: Point
 ) -> tuple[tuple[Point, ...], ...]:
-    """Return the shapes of the lanes near a point that are roads and on no path."""
+    """Return the shapes of the lanes near a point that are on no path."""
     used = {piece.lane for path in paths for piece in path.pieces}
     near = net.lanes_near(centre, SURROUNDINGS_M)
     return tuple(lane.shape for lane in near if lane.id not in used)

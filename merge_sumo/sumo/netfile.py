@@ -71,14 +71,19 @@ class NetFile:
         except OSError as error:
             raise UserError(f"cannot read the net {path}: {error.strerror}") from error
         parser = etree.XMLParser(
-            resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
+            # Whatever the file declares: another encoding could hide what was looked for.
+            encoding="utf-8",
+            resolve_entities=False,
+            no_network=True,
+            remove_comments=True,
+            remove_pis=True,
         )
         try:
             self._root = etree.fromstring(self.content, parser)
         except etree.XMLSyntaxError as error:
-            raise UserError(f"the net {path} is not readable XML: {error}") from error
+            raise UserError(f"the net {path} is not readable XML: {error!s:.200}") from error
         if self._root.tag != "net":
-            raise UserError(f"{path} is no SUMO net: it begins with <{self._root.tag}>")
+            raise UserError(f"{path} is no SUMO net: it does not begin with <net>")
         self._edges = {str(edge.get("id")): edge for edge in self._root.iterfind("edge")}
         self._known: dict[str, Lane] = {}
 
@@ -160,15 +165,24 @@ class NetFile:
         return UserError(f"the net {self.path} cannot host a merge: {what}")
 
     def lanes_near(self, place: Point, distance_m: float) -> list[Lane]:
-        """Return the lanes of roads that begin or end within a distance of a point."""
-        roads = [item for item in self._lane_elements.items() if not item[0].startswith(":")]
+        """Return the lanes that begin or end within a distance of a point, those of roads first.
+
+        Where people walk is none of them.
+        """
+        edges = sorted(self._edges.items(), key=lambda item: item[0].startswith(":"))
+        lanes = [
+            (str(lane.get("id")), lane)
+            for _, edge in edges
+            if edge.get("function") not in ("crossing", "walkingarea")
+            for lane in edge.iterfind("lane")
+        ]
         near = []
-        for name, lane in roads:
+        for name, lane in lanes:
             points = lane.get("shape", "").split()
             try:
                 ends = [_point(text) for text in points[:1] + points[-1:]]
             except ValueError as error:
-                raise self.broken(f"shape of lane {name} is no number ({error})") from error
+                raise self.broken(f"shape of lane {name} is no number ({error!s:.200})") from error
             if any(math.dist(end, place) <= distance_m for end in ends):
                 near.append(self._lane(name))
         return near
@@ -180,7 +194,7 @@ class NetFile:
             try:
                 self._known[name] = _lane(lane)
             except ValueError as error:
-                what = f"index, length, speed or shape of lane {name} is no number ({error})"
+                what = f"index, length, speed or shape of lane {name} is no number ({error!s:.200})"
                 raise self.broken(what) from error
         return self._known[name]
 
@@ -207,7 +221,7 @@ class NetFile:
                 float(element.get("x", "")), float(element.get("y", ""))
             except ValueError as error:
                 what = f"junction {element.get('id')} has a coordinate that is no number"
-                raise self.broken(f"{what} ({error})") from error
+                raise self.broken(f"{what} ({error!s:.200})") from error
             if element.get("type") != "internal":
                 found |= dict.fromkeys(element.get("incLanes", "").split(), element)
         return found

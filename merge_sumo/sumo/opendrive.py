@@ -14,7 +14,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo import allowed, received
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.corridor import Corridor, LanePath
-from merge_sumo.sumo.net import Net
 
 NET: Final = "road.net.xml"
 ROAD: Final = "road.xodr"
@@ -24,14 +23,13 @@ MAX_ELEMENTS: Final = 10**6
 """Of the net of a corridor, which a user chose: that of a city."""
 
 
-def opendrive(road: Net | Corridor) -> bytes:
+def opendrive(road: Corridor) -> bytes:
     """Return the net of a road as OpenDRIVE in the same coordinates.
 
     Raises `UserError` when the net file is gone or is another one now, or netconvert refuses it.
     """
-    content = road.text if isinstance(road, Net) else _net_of(road)
     with scratch_folder() as stage:
-        (stage / NET).write_bytes(content)
+        (stage / NET).write_bytes(_net_of(road))
         arguments = [
             *("--sumo-net-file", NET, "--opendrive-output", ROAD),
             *("--offset.disable-normalization", "true"),
@@ -41,8 +39,7 @@ def opendrive(road: Net | Corridor) -> bytes:
         ]
         ended = run_program("netconvert", arguments, stage)
         if ended.code == 0 and (stage / ROAD).is_file():
-            made = (stage / ROAD).read_bytes()
-            return made if isinstance(road, Net) else _with_crossings(made, road)
+            return _with_crossings((stage / ROAD).read_bytes(), road)
     raise UserError(f"netconvert cannot write {road.path} as OpenDRIVE: {ended.reason}")
 
 
@@ -54,8 +51,7 @@ def _net_of(road: Corridor) -> bytes:
         raise UserError(
             f"the net {road.path} is not the one that was driven in: it changed; put that one there"
         )
-    root, intact = received.parse(content, allowed.NET, f"the net {road.path}", MAX_ELEMENTS)
-    return content if intact else received.serialize(root)
+    return received.cleaned(content, allowed.NET, f"the net {road.path}", MAX_ELEMENTS)
 
 
 _Place = tuple[float, float]

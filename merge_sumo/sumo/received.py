@@ -147,6 +147,17 @@ def parse(
     return root, plain and cleaner.intact
 
 
+def cleaned(
+    content: bytes,
+    allowed: Mapping[str, Allowed],
+    name: str,
+    max_elements: int = MAX_ELEMENTS,
+) -> bytes:
+    """Return an XML file, or what is allowed of it where that is not all; raises as `parse`."""
+    root, intact = parse(content, allowed, name, max_elements)
+    return content if intact else serialize(root)
+
+
 def serialize(root: etree._Element) -> bytes:
     """Return a tree as an XML file."""
     etree.indent(root, space="    ")

@@ -1,20 +1,12 @@
-"""A recorded episode as a folder that sumo and sumo-gui replay with nothing else running.
-
-A road like the shipped one is replayed in its own net. Of any other road the folder has the net
-that hosts it (`hosting`), with a speed limit above all speeds: there lanes have ids and ends that
-every reader can check, and where the road goes on behind the end of the file, so does that net. The
-lanes beside it are polygons.
-"""
+"""Plays a replay folder in headless SUMO and tells whether what it shows is what was recorded."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -24,26 +16,21 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo import allowed, received
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint
-from merge_sumo.sumo.finder import find_corridor
-from merge_sumo.sumo.hosting import hosted_net
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.netfile import NetFile, Point
-from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, corridor_of
-from merge_sumo.system.folders import new_folder
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VEHICLES
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.sumo.replay_folder import (
+    CONFIG,
+    HOLD_STEPS,
+    HOSTED_NET,
+    NET,
+    RECORD,
+    SURROUNDINGS,
+    TYPES,
+    Road,
+    corridor_of_hosted,
+    corridor_of_shipped,
+    write_files,
+)
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VEHICLES, VUT
 
-CONFIG: Final = "replay.sumocfg"
-NET: Final = "us23.net.xml"
-"""The net of a road like the shipped one."""
-HOSTED_NET: Final = "road.net.xml"
-"""The net of any other road."""
-SURROUNDINGS: Final = "surroundings.add.xml"
-TYPES: Final = "vehicles.add.xml"
-RECORD: Final = "episode.fcd.xml"
-VIEW: Final = "view.settings.xml"
-CASE: Final = "case.json"
 REPLAYED: Final = "replayed.fcd.xml"
 
 COMPARED: Final = ("x", "y", "pos", "speed")
@@ -52,103 +39,8 @@ TOLERANCE: Final = 1e-6
 
 LANE_END_M: Final = 2e-3
 """Nearer than this to where a lane begins, a vehicle may be on the lane before or behind."""
-SPEED_LIMIT_MPS: Final = 200.0
-"""Above every speed: SUMO lets a vehicle enter a replay no faster than its lane allows."""
-
-COLOURS: Final = {"pov": "0.90,0.25,0.15", "vut": "0.10,0.35,0.90"}
-WINDOW: Final = (1280, 800)
-SEEN_M: Final = 700.0
-"""Width of the picture on the road."""
-SURROUNDINGS_COLOUR: Final = "0.70,0.70,0.68"
-LANE_WIDTH_M: Final = 3.2
-MAX_SURROUNDINGS: Final = 2_000
-HOLD_STEPS: Final = 10
-"""Steps for which the last picture stays, so that a person sees how it ended."""
 MIN_TIMESTEPS: Final = 1 + HOLD_STEPS
 MAX_TIMESTEPS: Final = round(MAX_EPISODE_S / DT_S) + 1 + HOLD_STEPS
-
-
-@dataclass(frozen=True, slots=True)
-class _Road:
-    """The road of a replay folder."""
-
-    net: bytes
-    corridor: Corridor
-    """Found in that net, so that its lanes have the ids that they have there."""
-    surroundings: etree._Element | None
-    """None where the net itself has all lanes."""
-
-    @property
-    def file(self) -> str:
-        """Name of the net in the folder."""
-        return NET if self.surroundings is None else HOSTED_NET
-
-    @property
-    def additional(self) -> list[str]:
-        """Names of the other files that SUMO loads at the start."""
-        return [TYPES] if self.surroundings is None else [TYPES, SURROUNDINGS]
-
-
-def write_scenario(
-    folder: Path, road: Net | Corridor, outcome: Outcome, trajectory: Trajectory
-) -> Path:
-    """Write an episode as a replay folder and return the path of its configuration.
-
-    Raises `UserError` when the folder exists or cannot be written; nothing is overwritten.
-    """
-    written = _road(road, folder)
-    with new_folder(folder) as new:
-        (new / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
-        _write(new, written, _types(trajectory), _fcd(written.corridor, trajectory))
-    return folder / CONFIG
-
-
-def _road(road: Net | Corridor, folder: Path) -> _Road:
-    """Return a road as a folder has it."""
-    net = road if isinstance(road, Net) else _like_shipped(road)
-    if net is not None:
-        return _Road(net.text, corridor_of(net), None)
-    corridor = corridor_of(road)
-    fast = replace(corridor, mainline=_fast(corridor.mainline), ramp=_fast(corridor.ramp))
-    content = hosted_net(fast, 1)
-    drawn = _polygons(corridor.surroundings)
-    return _Road(content, _corridor_of_hosted(content, folder / HOSTED_NET), drawn)
-
-
-def _like_shipped(road: Corridor) -> Net | None:
-    """Return the net of a road if it is one with the shipped edges, in which replays are exact."""
-    if (road.mainline_edges, road.ramp_edges) != (MAINLINE_EDGES, RAMP_EDGES):
-        return None
-    try:
-        net = Net(road.path)
-    except UserError:
-        return None
-    return net if net.sha256 == road.sha256 else None
-
-
-def _fast(path: LanePath) -> LanePath:
-    return LanePath(tuple(replace(p, speed_limit_mps=SPEED_LIMIT_MPS) for p in path.pieces))
-
-
-def _corridor_of_hosted(content: bytes, path: Path) -> Corridor:
-    """Find the corridor in the net of a folder; `UserError` when it has none."""
-    edges = re.findall(rb'<edge [^>]*\bid="((main|ramp|out)([0-9]{1,4})\.0)"', content)
-    main, ramp, out = (
-        [name.decode() for name, of, _ in sorted(edges, key=lambda e: int(e[2])) if of == kind]
-        for kind in (b"main", b"ramp", b"out")
-    )
-    return find_corridor(NetFile(path, content), main + out, ramp + out, room_after_m=0.0)
-
-
-def _write(folder: Path, road: _Road, types: etree._Element, record: etree._Element) -> None:
-    """Write all that SUMO reads, the configuration last."""
-    (folder / road.file).write_bytes(road.net)
-    (folder / TYPES).write_bytes(received.serialize(types))
-    if road.surroundings is not None:
-        (folder / SURROUNDINGS).write_bytes(received.serialize(road.surroundings))
-    (folder / RECORD).write_bytes(received.serialize(record))
-    (folder / VIEW).write_bytes(received.serialize(_view(road)))
-    (folder / CONFIG).write_bytes(received.serialize(_config(road, len(record))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,10 +53,10 @@ class Replay:
 
 
 def replay(folder: Path) -> Replay:
-    """Replay a folder in headless SUMO and compare every row of both vehicles with the record.
+    """Replay a folder in headless SUMO and compare every row of all vehicles with the record.
 
     Positions (x, y, along the lane) and speeds must agree within 1e-6, and the record must be an
-    episode: both vehicles on their lanes, moved by eq. (4) and held at its end.
+    episode: all vehicles on their lanes, moved by eq. (4) and held at its end.
 
     The folder is data: net, vehicle types and record are read from it and nothing else, and SUMO
     runs in a temporary folder on what is allowed of them and on a configuration of ours. Raises
@@ -191,12 +83,17 @@ Rows = dict[tuple[float, str], tuple[float, ...]]
 class _Episode:
     """What is allowed of a received folder."""
 
-    road: _Road
+    road: Road
     types: etree._Element
     record: etree._Element
     rows: Rows
     x_m: dict[tuple[float, str], float | None]
     """Lane coordinates of the rows; None for a lane on which a vehicle does not drive."""
+
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Names of the vehicles."""
+        return _vehicles(self.types)
 
     def path(self, who: str) -> LanePath:
         """Return the lanes of a vehicle."""
@@ -204,7 +101,7 @@ class _Episode:
 
 
 def _path(road: Corridor, who: str) -> LanePath:
-    return road.ramp if who == "vut" else road.mainline
+    return road.ramp if who == VEHICLES[VUT] else road.mainline
 
 
 def _received(folder: Path) -> _Episode:
@@ -221,28 +118,39 @@ def _received(folder: Path) -> _Episode:
     if surroundings:
         road = _checked_hosted(net, surroundings[0], folder)
     else:
-        road = _road(Net.of_bytes(net, folder / NET), folder)
-    root, rows = _checked_record(record, folder / RECORD)
+        path = folder / NET
+        content = received.cleaned(net, allowed.NET, f"the net {path}")
+        road = Road(content, corridor_of_shipped(content, path), None)
+    vtypes = _checked_types(types, folder / TYPES)
+    root, rows = _checked_record(record, folder / RECORD, _vehicles(vtypes))
     x_m = _lane_coordinates(root, road.corridor)
-    return _Episode(road, _checked_types(types, folder / TYPES), root, rows, x_m)
+    return _Episode(road, vtypes, root, rows, x_m)
 
 
-def _checked_hosted(net: bytes, surroundings: bytes, folder: Path) -> _Road:
-    root, _ = received.parse(net, allowed.HOSTED_NET, f"the net {folder / HOSTED_NET}")
-    content = received.serialize(root)
+def _checked_hosted(net: bytes, surroundings: bytes, folder: Path) -> Road:
+    content = received.cleaned(net, allowed.HOSTED_NET, f"the net {folder / HOSTED_NET}")
     name = f"the file {folder / SURROUNDINGS}"
     drawn, _ = received.parse(surroundings, allowed.SURROUNDINGS, name)
-    return _Road(content, _corridor_of_hosted(content, folder / HOSTED_NET), drawn)
+    return Road(content, corridor_of_hosted(content, folder / HOSTED_NET), drawn)
 
 
 def _checked_types(content: bytes, path: Path) -> etree._Element:
     root, _ = received.parse(content, allowed.TYPES, f"the file {path}")
-    if sorted(str(vtype.get("id")) for vtype in root) != sorted(COLOURS):
-        raise UserError(f"the file {path} must have one vType pov and one vType vut")
+    if sorted(_vehicles(root)) not in map(sorted, (VEHICLES[:2], VEHICLES)):
+        raise UserError(
+            f"the file {path} must have one vType pov and one vType vut, and in traffic one ahead "
+            "and one behind"
+        )
     return root
 
 
-def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
+def _vehicles(types: etree._Element) -> tuple[str, ...]:
+    return tuple(str(vtype.get("id")) for vtype in types)
+
+
+def _checked_record(
+    content: bytes, path: Path, vehicles: Sequence[str]
+) -> tuple[etree._Element, Rows]:
     root, _ = received.parse(content, allowed.RECORD, f"the record {path}")
     if not MIN_TIMESTEPS <= len(root) <= MAX_TIMESTEPS:
         raise UserError(
@@ -252,8 +160,10 @@ def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
         if not abs(float(timestep.get("time", "")) - step * DT_S) <= TOLERANCE:
             raise UserError(f"the record {path} must have a timestep every {DT_S:g} s from 0 s on")
     rows = _rows(root, f"the record {path}")
-    if len(rows) != len(COLOURS) * len(root):
-        raise UserError(f"the record {path} must have both vehicles in every timestep")
+    if rows.keys() != {(time, who) for time, _ in rows for who in vehicles} or (
+        len(rows) != len(vehicles) * len(root)
+    ):
+        raise UserError(f"the record {path} must have every vehicle in every timestep")
     return root, rows
 
 
@@ -261,7 +171,7 @@ def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
 def _staged(episode: _Episode) -> Iterator[Path]:
     """Yield a temporary folder that holds an episode, with nothing in it that was not checked."""
     with scratch_folder() as stage:
-        _write(stage, episode.road, episode.types, episode.record)
+        write_files(stage, episode.road, episode.types, episode.record)
         yield stage
 
 
@@ -297,7 +207,7 @@ def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
     times = sorted({time for time, _ in rows})
     moving = set(times[: -HOLD_STEPS - 1])
     for time, after in zip(times, [*times[1:], None], strict=True):
-        for who in COLOURS:
+        for who in episode.vehicles:
             x, y, _, speed = rows[time, who]
             x_m = episode.x_m[time, who]
             if x_m is None or _is_beside(episode.path(who).point(x_m), x, y):
@@ -323,7 +233,7 @@ def _lane_coordinates(
 ) -> dict[tuple[float, str], float | None]:
     """Return the lane coordinates of the rows of a record that was checked."""
     starts_m = {
-        who: {piece.lane: piece.start_m for piece in _path(road, who).pieces} for who in COLOURS
+        who: {piece.lane: piece.start_m for piece in _path(road, who).pieces} for who in VEHICLES
     }
     found: dict[tuple[float, str], float | None] = {}
     for timestep in record:
@@ -361,137 +271,3 @@ def _rows(root: etree._Element, name: str) -> Rows:
                 raise UserError(f"{name} has two rows of {key[1]} at {time:g} s")
             rows[key] = tuple(float(vehicle.get(column, "")) for column in COMPARED)
     return rows
-
-
-def _types(trajectory: Trajectory) -> etree._Element:
-    root = etree.Element("additional")
-    first_speeds = dict(zip(VEHICLES, trajectory.motion[0, :, 1].tolist(), strict=False))
-    for name, colour in COLOURS.items():
-        etree.SubElement(
-            root,
-            "vType",
-            id=name,
-            color=colour,
-            guiShape="passenger/sedan",
-            length="5",
-            minGap="0",
-            # The replay inserts a vehicle at the highest speed it may drive, so make that the
-            # first speed of the record; all later speeds come from the record itself.
-            maxSpeed=f"{max(first_speeds[name], 1e-9):.9f}",
-            speedFactor="2",
-            # Nor does SUMO then slow it down for the junction.
-            decel="1000",
-            emergencyDecel="1000",
-        )
-    return root
-
-
-def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
-    root = etree.Element("fcd-export")
-    motion = trajectory.motion.tolist()
-    motion += [motion[-1]] * HOLD_STEPS
-    for step, vehicles in enumerate(motion):
-        timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
-        for who, (x_m, v_mps, _) in zip(VEHICLES, vehicles, strict=False):
-            lane, position, x, y, angle = road.lane_point(x_m, on_ramp=who == "vut")
-            etree.SubElement(
-                timestep,
-                "vehicle",
-                id=who,
-                x=f"{x:.9f}",
-                y=f"{y:.9f}",
-                angle=f"{angle:.9f}",
-                type=who,
-                speed=f"{v_mps:.9f}",
-                pos=f"{position:.9f}",
-                lane=lane,
-            )
-    return root
-
-
-def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
-    root = etree.Element("additional")
-    for number, shape in enumerate(shapes[:MAX_SURROUNDINGS]):
-        etree.SubElement(
-            root,
-            "poly",
-            id=f"lane{number}",
-            color=SURROUNDINGS_COLOUR,
-            fill="0",
-            layer="-1",
-            # To either side.
-            lineWidth=f"{LANE_WIDTH_M / 2.0}",
-            shape=" ".join(f"{x:.3f},{y:.3f}" for x, y, _ in shape),
-        )
-    return root
-
-
-def _view(road: _Road) -> etree._Element:
-    root = etree.Element("viewsettings")
-    scheme = etree.SubElement(root, "scheme", name="merge")
-    etree.SubElement(
-        scheme,
-        "vehicles",
-        vehicleQuality="3",
-        vehicle_exaggeration="4",
-        vehicleName_show="1",
-        vehicleName_size="60",
-        vehicleName_color="0.1,0.1,0.1",
-    )
-    etree.SubElement(scheme, "background", backgroundColor="0.93,0.93,0.90", showGrid="0")
-    zoom, x, y = ("440", "-110", "-20") if road.surroundings is None else _viewport(road.corridor)
-    etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
-    etree.SubElement(root, "delay", value="100")
-    return root
-
-
-def _viewport(road: Corridor) -> tuple[str, str, str]:
-    """Return zoom and centre of a picture of the last 300 m of both paths before M.
-
-    At a zoom of 100 the picture has the whole net.
-    """
-    points = [
-        point for path in (road.mainline, road.ramp) for p in path.pieces for point in p.shape
-    ]
-    width_m, height_m = (
-        max(values) - min(values)
-        for values in ([x for x, *_ in points], [y for _, y, *_ in points])
-    )
-    whole_m = max(width_m, height_m * WINDOW[0] / WINDOW[1])
-    seen = [
-        path.point(max(x_m, -path.before_m))
-        for path in (road.mainline, road.ramp)
-        for x_m in (-300.0, 50.0)
-    ]
-    x, y = (
-        (min(values) + max(values)) / 2.0
-        for values in ([at.x_m for at in seen], [at.y_m for at in seen])
-    )
-    return f"{100.0 * whole_m / SEEN_M:.0f}", f"{x:.0f}", f"{y:.0f}"
-
-
-def _config(road: _Road, timesteps: int) -> etree._Element:
-    end_s = timesteps * DT_S
-    sections = {
-        "input": {"net-file": road.file, "additional-files": ",".join(road.additional)},
-        "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
-        "processing": {
-            "collision.action": "none",
-            "time-to-teleport": "-1",
-            "default.speeddev": "0",
-        },
-        "fcd_replay_device": {"device.fcd-replay.files": RECORD},
-        "report": {"no-warnings": "true", "xml-validation": "never"},
-        "gui_only": {
-            "gui-settings-file": VIEW,
-            "start": "true",
-            "delay": "100",
-            "window-size": ",".join(map(str, WINDOW)),
-        },
-    }
-    root = etree.Element("configuration")
-    for section, values in sections.items():
-        parent = etree.SubElement(root, section)
-        for name, value in values.items():
-            etree.SubElement(parent, name, value=value)
-    return root

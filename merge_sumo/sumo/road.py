@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from merge_sumo.sumo import received
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.finder import find_corridor
-from merge_sumo.sumo.net import MAIN_IN, MAIN_OUT, RAMP, Net, default_net_path
 from merge_sumo.sumo.netfile import NetFile
+from merge_sumo.system.resources import resource
 from merge_sumo.values.scenario import ROOM_AFTER_M
 
-MAINLINE_EDGES: Final = (MAIN_IN, MAIN_OUT)
-RAMP_EDGES: Final = (RAMP, MAIN_OUT)
+MAINLINE_EDGES: Final = ("main_in", "main_out")
+RAMP_EDGES: Final = ("ramp", "main_out")
 """Of the shipped net."""
 
 _found: dict[tuple[Path, str, tuple[str, ...], tuple[str, ...], float], Corridor] = {}
+
+
+def default_net_path() -> Path:
+    """Return the path of the shipped net."""
+    return resource("sumo_net") / "us23.net.xml"
 
 
 def road_of(
@@ -42,11 +46,3 @@ def road_of(
         net_file = NetFile(path, content)
         _found[key] = find_corridor(net_file, mainline, ramp, room_after_m=room_after_m)
     return _found[key]
-
-
-def corridor_of(road: Net | Corridor) -> Corridor:
-    """Return a road as a corridor, also that of a net whose edges have the shipped one's names."""
-    if isinstance(road, Corridor):
-        return road
-    found = find_corridor(NetFile(road.path, road.text), MAINLINE_EDGES, RAMP_EDGES)
-    return replace(found, sha256=road.sha256)

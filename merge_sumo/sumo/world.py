@@ -28,8 +28,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.sumo.net import Net
-from merge_sumo.sumo.road import corridor_of, road_of
+from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, US23, VEHICLES, VUT, Scenario
 
@@ -80,7 +79,7 @@ class World:
     def __init__(
         self,
         corridors: int = 32,
-        road: Net | Corridor | None = None,
+        road: Corridor | None = None,
         vut_type: Mapping[str, str] | None = None,
         scenario: Scenario = US23,
     ) -> None:
@@ -94,7 +93,7 @@ class World:
         if World._open:
             raise UserError("libsumo holds one simulation per process: close the other World first")
         self.corridors = corridors
-        self.road = road_of() if road is None else corridor_of(road)
+        self.road = road or road_of()
         self.vut_type = vut_type
         self.scenario = scenario
         self.vehicles = scenario.vehicles
@@ -329,9 +328,19 @@ def _types(vut_type: Mapping[str, str] | None, scenario: Scenario) -> bytes:
     for name, length_m in ((CAR, scenario.pov_length_m), (COMMANDED_VUT, scenario.vut_length_m)):
         etree.SubElement(root, "vType", {"id": name, "length": repr(length_m), **told})
     if vut_type is not None:
-        length = {"length": repr(scenario.vut_length_m)}
-        etree.SubElement(root, "vType", {"id": VUT_TYPE, **length, **vut_type})
+        etree.SubElement(root, "vType", {"id": VUT_TYPE, **_careful(scenario), **vut_type})
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
+
+
+def _careful(scenario: Scenario) -> dict[str, str]:
+    """Return the attributes of a driver who knows the limits and wants the level-0 speed."""
+    return {
+        "length": repr(scenario.vut_length_m),
+        "maxSpeed": repr(scenario.level0_v_mps),
+        "accel": repr(scenario.a_max_mps2),
+        "decel": repr(-scenario.a_min_mps2),
+        "emergencyDecel": repr(-scenario.a_min_mps2),
+    }
 
 
 @contextmanager

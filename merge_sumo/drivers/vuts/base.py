@@ -39,6 +39,7 @@ class VutOptions:
             debugger reaches it, and what it does wrong may take this process with it.
         memory_gib: memory that the process of a user's code may take.
         log: file to which what a controller prints is added; None is standard error.
+        policies: folder of the networks of the learned VUTs; None for the shipped ones.
     """
 
     command: str | None = None
@@ -47,6 +48,7 @@ class VutOptions:
     in_process: bool = False
     memory_gib: float = MEMORY_GIB
     log: Path | None = None
+    policies: Path | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers."""

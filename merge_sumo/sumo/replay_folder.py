@@ -1,0 +1,266 @@
+"""An episode as a folder that sumo and sumo-gui play with nothing else running: what is in it.
+
+On the shipped road it is played in the shipped net. Of any other road the folder has the net that
+hosts it (`hosting`), with a speed limit above all speeds: there lanes have ids and ends that every
+reader can check, and where the road goes on behind the end of the file, so does that net. The lanes
+beside it are polygons.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from lxml import etree
+
+from merge_sumo.sumo import received
+from merge_sumo.sumo.corridor import Corridor, LanePath
+from merge_sumo.sumo.finder import find_corridor
+from merge_sumo.sumo.hosting import hosted_net
+from merge_sumo.sumo.netfile import NetFile, Point
+from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, road_of
+from merge_sumo.system.folders import new_folder
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import Trajectory
+
+CONFIG: Final = "replay.sumocfg"
+NET: Final = "us23.net.xml"
+"""The net of the shipped road."""
+HOSTED_NET: Final = "road.net.xml"
+"""The net of any other road."""
+SURROUNDINGS: Final = "surroundings.add.xml"
+TYPES: Final = "vehicles.add.xml"
+RECORD: Final = "episode.fcd.xml"
+VIEW: Final = "view.settings.xml"
+CASE: Final = "case.json"
+SPEED_LIMIT_MPS: Final = 200.0
+"""Above every speed: SUMO lets a vehicle enter a replay no faster than its lane allows."""
+
+COLOURS: Final = {
+    "pov": "0.90,0.25,0.15",
+    "vut": "0.10,0.35,0.90",
+    "ahead": "0.95,0.60,0.15",
+    "behind": "0.95,0.60,0.15",
+}
+WINDOW: Final = (1280, 800)
+SEEN_M: Final = 700.0
+"""Width of the picture on the road."""
+SURROUNDINGS_COLOUR: Final = "0.70,0.70,0.68"
+LANE_WIDTH_M: Final = 3.2
+MAX_SURROUNDINGS: Final = 2_000
+HOLD_STEPS: Final = 10
+"""Steps for which the last picture stays, so that a person sees how it ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """The road of a replay folder."""
+
+    net: bytes
+    corridor: Corridor
+    """Found in that net, so that its lanes have the ids that they have there."""
+    surroundings: etree._Element | None
+    """None where the net itself has all lanes."""
+
+    @property
+    def file(self) -> str:
+        """Name of the net in the folder."""
+        return NET if self.surroundings is None else HOSTED_NET
+
+    @property
+    def additional(self) -> list[str]:
+        """Names of the other files that SUMO loads at the start."""
+        return [TYPES] if self.surroundings is None else [TYPES, SURROUNDINGS]
+
+
+def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: Trajectory) -> Path:
+    """Write an episode as a replay folder and return the path of its configuration.
+
+    Raises `UserError` when the folder exists or cannot be written; nothing is overwritten.
+    """
+    written = _road(road, folder)
+    with new_folder(folder) as new:
+        (new / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
+        write_files(new, written, _types(trajectory), _fcd(written.corridor, trajectory))
+    return folder / CONFIG
+
+
+def _road(road: Corridor, folder: Path) -> Road:
+    """Return a road as a folder has it."""
+    edges, shipped = (road.mainline_edges, road.ramp_edges), road_of()
+    if (road.sha256, *edges) == (shipped.sha256, MAINLINE_EDGES, RAMP_EDGES):
+        return Road(shipped.path.read_bytes(), shipped, None)
+    fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
+    content = hosted_net(fast, 1)
+    drawn = _polygons(road.surroundings)
+    return Road(content, corridor_of_hosted(content, folder / HOSTED_NET), drawn)
+
+
+def corridor_of_shipped(content: bytes, path: Path) -> Corridor:
+    """Find the corridor in a net with the edges of the shipped one; `UserError` if it has none."""
+    return find_corridor(NetFile(path, content), MAINLINE_EDGES, RAMP_EDGES)
+
+
+def _fast(path: LanePath) -> LanePath:
+    return LanePath(tuple(replace(p, speed_limit_mps=SPEED_LIMIT_MPS) for p in path.pieces))
+
+
+def corridor_of_hosted(content: bytes, path: Path) -> Corridor:
+    """Find the corridor in the net of a folder; `UserError` when it has none."""
+    edges = re.findall(rb'<edge [^>]*\bid="((main|ramp|out)([0-9]{1,4})\.0)"', content)
+    main, ramp, out = (
+        [name.decode() for name, of, _ in sorted(edges, key=lambda e: int(e[2])) if of == kind]
+        for kind in (b"main", b"ramp", b"out")
+    )
+    return find_corridor(NetFile(path, content), main + out, ramp + out, room_after_m=0.0)
+
+
+def write_files(folder: Path, road: Road, types: etree._Element, record: etree._Element) -> None:
+    """Write all that SUMO reads, the configuration last."""
+    (folder / road.file).write_bytes(road.net)
+    (folder / TYPES).write_bytes(received.serialize(types))
+    if road.surroundings is not None:
+        (folder / SURROUNDINGS).write_bytes(received.serialize(road.surroundings))
+    (folder / RECORD).write_bytes(received.serialize(record))
+    (folder / VIEW).write_bytes(received.serialize(_view(road)))
+    (folder / CONFIG).write_bytes(received.serialize(_config(road, len(record))))
+
+
+def _types(trajectory: Trajectory) -> etree._Element:
+    root = etree.Element("additional")
+    scenario = trajectory.case.scenario
+    for name, first_mps in zip(VEHICLES, trajectory.motion[0, :, 1].tolist(), strict=False):
+        length_m = scenario.vut_length_m if name == VEHICLES[VUT] else scenario.pov_length_m
+        etree.SubElement(
+            root,
+            "vType",
+            id=name,
+            color=COLOURS[name],
+            guiShape="passenger/sedan",
+            length=f"{length_m:g}",
+            minGap="0",
+            # The replay inserts a vehicle at the highest speed it may drive, so make that the
+            # first speed of the record; all later speeds come from the record itself.
+            maxSpeed=f"{max(first_mps, 1e-9):.9f}",
+            speedFactor="2",
+            # Nor does SUMO then slow it down for the junction.
+            decel="1000",
+            emergencyDecel="1000",
+        )
+    return root
+
+
+def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
+    root = etree.Element("fcd-export")
+    motion = trajectory.motion.tolist()
+    motion += [motion[-1]] * HOLD_STEPS
+    for step, vehicles in enumerate(motion):
+        timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
+        for who, (x_m, v_mps, _) in zip(VEHICLES, vehicles, strict=False):
+            lane, position, x, y, angle = road.lane_point(x_m, on_ramp=who == VEHICLES[VUT])
+            etree.SubElement(
+                timestep,
+                "vehicle",
+                id=who,
+                x=f"{x:.9f}",
+                y=f"{y:.9f}",
+                angle=f"{angle:.9f}",
+                type=who,
+                speed=f"{v_mps:.9f}",
+                pos=f"{position:.9f}",
+                lane=lane,
+            )
+    return root
+
+
+def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
+    root = etree.Element("additional")
+    for number, shape in enumerate(shapes[:MAX_SURROUNDINGS]):
+        etree.SubElement(
+            root,
+            "poly",
+            id=f"lane{number}",
+            color=SURROUNDINGS_COLOUR,
+            fill="0",
+            layer="-1",
+            # To either side.
+            lineWidth=f"{LANE_WIDTH_M / 2.0}",
+            shape=" ".join(f"{x:.3f},{y:.3f}" for x, y, _ in shape),
+        )
+    return root
+
+
+def _view(road: Road) -> etree._Element:
+    root = etree.Element("viewsettings")
+    scheme = etree.SubElement(root, "scheme", name="merge")
+    etree.SubElement(
+        scheme,
+        "vehicles",
+        vehicleQuality="3",
+        vehicle_exaggeration="4",
+        vehicleName_show="1",
+        vehicleName_size="60",
+        vehicleName_color="0.1,0.1,0.1",
+    )
+    etree.SubElement(scheme, "background", backgroundColor="0.93,0.93,0.90", showGrid="0")
+    zoom, x, y = ("440", "-110", "-20") if road.surroundings is None else _viewport(road.corridor)
+    etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
+    etree.SubElement(root, "delay", value="100")
+    return root
+
+
+def _viewport(road: Corridor) -> tuple[str, str, str]:
+    """Return zoom and centre of a picture of the last 300 m of both paths before M.
+
+    At a zoom of 100 the picture has the whole net.
+    """
+    points = [
+        point for path in (road.mainline, road.ramp) for p in path.pieces for point in p.shape
+    ]
+    width_m, height_m = (
+        max(values) - min(values)
+        for values in ([x for x, *_ in points], [y for _, y, *_ in points])
+    )
+    whole_m = max(width_m, height_m * WINDOW[0] / WINDOW[1])
+    seen = [
+        path.point(max(x_m, -path.before_m))
+        for path in (road.mainline, road.ramp)
+        for x_m in (-300.0, 50.0)
+    ]
+    x, y = (
+        (min(values) + max(values)) / 2.0
+        for values in ([at.x_m for at in seen], [at.y_m for at in seen])
+    )
+    return f"{100.0 * whole_m / SEEN_M:.0f}", f"{x:.0f}", f"{y:.0f}"
+
+
+def _config(road: Road, timesteps: int) -> etree._Element:
+    end_s = timesteps * DT_S
+    sections = {
+        "input": {"net-file": road.file, "additional-files": ",".join(road.additional)},
+        "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
+        "processing": {
+            "collision.action": "none",
+            "insertion-checks": "none",
+            "time-to-teleport": "-1",
+            "default.speeddev": "0",
+        },
+        "fcd_replay_device": {"device.fcd-replay.files": RECORD},
+        "report": {"no-warnings": "true", "xml-validation": "never"},
+        "gui_only": {
+            "gui-settings-file": VIEW,
+            "start": "true",
+            "delay": "100",
+            "window-size": ",".join(map(str, WINDOW)),
+        },
+    }
+    root = etree.Element("configuration")
+    for section, values in sections.items():
+        parent = etree.SubElement(root, section)
+        for name, value in values.items():
+            etree.SubElement(parent, name, value=value)
+    return root
