@@ -47,8 +47,6 @@ WAYS_IN = ("merge_sumo.api", "merge_sumo.cli")
 MOST_LINES = 400
 LONGER = {
     "merge_sumo.campaigns.experiments": "TODO",
-    "merge_sumo.reports.comparison": "TODO",
-    "merge_sumo.reports.reproduce": "TODO",
 }
 """Modules that are longer than others, and why."""
 
