@@ -12,8 +12,8 @@ import pytest
 from handmade import write_run
 from lxml import html
 
-from merge_sumo.campaigns.experiments import Truth
 from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.truth import Truth
 from merge_sumo.drivers.vuts.output import LINES, LOG
 from merge_sumo.reports import report_data, report_facts
 from merge_sumo.reports.report import report_page, write_report
