@@ -13,7 +13,7 @@ from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.reports import report
+from merge_sumo.reports import report, report_facts
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
@@ -221,7 +221,7 @@ def test_errors_and_timeouts_are_drawn_as_no_result_and_shown_first(browser, tmp
 
 
 def test_a_long_campaign_opens_too(browser, made, tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "SHOWN", 50)
+    monkeypatch.setattr(report_facts, "SHOWN", 50)
     file = tmp_path / "long.html"
     file.write_text(report.report_page(made), encoding="utf-8")
     with shown(browser, file) as page:
@@ -242,7 +242,7 @@ def test_a_campaign_without_cases_opens_too(browser, made, tmp_path):
 def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch, name):
     if name is not None:
         corridor = corridor_of(name, tmp_path)
-        monkeypatch.setattr(report, "road_of", lambda: corridor)
+        monkeypatch.setattr(report_facts, "road_of", lambda: corridor)
     run = write_run(tmp_path / "run", per_level=3, error=None)
     with shown(browser, report.write_report(run)) as page:
         for step in ("0", "0.5 * moving.rows", "moving.rows - 1"):

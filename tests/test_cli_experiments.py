@@ -9,7 +9,8 @@ import sys
 import pytest
 
 from merge_sumo import cli
-from merge_sumo.reports.reproduce import TABLE_II, TABLE_JSON, Scale
+from merge_sumo.reports.reproduce import TABLE_JSON
+from merge_sumo.reports.table2 import TABLE_II, Scale
 
 
 @pytest.fixture
@@ -78,7 +79,7 @@ class TestReproduce:
     @pytest.fixture
     def tiny(self, monkeypatch):
         scale = Scale(seeds=1, truth_cases=(100, 100, 100), batches=1, batch=6)
-        monkeypatch.setattr("merge_sumo.reports.reproduce.quick", lambda seeds: scale)
+        monkeypatch.setattr("merge_sumo.reports.table2.quick", lambda seeds: scale)
         monkeypatch.setattr("merge_sumo.reports.reproduce.TABLE_II", TABLE_II[:1])
 
     def test_prints_the_table_and_where_the_rest_is(self, call, tiny, tmp_path):

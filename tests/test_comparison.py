@@ -13,13 +13,8 @@ from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.reports.comparison import (
-    Change,
-    LevelChange,
-    RunComparison,
-    Untested,
-    compare_runs,
-)
+from merge_sumo.reports.changes import Change, LevelChange, RunComparison, Untested
+from merge_sumo.reports.comparison import compare_runs
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +95,7 @@ class TestTheSameVut:
 
 class TestRecordsOnly:
     def test_run_nothing_again(self, run, other_seed, monkeypatch):
-        monkeypatch.setattr("merge_sumo.reports.comparison.ProvingGround", None)
+        monkeypatch.setattr("merge_sumo.reports.comparison.ground_of", None)
         compared = compare_runs(run, other_seed, rerun=False)
         found = compared.levels[0]
         assert found.changes[Change.NOT_RUN_AGAIN] == len(compared.cases)

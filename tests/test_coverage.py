@@ -15,7 +15,7 @@ from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin
 from merge_sumo.values.case import Case, Pool, to_unit
-from merge_sumo.values.fmc import RADIUS, fmc
+from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
@@ -58,32 +58,49 @@ def coverage_of(outcomes: list[Outcome], level: int) -> float:
 
 
 class TestTheGround:
-    @pytest.mark.parametrize("dims", [2, 3])
+    @pytest.mark.parametrize("dims", range(2, 7))
     def test_counts_what_fmc_measures(self, dims):
-        points = np.random.default_rng(dims).uniform(0.3, 0.5, (30, dims))
+        reach = 2.0 * radius_for(dims)
+        points = np.random.default_rng(dims).uniform(0.5 - reach, 0.5 + reach, (30, dims))
         ground = Ground(dims)
         ground.cover(ground.balls(points), 1.0)
         one = np.array([[0.5] * dims])
         assert ground.covered_balls() == pytest.approx(fmc(points) / fmc(one), rel=0.05)
 
-    @pytest.mark.parametrize("dims", [2, 3])
+    @pytest.mark.parametrize("dims", range(2, 7))
     def test_holds_the_balls_at_the_corners_of_the_cube(self, dims):
         corners = np.array([[0.0] * dims, [1.0] * dims])
         ground = Ground(dims)
         ground.cover(ground.balls(corners), 1.0)
         assert ground.covered_balls() == pytest.approx(2.0)
 
-    def test_a_pick_that_fails_with_a_chance_of_60_percent_leaves_40_percent_uncovered(self):
-        ground = Ground(2)
-        here = ground.balls(np.array([[0.4, 0.4]]))
+    @pytest.mark.parametrize("dims", [2, 5])
+    def test_a_pick_that_fails_with_a_chance_of_60_percent_leaves_40_percent_uncovered(self, dims):
+        ground = Ground(dims)
+        here = ground.balls(np.full((1, dims), 0.4))
         ground.cover(here[0], 0.6)
         assert ground.new(here) == pytest.approx([0.4], rel=1e-6)
 
-    def test_a_ball_two_radii_away_is_all_new(self):
-        ground = Ground(2)
-        ground.cover(ground.balls(np.array([[0.4, 0.4]])), 1.0)
-        beside = np.array([[0.4 + 2.0 * RADIUS + 0.02, 0.4]])
+    @pytest.mark.parametrize("dims", [2, 4])
+    def test_a_ball_two_radii_away_is_all_new(self, dims):
+        ground = Ground(dims)
+        here = np.full((1, dims), 0.3)
+        ground.cover(ground.balls(here), 1.0)
+        beside = here + (2.0 * radius_for(dims) + 0.02) * np.eye(dims)[0]
         assert ground.new(ground.balls(beside)) == pytest.approx([1.0])
+
+    @pytest.mark.parametrize("dims", [4, 5, 6])
+    def test_has_balls_of_the_radius_where_they_are_no_grid(self, dims):
+        points = np.random.default_rng(1).random((200, dims))
+        places = Ground(dims)._places
+        farthest = places._tree.query(points, k=places.per_ball)[0][:, -1]
+        assert farthest == pytest.approx(radius_for(dims), rel=0.1)
+
+    def test_is_new_each_time(self):
+        first, second = Ground(4), Ground(4)
+        ball = first.balls(np.full((1, 4), 0.5))
+        first.cover(ball, 1.0)
+        assert second.new(ball) == [1.0]
 
 
 @pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
@@ -240,7 +257,7 @@ def test_looks_where_cases_come_near_but_counts_on_failures_alone():
     nothing, batch = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=np.int64)
     history = LevelHistory(points, score, nothing, gap_m, batch)
     assert _limit(history) is not None
-    proposal = _Search(history, 0, rng, 20).batch(20)
+    proposal = _Search(history, rng, 20).batch(20)
     assert np.median(proposal.points[:, 0]) < 0.1
     assert proposal.gain.sum() < 2.0
 

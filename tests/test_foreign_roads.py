@@ -27,7 +27,7 @@ from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.traci import TraciVut
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
-from merge_sumo.reports.report import _road
+from merge_sumo.reports.report_data import _road
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
 from merge_sumo.sumo.opendrive import opendrive
@@ -433,7 +433,9 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
     client.start()
     case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
     with World(1, road) as world:
-        vut = TraciVut(1, world.road, port, None, VutOptions(deadline_s=5.0, connect_s=10.0))
+        vut = TraciVut(
+            1, world.road, world.scenario, port, None, VutOptions(deadline_s=5.0, connect_s=10.0)
+        )
         try:
             ((_, trajectory),) = rollout(world, PovLibrary(1), vut, [case])
         finally:

@@ -37,7 +37,7 @@ def band_area(half_width):
 
 def aimed_at(half_width, blur=0.02):
     """Return a proposal whose surrogate knows the band, but not sharply."""
-    middle = cells(1)
+    middle = cells(2)
     beyond = np.abs(0.6 * middle[:, 0] + 0.8 * middle[:, 1] - 0.7) - half_width
     return Proposal({1: 1.0}, {1: 1.0 / (1.0 + np.exp(beyond / blur))})
 
@@ -52,7 +52,7 @@ class TestTheProposal:
     @pytest.mark.parametrize("seed", range(3))
     def test_has_a_density_that_integrates_to_1(self, seed):
         rng = np.random.default_rng(seed)
-        chance = {level: rng.random(len(cells(level))) ** 4 for level in LEVELS}
+        chance = {level: rng.random(len(cells(3 if level == 2 else 2))) ** 4 for level in LEVELS}
         proposal = Proposal({0: 0.2, 1: 0.5, 2: 0.3}, chance)
         assert proposal.total() == pytest.approx(1.0, abs=1e-12)
 
@@ -64,7 +64,7 @@ class TestTheProposal:
 
     def test_draws_what_its_weights_say(self):
         """E_q[w 1(A)] = p(A), for a set A far from any cell's edge."""
-        chance = {1: cells(1)[:, 0] ** 8, 2: cells(2)[:, 2] ** 8}
+        chance = {1: cells(2)[:, 0] ** 8, 2: cells(3)[:, 2] ** 8}
         proposal = Proposal({1: 0.25, 2: 0.75}, chance)
         draws = proposal.draw(40_000, np.random.default_rng(1))
         inside = (draws.level == 2) & (draws.chances[:, 2] > 0.9)
@@ -75,7 +75,7 @@ class TestTheProposal:
         assert draws.weight.mean() == pytest.approx(1.0, abs=0.02)
 
     def test_gives_each_draw_the_weight_of_its_place(self):
-        proposal = Proposal({0: 0.5, 2: 0.5}, {level: cells(level)[:, 1] for level in (0, 2)})
+        proposal = Proposal({0: 0.5, 2: 0.5}, {0: cells(2)[:, 1], 2: cells(3)[:, 1]})
         draws = proposal.draw(500, np.random.default_rng(2))
         for level in (0, 2):
             at = draws.level == level
@@ -101,7 +101,7 @@ class TestTheInterval:
         assert np.mean([e.probability for e in found]) == pytest.approx(truth, rel=0.15)
 
     def test_holds_with_a_surrogate_that_looks_in_the_wrong_place(self):
-        middle = cells(1)
+        middle = cells(2)
         wrong = Proposal({1: 1.0}, {1: np.exp(-50.0 * middle.sum(axis=1))})
         truth = band_area(0.02)
         held = 0
@@ -205,7 +205,7 @@ class TestADistribution:
         found = self.stated(
             tmp_path, {"levels": {"1": 1}, "v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 1}}
         )
-        middle = found.points(1, cells(1))
+        middle = found.points(1, cells(2))
         proposal = Proposal(found.levels, {1: (middle[:, 1] > 0.68).astype(float)})
         draws = proposal.draw(3000, np.random.default_rng(0))
         failed = found.points(1, draws.chances[:, :2])[:, 1] > 0.7

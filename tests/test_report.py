@@ -15,8 +15,10 @@ from lxml import html
 from merge_sumo.campaigns.experiments import Truth
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.drivers.vuts.output import LINES, LOG
-from merge_sumo.reports import report
-from merge_sumo.reports.report import SPEED_UNIT_MPS, headline, report_page, write_report
+from merge_sumo.reports import report_data, report_facts
+from merge_sumo.reports.report import report_page, write_report
+from merge_sumo.reports.report_data import SPEED_UNIT_MPS
+from merge_sumo.reports.report_words import headline
 from merge_sumo.reports.summary import summarise
 from merge_sumo.reports.surface import learn_surface
 from merge_sumo.reports.verdict import judge
@@ -204,7 +206,7 @@ class TestTheMotion:
 
 class TestALongCampaign:
     def test_shows_some_cases_and_counts_the_others(self, made, monkeypatch):
-        monkeypatch.setattr(report, "SHOWN", 50)
+        monkeypatch.setattr(report_facts, "SHOWN", 50)
         page = report_page(made)
         data = data_of(page)
         assert len(data["cases"]["index"]) == 50
@@ -218,7 +220,7 @@ class TestALongCampaign:
         assert {int(n) for n in root.xpath("//button/@data-case")} <= shown
 
     def test_with_many_failures_has_fewer_points_of_coverage(self, made, monkeypatch):
-        monkeypatch.setattr(report, "MOST_BALLS", 60)
+        monkeypatch.setattr(report_data, "MOST_BALLS", 60)
         for level in data_of(report_page(made))["search"]["levels"]:
             known = [value for value in level["fmc"] if value is not None]
             assert 1 <= len(known) < len(level["fmc"])
@@ -227,7 +229,7 @@ class TestALongCampaign:
             assert (np.diff(known) > -1e-4).all()
 
     def test_is_drawn_in_groups_of_batches(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(report, "MOST_STEPS", 4)
+        monkeypatch.setattr(report_data, "MOST_STEPS", 4)
         run = write_run(tmp_path / "run", per_level=60)
         search = data_of(report_page(run))["search"]
         assert search["batch"] == [0, 3, 6]
@@ -246,7 +248,7 @@ class TestTheTruth:
             points = np.random.default_rng(1).random((2000, len(dimensions(level))))
             return Truth(points, np.where(points[:, 0] < 0.5, -900.0, -10.0))
 
-        monkeypatch.setattr(report, "read_truth", truth)
+        monkeypatch.setattr(report_facts, "read_truth", truth)
         return truth
 
     def test_is_drawn_where_it_is_cached(self, tmp_path, cached):

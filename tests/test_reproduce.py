@@ -8,7 +8,8 @@ import pytest
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports import reproduce as paper
-from merge_sumo.reports.reproduce import TABLE_II, Scale, reproduce
+from merge_sumo.reports.reproduce import reproduce
+from merge_sumo.reports.table2 import TABLE_II, Scale
 from merge_sumo.system.workers import open_workers
 
 FIGURES = {

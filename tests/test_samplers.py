@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.base import LevelHistory, Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.values.case import Case, Pool, dimensions, to_unit
+from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
@@ -35,6 +37,7 @@ def measures(
             "pov_max_brake_mps2": 0.0,
             "clipped_steps": 0,
             "error": error,
+            "nearest": "pov",
         }
     )
 
@@ -71,9 +74,20 @@ def name(request) -> str:
     return request.param
 
 
-@pytest.fixture(scope="module", params=[(0,), (2,), (0, 1, 2)], ids=str)
+TRAFFIC = replace(US23, headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 3.0))
+POOLS = {
+    "2-d": Pool(levels=(0,), v_vut0_mps=17.5),
+    "3-d": Pool(levels=(2,), v_vut0_mps=17.5),
+    "2-d and 3-d": Pool(levels=(0, 1, 2), v_vut0_mps=17.5),
+    "4-d": Pool(levels=(0,), v_vut0_mps=17.5, scenario=TRAFFIC),
+    "4-d and 5-d": Pool(levels=(1, 2), v_vut0_mps=17.5, scenario=TRAFFIC),
+    "6-d": Pool(levels=(2,), scenario=replace(TRAFFIC, v_vut0_mps=(14.0, 22.0))),
+}
+
+
+@pytest.fixture(scope="module", params=POOLS)
 def pool(request) -> Pool:
-    return Pool(levels=request.param, v_vut0_mps=17.5)
+    return POOLS[request.param]
 
 
 @pytest.fixture(scope="module")
@@ -99,9 +113,10 @@ class TestEverySampler:
         for case in make_sampler(name, pool, 1).ask(30) + played[0].ask(20):
             assert case.level in pool.levels
             assert type(case.level) is int
-            assert case.v_vut0_mps == pool.v_vut0_mps
+            assert case.scenario is pool.scenario
+            assert pool.v_vut0_mps in (None, case.v_vut0_mps)
             assert (case.svo_rad is None) == (case.level != 2)
-            for dimension in dimensions(case.level):
+            for dimension in pool.scenario.dimensions(case.level):
                 value = getattr(case, dimension.field)
                 assert type(value) is float
                 assert dimension.low <= value <= dimension.high
@@ -177,7 +192,8 @@ class TestEverySampler:
     def test_goes_on_from_a_journal_read_from_its_records(self, name, pool, played, expected):
         _, outcomes = played
         resumed = make_sampler(name, pool, 5)
-        resumed.tell(Outcome.from_record(outcome.to_record()) for outcome in outcomes)
+        records = [outcome.to_record() for outcome in outcomes]
+        resumed.tell(Outcome.from_record(record, pool.scenario) for record in records)
         assert resumed.ask(9) == expected
 
     def test_proposes_other_cases_for_another_seed(self, name, pool, played, expected):

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from merge_sumo.campaigns.ground import ProvingGround
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.ground import ProvingGround, road_for
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions, seen_at_start, seen_in
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.sumo.replay import replay
+from merge_sumo.sumo.replay_folder import HOLD_STEPS, RECORD, write_scenario
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, Pool, from_unit, to_unit
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, VUT, Scenario
@@ -219,6 +225,69 @@ class TestWhatTheVutMeets:
         far = replace(near, headway_ahead_s=30.0)
         (behind_it,), (alone,) = run("sumo:IDM", [near], 1), run("sumo:IDM", [far], 1)
         assert not np.array_equal(behind_it.motion[:80, VUT], alone.motion[:80, VUT])
+
+
+class TestARunInTraffic:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def made(cls, tmp_path_factory):
+        folder = tmp_path_factory.mktemp("traffic") / "run"
+        settings = CampaignSettings(
+            vut="design2", levels=(0, 1, 2), sampler="uniform", cases=30, batch=15, scenario=TRAFFIC
+        )
+        return run_campaign(settings, folder)
+
+    def test_is_read_back_as_it_was_written(self, made):
+        again = Run(made.folder)
+        assert again.outcomes == made.outcomes
+        assert again.scenario == TRAFFIC
+        assert {o.measures.nearest for o in again.outcomes} == {"pov", "ahead", "behind"}
+        trajectory = again.trajectory(7)
+        assert trajectory.motion.shape[1:] == (4, 3)
+        assert measure(trajectory) == again.outcome(7).measures
+
+    @pytest.mark.parametrize("hosted", [False, True])
+    def test_is_replayed_identically(self, made, tmp_path, hosted):
+        road = road_for(TRAFFIC)
+        if hosted:  # as a road that is not the shipped one
+            road = replace(road, sha256="0" * 64)
+        for index in (0, 12, 25):
+            folder = tmp_path / str(index)
+            write_scenario(folder, road, made.outcome(index), made.trajectory(index))
+            result = replay(folder)
+            assert (result.diverged_at_s, result.detail) == (None, "")
+            assert result.rows == 4 * (len(made.trajectory(index).motion) + HOLD_STEPS)
+
+    def test_is_no_replay_without_one_of_the_cars(self, made, tmp_path):
+        write_scenario(tmp_path / "c", road_for(TRAFFIC), made.outcome(0), made.trajectory(0))
+        record = tmp_path / "c" / RECORD
+        lines = record.read_text().splitlines(keepends=True)
+        gone = next(n for n, line in enumerate(lines) if 'id="behind"' in line)
+        record.write_text("".join(lines[:gone] + lines[gone + 1 :]))
+        with pytest.raises(UserError, match="every vehicle in every timestep"):
+            replay(tmp_path / "c")
+
+    def test_shows_all_cars_to_a_traci_client(self, tmp_path):
+        script = tmp_path / "client.py"
+        script.write_text(
+            "import sys, traci\n"
+            "traci.init(int(sys.argv[1]))\n"
+            "while traci.simulation.getMinExpectedNumber() > 0:\n"
+            "    traci.simulationStep()\n"
+            "    if 'vut' in (names := traci.vehicle.getIDList()):\n"
+            "        assert sorted(names) == ['ahead', 'behind', 'pov', 'vut'], names\n"
+            "        assert traci.vehicle.getLeader('behind')[0] == 'pov'\n"
+            "        assert traci.vehicle.getLength('vut') == 4.0\n"
+            "        gap = traci.vehicle.getLeader('pov', 500.0)[1]\n"
+            "        at = [traci.vehicle.getPosition(n)[0] for n in ('ahead', 'pov')]\n"
+            "        assert abs(gap - (at[0] - at[1] - 6.0)) < 1e-6, (gap, at)\n"
+            "        traci.vehicle.setSpeed('vut', 20.0)\n"
+        )
+        scenario = replace(TRAFFIC, pov_length_m=6.0, vut_length_m=4.0)
+        command = f"{sys.executable} {script} {{port}}"
+        trajectories = run("traci", cases_of(0, 2, scenario), command=command)
+        assert [t.error for t in trajectories] == [None, None]
+        assert [t.end for t in trajectories] == [End.MERGED] * 2
 
 
 def ending(gaps_m: dict[int, float], speeds: dict[int, float] | None = None) -> Trajectory:

@@ -35,7 +35,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.trajectory import End
 
 TESTS = Path(__file__).parent
@@ -60,7 +60,7 @@ class Played:
         thread = threading.Thread(target=self._client, args=(client,))
         thread.start()
         options = VutOptions(deadline_s=deadline_s, connect_s=10.0)
-        vut = TraciVut(1, road_of(), self.port, None, options)
+        vut = TraciVut(1, road_of(), US23, self.port, None, options)
         try:
             for _ in range(episodes):
                 self._episode(vut, steps)

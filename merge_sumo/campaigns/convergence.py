@@ -16,7 +16,7 @@ import numpy as np
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.values.case import dimensions, to_unit
+from merge_sumo.values.case import to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import Outcome
 
@@ -86,9 +86,9 @@ def gained(outcomes: Sequence[Outcome], batch: int) -> float:
 
 
 def covered_balls(outcomes: Sequence[Outcome]) -> float:
-    """Return the coverage of all levels in balls: volumes of 2 and 3 dimensions do not compare."""
+    """Return the coverage of all levels in balls: areas and volumes do not compare."""
     balls = 0.0
     for level in {outcome.case.level for outcome in outcomes}:
         failing = to_unit((o.case for o in outcomes if o.failed and o.case.level == level), level)
-        balls += fmc(failing) / fmc(np.zeros((1, len(dimensions(level)))))
+        balls += fmc(failing) / fmc(np.zeros((1, failing.shape[1])))
     return balls

@@ -11,11 +11,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from heapq import heappop, heapreplace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Final, cast
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.conductor import conduct, workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
@@ -32,8 +34,8 @@ from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import FloatArray, Pool, dimensions, to_unit
-from merge_sumo.values.fmc import RADIUS, fmc, regions
+from merge_sumo.values.case import FloatArray, Pool, to_unit
+from merge_sumo.values.fmc import fmc, radius_for, regions
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 
@@ -112,12 +114,12 @@ def ground_truth(
         policies=povs.sha256(),
     )
     path = kept.path(cache)
-    found = read_truth(path, level, count)
+    found = read_truth(path, level, count, scenario)
     if found is not None:
         return found
     check_place(path.parent, "MERGE_SUMO_CACHE")
     check_own(path)
-    points = np.random.default_rng([seed, level]).random((count, len(dimensions(level))))
+    points = np.random.default_rng([seed, level]).random((count, len(scenario.dimensions(level))))
     scores = np.full(count, np.nan)
     files = dict(factory.files or {})
     road = road_for(scenario)
@@ -187,7 +189,7 @@ class Kept:
         return (cache or cache_folder()) / f"truth-{key}.npz"
 
 
-def read_truth(path: Path, level: int, cases: int) -> Truth | None:
+def read_truth(path: Path, level: int, cases: int, scenario: Scenario = US23) -> Truth | None:
     """Return what a file of the cache holds.
 
     None where there is none, or it is torn or something else, such as another truth under this
@@ -200,7 +202,8 @@ def read_truth(path: Path, level: int, cases: int) -> Truth | None:
             return None
     except UNREADABLE_NPZ:
         return None
-    fits = points.shape == (cases, len(dimensions(level))) and score.shape == (cases,)
+    shape = cases, len(scenario.dimensions(level))
+    fits = points.shape == shape and score.shape == (cases,)
     numbers = points.dtype == score.dtype == np.float64
     if not (fits and numbers):
         return None
@@ -443,8 +446,8 @@ def _found(points: FloatArray, region: FloatArray) -> bool:
     """Return whether some failure that was found lies in a region of the truth."""
     if not len(points):
         return False
-    distance = np.linalg.norm(points[:, None, :] - region[None, :, :], axis=2)
-    return bool((distance <= RADIUS).any())
+    distance, _ = cKDTree(region).query(points)
+    return bool((distance <= radius_for(points.shape[1])).any())
 
 
 def oracle(truths: Mapping[int, Truth], cases: int, batch: int) -> dict[int, float]:
@@ -458,8 +461,8 @@ def oracle(truths: Mapping[int, Truth], cases: int, batch: int) -> dict[int, flo
     Returns:
         FMC after every case of the first batch, and then after every batch, up to `cases`.
     """
-    greedy = {level: _greedy(truth.failures) for level, truth in truths.items()}
-    ball = {level: fmc(np.zeros((1, len(dimensions(level))))) for level in truths}
+    greedy = {level: _greedy(truth.failures, cases) for level, truth in truths.items()}
+    ball = {level: fmc(np.zeros((1, truth.points.shape[1]))) for level, truth in truths.items()}
     gains = [(-g * ball[level], level) for level, (_, gain) in greedy.items() for g in gain]
     order = [level for _, level in sorted(gains)]
     shown = sorted({*range(min(batch, cases) + 1), *range(0, cases, batch), cases})
@@ -469,17 +472,25 @@ def oracle(truths: Mapping[int, Truth], cases: int, batch: int) -> dict[int, flo
     }
 
 
-def _greedy(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points, (m, d), in greedy order and what each adds, in balls; it never grows."""
+def _greedy(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """Return at most so many points, (m, d), in greedy order and what each adds, in balls.
+
+    What a point adds never grows. So the best is one that still adds as much as it once did, if no
+    other one ever did more (Minoux, 1978); of points that add the same it is the first.
+    """
     ground = Ground(points.shape[1])
-    balls = ground.balls(points)
-    left = np.ones(len(points), dtype=bool)
-    order, gains = [], []
-    for _ in points:
-        new = np.where(left, ground.new(balls), -1.0)
-        best = int(np.argmax(new))
-        left[best] = False
-        ground.cover(balls[best], 1.0)
-        order.append(best)
-        gains.append(float(new[best]))
+    queue = [(-1.0, place) for place in range(len(points))]
+    order: list[int] = []
+    gains: list[float] = []
+    while queue and len(order) < most:
+        once, place = queue[0]
+        ball = ground.balls(points[[place]])
+        new = float(ground.new(ball)[0])
+        if new < -once:
+            heapreplace(queue, (-new, place))
+            continue
+        heappop(queue)
+        ground.cover(ball[0], 1.0)
+        order.append(place)
+        gains.append(new)
     return points[order], np.array(gains)

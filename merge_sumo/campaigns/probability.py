@@ -28,7 +28,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.folders import check_new_file, write_new
-from merge_sumo.values.case import Case, dimensions
+from merge_sumo.values.case import Case
 from merge_sumo.values.score import Outcome, measure
 
 RESULT: Final = "probability.json"
@@ -82,11 +82,11 @@ def failure_probability(
     check_new_file(lines)
     told = make_sampler("uniform", settings.pool, 0)
     told.tell(run.outcomes)
-    chance = {
-        level: expected_chance(told.history(level), stated.points(level, cells(level)))
-        for level in stated.levels
-    }
-    proposal = Proposal(stated.levels, chance)
+    chance = {}
+    for level in stated.levels:
+        history = told.history(level)
+        chance[level] = expected_chance(history, stated.points(level, cells(history.dims)))
+    proposal = Proposal(stated.levels, chance, settings.scenario)
     draws = proposal.draw(cases, np.random.default_rng([seed, STREAM]))
     outcomes = _run(settings, net, stated, draws, lines, on_case)
     failed = np.array([outcome.failed for outcome in outcomes])
@@ -124,7 +124,8 @@ def _run(
     by_place: dict[int, Case] = {}
     for level in stated.levels:
         places = np.flatnonzero(draws.level == level)
-        points = stated.points(level, draws.chances[places, : len(dimensions(level))])
+        dims = len(settings.scenario.dimensions(level))
+        points = stated.points(level, draws.chances[places, :dims])
         drawn = settings.pool.cases(points, level)
         by_place.update(zip(places.tolist(), drawn, strict=True))
     cases = [by_place[place] for place in range(len(by_place))]

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from merge_sumo.samplers.base import LevelHistory
 from merge_sumo.samplers.belief import learn_chance
-from merge_sumo.values.case import FloatArray, dimensions
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import LEVELS, US23, Scenario
 
 DEFENSIVE: Final = 0.5
 """Share of the fresh cases that are drawn from the stated distribution itself."""
-CELLS: Final = {2: 64, 3: 24}
-"""Cells per coordinate on which the proposal is constant."""
+CELLS: Final = {2: 64, 3: 24, 4: 12, 5: 8, 6: 6}
+"""Cells per coordinate, by their number, on which the proposal is constant."""
 CHUNK: Final = 4096
 """Cells that are predicted at a time."""
 
@@ -34,7 +35,8 @@ class Draws:
 
     Attributes:
         level: (n,).
-        chances: place of each in the distribution, (n, 3); below level 2 the last is not used.
+        chances: place of each in the distribution, (n, d), with d of the level that has the most
+            coordinates; below level 2 the last is not used.
         weight: p / q, (n,).
         plain: whether it was drawn from the stated distribution itself, (n,).
     """
@@ -52,9 +54,16 @@ class Proposal:
     coordinates, where p is uniform.
     """
 
-    def __init__(self, weights: Mapping[int, float], chance: Mapping[int, FloatArray]) -> None:
-        """Take level weights, and P(fail) as expected in each cell of `cells(level)`, (c,)."""
+    def __init__(
+        self,
+        weights: Mapping[int, float],
+        chance: Mapping[int, FloatArray],
+        scenario: Scenario = US23,
+    ) -> None:
+        """Take level weights, and P(fail) as expected in each cell of `cells(d)`, (c,)."""
         self._levels = list(weights)
+        self._dims = [len(scenario.dimensions(level)) for level in self._levels]
+        self._drawn = len(scenario.dimensions(LEVELS[-1]))
         self._weights = np.array(list(weights.values()))
         wanted = [np.sqrt(chance[level]) for level in self._levels]
         mean = float(sum(w * s.mean() for w, s in zip(self._weights, wanted, strict=True)))
@@ -85,11 +94,10 @@ class Proposal:
             rng.choice(len(self._levels), size=n, p=self._weights),
             np.searchsorted(self._starts, cell, side="right") - 1,
         )
-        chances = rng.random((n, 3))
+        chances = rng.random((n, self._drawn))
         weight = np.empty(n)
-        for number, level in enumerate(self._levels):
+        for number, (level, dims) in enumerate(zip(self._levels, self._dims, strict=True)):
             here = place == number
-            dims = len(dimensions(level))
             per_side = CELLS[dims]
             aimed = here & ~plain
             corner = np.unravel_index(cell[aimed] - self._starts[number], (per_side,) * dims)
@@ -106,9 +114,8 @@ class Proposal:
         return np.asarray(1.0 / self._density[self._levels.index(level)][cell], dtype=np.float64)
 
 
-def cells(level: int) -> FloatArray:
-    """Return the middle of each cell of a level, in chances, (c, d)."""
-    dims = len(dimensions(level))
+def cells(dims: int) -> FloatArray:
+    """Return the middle of each cell of a level with so many coordinates, in chances, (c, d)."""
     middle = (np.arange(CELLS[dims]) + 0.5) / CELLS[dims]
     return np.stack(np.meshgrid(*[middle] * dims, indexing="ij"), axis=-1).reshape(-1, dims)
 

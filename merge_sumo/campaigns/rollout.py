@@ -30,8 +30,8 @@ WRONGS: Final = (Exception, SystemExit)
 MAX_LOSSES: Final = 2
 """A case that made the driver lose its memory so often, on its own, is not tried again."""
 
-IDLE: Final = 2**62
-"""Steps left in a corridor without an episode: it never times out."""
+NEVER: Final = 2**62
+"""The step at which a corridor without an episode times out."""
 
 
 @dataclass(slots=True)
@@ -80,8 +80,9 @@ class _Rollout:
         self.errors: dict[int, str] = {}
         self.a_min = np.zeros((vehicles, corridors))
         self.a_max = np.zeros((vehicles, corridors))
-        self.left = np.full(corridors, IDLE)
-        """Steps until the timeout."""
+        self.timeout_at = np.full(corridors, NEVER)
+        """Rows of the record at which episodes time out."""
+        self.next_timeout = NEVER
         # One row per step of the world, shared by all corridors: x, v, a of every vehicle.
         self.record = np.zeros((RING_ROWS, vehicles, 3, corridors))
         self.row = 0
@@ -105,11 +106,10 @@ class _Rollout:
                 self.refill(everywhere)
                 continue
             self.step += 1
-            self.left -= 1
             x_vut_m = world.x_m[VUT]
             # Scalars first: in most steps no episode ends. Idle corridors stand before M.
-            if x_vut_m.max() >= 0.0 or self.left.min() <= 0 or self.errors:
-                ended = (x_vut_m >= 0.0) | (self.left <= 0)
+            if x_vut_m.max() >= 0.0 or self.row >= self.next_timeout or self.errors:
+                ended = (x_vut_m >= 0.0) | (self.row >= self.timeout_at)
                 ended[list(self.errors)] = True
                 corridors = np.flatnonzero(ended).tolist()
                 for corridor in corridors:
@@ -151,6 +151,7 @@ class _Rollout:
             self.active[corridor] = False
         for corridor in corridors:
             self.begin(corridor, *self.next_case())
+        self.next_timeout = int(self.timeout_at.min())
 
     def next_case(self) -> tuple[int, Case | None]:
         """Return what is to run next; None where a corridor is to stay empty."""
@@ -167,13 +168,13 @@ class _Rollout:
         if case is None:
             self.episodes[corridor] = None
             self.world.park(corridor)
-            self.left[corridor] = IDLE
+            self.timeout_at[corridor] = NEVER
             self.a_min[:, corridor] = self.a_max[:, corridor] = 0.0
             return
         scenario = case.scenario
         self.a_min[:, corridor] = scenario.a_min_mps2
         self.a_max[:, corridor] = scenario.a_max_mps2
-        self.left[corridor] = scenario.max_steps
+        self.timeout_at[corridor] = self.row + scenario.max_steps
         self.episodes[corridor] = _Episode(index, case, self.row)
         self.world.place(corridor, case.starts())
         for car in range(len(self.mainline)):

@@ -254,12 +254,13 @@ def reproduce(
     """
     from merge_sumo.campaigns.settings import povs_of
     from merge_sumo.reports import reproduce as paper
+    from merge_sumo.reports import table2
     from merge_sumo.reports.progress import Bars
     from merge_sumo.system.workers import open_workers
 
     if seeds is None:
         seeds = 2 if quick else 10
-    scale = paper.quick(seeds) if quick else paper.Scale(seeds=seeds)
+    scale = table2.quick(seeds) if quick else table2.Scale(seeds=seeds)
     povs = povs_of(policies, US23)
     folder = out or dated("reproduce")
     with open_workers(workers, dask) as there, Bars() as bars:

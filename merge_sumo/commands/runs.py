@@ -25,7 +25,7 @@ from merge_sumo.system.folders import check_own
 from merge_sumo.system.printable import quoted
 
 if TYPE_CHECKING:
-    from merge_sumo.reports.comparison import RunComparison
+    from merge_sumo.reports.changes import RunComparison
 
 EXPORTS: Final = "exports"
 
@@ -185,7 +185,7 @@ def compare_runs(
 
 
 def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
-    from merge_sumo.reports.comparison import Change
+    from merge_sumo.reports.changes import Change
 
     show(
         f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "

@@ -16,11 +16,15 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.drivers.units import Units
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, LEVEL0_V_MPS, V_HW_MIN_MPS
+from merge_sumo.values.scenario import US23, Scenario
 
-ACTIONS_MPS2: Final = np.arange(A_MIN_MPS2, A_MAX_MPS2 + 1.0)
-"""The accelerations that a learned driver chooses from, -4 to +2 m/s2."""
+BRAKING: Final = (1.0, 0.75, 0.5, 0.25)
+"""Shares of the hardest braking that a learned driver chooses from,"""
+ACCELERATING: Final = (0.5, 1.0)
+"""and of the hardest acceleration; between them it coasts."""
+ACTIONS: Final = len(BRAKING) + 1 + len(ACCELERATING)
 DECISION_STEPS: Final = 5
 """A learned driver decides every 0.5 s and holds its acceleration in between."""
 
@@ -33,12 +37,22 @@ _HORIZON_S: Final = 20.0
 _GAP_SCALES_M: Final = (80.0, 25.0, 8.0)
 
 
+def actions_mps2(scenario: Scenario) -> FloatArray:
+    """Return the accelerations of the actions of a learned driver, (7,), in rising order.
+
+    In the paper's scenario they are the whole numbers from -4 to +2 m/s2.
+    """
+    hardest = [share * scenario.a_min_mps2 for share in BRAKING]
+    return np.array([*hardest, 0.0, *(share * scenario.a_max_mps2 for share in ACCELERATING)])
+
+
 def features(
     x_pov_m: FloatArray,
     v_pov_mps: FloatArray,
     x_vut_m: FloatArray,
     v_vut_mps: FloatArray,
     svo_rad: FloatArray | None = None,
+    scenario: Scenario = US23,
 ) -> FloatArray:
     """Return what the network sees of n states, (n, 26), or (n, 28) with an orientation.
 
@@ -47,33 +61,38 @@ def features(
     acceleration; the gap at M that follows from them for a POV that keeps its speed, accelerates
     or brakes, each on three scales; and final speeds. A gap decides the reward, so a network that
     is given gaps learns in minutes what it would otherwise have to work out first.
+
+    Times and gaps follow from what vehicles can do in the scenario, and all is measured in its
+    units. The numbers below are those of the paper's scenario, whose units are 1.
     """
+    unit, a_min, a_max = Units.of(scenario), scenario.a_min_mps2, scenario.a_max_mps2
+    a_level0, v_cruise = scenario.level0_a_mps2, scenario.level0_v_mps
+    horizon_s = _HORIZON_S * unit.time
     distance = np.maximum(-x_vut_m, 0.0)
-    t_level0 = np.minimum(level0_time_to(distance, v_vut_mps), _HORIZON_S)
-    t_constant = np.minimum(distance / np.maximum(v_vut_mps, 0.5), _HORIZON_S)
-    t_full = (np.sqrt(v_vut_mps * v_vut_mps + 4.0 * distance) - v_vut_mps) / 2.0
-    t_brake = np.minimum(t_level0, v_pov_mps / 4.0)
+    t_level0 = np.minimum(level0_time_to(distance, v_vut_mps, a_level0, v_cruise), horizon_s)
+    t_constant = np.minimum(distance / np.maximum(v_vut_mps, 0.5 * unit.speed), horizon_s)
+    t_full = (np.sqrt(v_vut_mps * v_vut_mps + 2.0 * a_max * distance) - v_vut_mps) / a_max
+    t_brake = np.minimum(t_level0, v_pov_mps / -a_min)
     gaps = (
         x_pov_m + v_pov_mps * t_level0,
-        x_pov_m + (v_pov_mps + t_level0) * t_level0,
-        x_pov_m + (v_pov_mps - 2.0 * t_brake) * t_brake,
+        x_pov_m + (v_pov_mps + 0.5 * a_max * t_level0) * t_level0,
+        x_pov_m + (v_pov_mps + 0.5 * a_min * t_brake) * t_brake,
         x_pov_m + v_pov_mps * t_constant,
         x_pov_m + v_pov_mps * t_full,
     )
-    v_level0 = np.maximum(v_vut_mps, np.minimum(v_vut_mps + t_level0, LEVEL0_V_MPS))
+    v_level0 = np.maximum(v_vut_mps, np.minimum(v_vut_mps + a_level0 * t_level0, v_cruise))
+    v_hw = scenario.v_hw_min_mps
     columns = [
-        x_pov_m / 100.0 + 1.0,
-        (v_pov_mps - 28.0) / 6.0,
-        x_vut_m / 100.0 + 1.0,
-        (v_vut_mps - 22.0) / 6.0,
-        t_level0 / 5.0 - 1.0,
-        t_constant / 5.0 - 1.0,
-        t_full / 5.0 - 1.0,
-        *(np.tanh(gap / scale) for gap in gaps for scale in _GAP_SCALES_M),
-        (v_level0 - V_HW_MIN_MPS) / 4.0,
-        (v_vut_mps + 2.0 * t_full - V_HW_MIN_MPS) / 8.0,
-        np.tanh((v_pov_mps - v_level0) / 3.0),
-        (v_pov_mps - V_HW_MIN_MPS) / 4.0,
+        x_pov_m / (100.0 * unit.length) + 1.0,
+        (v_pov_mps - (v_hw + 3.4 * unit.speed)) / (6.0 * unit.speed),
+        x_vut_m / (100.0 * unit.length) + 1.0,
+        (v_vut_mps - (v_hw - 2.6 * unit.speed)) / (6.0 * unit.speed),
+        *(t / (5.0 * unit.time) - 1.0 for t in (t_level0, t_constant, t_full)),
+        *(np.tanh(gap / (scale * unit.gap)) for gap in gaps for scale in _GAP_SCALES_M),
+        (v_level0 - v_hw) / (4.0 * unit.speed),
+        (v_vut_mps + a_max * t_full - v_hw) / (8.0 * unit.speed),
+        np.tanh((v_pov_mps - v_level0) / (3.0 * unit.speed)),
+        (v_pov_mps - v_hw) / (4.0 * unit.speed),
     ]
     if svo_rad is not None:
         columns += [np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0]
@@ -143,21 +162,34 @@ class LevelKDriver(Driver):
         self.network = network
         self._svo_rad = np.zeros(corridors)
         self._held = np.zeros(corridors)
+        self._scenarios = [US23]
+        self._scenario = np.zeros(corridors, dtype=np.int64)
+        """Which of them is a corridor's; a campaign has one."""
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the social value orientation of the case."""
+        """Take the scenario and the social value orientation of the case."""
         self._svo_rad[corridor] = case.svo_rad or 0.0
+        if case.scenario not in self._scenarios:
+            self._scenarios.append(case.scenario)
+        self._scenario[corridor] = self._scenarios.index(case.scenario)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the held accelerations, decided anew where a decision is due."""
         due = np.flatnonzero((scene.step % DECISION_STEPS == 0) & scene.active)
-        if due.size:
-            inputs = features(
-                scene.x_pov_m[due],
-                scene.v_pov_mps[due],
-                scene.x_vut_m[due],
-                scene.v_vut_mps[due],
-                self._svo_rad[due] if self.network.sees_svo else None,
-            )
-            self._held[due] = ACTIONS_MPS2[self.network.values(inputs).argmax(axis=1)]
+        for number, scenario in enumerate(self._scenarios):
+            mine = due[self._scenario[due] == number]
+            if mine.size:
+                self._decide(mine, scene, scenario)
         return self._held
+
+    def _decide(self, due: NDArray[np.int64], scene: Scene, scenario: Scenario) -> None:
+        """Choose anew in corridors, which play a scenario."""
+        inputs = features(
+            scene.x_pov_m[due],
+            scene.v_pov_mps[due],
+            scene.x_vut_m[due],
+            scene.v_vut_mps[due],
+            self._svo_rad[due] if self.network.sees_svo else None,
+            scenario,
+        )
+        self._held[due] = actions_mps2(scenario)[self.network.values(inputs).argmax(axis=1)]

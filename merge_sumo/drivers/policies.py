@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
+from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.resources import resource
@@ -21,6 +21,12 @@ from merge_sumo.values.scenario import US23, Scenario
 MANIFEST: Final = "manifest.json"
 NETWORKS: Final = ("pov1", "vut1", "pov2", "vut2")
 """In the order of the helix: each is trained against an earlier one, or against level 0."""
+PLAYED: Final = (
+    *("x_pov0_m", "v_pov0_mps", "x_vut0_m", "v_vut0_mps", "a_min_mps2", "a_max_mps2"),
+    *("v_hw_min_mps", "v_hw_max_mps", "v_min_mps", "ttc_min_s", "dx_crash_m", "dx_critical_m"),
+    *("level0_a_mps2", "level0_v_mps", "timeout_s"),
+)
+"""Numbers of a scenario that decide what a driver learns; the road and other cars do not."""
 MOST_BYTES: Final = 1 << 26
 """No network and no manifest is larger."""
 
@@ -65,9 +71,35 @@ def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
         for name, entry in found.items():
             if not isinstance(entry["sha256"], str):
                 raise TypeError(f"the sha256 of {name} is no text")
+            scenario_of(entry)
         return found
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, UserError) as error:
         raise UserError(f"{path} is not a readable manifest of policies: {error}") from error
+
+
+def scenario_record(scenario: Scenario) -> dict[str, Any]:
+    """Return what a manifest says of the scenario that a network was trained for."""
+    values = {name: getattr(scenario, name) for name in PLAYED}
+    return {
+        "name": scenario.name,
+        **{k: list(v) if isinstance(v, tuple) else v for k, v in values.items()},
+    }
+
+
+def scenario_of(entry: dict[str, Any]) -> Scenario:
+    """Return the scenario that a network was trained for, on no road; the paper's if none is said.
+
+    Raises `UserError` when the manifest describes none.
+    """
+    record = entry.get("scenario", scenario_record(US23))
+    if not isinstance(record, dict) or not set(record) <= {"name", *PLAYED}:
+        raise UserError("the scenario of a policy is a table of its numbers")
+    return Scenario.from_record(record)
+
+
+def plays_as(one: Scenario, other: Scenario) -> bool:
+    """Return whether a driver learns the same in two scenarios."""
+    return all(getattr(one, name) == getattr(other, name) for name in PLAYED)
 
 
 def load_network(name: str, folder: Path | None = None) -> QNetwork:
@@ -116,7 +148,7 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
     except (SafetensorError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise UserError(f"{path} holds no action-value network: {error}") from error
     expected = FEATURES + (SVO_FEATURES if name == "pov2" else 0)
-    if (inputs, outputs) != (expected, len(ACTIONS_MPS2)):
+    if (inputs, outputs) != (expected, ACTIONS):
         raise UserError(f"{path} has {inputs} inputs and {outputs} actions: train it again")
     return network
 

@@ -23,7 +23,7 @@ from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, VEHICLES, VUT
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
 TABLE: Final = "trajectories"
 COLUMNS: Final = (
@@ -34,8 +34,8 @@ ROAD: Final = "road.xodr"
 _EPOCH: Final = datetime(2000, 1, 1)
 MINOR_VERSION: Final = 2
 """OpenSCENARIO 1.2."""
-CAR_M: Final = {"length": 5.0, "width": 1.8, "height": 1.5}
-"""The car of the replay folders; it plays no part in a verdict."""
+WIDTH_M: Final = 1.8
+HEIGHT_M: Final = 1.5
 WHEEL_M: Final = 0.7
 
 WriteCase = Callable[[Run, int, Path, Corridor], Path]
@@ -114,7 +114,7 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
     for row, who in enumerate(VEHICLES[: trajectory.motion.shape[1]]):
-        entities.add_scenario_object(who, _car(xosc, who))
+        entities.add_scenario_object(who, _car(xosc, who, trajectory.case.scenario))
         places = [
             _place(xosc, road, x_m, on_ramp=row == VUT)
             for x_m in trajectory.motion[:, row, 0].tolist()
@@ -199,11 +199,10 @@ def _speed(xosc: Any, v_mps: float) -> Any:
     return xosc.AbsoluteSpeedAction(v_mps, at_once)
 
 
-def _car(xosc: Any, who: str) -> Any:
-    length, width, height = CAR_M["length"], CAR_M["width"], CAR_M["height"]
+def _car(xosc: Any, who: str, scenario: Scenario) -> Any:
+    length = scenario.vut_length_m if who == VEHICLES[VUT] else scenario.pov_length_m
+    width, height, limits = WIDTH_M, HEIGHT_M, (scenario.a_max_mps2, -scenario.a_min_mps2)
     box = xosc.BoundingBox(width, length, height, -length / 2.0, 0.0, height / 2.0)
     front = xosc.Axle(0.5, WHEEL_M, width - 0.2, -0.2 * length, WHEEL_M / 2.0)
     rear = xosc.Axle(0.0, WHEEL_M, width - 0.2, -0.8 * length, WHEEL_M / 2.0)
-    return xosc.Vehicle(
-        who, xosc.VehicleCategory.car, box, front, rear, 70.0, A_MAX_MPS2, -A_MIN_MPS2
-    )
+    return xosc.Vehicle(who, xosc.VehicleCategory.car, box, front, rear, 70.0, *limits)

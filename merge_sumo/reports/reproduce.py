@@ -7,16 +7,13 @@ the median. Same seeds and same versions give the same files.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from merge_sumo.campaigns.experiments import (
-    TRUTH_CASES,
-    Comparison,
     Search,
     Truth,
     compare,
@@ -26,9 +23,19 @@ from merge_sumo.campaigns.experiments import (
 )
 from merge_sumo.campaigns.settings import check_level, versions
 from merge_sumo.drivers.povs import Povs
-from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.reports.figures import Levels, Panel, Surface
+from merge_sumo.reports.table2 import (
+    ADAPTIVE,
+    SAMPLERS,
+    TABLE_II,
+    Column,
+    Result,
+    Scale,
+    table_markdown,
+    table_record,
+    table_rows,
+)
 from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.system.folders import make_folder, write_new
@@ -41,76 +48,9 @@ from merge_sumo.values.score import FAILURE_SCORE, Outcome
 TABLE_JSON: Final = "table2.json"
 TABLE_MARKDOWN: Final = "table2.md"
 PAGE: Final = "index.html"
-SAMPLERS: Final = ("uniform", "annealing", "subset", "gpr", "coverage")
-ADAPTIVE: Final = ("gpr", "coverage")
-"""The paper's sampler and ours: whose shares of the truth and of the levels are shown."""
 SURFACE_BATCHES: Final = (1, 4, 13, 20)
 SURFACE_POINTS: Final = 81
 """Points of a surface's grid, in each direction."""
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """A column of Table II: a VUT against one POV level, and what the paper found.
-
-    Attributes:
-        paper: FMC of the truth and of each sampler that the paper has.
-    """
-
-    vut: str
-    level: int
-    paper: Mapping[str, float]
-
-    @property
-    def title(self) -> str:
-        """What stands above the column."""
-        return f"level-{self.level} POV, {self.vut}"
-
-
-TABLE_II: Final = (
-    Column(
-        "design1",
-        0,
-        {"truth": 0.1296, "uniform": 0.0223, "annealing": 0.0497, "subset": 0.0830, "gpr": 0.1012},
-    ),
-    Column(
-        "design2",
-        1,
-        {"truth": 0.0849, "uniform": 0.0144, "annealing": 0.0184, "subset": 0.0445, "gpr": 0.0585},
-    ),
-    Column(
-        "design2",
-        2,
-        {"truth": 0.0073, "uniform": 0.0, "annealing": 0.0006, "subset": 0.0019, "gpr": 0.0032},
-    ),
-)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Scale:
-    """How much is run. The default is the paper's; `UserError` for numbers that make none.
-
-    Attributes:
-        seeds: runs of each sampler.
-        truth_cases: uniform cases of the truth at each level.
-        batches: k, the batches of every run.
-        batch: n, the cases per batch at one level; twice as many run where all levels do.
-    """
-
-    seeds: int = 10
-    truth_cases: tuple[int, int, int] = (TRUTH_CASES[0], TRUTH_CASES[1], TRUTH_CASES[2])
-    batches: int = 20
-    batch: int = 20
-
-    def __post_init__(self) -> None:
-        """Check the number of seeds."""
-        if self.seeds < 1:
-            raise UserError(f"--seeds is {self.seeds}: it must be 1 or more")
-
-
-def quick(seeds: int) -> Scale:
-    """Return a scale for a first look and for tests: it shows that all works, and no more."""
-    return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
 
 
 OnRun = Callable[[str, int, int, str], None]
@@ -138,22 +78,11 @@ def reproduce(
     work = _Work(folder, scale, povs, workers, on_run or (lambda *_: None))
     table = {column.title: work.column(column) for column in TABLE_II}
     work.all_levels()
-    _write(folder / TABLE_JSON, json.dumps(_table_record(table, scale), allow_nan=False) + "\n")
-    _write(folder / TABLE_MARKDOWN, _markdown(table))
+    _write(folder / TABLE_JSON, json.dumps(table_record(table, scale), allow_nan=False) + "\n")
+    _write(folder / TABLE_MARKDOWN, table_markdown(table))
     index = folder / PAGE
     _write(index, _page(table, scale, work.pictures))
     return index
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """A column that has run: what the truth holds, and each sampler beside it."""
-
-    column: Column
-    truth_fmc: float
-    truth_failures: int
-    truth_regions: int
-    compared: dict[str, Comparison]
 
 
 class _Work:
@@ -333,71 +262,6 @@ def _levels(searches: list[Search]) -> Levels:
     return Levels(cases, score)
 
 
-def _rows(table: Mapping[str, Result]) -> Iterator[tuple[str, list[tuple[float, float | None]]]]:
-    """Yield the rows of the table: a name, and (ours, the paper's) for each column."""
-    results = table.values()
-    yield "truth", [(r.truth_fmc, r.column.paper["truth"]) for r in results]
-    for name in SAMPLERS:
-        yield name, [(r.compared[name].fmc_median, r.column.paper.get(name)) for r in results]
-
-
-def _markdown(table: Mapping[str, Result]) -> str:
-    """Return Table II as Markdown: our medians, with the paper's numbers in brackets."""
-    lines = ["| FMC: ours (the paper's) | " + " | ".join(table) + " |"]
-    lines.append("|---|" + "---|" * len(table))
-    for name, pairs in _rows(table):
-        cells = [
-            f"{ours:.4f} ({'-' if paper is None else f'{paper:.4f}'})" for ours, paper in pairs
-        ]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    for name in ADAPTIVE:
-        cells = []
-        for result in table.values():
-            paper = result.column.paper
-            share = paper[name] / paper["truth"] if name in paper else None
-            ours = result.compared[name].fmc_over_truth_median
-            cells.append(f"{_or_dash(ours, '.2f')} ({_or_dash(share, '.2f')})")
-        lines.append(f"| {name} / truth | " + " | ".join(cells) + " |")
-    for name in ADAPTIVE:
-        results = [(result, result.compared[name]) for result in table.values()]
-        early = max(len(results[0][1].cases_by_batch) // 4, 1) - 1
-        cases = results[0][1].cases_by_batch[early]
-        cells = [
-            _or_dash(
-                found.fmc_by_batch_median[early] / result.truth_fmc if result.truth_fmc else None,
-                ".2f",
-            )
-            for result, found in results
-        ]
-        lines.append(f"| {name} / truth after {cases} cases | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _or_dash(value: float | None, form: str) -> str:
-    return "-" if value is None else f"{value:{form}}"
-
-
-def _table_record(table: Mapping[str, Result], scale: Scale) -> dict[str, Any]:
-    """Return Table II for a program; without seconds, so that it can be compared bit by bit."""
-    columns = []
-    for result in table.values():
-        samplers = {name: asdict(found) for name, found in result.compared.items()}
-        for found in samplers.values():
-            del found["sampler_s_median"]
-        columns.append(
-            {
-                "vut": result.column.vut,
-                "level": result.column.level,
-                "truth_fmc": result.truth_fmc,
-                "truth_failures": result.truth_failures,
-                "truth_regions": result.truth_regions,
-                "paper_fmc": dict(result.column.paper),
-                "samplers": samplers,
-            }
-        )
-    return {"scale": asdict(scale), "versions": versions(), "columns": columns}
-
-
 def _page(table: Mapping[str, Result], scale: Scale, pictures: Mapping[str, str]) -> str:
     from jinja2 import Environment, PackageLoader
 
@@ -405,7 +269,7 @@ def _page(table: Mapping[str, Result], scale: Scale, pictures: Mapping[str, str]
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
     return environment.get_template("reproduce.html.jinja").render(
         results=list(table.values()),
-        rows=dict(_rows(table)),
+        rows=dict(table_rows(table)),
         samplers=SAMPLERS,
         scale=scale,
         pictures=pictures,

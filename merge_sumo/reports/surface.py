@@ -13,7 +13,7 @@ import numpy as np
 
 from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
-from merge_sumo.values.case import FloatArray, Pool, dimensions
+from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import Outcome
 
@@ -21,8 +21,8 @@ FEWEST_FAILURES: Final = 5
 """Failures at a level from which a surrogate has something to say of others."""
 PLAUSIBLE: Final = 0.1
 """Chance to fail from which a place counts for `plausible_fmc`."""
-POOL_POINTS: Final = {2: 10_000, 3: 20_000}
-"""Uniform points by dimension: as many as the cases of a ground truth."""
+POOL_POINTS: Final = {2: 10_000, 3: 20_000, 4: 20_000, 5: 20_000, 6: 20_000}
+"""Uniform points by dimension: up to three as many as the cases of a ground truth."""
 PART: Final = 4000
 """Points asked at a time, so that memory does not grow with their number."""
 
@@ -30,11 +30,9 @@ PART: Final = 4000
 class Surface:
     """The surrogate of one level of a run."""
 
-    def __init__(
-        self, level: int, failing: FloatArray, chance: Callable[[FloatArray], FloatArray]
-    ) -> None:
+    def __init__(self, failing: FloatArray, chance: Callable[[FloatArray], FloatArray]) -> None:
         """Use a learned chance to fail and the points, (n, d), of the failures found."""
-        self._dims = len(dimensions(level))
+        self._dims = failing.shape[1]
         self._failing = failing
         self._chance = chance
 
@@ -63,12 +61,15 @@ def learn_surface(outcomes: Sequence[Outcome], level: int) -> Surface | None:
     """Return the surrogate of a level, or None where too few cases failed to learn from."""
     from threadpoolctl import threadpool_limits
 
-    sampler = UniformSampler(Pool(levels=(level,)), seed=0)
-    sampler.tell(outcome for outcome in outcomes if outcome.case.level == level)
+    at_level = [outcome for outcome in outcomes if outcome.case.level == level]
+    if not at_level:
+        return None
+    sampler = UniformSampler(Pool(levels=(level,), scenario=at_level[0].case.scenario), seed=0)
+    sampler.tell(at_level)
     history = sampler.history(level)
     failing = history.points[history.failed]
     if len(failing) < FEWEST_FAILURES:
         return None
     with threadpool_limits(1):
         chance = learn_chance(history)
-    return None if chance is None else Surface(level, failing, chance)
+    return None if chance is None else Surface(failing, chance)

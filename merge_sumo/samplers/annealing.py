@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, reflect, uniform_points
+from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, reflect
 from merge_sumo.values.case import FloatArray
 
 CHAINS: Final = 2
@@ -40,7 +40,7 @@ class AnnealingSampler(LevelwiseSampler):
     ) -> FloatArray:
         """Return `n` moves, (n, d), of the chains; a uniform batch before they stand anywhere."""
         if not len(history.points):
-            return uniform_points(n, level, rng)
+            return rng.random((n, history.dims))
         standing = self._replay(history, level)
         cooled = len(np.unique(history.batch)) - 1
         step = max(STEP0 * STEP_SHRINK**cooled, STEP_MIN)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.samplers.allocation import even_shares
-from merge_sumo.values.case import Case, FloatArray, Pool, dimensions, to_unit
+from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
 from merge_sumo.values.score import Outcome
 
 
@@ -31,6 +31,11 @@ class LevelHistory:
     failed: NDArray[np.bool_]
     dx_m: FloatArray
     batch: NDArray[np.int64]
+
+    @property
+    def dims(self) -> int:
+        """Return d, the number of coordinates."""
+        return int(self.points.shape[1])
 
     def take(self, places: slice | NDArray[np.int64]) -> LevelHistory:
         """Return some of the outcomes."""
@@ -82,7 +87,7 @@ class Sampler(ABC):
         """Return the outcomes with a verdict at one level as arrays."""
         outcomes = self.told(level)
         return LevelHistory(
-            points=to_unit((o.case for o in outcomes), level),
+            points=to_unit((o.case for o in outcomes), level, self.pool.scenario),
             score=np.array([o.measures.score for o in outcomes], dtype=np.float64),
             failed=np.array([o.failed for o in outcomes], dtype=bool),
             # None becomes NaN.
@@ -122,12 +127,7 @@ class LevelwiseSampler(Sampler):
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Return `n` points, (n, d), of the level's unit cube."""
-
-
-def uniform_points(n: int, level: int, rng: np.random.Generator) -> FloatArray:
-    """Return `n` points, (n, d), drawn uniformly from the level's unit cube."""
-    return rng.random((n, len(dimensions(level))))
+        """Return `n` points, (n, d), of the level's unit cube; the history's points have its d."""
 
 
 def reflect(points: FloatArray) -> FloatArray:

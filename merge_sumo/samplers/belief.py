@@ -31,7 +31,7 @@ from scipy.special import expit, log_expit, logit
 from merge_sumo.samplers.base import LevelHistory
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.fmc import RADIUS
+from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import DX_CRASH_M
 from merge_sumo.values.score import FAILURE_SCORE
 
@@ -85,9 +85,13 @@ class Belief:
 
     def of(self, cases: FloatArray) -> FloatArray:
         """Return P(fail) of cases, (m, d)."""
+        dims = self.history.dims
         distances = [nearest(cases, self.history.points[group]) for group in self.groups]
         chances = [
-            expit(_evidence(_lowered(expert.at(cases), distances, width), distances) @ calibration)
+            expit(
+                _evidence(_lowered(expert.at(cases), distances, width), distances, dims)
+                @ calibration
+            )
             for expert, (width, calibration) in zip(self._experts, self._judged, strict=True)
         ]
         return np.asarray(np.average(chances, axis=0, weights=self._weights), dtype=np.float64)
@@ -102,7 +106,7 @@ class Belief:
             chance = expert.left_out()
             found = []
             for width, prior in zip(WIDTHS.tolist(), log_prior.tolist(), strict=True):
-                evidence = _evidence(_lowered(chance, distances, width), distances)
+                evidence = _evidence(_lowered(chance, distances, width), distances, learned.dims)
                 calibration, posterior = _calibrated(evidence, learned.failed)
                 found.append((posterior + prior, width, calibration))
             posterior, width, calibration = max(found, key=lambda one: one[0])
@@ -192,12 +196,13 @@ def _lowered(
     return np.where(closed, probability * width / (width + typical_width), probability)
 
 
-def _evidence(chance: FloatArray, distances: list[FloatArray]) -> FloatArray:
+def _evidence(chance: FloatArray, distances: list[FloatArray], dims: int) -> FloatArray:
     """Return what speaks for and against failures, (m, 4): see CALIBRATION."""
     to_failing, before, behind = distances
+    radius = radius_for(dims)
     odds = logit(np.clip(chance, SURE, 1.0 - SURE))
     to_curve = np.maximum(before, behind)
-    near = [np.log((distance + NEAR) / (RADIUS + NEAR)) for distance in (to_failing, to_curve)]
+    near = [np.log((distance + NEAR) / (radius + NEAR)) for distance in (to_failing, to_curve)]
     return np.column_stack([odds, np.ones(len(chance)), *near])
 
 

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from merge_sumo.samplers.allocation import even_shares
-from merge_sumo.samplers.base import LevelHistory, Sampler, uniform_points
+from merge_sumo.samplers.base import LevelHistory, Sampler
 from merge_sumo.samplers.belief import Belief, gap_m, has_gaps, nearest
 from merge_sumo.samplers.ground import Ground
-from merge_sumo.values.case import Case, FloatArray, dimensions
-from merge_sumo.values.fmc import RADIUS
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.fmc import radius_for
 
 UNIFORM_QUERIES: Final = 1500
 LOCAL_QUERIES: Final = 600
@@ -29,9 +29,10 @@ LINE_STEPS: Final = 120
 REFINED_QUERIES: Final = 600
 """Candidates per batch: anywhere, within LOCAL_REACH of a failure, between safe cases on either
 side, on lines across the cube along the slope of the margin, and around the best of all these."""
-LOCAL_REACH: Final = 2.0 * RADIUS
+LOCAL_REACH: Final = 2.0
 BEST: Final = 150
-REFINED_REACH: Final = 0.03
+REFINED_REACH: Final = 0.6
+"""Reaches are in radii of the FMC."""
 SHORTLIST: Final = 2000
 """Candidates from which the batch is picked."""
 PICKED: Final = 0.8
@@ -85,7 +86,7 @@ class CoverageSampler(Sampler):
         covered = 0.0
         for level in self.pool.levels:
             history = self.history(level)
-            ground = Ground(len(dimensions(level)))
+            ground = Ground(history.dims)
             ground.cover(ground.balls(history.points[history.failed]), 1.0)
             covered += ground.covered_balls()
         return gain / covered if covered > 0.0 else np.inf
@@ -99,10 +100,10 @@ class CoverageSampler(Sampler):
 
         history, rng = self.history(level), self.rng(level)
         if len(history.points) < 2:
-            return Proposal(_spread_out(n, len(dimensions(level)), rng), np.ones(n))
+            return Proposal(_spread_out(n, history.dims, rng), np.ones(n))
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
-            return _Search(history, level, rng, n).batch(n)
+            return _Search(history, rng, n).batch(n)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: half of them evenly, the rest by the next gain.
@@ -122,9 +123,9 @@ class CoverageSampler(Sampler):
 class _Search:
     """One batch at one level."""
 
-    def __init__(self, history: LevelHistory, level: int, rng: np.random.Generator, n: int) -> None:
+    def __init__(self, history: LevelHistory, rng: np.random.Generator, n: int) -> None:
         failing = history.points[history.failed]
-        self._ground = Ground(failing.shape[1])
+        self._ground = Ground(history.dims)
         self._ground.cover(self._ground.balls(failing), 1.0)
         limit, trust = _limit(history), _trust(history)
         belief = Belief(history, limit)
@@ -132,11 +133,11 @@ class _Search:
         def trusted(of: Belief, cases: FloatArray) -> FloatArray:
             return of.of(cases) * trust[_far(cases, failing)]
 
-        candidates = _candidates(history, belief, level, rng, n)
+        candidates = _candidates(history, belief, rng, n)
         probability = trusted(belief, candidates)
         worth = probability * self._ground.new(self._ground.balls(candidates))
         best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
-        refined = _around(best, REFINED_QUERIES, REFINED_REACH, rng)
+        refined = _around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
         candidates = np.concatenate([candidates, refined])
         probability = np.concatenate([probability, trusted(belief, refined)])
         worth = probability * (self._ground.new(self._ground.balls(candidates)) + EVEN_IF_COVERED)
@@ -170,7 +171,8 @@ class _Search:
 
 def _far(points: FloatArray, failing: FloatArray) -> NDArray[np.int64]:
     """Return for each point, (n,), 1 where no failure is within LOCAL_REACH, else 0."""
-    return (nearest(points, failing) > LOCAL_REACH).astype(np.int64)
+    reach = LOCAL_REACH * radius_for(points.shape[1])
+    return (nearest(points, failing) > reach).astype(np.int64)
 
 
 def _trust(history: LevelHistory) -> FloatArray:
@@ -210,19 +212,20 @@ def _spread_out(n: int, dims: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _candidates(
-    history: LevelHistory, belief: Belief, level: int, rng: np.random.Generator, n: int
+    history: LevelHistory, belief: Belief, rng: np.random.Generator, n: int
 ) -> FloatArray:
     """Return more than `n` candidates, (m, d)."""
     worst = history.points[np.argsort(history.score, kind="stable")[:20]]
     failing = history.points[history.failed]
+    local_reach = LOCAL_REACH * radius_for(history.dims)
     along = np.linspace(-1.0, 1.0, LINE_STEPS) + rng.uniform(-0.01, 0.01, (LINES, LINE_STEPS))
-    base = uniform_points(LINES, level, rng)
+    base = rng.random((LINES, history.dims))
     lines = base[:, None] + along[..., None] * belief.rotation[:, 0]
-    lines = lines.reshape(-1, base.shape[1])
+    lines = lines.reshape(-1, history.dims)
     return np.concatenate(
         [
-            uniform_points(UNIFORM_QUERIES + n, level, rng),
-            _around(failing if len(failing) else worst, LOCAL_QUERIES, LOCAL_REACH, rng),
+            rng.random((UNIFORM_QUERIES + n, history.dims)),
+            _around(failing if len(failing) else worst, LOCAL_QUERIES, local_reach, rng),
             _between(belief, BETWEEN_QUERIES, rng),
             lines[((lines >= 0.0) & (lines <= 1.0)).all(axis=1)],
         ]
@@ -240,7 +243,8 @@ def _between(belief: Belief, n: int, rng: np.random.Generator) -> FloatArray:
     near = [*range(1, 1 + min(3, len(before), len(behind)))]
     pairs = np.concatenate([_pairs(before, behind, near), _pairs(behind, before, near)[:, ::-1]])
     first, second = before[pairs[:, 0]], behind[pairs[:, 1]]
-    weight = (np.linalg.norm(first - second, axis=1) + REFINED_REACH) ** -2.0
+    reach = REFINED_REACH * radius_for(points.shape[1])
+    weight = (np.linalg.norm(first - second, axis=1) + reach) ** -2.0
     chosen = rng.choice(len(pairs), size=n, p=weight / weight.sum())
     part = rng.random((n, 1))
     return np.asarray(first[chosen] * (1.0 - part) + second[chosen] * part, dtype=np.float64)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from merge_sumo.samplers.allocation import last_failure_share, softmax_shares
-from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, uniform_points
+from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.surrogate import most_telling
 from merge_sumo.values.case import FloatArray
@@ -72,8 +72,8 @@ class GprSampler(LevelwiseSampler):
     ) -> FloatArray:
         """Return `n` points by lines 1 to 9 of Algorithm 1."""
         if not len(history.points):
-            return uniform_points(n, level, rng)
-        queries = uniform_points(QUERIES, level, rng)
+            return rng.random((n, history.dims))
+        queries = rng.random((QUERIES, history.dims))
         batches_before = len(np.unique(history.batch))
         epsilon = EPSILON0 * ALPHA**batches_before
         exploring = round(epsilon * n)

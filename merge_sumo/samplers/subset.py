@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, reflect, uniform_points
+from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, reflect
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.score import FAILURE_SCORE
 
@@ -116,7 +116,7 @@ class SubsetSampler(LevelwiseSampler):
         """Return the next move of `n` chains, (n, d), or uniform points at first."""
         stage = replay(history)
         if stage.number == 0:
-            return uniform_points(n, level, rng)
+            return rng.random((n, history.dims))
         dims = stage.chains.shape[1]
         chain = (stage.moved + np.arange(n)) % len(stage.chains)
         # A region with p0 of the volume of the one before has p0^(1/d) of its size.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, uniform_points
+from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler
 from merge_sumo.values.case import FloatArray
 
 
@@ -15,4 +15,4 @@ class UniformSampler(LevelwiseSampler):
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
         """Return `n` uniform points."""
-        return uniform_points(n, level, rng)
+        return rng.random((n, history.dims))

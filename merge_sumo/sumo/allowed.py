@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from merge_sumo.sumo.received import Allowed, Values, is_number, matching, number
+from merge_sumo.values.scenario import VEHICLES
 
 
 def _are_points(text: str) -> bool:
@@ -129,7 +130,7 @@ HOSTED_NET: Final = {
 }
 """A net that `hosting` made, with lanes inside of junctions."""
 
-_WHO: Final = matching("pov|vut", "pov or vut")
+_WHO: Final = matching("|".join(VEHICLES), "one of " + ", ".join(VEHICLES))
 _COLOUR: Final = matching(r"[0-9.]{1,20}(?:,[0-9.]{1,20}){2,3}|[a-z]{1,20}", "a colour")
 
 TYPES: Final = {
@@ -151,7 +152,7 @@ TYPES: Final = {
         },
     )
 }
-"""The types of the two vehicles; SUMO chooses what is not named."""
+"""The types of the vehicles; SUMO chooses what is not named."""
 
 SURROUNDINGS: Final = {
     "additional": Allowed(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,6 @@ from merge_sumo.sumo import allowed, received
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint
 from merge_sumo.sumo.replay_folder import (
-    COLOURS,
     CONFIG,
     HOLD_STEPS,
     HOSTED_NET,
@@ -30,7 +29,7 @@ from merge_sumo.sumo.replay_folder import (
     corridor_of_shipped,
     write_files,
 )
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VEHICLES, VUT
 
 REPLAYED: Final = "replayed.fcd.xml"
 
@@ -54,10 +53,10 @@ class Replay:
 
 
 def replay(folder: Path) -> Replay:
-    """Replay a folder in headless SUMO and compare every row of both vehicles with the record.
+    """Replay a folder in headless SUMO and compare every row of all vehicles with the record.
 
     Positions (x, y, along the lane) and speeds must agree within 1e-6, and the record must be an
-    episode: both vehicles on their lanes, moved by eq. (4) and held at its end.
+    episode: all vehicles on their lanes, moved by eq. (4) and held at its end.
 
     The folder is data: net, vehicle types and record are read from it and nothing else, and SUMO
     runs in a temporary folder on what is allowed of them and on a configuration of ours. Raises
@@ -91,13 +90,18 @@ class _Episode:
     x_m: dict[tuple[float, str], float | None]
     """Lane coordinates of the rows; None for a lane on which a vehicle does not drive."""
 
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Names of the vehicles."""
+        return _vehicles(self.types)
+
     def path(self, who: str) -> LanePath:
         """Return the lanes of a vehicle."""
         return _path(self.road.corridor, who)
 
 
 def _path(road: Corridor, who: str) -> LanePath:
-    return road.ramp if who == "vut" else road.mainline
+    return road.ramp if who == VEHICLES[VUT] else road.mainline
 
 
 def _received(folder: Path) -> _Episode:
@@ -117,9 +121,10 @@ def _received(folder: Path) -> _Episode:
         path = folder / NET
         content = received.cleaned(net, allowed.NET, f"the net {path}")
         road = Road(content, corridor_of_shipped(content, path), None)
-    root, rows = _checked_record(record, folder / RECORD)
+    vtypes = _checked_types(types, folder / TYPES)
+    root, rows = _checked_record(record, folder / RECORD, _vehicles(vtypes))
     x_m = _lane_coordinates(root, road.corridor)
-    return _Episode(road, _checked_types(types, folder / TYPES), root, rows, x_m)
+    return _Episode(road, vtypes, root, rows, x_m)
 
 
 def _checked_hosted(net: bytes, surroundings: bytes, folder: Path) -> Road:
@@ -131,12 +136,21 @@ def _checked_hosted(net: bytes, surroundings: bytes, folder: Path) -> Road:
 
 def _checked_types(content: bytes, path: Path) -> etree._Element:
     root, _ = received.parse(content, allowed.TYPES, f"the file {path}")
-    if sorted(str(vtype.get("id")) for vtype in root) != sorted(COLOURS):
-        raise UserError(f"the file {path} must have one vType pov and one vType vut")
+    if sorted(_vehicles(root)) not in map(sorted, (VEHICLES[:2], VEHICLES)):
+        raise UserError(
+            f"the file {path} must have one vType pov and one vType vut, and in traffic one ahead "
+            "and one behind"
+        )
     return root
 
 
-def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
+def _vehicles(types: etree._Element) -> tuple[str, ...]:
+    return tuple(str(vtype.get("id")) for vtype in types)
+
+
+def _checked_record(
+    content: bytes, path: Path, vehicles: Sequence[str]
+) -> tuple[etree._Element, Rows]:
     root, _ = received.parse(content, allowed.RECORD, f"the record {path}")
     if not MIN_TIMESTEPS <= len(root) <= MAX_TIMESTEPS:
         raise UserError(
@@ -146,8 +160,10 @@ def _checked_record(content: bytes, path: Path) -> tuple[etree._Element, Rows]:
         if not abs(float(timestep.get("time", "")) - step * DT_S) <= TOLERANCE:
             raise UserError(f"the record {path} must have a timestep every {DT_S:g} s from 0 s on")
     rows = _rows(root, f"the record {path}")
-    if len(rows) != len(COLOURS) * len(root):
-        raise UserError(f"the record {path} must have both vehicles in every timestep")
+    if rows.keys() != {(time, who) for time, _ in rows for who in vehicles} or (
+        len(rows) != len(vehicles) * len(root)
+    ):
+        raise UserError(f"the record {path} must have every vehicle in every timestep")
     return root, rows
 
 
@@ -191,7 +207,7 @@ def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
     times = sorted({time for time, _ in rows})
     moving = set(times[: -HOLD_STEPS - 1])
     for time, after in zip(times, [*times[1:], None], strict=True):
-        for who in COLOURS:
+        for who in episode.vehicles:
             x, y, _, speed = rows[time, who]
             x_m = episode.x_m[time, who]
             if x_m is None or _is_beside(episode.path(who).point(x_m), x, y):
@@ -217,7 +233,7 @@ def _lane_coordinates(
 ) -> dict[tuple[float, str], float | None]:
     """Return the lane coordinates of the rows of a record that was checked."""
     starts_m = {
-        who: {piece.lane: piece.start_m for piece in _path(road, who).pieces} for who in COLOURS
+        who: {piece.lane: piece.start_m for piece in _path(road, who).pieces} for who in VEHICLES
     }
     found: dict[tuple[float, str], float | None] = {}
     for timestep in record:

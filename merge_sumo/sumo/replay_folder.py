@@ -24,7 +24,7 @@ from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.sumo.netfile import NetFile, Point
 from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.system.folders import new_folder
-from merge_sumo.values.scenario import DT_S, VEHICLES
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -41,7 +41,12 @@ CASE: Final = "case.json"
 SPEED_LIMIT_MPS: Final = 200.0
 """Above every speed: SUMO lets a vehicle enter a replay no faster than its lane allows."""
 
-COLOURS: Final = {"pov": "0.90,0.25,0.15", "vut": "0.10,0.35,0.90"}
+COLOURS: Final = {
+    "pov": "0.90,0.25,0.15",
+    "vut": "0.10,0.35,0.90",
+    "ahead": "0.95,0.60,0.15",
+    "behind": "0.95,0.60,0.15",
+}
 WINDOW: Final = (1280, 800)
 SEEN: Final = 1.6
 """Width of the picture, as a multiple of where the cars drove."""
@@ -132,19 +137,20 @@ def write_files(folder: Path, road: Road, types: etree._Element, record: etree._
 
 def _types(trajectory: Trajectory) -> etree._Element:
     root = etree.Element("additional")
-    first_speeds = dict(zip(VEHICLES, trajectory.motion[0, :, 1].tolist(), strict=False))
-    for name, colour in COLOURS.items():
+    scenario = trajectory.case.scenario
+    for name, first_mps in zip(VEHICLES, trajectory.motion[0, :, 1].tolist(), strict=False):
+        length_m = scenario.vut_length_m if name == VEHICLES[VUT] else scenario.pov_length_m
         etree.SubElement(
             root,
             "vType",
             id=name,
-            color=colour,
+            color=COLOURS[name],
             guiShape="passenger/sedan",
-            length="5",
+            length=f"{length_m:g}",
             minGap="0",
             # The replay inserts a vehicle at the highest speed it may drive, so make that the
             # first speed of the record; all later speeds come from the record itself.
-            maxSpeed=f"{max(first_speeds[name], 1e-9):.9f}",
+            maxSpeed=f"{max(first_mps, 1e-9):.9f}",
             speedFactor="2",
             # Nor does SUMO then slow it down for the junction.
             decel="1000",
@@ -160,7 +166,7 @@ def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
     for step, vehicles in enumerate(motion):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
         for who, (x_m, v_mps, _) in zip(VEHICLES, vehicles, strict=False):
-            lane, position, x, y, angle = road.lane_point(x_m, on_ramp=who == "vut")
+            lane, position, x, y, angle = road.lane_point(x_m, on_ramp=who == VEHICLES[VUT])
             etree.SubElement(
                 timestep,
                 "vehicle",
@@ -244,6 +250,7 @@ def _config(road: Road, timesteps: int) -> etree._Element:
         "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
         "processing": {
             "collision.action": "none",
+            "insertion-checks": "none",
             "time-to-teleport": "-1",
             "default.speeddev": "0",
         },

@@ -328,9 +328,19 @@ def _types(vut_type: Mapping[str, str] | None, scenario: Scenario) -> bytes:
     for name, length_m in ((CAR, scenario.pov_length_m), (COMMANDED_VUT, scenario.vut_length_m)):
         etree.SubElement(root, "vType", {"id": name, "length": repr(length_m), **told})
     if vut_type is not None:
-        length = {"length": repr(scenario.vut_length_m)}
-        etree.SubElement(root, "vType", {"id": VUT_TYPE, **length, **vut_type})
+        etree.SubElement(root, "vType", {"id": VUT_TYPE, **_careful(scenario), **vut_type})
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
+
+
+def _careful(scenario: Scenario) -> dict[str, str]:
+    """Return the attributes of a driver who knows the limits and wants the level-0 speed."""
+    return {
+        "length": repr(scenario.vut_length_m),
+        "maxSpeed": repr(scenario.level0_v_mps),
+        "accel": repr(scenario.a_max_mps2),
+        "decel": repr(-scenario.a_min_mps2),
+        "emergencyDecel": repr(-scenario.a_min_mps2),
+    }
 
 
 @contextmanager

@@ -8,36 +8,19 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, LevelKDriver, QNetwork
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
+from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.sumo.world import World
-from merge_sumo.training.best_response import (
-    beam_search,
-    best_response_pov1,
-    best_response_vut1,
-)
+from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.env import pool_starts
-from merge_sumo.training.game import Game, IntArray, greedy
-from merge_sumo.training.reward import (
-    RewardWeights,
-    pov_reward,
-    pov_step,
-    safety,
-    vut_end,
-    vut_step,
-)
+from merge_sumo.training.game import Game, IntArray, greedy, of_two
+from merge_sumo.training.reward import Reward, RewardWeights, pov_reward
 from merge_sumo.values.case import Case, FloatArray, from_unit
-from merge_sumo.values.scenario import (
-    DX_CRASH_M,
-    LEVEL0_A_MPS2,
-    LEVEL0_V_MPS,
-    SVO,
-    V_VUT0_MPS,
-    X_VUT0_M,
-)
+from merge_sumo.values.scenario import SVO, US23, Scenario
 from merge_sumo.values.trajectory import End, Trajectory
 
 CHECK_CASES: Final = 300
@@ -81,7 +64,7 @@ class Returns:
     collided: np.ndarray
 
 
-def returns_of(trajectories: list[Trajectory], weights: RewardWeights) -> Returns:
+def returns_of(trajectories: list[Trajectory], reward: Reward) -> Returns:
     """Return the reward parts of episodes that were played in SUMO.
 
     The accelerations that count are the commanded ones; at a stand, those that were possible.
@@ -91,23 +74,24 @@ def returns_of(trajectories: list[Trajectory], weights: RewardWeights) -> Return
     for n, trajectory in enumerate(trajectories):
         v_pov, a_pov = trajectory.v_pov_mps[:-1], trajectory.a_pov_mps2[:-1]
         v_vut, a_vut = trajectory.v_vut_mps[:-1], trajectory.a_vut_mps2[:-1]
-        parts[1, n] = pov_step(v_pov, a_pov, weights).sum()
-        parts[2, n] = vut_step(v_vut, a_vut, weights).sum()
+        parts[1, n] = reward.pov_step(v_pov, a_pov).sum()
+        parts[2, n] = reward.vut_step(v_vut, a_vut).sum()
         if trajectory.end is End.MERGED:
             (x_pov, v_pov_end, _), (x_vut, v_vut_end, _) = trajectory.motion[-1]
             dx = np.array([x_pov - x_vut])
-            parts[0, n] = safety(dx, np.array([v_pov_end - v_vut_end]), weights)[0]
-            parts[2, n] += vut_end(np.array([v_vut_end]), weights)[0]
-            collided[n] = abs(dx[0]) < DX_CRASH_M
+            parts[0, n] = reward.safety(dx, np.array([v_pov_end - v_vut_end]))[0]
+            parts[2, n] += reward.vut_end(np.array([v_vut_end]))[0]
+            collided[n] = abs(dx[0]) < reward.scenario.dx_crash_m
     return Returns(parts[0], parts[1], parts[2], collided)
 
 
 def play(
     cases: list[Case], make_pov: type[Driver] | QNetwork, make_vut: type[Driver] | QNetwork
 ) -> list[Trajectory]:
-    """Play cases in SUMO between two drivers; return the trajectories in order."""
+    """Play cases of one scenario in SUMO between two drivers; return the trajectories in order."""
+    scenario = cases[0].scenario
     played: list[Trajectory | None] = [None] * len(cases)
-    with World(CORRIDORS) as world:
+    with World(CORRIDORS, road_for(scenario), scenario=scenario) as world:
         pov, vut = _driver(make_pov), _driver(make_vut)
         for index, trajectory in rollout(world, pov, vut, cases):
             played[index] = trajectory
@@ -118,11 +102,15 @@ def _driver(maker: type[Driver] | QNetwork) -> Driver:
     return LevelKDriver(CORRIDORS, maker) if isinstance(maker, QNetwork) else maker(CORRIDORS)
 
 
-def check_cases(name: str, count: int = CHECK_CASES, seed: int = CHECK_SEED) -> list[Case]:
+def check_cases(
+    name: str, count: int = CHECK_CASES, seed: int = CHECK_SEED, scenario: Scenario = US23
+) -> list[Case]:
     """Return random cases of the pool in which to check a network."""
     rng = np.random.default_rng(seed)
     level = 2 if name == "pov2" else 1
-    return from_unit(rng.random((count, 3 if level == 2 else 2)), level)
+    scenario = of_two(scenario)
+    points = rng.random((count, len(scenario.dimensions(level))))
+    return from_unit(points, level, scenario=scenario)
 
 
 def opponents(name: str, folder: Path | None) -> type[Driver] | QNetwork:
@@ -137,6 +125,7 @@ def check_policy(
     folder: Path | None = None,
     weights: RewardWeights | None = None,
     count: int = CHECK_CASES,
+    scenario: Scenario = US23,
 ) -> PolicyCheck:
     """Return how near a network is to its best response over `count` cases of the pool."""
     opponent = opponents(name, folder)
@@ -144,16 +133,16 @@ def check_policy(
         name,
         load_network(name, folder),
         opponent if isinstance(opponent, QNetwork) else None,
-        weights or RewardWeights(),
+        Reward(weights or RewardWeights.of(scenario), scenario),
         count,
     )
 
 
 def check_network(
-    name: str, network: QNetwork, opponent: QNetwork | None, weights: RewardWeights, count: int
+    name: str, network: QNetwork, opponent: QNetwork | None, reward: Reward, count: int
 ) -> PolicyCheck:
     """Return how near a network is to its best response; `opponent` is None for level 0."""
-    cases = check_cases(name, count)
+    cases = check_cases(name, count, scenario=reward.scenario)
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
     is_pov = name.startswith("pov")
     level0 = Level0Pov if is_pov else Level0Vut
@@ -161,14 +150,14 @@ def check_network(
 
     def returns(driver: type[Driver] | QNetwork) -> tuple[FloatArray, np.ndarray]:
         pair = (driver, other) if is_pov else (other, driver)
-        got = returns_of(play(cases, *pair), weights)
+        got = returns_of(play(cases, *pair), reward)
         if is_pov:
             return pov_reward(got.safe, got.pov_ego, got.vut_ego, svo_rad), got.collided
         return got.safe + got.vut_ego, got.collided
 
     reached, collided = returns(network)
     unmoved, _ = returns(level0)
-    best = best_returns(name, network, opponent, weights, cases, svo_rad)
+    best = best_returns(Game("pov" if is_pov else "vut", opponent, reward), network, cases, svo_rad)
     if opponent is not None:
         # The driver's own games are some that a search may find.
         best = np.maximum(best, reached)
@@ -182,30 +171,21 @@ def check_network(
         mean_regret=float(regret.mean()),
         p99_regret=float(np.quantile(regret, 0.99)),
         collisions=int(collided.sum()),
-        avoidable_collisions=int((collided & (best > -weights.crash / 2)).sum()),
+        avoidable_collisions=int((collided & (best > -reward.weights.crash / 2)).sum()),
     )
 
 
 def best_returns(
-    name: str,
-    network: QNetwork,
-    opponent: QNetwork | None,
-    weights: RewardWeights,
-    cases: list[Case],
-    svo_rad: FloatArray,
+    game: Game, network: QNetwork, cases: list[Case], svo_rad: FloatArray
 ) -> FloatArray:
-    """Return what the best response to an opponent would have, (n,): see `best_response`."""
-    x0 = np.array([case.x_pov0_m for case in cases])
-    v0 = np.array([case.v_pov0_mps for case in cases])
-    if opponent is None:
-        exact = best_response_pov1 if name == "pov1" else best_response_vut1
-        return exact(x0, v0, weights)
-    n = len(cases)
-    game = Game("pov" if name == "pov2" else "vut", opponent, weights)
-    start = np.stack([x0, v0, np.full(n, X_VUT0_M), np.full(n, V_VUT0_MPS)], axis=1)
+    """Return what the best response to the opponent would have, (n,): see `best_response`."""
+    x_vut0 = game.scenario.x_vut0_m
+    start = np.array([[c.x_pov0_m, c.v_pov0_mps, x_vut0, c.v_vut0_mps] for c in cases])
+    if game.opponent is None:
+        return best_response(game, start)
     searched = beam_search(game, start, svo_rad, network).returns
-    played_out = game.play(start, svo_rad, game.improved(greedy(network)))
-    return np.maximum(searched, played_out)
+    policy = greedy(network, game.scenario)
+    return np.maximum(searched, game.play(start, svo_rad, game.improved(policy)))
 
 
 class QuickRegret:
@@ -219,21 +199,20 @@ class QuickRegret:
         """Draw the starts."""
         rng = np.random.default_rng(CHECK_SEED + 1)
         self._game = game
-        self._start = pool_starts(starts, rng)
+        self._start = pool_starts(starts, rng, game.scenario)
         self._svo_rad = rng.uniform(SVO.low, SVO.high, starts) * sees_svo
-        still = ACTIONS_MPS2.tolist().index(0.0)
-        along = ACTIONS_MPS2.tolist().index(LEVEL0_A_MPS2)
+        profile = game.scenario.level0_a_mps2, game.scenario.level0_v_mps
 
         def level0(state: FloatArray, _: FloatArray) -> IntArray:
-            if game.role == "pov":
-                return np.full(len(state), still)
-            return np.where(state[:, 3] < LEVEL0_V_MPS, along, still)
+            of_pov = game.role == "pov"
+            a = np.zeros(len(state)) if of_pov else level0_acceleration(state[:, 3], *profile)
+            return np.asarray(np.abs(game.actions_mps2 - a[:, None]).argmin(axis=1))
 
         self._level0 = game.play(self._start, self._svo_rad, level0)
 
     def __call__(self, network: QNetwork) -> float:
         """Return the bound for a network, as a share of the mean gain over level-0 behaviour."""
-        policy = greedy(network)
+        policy = greedy(network, self._game.scenario)
         reached = self._game.play(self._start, self._svo_rad, policy)
         improved = self._game.play(self._start, self._svo_rad, self._game.improved(policy))
         best = np.maximum(reached, improved)

@@ -22,9 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, SVO_FEATURES, QNetwork, features
+from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, QNetwork, features
 from merge_sumo.training.env import MergeGame, exploring_starts
-from merge_sumo.training.game import MAX_DECISIONS
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import SVO
 
@@ -205,7 +204,7 @@ class _Collector:
         self.state = game.state()
 
     def _begin(self, which: np.ndarray) -> None:
-        starts = exploring_starts(len(which), self.rng, self.midway)
+        starts = exploring_starts(len(which), self.rng, self.midway, self.game.scenario)
         self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, len(which)) * self.sees_svo
         for corridor, start in zip(which.tolist(), starts, strict=True):
             self.game.begin(corridor, start)
@@ -215,22 +214,22 @@ class _Collector:
     def collect(self, online: nn.Sequential, epsilon: float, replay: Replay) -> None:
         """Take one decision in every game, a random one with probability epsilon."""
         games = self.game.corridors
-        before = features(*self.state.T)
+        before = _seen(self.state, self.game)
         seen = before
         if self.sees_svo:
             seen = np.column_stack([before, *_svo_columns(self.svo_rad)])
         with torch.no_grad():
             action = online(torch.from_numpy(seen.astype(np.float32))).argmax(-1).numpy()
-        random = self.rng.integers(0, len(ACTIONS_MPS2), games)
+        random = self.rng.integers(0, ACTIONS, games)
         action = np.where(self.rng.random(games) < epsilon, random, action)
-        state, parts, over = self.game.decide(ACTIONS_MPS2[action])
+        state, parts, over = self.game.decide(self.game.actions_mps2[action])
         in_parts = np.stack([parts.safe, parts.pov_ego, parts.vut_ego], axis=1)
-        replay.add(before, action, in_parts, features(*state.T), ~over)
+        replay.add(before, action, in_parts, _seen(state, self.game), ~over)
         self.returns += parts.of(self.game.role, self.svo_rad)
         self.decisions += 1
-        again = np.flatnonzero(over | (self.decisions >= MAX_DECISIONS))
+        again = np.flatnonzero(over | (self.decisions >= self.game.max_decisions))
         if again.size:
-            crash = self.game.weights.crash
+            crash = self.game.reward.weights.crash
             self.ended += zip(
                 self.returns[again].tolist(), (parts.safe[again] < -crash / 2).tolist(), strict=True
             )
@@ -247,6 +246,12 @@ class _Collector:
             float(np.mean([value for value, _ in last])),
             float(np.mean([crashed for _, crashed in last])),
         )
+
+
+def _seen(state: FloatArray, game: MergeGame) -> FloatArray:
+    """Return what a network sees of states, (n, 4), but for psi."""
+    x_pov, v_pov, x_vut, v_vut = state.T
+    return features(x_pov, v_pov, x_vut, v_vut, scenario=game.scenario)
 
 
 def _loss(
@@ -292,7 +297,7 @@ def make_network(inputs: int, width: int) -> nn.Sequential:
         nn.ReLU(),
         nn.Linear(width, width),
         nn.ReLU(),
-        nn.Linear(width, len(ACTIONS_MPS2)),
+        nn.Linear(width, ACTIONS),
     )
 
 

@@ -5,7 +5,7 @@
 
 The agent plays the POV or the VUT; its opponent is a driver of this package. Observations are
 [x_POV, v_POV, x_VUT, v_VUT] in m and m/s, and psi for a POV with a social value orientation;
-actions 0 to 6 are accelerations of -4 to +2 m/s2.
+actions 0 to 6 are accelerations of -4 to +2 m/s2. `scenario=` plays another scenario.
 """
 
 from __future__ import annotations
@@ -20,27 +20,23 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from merge_sumo.campaigns.ground import road_for
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, DECISION_STEPS
+from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, actions_mps2
 from merge_sumo.drivers.policies import load_driver
+from merge_sumo.drivers.units import Units
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.world import World
-from merge_sumo.training.game import Role
-from merge_sumo.training.reward import (
-    RewardWeights,
-    pov_reward,
-    pov_step,
-    safety,
-    vut_end,
-    vut_step,
-)
-from merge_sumo.values.case import V_POV0, X_POV0, Case, FloatArray
-from merge_sumo.values.scenario import MAX_STEPS, POV, SVO, V_VUT0_MPS, VUT, X_VUT0_M
+from merge_sumo.training.game import Role, of_two
+from merge_sumo.training.reward import Reward, RewardWeights, pov_reward
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import POV, SVO, US23, VUT, Scenario
 
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])
+"""Of an observation, in the units of the scenario."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,20 +58,33 @@ class MergeGame:
     """K games in the corridors of one SUMO world, each advanced by decisions of 0.5 s."""
 
     def __init__(
-        self, role: Role, opponent: Driver, weights: RewardWeights, net: Corridor | None = None
+        self, role: Role, opponent: Driver, reward: Reward, road: Corridor | None = None
     ) -> None:
-        """Open a world with as many corridors as the opponent drives in."""
-        self.role, self.opponent, self.weights = role, opponent, weights
+        """Open a world with as many corridors as the opponent drives in.
+
+        The reward says which scenario is played; its road is the shipped one where none is given.
+        """
+        self.role, self.opponent, self.reward = role, opponent, reward
+        self.scenario = reward.scenario
+        self.actions_mps2 = actions_mps2(self.scenario)
+        self.max_decisions = self.scenario.max_steps // DECISION_STEPS
         self.corridors = opponent.corridors
-        self.world = World(self.corridors, net)
+        self.world = World(self.corridors, road, scenario=self.scenario)
         self.step_count = np.zeros(self.corridors, dtype=np.int64)
 
     def begin(self, corridor: int, state: FloatArray, svo_rad: float | None = None) -> None:
         """Start a game in a corridor from a state [x_POV, v_POV, x_VUT, v_VUT]."""
         x_pov, v_pov, x_vut, v_vut = state.tolist()
+        x_pov = max(x_pov, -self.world.road.mainline.before_m)
         self.world.place(corridor, [(x_pov, v_pov), (x_vut, v_vut)])
         level = 1 if svo_rad is None else 2
-        case = Case(level=level, x_pov0_m=X_POV0.low, v_pov0_mps=V_POV0.low, svo_rad=svo_rad)
+        case = Case(
+            level=level,
+            x_pov0_m=self.scenario.x_pov0_m[0],
+            v_pov0_mps=self.scenario.v_pov0_mps[0],
+            svo_rad=svo_rad,
+            scenario=self.scenario,
+        )
         self.opponent.begin(corridor, case)
         self.step_count[corridor] = 0
 
@@ -90,7 +99,7 @@ class MergeGame:
         Returns the states at its end (or at t1, where that came first), the reward in parts, and
         which games are over because the VUT is at M. Those stand until they begin anew.
         """
-        world, weights = self.world, self.weights
+        world, reward = self.world, self.reward
         parts = RewardParts(*np.zeros((3, self.corridors)))
         over = np.zeros(self.corridors, dtype=bool)
         state = self.state()
@@ -103,16 +112,16 @@ class MergeGame:
             a[agent] = a_mps2
             a[other] = self.opponent.act(scene)
             a[:, over] = 0.0
-            parts.pov_ego[live] += pov_step(v[POV], a[POV], weights)[live]
-            parts.vut_ego[live] += vut_step(v[VUT], a[VUT], weights)[live]
+            parts.pov_ego[live] += reward.pov_step(v[POV], a[POV])[live]
+            parts.vut_ego[live] += reward.vut_step(v[VUT], a[VUT])[live]
             world.step(a)
             self.step_count += 1
             arrived = live & (world.x_m[VUT] >= 0.0)
             state = np.where(over[:, None], state, self.state())
             if arrived.any():
                 dx, dv = world.x_m[POV] - world.x_m[VUT], world.v_mps[POV] - world.v_mps[VUT]
-                parts.safe[arrived] += safety(dx, dv, weights)[arrived]
-                parts.vut_ego[arrived] += vut_end(world.v_mps[VUT], weights)[arrived]
+                parts.safe[arrived] += reward.safety(dx, dv)[arrived]
+                parts.vut_ego[arrived] += reward.vut_end(world.v_mps[VUT])[arrived]
                 over |= arrived
         return state, parts, over
 
@@ -122,28 +131,53 @@ class MergeGame:
         self.opponent.close()
 
 
-def pool_starts(n: int, rng: np.random.Generator) -> FloatArray:
+def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario = US23) -> FloatArray:
     """Return `n` starting states, (n, 4), uniform over the pool."""
-    x_pov = rng.uniform(X_POV0.low, X_POV0.high, n)
-    v_pov = rng.uniform(V_POV0.low, V_POV0.high, n)
-    return np.stack([x_pov, v_pov, np.full(n, X_VUT0_M), np.full(n, V_VUT0_MPS)], axis=1)
+    x_pov = rng.uniform(*scenario.x_pov0_m, n)
+    v_pov = rng.uniform(*scenario.v_pov0_mps, n)
+    v_vut = _starting_speeds(n, rng, scenario)
+    return np.stack([x_pov, v_pov, np.full(n, scenario.x_vut0_m), v_vut], axis=1)
 
 
-def exploring_starts(n: int, rng: np.random.Generator, midway: float = 0.6) -> FloatArray:
+def _starting_speeds(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
+    low, high = scenario.bounds("v_vut0_mps")
+    return rng.uniform(low, high, n) if low < high else np.full(n, low)
+
+
+def exploring_starts(
+    n: int, rng: np.random.Generator, midway: float = 0.6, scenario: Scenario = US23
+) -> FloatArray:
     """Return `n` starting states, (n, 4): a share from mid-way in a game, the rest of the pool.
 
     Most of the former are states from which both would reach M together, because that is where
     a small error of Q is a collision; some are anywhere, because a black-box VUT brings the
     drivers there.
     """
-    x_vut = rng.uniform(X_VUT0_M, -1.0, n)
-    on_profile = np.sqrt(V_VUT0_MPS**2 + 2.0 * (x_vut - X_VUT0_M)) + rng.normal(0.0, 3.0, n)
-    v_vut = np.where(rng.random(n) < 0.6, on_profile, rng.uniform(2.0, 35.0, n)).clip(1.0, 36.0)
-    v_pov = np.where(rng.random(n) < 0.7, rng.uniform(20.0, 37.0, n), rng.uniform(8.0, 42.0, n))
-    gap = np.where(rng.random(n) < 0.7, rng.normal(0.0, 25.0, n), rng.uniform(-120.0, 120.0, n))
-    x_pov = (gap - v_pov * level0_time_to(-x_vut, v_vut)).clip(-420.0, 150.0)
+    unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
+    x_vut0, a, v_cruise = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
+    (x_low, _), (v_low, v_high) = scenario.x_pov0_m, scenario.v_pov0_mps
+    x_vut = rng.uniform(x_vut0, -1.0 * unit.length, n)
+    v_vut0 = _starting_speeds(n, rng, scenario)
+    on_profile = np.sqrt(v_vut0**2 + 2.0 * a * (x_vut - x_vut0)) + rng.normal(
+        0.0, 3.0 * unit.speed, n
+    )
+    v_vut = np.where(
+        rng.random(n) < 0.6,
+        on_profile,
+        rng.uniform(2.0 * unit.speed, scenario.v_hw_max_mps, n),
+    ).clip(unit.speed, scenario.v_hw_max_mps + unit.speed)
+    v_pov = np.where(
+        rng.random(n) < 0.7,
+        rng.uniform(v_low - 5.0 * unit.speed, v_high + 2.0 * unit.speed, n),
+        rng.uniform(v_low - 17.0 * unit.speed, v_high + 7.0 * unit.speed, n),
+    ).clip(0.0)
+    gap = wide_gap * np.where(
+        rng.random(n) < 0.7, rng.normal(0.0, 25.0, n), rng.uniform(-120.0, 120.0, n)
+    )
+    x_pov = gap - v_pov * level0_time_to(-x_vut, v_vut, a, v_cruise)
+    x_pov = x_pov.clip(x_low - 80.0 * unit.length, 150.0 * unit.length)
     states = np.stack([x_pov, v_pov, x_vut, v_vut], axis=1)
-    return np.where(rng.random((n, 1)) < midway, states, pool_starts(n, rng))
+    return np.where(rng.random((n, 1)) < midway, states, pool_starts(n, rng, scenario))
 
 
 class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
@@ -158,24 +192,28 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         opponent: str = "level0",
         svo: float | Literal["random"] | None = None,
         weights: RewardWeights | None = None,
+        scenario: Scenario = US23,
     ) -> None:
         """Play `role` against `opponent`: "level0", or a policy such as "vut1" or "pov1".
 
         `svo` is psi of a POV of level 2, or "random" for one drawn anew for every game; psi is
-        then part of the observation.
+        then part of the observation. The weights are those of the scenario unless they are given.
         """
         if role == "vut" and svo is not None:
             raise UserError("svo is the orientation of a POV: leave it out for role='vut'")
         self.num_envs, self.role, self.svo = num_envs, role, svo
         self._opponent = make_opponent(role, opponent, num_envs)
-        self._weights = weights or RewardWeights()
+        self._scenario = of_two(scenario)
+        self._reward = Reward(weights or RewardWeights.of(scenario), self._scenario)
         self._game: MergeGame | None = None
-        low, high = STATE_LOW, STATE_HIGH
+        unit = Units.of(scenario)
+        units = np.array([unit.length, unit.speed, unit.length, unit.speed])
+        low, high = STATE_LOW * units, STATE_HIGH * units
         if svo is not None:
             low, high = np.append(low, SVO.low), np.append(high, SVO.high)
         self._low, self._high = low, high
         self.single_observation_space = spaces.Box(low, high, dtype=np.float64)
-        self.single_action_space = spaces.Discrete(len(ACTIONS_MPS2))
+        self.single_action_space = spaces.Discrete(ACTIONS)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._rng = np.random.default_rng()
@@ -186,7 +224,8 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
     def game(self) -> MergeGame:
         """The games; SUMO starts when they are first needed, for one process holds only one."""
         if self._game is None:
-            self._game = MergeGame(self.role, self._opponent, self._weights)
+            road = road_for(self._scenario)
+            self._game = MergeGame(self.role, self._opponent, self._reward, road)
         return self._game
 
     def reset(
@@ -205,9 +244,9 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         self, actions: NDArray[np.int64]
     ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Take one decision in every game; `info` has the last observation of those that ended."""
-        state, parts, terminated = self.game.decide(ACTIONS_MPS2[np.asarray(actions)])
+        state, parts, terminated = self.game.decide(self.game.actions_mps2[np.asarray(actions)])
         self._steps += DECISION_STEPS
-        truncated = ~terminated & (self._steps >= MAX_STEPS)
+        truncated = ~terminated & (self._steps >= self._scenario.max_steps)
         reward = parts.of(self.role, self._svo_rad)
         observation = self._observe(state)
         info: dict[str, Any] = {}
@@ -225,7 +264,7 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
             self._game = None
 
     def _begin(self, which: NDArray[np.int64]) -> None:
-        starts = pool_starts(len(which), self._rng)
+        starts = pool_starts(len(which), self._rng, self._scenario)
         for corridor, start in zip(which.tolist(), starts, strict=True):
             if self.svo is not None:
                 draw = self._rng.uniform(SVO.low, SVO.high) if self.svo == "random" else self.svo
@@ -251,10 +290,11 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         svo: float | Literal["random"] | None = None,
         weights: RewardWeights | None = None,
         render_mode: None = None,
+        scenario: Scenario = US23,
     ) -> None:
         """See `MergeVectorEnv`."""
         self.render_mode = render_mode
-        self._games = MergeVectorEnv(1, role, opponent, svo, weights)
+        self._games = MergeVectorEnv(1, role, opponent, svo, weights, scenario)
         self.observation_space = self._games.single_observation_space
         self.action_space = self._games.single_action_space
 

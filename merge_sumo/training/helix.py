@@ -20,17 +20,29 @@ from typing import Any, Final
 
 from safetensors.numpy import save
 
+from merge_sumo.campaigns.ground import road_for
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
-from merge_sumo.drivers.policies import MANIFEST, NETWORKS, load_network, read_manifest
+from merge_sumo.drivers.policies import (
+    MANIFEST,
+    NETWORKS,
+    load_network,
+    plays_as,
+    read_manifest,
+    scenario_of,
+    scenario_record,
+)
 from merge_sumo.errors import UserError
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.folders import cannot_write, check_own, make_place, replace_own, write_new
+from merge_sumo.system.printable import quoted
 from merge_sumo.system.workers import leave_signals_to_parent
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, QuickRegret, check_network
 from merge_sumo.training.ddqn import DdqnProgress, DdqnSettings, train
 from merge_sumo.training.env import MergeGame, make_opponent
-from merge_sumo.training.game import Game, Role
+from merge_sumo.training.game import Game, Role, of_two
 from merge_sumo.training.refine import RefineProgress, RefineSettings, refine
-from merge_sumo.training.reward import RewardWeights
+from merge_sumo.training.reward import Reward, RewardWeights
+from merge_sumo.values.scenario import US23, Scenario
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "pov1": ("pov", "level0"),
@@ -104,7 +116,8 @@ class _Task:
     name: str
     role: Role
     opponent: QNetwork | None
-    weights: RewardWeights
+    reward: Reward
+    road: Corridor
     seed: int
     settings: TrainingSettings
 
@@ -115,37 +128,41 @@ def train_library(
     seed: int = 0,
     weights: RewardWeights | None = None,
     settings: TrainingSettings | None = None,
+    scenario: Scenario = US23,
     *,
     on_progress: Callable[[TrainingProgress], None] | None = None,
     on_done: Callable[[str, PolicyCheck | None], None] | None = None,
 ) -> None:
     """Train networks into a folder, in the order of the helix; finished ones are kept.
 
-    A network that the folder's manifest already has with the same seed, weights, settings and
-    opponent is not trained again, so an interrupted training goes on with what is not finished.
-    Next to each network lies a log, `<name>.training.jsonl`. Raises `UserError` when an opponent
-    is missing, the folder has such a network of another plan, or the folder cannot be written or
-    holds something else.
+    A network that the folder's manifest already has with the same scenario, seed, weights,
+    settings and opponent is not trained again, so an interrupted training goes on with what is not
+    finished. Next to each network lies a log, `<name>.training.jsonl`. Raises `UserError` when the
+    scenario has no road, an opponent is missing or of another scenario, the folder has such a
+    network of another plan, or the folder cannot be written or holds something else.
     """
-    weights = weights or RewardWeights()
+    scenario = of_two(scenario)
+    reward = Reward(weights or RewardWeights.of(scenario), scenario)
+    road = road_for(scenario)
     _take(folder)
     for level, pair in enumerate(PAIRS, start=1):
         of_level = settings or LEVEL_SETTINGS[level]
         plans = {
-            name: _plan(folder, name, seed, weights, of_level) for name in pair if name in names
+            name: _plan(folder, name, seed, reward, of_level) for name in pair if name in names
         }
         tasks = []
         for name, plan in plans.items():
             known = read_manifest(folder).get(name, {})
-            if {key: known.get(key) for key in plan} != plan:
+            of_paper = {"scenario": scenario_record(US23)} if known else {}
+            if {key: {**of_paper, **known}.get(key) for key in plan} != plan:
                 if known:
                     raise UserError(
-                        f"{folder} has a {name} of another seed, opponent or setting: choose "
-                        "another folder with --out, or remove it first"
+                        f"{folder} has a {name} of another scenario, seed, opponent or setting: "
+                        "choose another folder with --out, or remove it first"
                     )
                 role, opponent = OPPONENTS[name]
                 network = None if opponent == "level0" else load_network(opponent, folder)
-                tasks.append(_Task(name, role, network, weights, seed, of_level))
+                tasks.append(_Task(name, role, network, reward, road, seed, of_level))
             elif on_done is not None:
                 on_done(name, None)
         for trained, network, check, seconds in _train_beside(folder, tasks, on_progress):
@@ -177,23 +194,31 @@ def _take(folder: Path) -> None:
 
 
 def _plan(
-    folder: Path, name: str, seed: int, weights: RewardWeights, settings: TrainingSettings
+    folder: Path, name: str, seed: int, reward: Reward, settings: TrainingSettings
 ) -> dict[str, Any]:
     """Return everything that decides the weights of a network."""
     role, opponent = OPPONENTS[name]
+    scenario = reward.scenario
+    of_scenario = "" if scenario.name == US23.name else f" --scenario {quoted(scenario.name)}"
     opponent_sha256 = None
     if opponent != "level0":
         entry = read_manifest(folder).get(opponent)
         if entry is None:
             raise UserError(f"{name} is trained against {opponent}: train that one first")
+        if not plays_as(scenario_of(entry), scenario):
+            raise UserError(
+                f"the {opponent} of {folder} was trained for another scenario, "
+                f"{scenario_of(entry).name}: choose another folder with --out"
+            )
         opponent_sha256 = entry["sha256"]
     return {
-        "command": f"merge-sumo train --only {name} --seed {seed}",
+        "command": f"merge-sumo train --only {name} --seed {seed}{of_scenario}",
+        "scenario": scenario_record(scenario),
         "role": role,
         "opponent": opponent,
         "opponent_sha256": opponent_sha256,
         "seed": seed,
-        "reward_weights": asdict(weights),
+        "reward_weights": asdict(reward.weights),
         "settings": asdict(settings),
     }
 
@@ -258,7 +283,7 @@ def _report_into(told: Any) -> None:
 def _train_one(task: _Task) -> _Trained:
     """Train a network by DDQN in SUMO, refine it, check it in SUMO."""
     sees_svo = task.name == "pov2"
-    played_out = Game(task.role, task.opponent, task.weights)
+    played_out = Game(task.role, task.opponent, task.reward)
     regret = QuickRegret(played_out, sees_svo=sees_svo)
     ddqn, refinement = task.settings.ddqn, task.settings.refine
 
@@ -277,16 +302,14 @@ def _train_one(task: _Task) -> _Trained:
         opponent = make_opponent(task.role, "level0", GAMES)
     else:
         opponent = LevelKDriver(GAMES, task.opponent)
-    game = MergeGame(task.role, opponent, task.weights)
+    game = MergeGame(task.role, opponent, task.reward, task.road)
     try:
         network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=covering)
     finally:
         game.close()
     network = refine(played_out, network, task.seed, refinement, refining)
     seconds = time.perf_counter() - started
-    check = check_network(
-        task.name, network, task.opponent, task.weights, task.settings.check_cases
-    )
+    check = check_network(task.name, network, task.opponent, task.reward, task.settings.check_cases)
     return task.name, network, check, seconds
 
 

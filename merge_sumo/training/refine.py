@@ -26,11 +26,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, QNetwork
+from merge_sumo.drivers.levelk import ACTIONS, QNetwork
 from merge_sumo.training.best_response import beam_search
 from merge_sumo.training.ddqn import as_torch, export, squash
 from merge_sumo.training.env import exploring_starts
-from merge_sumo.training.game import MAX_DECISIONS, Game, IntArray, greedy, inputs_of
+from merge_sumo.training.game import Game, IntArray, greedy, inputs_of
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import SVO
 
@@ -131,14 +131,14 @@ def _label(
     game: Game, network: QNetwork, rng: np.random.Generator, s: RefineSettings
 ) -> tuple[_Labelled, float]:
     """Return states of this round with the worth of each action, and the mean return."""
-    policy = greedy(network)
-    start = exploring_starts(s.starts, rng, s.midway)
+    policy = greedy(network, game.scenario)
+    start = exploring_starts(s.starts, rng, s.midway, game.scenario)
     svo_rad = rng.uniform(SVO.low, SVO.high, s.starts) * network.sees_svo
     tried = _try(game, network, start, svo_rad, rng, s)
     returns = game.action_returns(tried.state, tried.svo_rad, policy)
     row = np.arange(len(returns))
     returns[row, tried.action] = np.maximum(returns[row, tried.action], tried.to_go)
-    inputs = inputs_of(network, tried.state, tried.svo_rad)
+    inputs = inputs_of(network, tried.state, tried.svo_rad, game.scenario)
     return _Labelled(inputs.astype(np.float32), returns.astype(np.float32)), tried.mean_return
 
 
@@ -162,23 +162,23 @@ def _try(
     s: RefineSettings,
 ) -> _Tried:
     """Play by the policy, from half of the starts with random actions too, and what is found."""
-    policy, searched = greedy(network), slice(s.searched)
+    policy, searched = greedy(network, game.scenario), slice(s.searched)
     found = beam_search(game, start[searched], svo_rad[searched], network, s.beam)
     state = np.concatenate([start, start[::2], start[searched]])
     psi = np.concatenate([svo_rad, svo_rad[::2], svo_rad[searched]])
     index, total = np.arange(len(state)), np.zeros(len(state))
-    plan = np.full((len(state), MAX_DECISIONS), -1)
+    plan = np.full((len(state), game.max_decisions), -1)
     plan[len(state) - len(found.plans) :] = found.plans
     random = np.zeros(len(state))
     random[len(start) : len(state) - len(found.plans)] = s.exploration
     steps: list[tuple[IntArray, FloatArray, IntArray, FloatArray]] = []
-    for decision in range(MAX_DECISIONS):
+    for decision in range(game.max_decisions):
         planned = plan[index, decision]
         action = np.where(planned >= 0, planned, policy(state, psi[index]))
         at_random = rng.random(len(index)) < random[index]
-        action = np.where(at_random, rng.integers(0, len(ACTIONS_MPS2), len(index)), action)
+        action = np.where(at_random, rng.integers(0, ACTIONS, len(index)), action)
         before = state
-        state, reward, over = game.advance(state, psi[index], ACTIONS_MPS2[action])
+        state, reward, over = game.advance(state, psi[index], game.actions_mps2[action])
         steps.append((index, before, action, total[index]))
         total[index] += reward
         index, state = index[~over], state[~over]

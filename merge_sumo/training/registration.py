@@ -7,7 +7,7 @@ from typing import Final
 from gymnasium.envs import registration
 
 from merge_sumo.drivers.levelk import DECISION_STEPS
-from merge_sumo.values.scenario import MAX_STEPS
+from merge_sumo.values.scenario import US23
 
 ENV_ID: Final = "merge_sumo/Merge-v0"
 
@@ -16,5 +16,5 @@ registration.register(
     ENV_ID,
     entry_point="merge_sumo.training.env:MergeEnv",
     vector_entry_point="merge_sumo.training.env:MergeVectorEnv",
-    max_episode_steps=MAX_STEPS // DECISION_STEPS,
+    max_episode_steps=US23.max_steps // DECISION_STEPS,
 )

@@ -11,37 +11,35 @@ Every phi is 0 or negative, but for the reward of a wide gap in `phi_dx`. No dis
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.drivers.units import Units
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import (
-    DT_S,
-    DX_CRASH_M,
-    DX_CRITICAL_M,
-    TTC_MIN_S,
-    V_HW_MAX_MPS,
-    V_HW_MIN_MPS,
-    V_MIN_MPS,
-)
+from merge_sumo.values.scenario import DT_S, US23, Scenario
+
+FULL_GAP_M: Final = 45.0
+"""In the paper's scenario a gap is full when it is this much wider than one that is not critical:
+what a vehicle on the level-0 profile drives in 1.6 s."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RewardWeights:
-    """Weights W; `policies/README.md` says how they were found.
+    """Weights W, by default of the paper's scenario; `policies/README.md` says how they were found.
 
     Attributes:
         pov_acc: per s and (m/s2)^2.
-        pov_v_hw: per s and m/s outside [24.6, 35].
+        pov_v_hw: per s and m/s outside the speeds that the mainline drives at.
         vut_acc: per s and (m/s2)^2.
-        vut_v_min: per s and m/s below 12.
-        vut_v_end: once, per m/s outside [24.6, 35] at t1.
-        ttc: once, for TTC = 0; falls linearly to 0 at 7 s.
+        vut_v_min: per s and m/s below the speed at which the VUT is slow.
+        vut_v_end: once, per m/s outside the mainline's speeds at t1.
+        ttc: once, for TTC = 0; falls linearly to 0 where it is no longer short.
         gap: once, the reward of |dx| >= `gap_full_m`; grows linearly from 0 at dx = 0.
         gap_full_m: |dx| from which the reward of a gap is full.
-        critical: once, for dx = 0; falls linearly to 0 at 15 m.
-        crash: once, for |dx| < 6 m.
+        critical: once, for dx = 0; falls linearly to 0 where the gap is no longer critical.
+        crash: once, for a collision.
     """
 
     pov_acc: float = 0.1
@@ -55,73 +53,102 @@ class RewardWeights:
     critical: float = 0.5
     crash: float = 20.0
 
+    @classmethod
+    def of(cls, scenario: Scenario) -> Self:
+        """Return the weights of a scenario: the paper's, measured in its units.
+
+        What a second of acceleration or of a wrong speed costs is a share of the game's length;
+        accelerations count as shares of the hardest, speeds as shares of the VUT's at M. The
+        crash, and what a gap can win, cost and win the same everywhere.
+        """
+        unit, paper = Units.of(scenario), cls()
+        acceleration = unit.acceleration * unit.acceleration * unit.time
+        speed = unit.speed * unit.time
+        return cls(
+            pov_acc=paper.pov_acc / acceleration,
+            pov_v_hw=paper.pov_v_hw / speed,
+            vut_acc=paper.vut_acc / acceleration,
+            vut_v_min=paper.vut_v_min / speed,
+            vut_v_end=paper.vut_v_end / unit.speed,
+            gap_full_m=scenario.dx_critical_m + FULL_GAP_M * unit.speed,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Reward:
+    """The reward of a scenario: its weights, and from where on what is bad or good.
+
+    Speeds and accelerations are arrays of one shape, and so is what is returned.
+    """
+
+    weights: RewardWeights
+    scenario: Scenario = US23
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Self:
+        """Return the reward of a scenario with the weights that it is trained with."""
+        return cls(RewardWeights.of(scenario), scenario)
+
+    def phi_v_hw(self, v_mps: FloatArray) -> FloatArray:
+        """Return minus the m/s by which a speed is outside the mainline's range.
+
+        The speed of the POV, and the VUT's at t1.
+        """
+        below, above = self.scenario.v_hw_min_mps - v_mps, v_mps - self.scenario.v_hw_max_mps
+        return -np.maximum(np.maximum(below, above), 0.0)
+
+    def phi_v_min(self, v_vut_mps: FloatArray) -> FloatArray:
+        """Return minus the m/s by which the VUT is slower than it should be."""
+        return -np.maximum(self.scenario.v_min_mps - v_vut_mps, 0.0)
+
+    def phi_ttc(self, dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
+        """Return -(1 - TTC / limit) for a TTC below the scenario's limit, else 0."""
+        closing = dx_m * dv_mps < 0.0
+        ttc_s = np.abs(dx_m) / np.where(closing, np.abs(dv_mps), 1.0)
+        short = np.maximum(1.0 - ttc_s / self.scenario.ttc_min_s, 0.0)
+        return -np.where(closing, short, 0.0)
+
+    def phi_dx(self, dx_m: FloatArray) -> FloatArray:
+        """Return the reward of a wide gap less the penalty of a critical one, both weighted."""
+        gap, weights = np.abs(dx_m), self.weights
+        wide = np.minimum(gap / weights.gap_full_m, 1.0)
+        near = np.maximum(1.0 - gap / self.scenario.dx_critical_m, 0.0)
+        reward: FloatArray = weights.gap * wide - weights.critical * near
+        return reward
+
+    def phi_crash(self, dx_m: FloatArray) -> FloatArray:
+        """Return -1 for a collision."""
+        crashed: NDArray[np.bool_] = np.abs(dx_m) < self.scenario.dx_crash_m
+        return -crashed.astype(np.float64)
+
+    def safety(self, dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
+        """Return the safety reward of both vehicles at t1."""
+        return (
+            self.weights.ttc * self.phi_ttc(dx_m, dv_mps)
+            + self.phi_dx(dx_m)
+            + self.weights.crash * self.phi_crash(dx_m)
+        )
+
+    def pov_step(self, v_pov_mps: FloatArray, a_pov_mps2: FloatArray) -> FloatArray:
+        """Return the POV's ego reward of one 0.1 s step."""
+        weights = self.weights
+        speed = weights.pov_v_hw * self.phi_v_hw(v_pov_mps)
+        return (weights.pov_acc * phi_acc(a_pov_mps2) + speed) * DT_S
+
+    def vut_step(self, v_vut_mps: FloatArray, a_vut_mps2: FloatArray) -> FloatArray:
+        """Return the VUT's running ego reward of one 0.1 s step."""
+        weights = self.weights
+        speed = weights.vut_v_min * self.phi_v_min(v_vut_mps)
+        return (weights.vut_acc * phi_acc(a_vut_mps2) + speed) * DT_S
+
+    def vut_end(self, v_vut_mps: FloatArray) -> FloatArray:
+        """Return the VUT's ego reward of its final speed, at t1."""
+        return self.weights.vut_v_end * self.phi_v_hw(v_vut_mps)
+
 
 def phi_acc(a_mps2: FloatArray) -> FloatArray:
     """Return minus the squared acceleration, (m/s2)^2."""
     return -np.square(a_mps2)
-
-
-def phi_v_hw(v_mps: FloatArray) -> FloatArray:
-    """Return minus the m/s by which a speed is outside the highway's [24.6, 35]."""
-    below, above = V_HW_MIN_MPS - v_mps, v_mps - V_HW_MAX_MPS
-    return -np.maximum(np.maximum(below, above), 0.0)
-
-
-def phi_v_min(v_vut_mps: FloatArray) -> FloatArray:
-    """Return minus the m/s by which the VUT is slower than 12."""
-    return -np.maximum(V_MIN_MPS - v_vut_mps, 0.0)
-
-
-phi_v_end = phi_v_hw
-"""The VUT's final speed is held against the same range as the POV's speed."""
-
-
-def phi_ttc(dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
-    """Return -(1 - TTC / 7 s) for a TTC below 7 s, else 0."""
-    closing = dx_m * dv_mps < 0.0
-    ttc_s = np.abs(dx_m) / np.where(closing, np.abs(dv_mps), 1.0)
-    return -np.where(closing, np.maximum(1.0 - ttc_s / TTC_MIN_S, 0.0), 0.0)
-
-
-def phi_dx(dx_m: FloatArray, weights: RewardWeights) -> FloatArray:
-    """Return the reward of a wide gap less the penalty of one below 15 m, both weighted."""
-    gap = np.abs(dx_m)
-    wide = np.minimum(gap / weights.gap_full_m, 1.0)
-    near = np.maximum(1.0 - gap / DX_CRITICAL_M, 0.0)
-    reward: FloatArray = weights.gap * wide - weights.critical * near
-    return reward
-
-
-def phi_crash(dx_m: FloatArray) -> FloatArray:
-    """Return -1 for a collision, |dx| < 6 m."""
-    crashed: NDArray[np.bool_] = np.abs(dx_m) < DX_CRASH_M
-    return -crashed.astype(np.float64)
-
-
-def safety(dx_m: FloatArray, dv_mps: FloatArray, weights: RewardWeights) -> FloatArray:
-    """Return the safety reward of both vehicles at t1."""
-    return (
-        weights.ttc * phi_ttc(dx_m, dv_mps)
-        + phi_dx(dx_m, weights)
-        + weights.crash * phi_crash(dx_m)
-    )
-
-
-def pov_step(v_pov_mps: FloatArray, a_pov_mps2: FloatArray, weights: RewardWeights) -> FloatArray:
-    """Return the POV's ego reward of one 0.1 s step."""
-    rate = weights.pov_acc * phi_acc(a_pov_mps2) + weights.pov_v_hw * phi_v_hw(v_pov_mps)
-    return rate * DT_S
-
-
-def vut_step(v_vut_mps: FloatArray, a_vut_mps2: FloatArray, weights: RewardWeights) -> FloatArray:
-    """Return the VUT's running ego reward of one 0.1 s step."""
-    rate = weights.vut_acc * phi_acc(a_vut_mps2) + weights.vut_v_min * phi_v_min(v_vut_mps)
-    return rate * DT_S
-
-
-def vut_end(v_vut_mps: FloatArray, weights: RewardWeights) -> FloatArray:
-    """Return the VUT's ego reward of its final speed, at t1."""
-    return weights.vut_v_end * phi_v_end(v_vut_mps)
 
 
 def pov_reward(

@@ -122,13 +122,18 @@ class Pool:
         return from_unit(points, level, self.v_vut0_mps, self.scenario)
 
 
-def to_unit(cases: Iterable[Case], level: int) -> FloatArray:
-    """Return the cases of one level as points, (n, d), with the pool's box as the unit cube."""
+def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> FloatArray:
+    """Return the cases of one level as points, (n, d), with the pool's box as the unit cube.
+
+    Where there are no cases, d is that of the scenario.
+    """
     rows = []
     for case in cases:
         dims = case.scenario.dimensions(level)
         rows.append([(getattr(case, d.field) - d.low) / (d.high - d.low) for d in dims])
-    return np.array(rows, dtype=np.float64) if rows else np.empty((0, len(dimensions(level))))
+    return (
+        np.array(rows, dtype=np.float64) if rows else np.empty((0, len(scenario.dimensions(level))))
+    )
 
 
 def from_unit(

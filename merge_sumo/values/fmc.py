@@ -91,10 +91,10 @@ def fmc_and_error(points: ArrayLike, radius: float | None = None) -> tuple[float
     """Return `fmc` and its standard error; 0 for d = 1 and 2, and 1e-4 of the volume for d = 3.
 
     For d > 3 it is the standard error of the mean of eight independent scramblings, 0 where no two
-    balls overlap. Measured on clouds, bands and heaps of 10 to 1,000 points it is at most 5e-4 of
-    the volume for d = 4 to 6, a fiftieth of what one of those points adds to it; for up to 100,000
-    points at most 1.5e-3 for d = 4, 4e-3 for d = 5 and 8e-3 for d = 6, in some seconds. The same
-    points have the same figure. Raises as `fmc` does.
+    balls overlap. As a share of the volume it is, for clouds and bands of up to 1,000 points, at
+    most 4e-4 (measured for d = 4 to 6), and for heaps of them 1.3e-3; for up to 100,000 points at
+    most 1.4e-3 for d = 4, 3.5e-3 for d = 5 and 8e-3 for d = 6. The same points have the same
+    figure. Raises as `fmc` does.
     """
     cases = _checked(points, radius)
     dimension = cases.shape[1]

@@ -8,12 +8,13 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.levelk import ACTIONS_MPS2
+from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
 from merge_sumo.drivers.vuts.base import PerCorridor, Seen, Vut, VutOptions
 from merge_sumo.drivers.vuts.options import split_options
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S, US23
 
 PERIOD: Final = "decision_period_s"
 """Metadata of a network, or option: it decides this often and holds its acceleration."""
@@ -77,10 +78,10 @@ class Network:
             )
         self._input, self._dtype = inputs[0].name, _DTYPES[inputs[0].type]
         outputs = self.run((0.0, 0.0, 0.0, 0.0))
-        if outputs.size not in (1, len(ACTIONS_MPS2)):
+        if outputs.size not in (1, ACTIONS):
             raise UserError(
                 f"{path} gives {outputs.size} numbers: a VUT gives one acceleration, or "
-                f"{len(ACTIONS_MPS2)} values of the actions -4 to +2 m/s2"
+                f"{ACTIONS} values of actions, from the hardest braking to the hardest acceleration"
             )
         metadata = self._session.get_modelmeta().custom_metadata_map
         text = period_s or metadata.get(PERIOD) or str(DT_S)
@@ -96,14 +97,14 @@ class Network:
         fed = np.array([state], dtype=self._dtype)
         return np.asarray(self._session.run(None, {self._input: fed})[0]).ravel()
 
-    def acceleration_mps2(self, state: tuple[float, ...]) -> float:
-        """Return the acceleration, or that of the highest action value."""
+    def acceleration_mps2(self, state: tuple[float, ...], of_actions: FloatArray) -> float:
+        """Return the acceleration, or that of the action of the highest value."""
         output = self.run(state)
         if output.size == 1:
             return float(output[0])
         if not np.isfinite(output).all():
             return float("nan")
-        return float(ACTIONS_MPS2[int(output.argmax())])
+        return float(of_actions[int(output.argmax())])
 
 
 class OnnxVut(PerCorridor):
@@ -114,6 +115,12 @@ class OnnxVut(PerCorridor):
         super().__init__(corridors, deadline_s)
         self._network = network
         self._held = [0.0] * corridors
+        self._of_actions = [actions_mps2(US23)] * corridors
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Take what the actions are in the scenario of the case."""
+        self._of_actions[corridor] = actions_mps2(case.scenario)
+        super().begin(corridor, case)
 
     def renew(self, corridor: int) -> None:
         """Do nothing."""
@@ -124,5 +131,7 @@ class OnnxVut(PerCorridor):
     def answer(self, corridor: int, seen: Seen) -> float:
         """Return the held acceleration, decided anew where a decision is due."""
         if round(seen.t_s / DT_S) % self._network.period_steps == 0:
-            self._held[corridor] = self._network.acceleration_mps2(seen[1:])
+            self._held[corridor] = self._network.acceleration_mps2(
+                seen[1:], self._of_actions[corridor]
+            )
         return self._held[corridor]

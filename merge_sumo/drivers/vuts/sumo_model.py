@@ -17,17 +17,10 @@ from merge_sumo.drivers.vuts.options import split_options
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, LEVEL0_V_MPS
+from merge_sumo.values.scenario import DT_S
 
-DEFAULTS: Final = {
-    "maxSpeed": LEVEL0_V_MPS,
-    "accel": A_MAX_MPS2,
-    "decel": -A_MIN_MPS2,
-    "emergencyDecel": -A_MIN_MPS2,
-}
-"""A realistic driver that knows the limits of acceleration, and wants the level-0 speed."""
 SHARED_OPTIONS: Final = {
-    *DEFAULTS,
+    *("maxSpeed", "accel", "decel", "emergencyDecel"),
     *("apparentDecel", "tau", "minGap", "speedFactor", "impatience", "jmIgnoreFoeProb"),
     *("jmIgnoreFoeSpeed", "jmSigmaMinor", "jmStoplineGap", "jmTimegapMinor", "jmExtraGap"),
     *("jmAdvance",),
@@ -72,7 +65,7 @@ def sumo_vut(argument: str, _options: VutOptions) -> Vut:
         raise UserError(f"--vut {spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
     own, defaults = MODELS[model]
     known = SHARED_OPTIONS | own
-    values = DEFAULTS | defaults
+    values = dict(defaults)
     for name, text in given.items():
         if name not in known:
             raise UserError(

@@ -21,16 +21,17 @@ import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.vuts import traci_protocol as tp
-from merge_sumo.drivers.vuts.base import Seen, Vut, VutOptions
+from merge_sumo.drivers.vuts.base import Seen, Vut, VutOptions, seen_in
 from merge_sumo.drivers.vuts.process import GRACE_S, Program, split_command
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
-from merge_sumo.drivers.vuts.traci_session import CLOSE, SIMULATION_STEP, VUT, Session
+from merge_sumo.drivers.vuts.traci_session import CLOSE, SIMULATION_STEP, Session
+from merge_sumo.drivers.vuts.traci_simulation import VUT
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, POV, US23, Scenario
 
 T = TypeVar("T")
 
@@ -50,8 +51,8 @@ def traci_vut(argument: str, options: VutOptions) -> Vut:
     command = None if options.command is None else split_command(options.command)
 
     def make(corridors: int, world: World | None) -> Driver:
-        road = road_of() if world is None else world.road
-        return TraciVut(corridors, road, port, command, options)
+        road, scenario = (road_of(), US23) if world is None else (world.road, world.scenario)
+        return TraciVut(corridors, road, scenario, port, command, options)
 
     files = [Path(word) for word in command or () if Path(word).is_file()]
     return Vut(
@@ -78,6 +79,7 @@ class TraciVut(Driver):
         self,
         corridors: int,
         road: Corridor,
+        scenario: Scenario,
         port: int,
         command: list[str] | None,
         options: VutOptions,
@@ -86,7 +88,7 @@ class TraciVut(Driver):
         if corridors != 1:
             raise ValueError("a TraCI client drives in one corridor")
         super().__init__(corridors)
-        self._road, self._port = road, port
+        self._road, self._scenario, self._port = road, scenario, port
         self._command, self._options = command, options
         self._listener: socket.socket | None = None
         self._program: Program | None = None
@@ -112,8 +114,8 @@ class TraciVut(Driver):
         """Return the acceleration that follows from what the client commanded, or NaN."""
         if self._reason is None:
             try:
-                state = (scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps)
-                seen = Seen(float(scene.step[0]) * DT_S, *(float(column[0]) for column in state))
+                x_m, v_mps = scene.x_m[:, 0].tolist(), scene.v_mps[:, 0].tolist()
+                seen = seen_in(float(scene.step[0]) * DT_S, POV, x_m, v_mps)
                 return np.array([self._ask(seen)])
             except FaultError as error:
                 self._reason = str(error)
@@ -193,7 +195,7 @@ class TraciVut(Driver):
                     before = f"{ended} (before it connected)" if ended else late
                     raise FaultError(before) from None
         self._patience_s = self._options.connect_s
-        session = Session(self._road)
+        session = Session(self._road, self._scenario)
         self._client = _Client(connection, session, self._options.deadline_s, self._program)
 
     def _disconnect(self, *, grace: bool = False) -> None:

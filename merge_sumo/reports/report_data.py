@@ -1,0 +1,240 @@
+"""What the report draws from: maps, motion and charts as plain JSON for the script of the page."""
+
+from __future__ import annotations
+
+import base64
+import math
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.campaigns.conductor import SCENARIOS, case_name
+from merge_sumo.campaigns.experiments import Truth
+from merge_sumo.reports.diagnosis import (
+    Diagnosis,
+    Kind,
+)
+from merge_sumo.reports.report_facts import ERROR_CHARACTERS, Facts
+from merge_sumo.reports.surface import Surface
+from merge_sumo.reports.verdict import shortened
+from merge_sumo.sumo.corridor import Corridor, LanePath
+from merge_sumo.values.case import FloatArray, dimensions, to_unit
+from merge_sumo.values.fmc import RADIUS, fmc
+from merge_sumo.values.scenario import DT_S, POV, VUT
+from merge_sumo.values.score import FAILURE_SCORE
+from merge_sumo.values.trajectory import End, Trajectory
+
+COUNT_GRID: Final = (32, 20)
+SPEED_UNIT_MPS: Final = 0.002
+"""Speeds are kept as whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
+GRID: Final = {2: (97, 97, 1), 3: (49, 49, 17)}
+"""Nodes of the maps in x_POV0, v_POV0 and psi, by the level's number of dimensions."""
+NEIGHBOURS: Final = 3
+"""Cases of the truth that decide whether a node of the map fails."""
+MOST_STEPS: Final = 40
+"""Batches, or groups of batches, in the charts of the search."""
+MOST_BALLS: Final = 20_000
+"""Balls that are counted for a level's curve of coverage: of more failures it has fewer points."""
+
+
+def page_data(facts: Facts) -> dict[str, Any]:
+    """Return what the script draws from: plain JSON."""
+    speeds, offsets = _packed(facts.motion)
+    scenarios = facts.run.folder / SCENARIOS
+    return {
+        "dt": DT_S,
+        "crash_m": facts.run.scenario.dx_crash_m,
+        "radius": RADIUS,
+        "x_vut0_m": facts.run.scenario.x_vut0_m,
+        "speed_unit_mps": SPEED_UNIT_MPS,
+        "dimensions": {
+            name: [round(d.low, 4), round(d.high, 4)]
+            for name, d in zip(("x", "v", "psi"), facts.run.scenario.dimensions(2), strict=True)
+        },
+        "ends": [end.value for end in End],
+        "kinds": [kind.value for kind in Kind],
+        "cases": _columns(facts, offsets),
+        "errors": {
+            o.index: shortened(o.measures.error, ERROR_CHARACTERS)
+            for o in facts.shown
+            if o.measures.error
+        },
+        "speeds": speeds,
+        "counts": _counts(facts),
+        "chance": {
+            level: None if surface is None else _chance_grid(surface, level)
+            for level, surface in facts.surfaces.items()
+        },
+        "truth": {
+            level: None if truth is None else _truth_grid(truth, level)
+            for level, truth in facts.truths.items()
+        },
+        "search": _search(facts),
+        "commands": _commands(facts),
+        "export": f"merge-sumo export {_quoted(facts.run.folder)}",
+        "replay": f"merge-sumo replay {_quoted(scenarios / 'case-NNNNN')} --gui",
+        **_road(facts.road),
+    }
+
+
+def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
+    ends, kinds = list(End), list(Kind)
+    columns: dict[str, list[Any]] = {}
+    for o in facts.shown:
+        found = facts.diagnoses.get(o.index, Diagnosis(None, None, None))
+        row = {
+            "index": o.index,
+            "level": o.case.level,
+            "x": round(o.case.x_pov0_m, 3),
+            "v": round(o.case.v_pov0_mps, 4),
+            "psi": _rounded(o.case.svo_rad, 4),
+            "end": ends.index(o.measures.end),
+            "failed": int(o.failed),
+            "score": _rounded(o.measures.score, 1),
+            "dx": _rounded(o.measures.dx_m, 2),
+            "dv": _rounded(o.measures.dv_mps, 2),
+            "t_end": o.measures.t_end_s,
+            "way_out": _rounded(o.measures.last_avoidable_s, 1),
+            "vut_yields": found.vut_yields_s,
+            "pov_yields": found.pov_yields_s,
+            "kind": None if found.kind is None else kinds.index(found.kind),
+            "offset": offsets.get(o.index, 0),
+            "rows": len(facts.motion[o.index].motion) if o.index in facts.motion else 0,
+        }
+        for name, value in row.items():
+            columns.setdefault(name, []).append(value)
+    return columns or {"index": []}
+
+
+def _counts(facts: Facts) -> dict[int, dict[str, Any]]:
+    """Return how many cases that are not shown one by one lie where, by level."""
+    shown = {o.index for o in facts.shown}
+    others = [o for o in facts.run.outcomes if o.index not in shown]
+    nx, ny = COUNT_GRID
+    counts = {}
+    for level in facts.levels if others else ():
+        grid: dict[str, Any] = {"nx": nx, "ny": ny}
+        for name, failing in (("safe", False), ("failing", True)):
+            at = [o for o in others if o.case.level == level and o.failed is failing]
+            points = to_unit((o.case for o in at), level)[:, :2]
+            cells, _, _ = np.histogram2d(
+                points[:, 1], points[:, 0], bins=(ny, nx), range=((0, 1), (0, 1))
+            )
+            grid[name] = cells.astype(int).ravel().tolist()
+        counts[level] = grid
+    return counts
+
+
+def _search(facts: Facts) -> dict[str, Any]:
+    """Return cases, mean score and coverage of each level after groups of batches."""
+    batches = sorted({o.batch for o in facts.run.outcomes})
+    width = -(-len(batches) // MOST_STEPS) or 1
+    groups = batches[::width]
+    levels = []
+    for level in facts.levels:
+        at = [o for o in facts.run.outcomes if o.case.level == level]
+        group = np.array([o.batch // width for o in at], dtype=np.int64)
+        score = np.array([o.measures.score for o in at], dtype=np.float64)
+        failed = np.array([o.failed for o in at], dtype=bool)
+        points = to_unit((o.case for o in at), level)
+        counted: list[int] = []
+        means: list[float | None] = []
+        covered: list[float | None] = []
+        stride = -(-len(groups) * int(failed.sum()) // MOST_BALLS) or 1
+        last = len(groups) - 1
+        for number in range(len(groups)):
+            inside = score[(group == number) & ~np.isnan(score)]
+            counted.append(int((group == number).sum()))
+            means.append(round(float(inside.mean()), 1) if len(inside) else None)
+            so_far = points[failed & (group <= number)]
+            wanted = (last - number) % stride == 0
+            covered.append(round(fmc(so_far), 5) if wanted else None)
+        levels.append({"level": level, "cases": counted, "score": means, "fmc": covered})
+    return {"batch": groups, "width": width, "levels": levels}
+
+
+def _commands(facts: Facts) -> dict[int, str]:
+    """Return the commands that replay the cases that are exported already."""
+    folder = facts.run.folder / SCENARIOS
+    return {
+        o.index: f"merge-sumo replay {_quoted(folder / case_name(o.index))} --gui"
+        for o in facts.shown
+        if (folder / case_name(o.index)).is_dir()
+    }
+
+
+def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:
+    """Return the speeds of POV and VUT at every step in base64, and the first row of each case."""
+    offsets, first = {}, 0
+    parts = [np.empty((0, 2), dtype="<u2")]
+    for index, trajectory in motion.items():
+        speeds = trajectory.motion[:, (POV, VUT), 1]
+        parts.append(np.rint(np.clip(speeds / SPEED_UNIT_MPS, 0, 65535)).astype("<u2"))
+        offsets[index] = first
+        first += len(speeds)
+    return base64.b64encode(np.concatenate(parts).tobytes()).decode(), offsets
+
+
+def _nodes(level: int) -> FloatArray:
+    """Return the nodes of a level's map, (n, d), x_POV0 running fastest and psi slowest."""
+    axes = [np.linspace(0.0, 1.0, n) for n in GRID[len(dimensions(level))] if n > 1]
+    mesh = np.meshgrid(*axes[::-1], indexing="ij")
+    return np.stack([axis.ravel() for axis in mesh[::-1]], axis=1)
+
+
+def _grid(level: int, share: NDArray[Any]) -> dict[str, Any]:
+    nx, ny, np_ = GRID[len(dimensions(level))]
+    values = np.rint(255.0 * share).astype(np.uint8)
+    return {"nx": nx, "ny": ny, "np": np_, "data": base64.b64encode(values.tobytes()).decode()}
+
+
+def _chance_grid(surface: Surface, level: int) -> dict[str, Any]:
+    return _grid(level, surface.chance(_nodes(level)))
+
+
+def _truth_grid(truth: Truth, level: int) -> dict[str, Any]:
+    from scipy.spatial import cKDTree
+
+    _, near = cKDTree(truth.points).query(_nodes(level), k=NEIGHBOURS)
+    return _grid(level, (truth.score < FAILURE_SCORE)[near].mean(axis=1))
+
+
+def _road(road: Corridor) -> dict[str, Any]:
+    """Return both paths as points (lane coordinate, x, y), and the lines of all lanes near M.
+
+    M is the origin of the plane, and the road goes on to the right: a net may lie anywhere.
+    """
+    at = road.lane_point(0.0, on_ramp=False)
+    ahead_x, ahead_y = math.sin(math.radians(at.angle_deg)), math.cos(math.radians(at.angle_deg))
+
+    def place(x: float, y: float) -> list[float]:
+        dx, dy = x - at.x_m, y - at.y_m
+        along, left = dx * ahead_x + dy * ahead_y, dy * ahead_x - dx * ahead_y
+        return [round(along, 2), round(left, 2)]
+
+    def points(path: LanePath) -> list[list[float]]:
+        return [
+            [round(piece.start_m + share * piece.length_m, 2), *place(x, y)]
+            for piece in path.pieces
+            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True)
+        ]
+
+    shapes = [piece.shape for path in (road.mainline, road.ramp) for piece in path.pieces]
+    lanes = [*road.surroundings, *dict.fromkeys(shapes)]
+    return {
+        "main": points(road.mainline),
+        "ramp": points(road.ramp),
+        "lanes": [[place(x, y) for x, y, _ in shape] for shape in lanes],
+    }
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)

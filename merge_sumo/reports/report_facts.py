@@ -1,0 +1,119 @@
+"""What the report shows of a run: cases, their motion, verdicts, and what is known beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from merge_sumo.campaigns.experiments import TRUTH_CASES, Kept, Truth, read_truth
+from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.run import SETTINGS, Run, failures
+from merge_sumo.campaigns.settings import versions
+from merge_sumo.errors import UserError
+from merge_sumo.reports.diagnosis import (
+    Diagnosis,
+    Kind,
+    diagnose,
+)
+from merge_sumo.reports.summary import summarise
+from merge_sumo.reports.surface import learn_surface
+from merge_sumo.reports.verdict import Trouble, judge
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.sumo.road import road_of
+from merge_sumo.values.scenario import DEADLINE_S, LEVELS
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import Trajectory
+
+LISTED: Final = 10
+"""Cases in a list, and messages of errors and timeouts."""
+SHOWN: Final = 2000
+"""Cases that the page holds one by one, with their motion; more are shown as counts."""
+ERROR_CHARACTERS: Final = 2000
+"""Of the message of a case; `outcomes.jsonl` has the whole."""
+
+
+class Facts:
+    """Everything that the page shows of a run."""
+
+    def __init__(self, run: Run) -> None:
+        """Read what the page shows; raises `UserError` where settings have no list of levels."""
+        levels = run.settings.get("levels")
+        if not isinstance(levels, list) or any(level not in LEVELS for level in levels):
+            raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
+        self.run = run
+        self.road = _road_of(run)
+        self.summary = summarise(run.outcomes, levels)
+        self.verdict = judge(run.outcomes)
+        self.levels = list(self.summary.levels)
+        self.worst = failures(run.outcomes)
+        self.near = sorted(
+            (o for o in run.outcomes if _is_told(o) and not o.failed),
+            key=lambda o: (o.measures.score, o.index),
+        )
+        self.untested = [o for o in run.outcomes if not _is_told(o)]
+        examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
+        listed = examples + self.worst[:LISTED] + self.near[:LISTED]
+        telling = {o.index: o for o in (*listed, *self.worst, *self.untested, *self.near)}
+        self.shown = sorted(list(telling.values())[:SHOWN], key=lambda outcome: outcome.index)
+        self.motion = {o.index: motion for o in self.shown if (motion := _motion(run, o.index))}
+        self.diagnoses: dict[int, Diagnosis] = {
+            o.index: diagnose(self.motion[o.index], o.measures)
+            for o in self.shown
+            if o.index in self.motion
+        }
+        self.kinds: dict[int, Kind] = {
+            index: found.kind for index, found in self.diagnoses.items() if found.kind is not None
+        }
+        self.surfaces = {level: learn_surface(run.outcomes, level) for level in self.levels}
+        self.truths = {level: _truth(run, self.road, level) for level in self.levels}
+
+    def troubles(self) -> Sequence[Trouble]:
+        """Return the errors and timeouts that are listed, by message."""
+        return self.verdict.troubles[:LISTED]
+
+    def examples_of(self, trouble: Trouble) -> list[Outcome]:
+        """Return the cases that are listed for a message."""
+        return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
+
+
+def _is_told(outcome: Outcome) -> bool:
+    return outcome.measures.end.is_tested and outcome.measures.score is not None
+
+
+def _motion(run: Run, index: int) -> Trajectory | None:
+    """Return the trajectory of a case; None where it is lost: the report goes without."""
+    try:
+        return run.trajectory(index)
+    except UserError:
+        return None
+
+
+def _road_of(run: Run) -> Corridor:
+    """Return the road of a run, or the shipped one to draw on where that is not there any more."""
+    try:
+        return road_for(run.scenario)
+    except UserError:
+        return road_of()
+
+
+def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
+    """Return the ground truth that is cached for what this run tested, if there is one."""
+    settings = run.settings
+    same = (
+        settings.get("net_sha256") == road.sha256
+        and settings.get("versions") == versions()
+        and settings.get("v_vut0_mps") == run.scenario.v_vut0_mps
+    )
+    if not same:
+        return None
+    kept = Kept(
+        str(settings.get("vut")),
+        level,
+        TRUTH_CASES[level],
+        0,
+        settings.get("vut_command"),
+        settings.get("deadline_s", DEADLINE_S),
+        run.scenario,
+        policies=settings.get("policies_sha256", {}),
+    )
+    return read_truth(kept.path(), level, kept.cases, kept.scenario)

@@ -1,0 +1,255 @@
+"""What the report says: the text and the tables of the page."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from merge_sumo.campaigns.experiments import TRUTH_CASES
+from merge_sumo.drivers.vuts.output import LOG, end_of
+from merge_sumo.reports.diagnosis import (
+    CEDED_MPS,
+    MEANING,
+    Kind,
+    failure_boxes,
+)
+from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
+from merge_sumo.reports.summary import LevelSummary, Summary
+from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
+from merge_sumo.reports.verdict import Verdict, counted, in_words
+from merge_sumo.system.printable import printable
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """What the page says of a level; bars are shares of 100."""
+
+    level: int
+    about: str
+    cases: int
+    failures: int
+    untested: int
+    share_bar: float
+    untested_bar: float
+    fmc: float | None
+    fmc_bar: float | None
+    plausible: float | None
+    plausible_bar: float
+    truth: float | None
+    truth_bar: float
+    note: str
+
+
+ABOUT: Final = {
+    0: "keeps its speed",
+    1: "makes room for a VUT that accelerates",
+    2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
+}
+
+
+def page_words(facts: Facts) -> dict[str, Any]:
+    """Return what the template needs for text and tables."""
+    settings, summary = facts.run.settings, facts.summary
+    wanted = settings.get("cases")
+    boxes = [
+        box
+        for level in facts.levels
+        for box in failure_boxes(facts.worst + facts.near, level, facts.kinds)
+    ]
+    described = Counter(box.level for box in boxes for _ in range(box.failures))
+    lost = [str(o.index) for o in facts.shown if o.index not in facts.motion]
+    if len(lost) > LISTED:
+        lost = [*lost[:LISTED], counted(len(lost) - LISTED, "other")]
+    left = {n: summary.levels[n].failures - described[n] for n in facts.levels}
+    levels = _levels(facts)
+    tables = [
+        (f"{trouble.count} {trouble.end}: {trouble.message}", facts.examples_of(trouble))
+        for trouble in facts.troubles()
+    ]
+    tables += [
+        ("Ten worst failures", facts.worst[:LISTED]),
+        ("Ten nearest misses", facts.near[:LISTED]),
+    ]
+    return {
+        "vut": facts.run.vut,
+        "headline": headline(facts.verdict, summary, facts.worst, facts.kinds),
+        "counts": facts.verdict.counts,
+        "found": facts.verdict,
+        "troubles": facts.troubles(),
+        "more_troubles": facts.verdict.troubles[LISTED:],
+        "lost": in_words(lost) if lost else "",
+        "torn": facts.run.torn or (isinstance(wanted, int) and summary.cases < wanted),
+        "counted": summary.cases - len(facts.shown),
+        "summary": summary,
+        "levels": levels,
+        "any_truth": any(level.truth is not None for level in levels),
+        "truth_cases": " or ".join(
+            f"{count:,}" for count in sorted({TRUTH_CASES[level] for level in facts.levels})
+        ),
+        "plausible_chance": f"{PLAUSIBLE:.0%}",
+        "fewest_failures": FEWEST_FAILURES,
+        "avoidable": _avoidable(facts.worst),
+        "batches": len({o.batch for o in facts.run.outcomes}),
+        "driven": _duration(sum(o.measures.t_end_s for o in facts.run.outcomes)),
+        "sentences": [box.sentence for box in boxes],
+        "scattered": ", ".join(
+            f"{counted(count, 'failure')} at level {level}"
+            for level, count in left.items()
+            if count > 0
+        ),
+        "kinds": _kinds(facts),
+        "ceded": f"{CEDED_MPS:g}",
+        "scenario": facts.run.scenario,
+        "printed": end_of(facts.run.folder / LOG),
+        "tables": tables,
+        "settings": {name: _shown(value) for name, value in settings.items() if value},
+        "flat_settings": list(_flat(settings)),
+        "other_net": settings.get("net_sha256") != facts.road.sha256,
+    }
+
+
+def _levels(facts: Facts) -> list[Level]:
+    plausible = {
+        level: None if surface is None else surface.plausible_fmc()
+        for level, surface in facts.surfaces.items()
+    }
+    truth = {
+        level: None if found is None else fmc(found.failures)
+        for level, found in facts.truths.items()
+    }
+    most_share = max(
+        (
+            (s.failures + s.cases - s.tested) / s.cases
+            for s in facts.summary.levels.values()
+            if s.cases
+        ),
+        default=0.0,
+    )
+
+    def row(level: int, found: LevelSummary) -> Level:
+        # Found against what there may be: a bar shows nothing where only one of them is known.
+        most = max(found.fmc, plausible[level] or 0.0, truth[level] or 0.0)
+        known = plausible[level] is not None or truth[level] is not None
+        scale = 90.0 / most if known and most > 0.0 else 0.0
+        share = 100.0 / (most_share * found.cases) if most_share > 0.0 and found.cases else 0.0
+        return Level(
+            level=level,
+            about=ABOUT.get(level, ""),
+            cases=found.cases,
+            failures=found.failures,
+            untested=found.cases - found.tested,
+            share_bar=round(share * found.failures, 1),
+            untested_bar=round(share * (found.cases - found.tested), 1),
+            fmc=found.fmc if found.tested else None,
+            fmc_bar=round(scale * found.fmc, 1) if scale else None,
+            plausible=plausible[level],
+            plausible_bar=round(scale * (plausible[level] or 0.0), 1),
+            truth=truth[level],
+            truth_bar=round(scale * (truth[level] or 0.0), 1),
+            note=_note(facts, level, found),
+        )
+
+    return [row(level, found) for level, found in facts.summary.levels.items()]
+
+
+def _note(facts: Facts, level: int, found: LevelSummary) -> str:
+    if found.cases and not found.tested:
+        return f"Nothing was tested in {counted(found.cases, 'case')}."
+    text = f"{counted(found.failures, 'failure')} in {counted(found.cases, 'case')}"
+    if found.failures:
+        text += f", {counted(found.regions, 'region')}"
+    if found.tested < found.cases:
+        text += f"; {found.cases - found.tested} not tested"
+    if facts.surfaces[level] is None:
+        text += f". No surrogate: it takes {FEWEST_FAILURES} failures to learn one"
+    return text + "."
+
+
+def _kinds(facts: Facts) -> list[dict[str, Any]]:
+    found = Counter(facts.kinds.values())
+    avoidable = Counter(facts.kinds[o.index] for o in facts.worst if _avoidable_kind(facts, o))
+    return [
+        {
+            "name": kind.value,
+            "meaning": MEANING[kind],
+            "count": count,
+            "avoidable": avoidable[kind],
+        }
+        for kind, count in found.most_common()
+    ]
+
+
+def _avoidable_kind(facts: Facts, outcome: Outcome) -> bool:
+    return outcome.index in facts.kinds and bool(outcome.measures.avoidable)
+
+
+def headline(
+    verdict: Verdict, summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]
+) -> str:
+    """Return the result of a campaign in a few sentences: what was not tested comes first."""
+    if not verdict.cases:
+        return "No case has run."
+    said = verdict.sentences
+    if verdict.tested:
+        for level, found in summary.levels.items():
+            if found.cases and not found.tested:
+                said.append(f"At POV level {level} nothing was tested.")
+        said.append(_collisions(verdict, summary, worst, kinds))
+    return " ".join(said)
+
+
+def _collisions(
+    verdict: Verdict, summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]
+) -> str:
+    if not summary.failures:
+        others = "the other " if verdict.tested < verdict.cases else ""
+        return (
+            f"No collision in {others}{counted(verdict.tested, 'case')}. That is no proof: the "
+            "search saw these cases and no others."
+        )
+    failing = {level: found for level, found in summary.levels.items() if found.failures}
+    never = [str(n) for n, found in summary.levels.items() if found.tested and not found.failures]
+    parts = [
+        f"{found.failures} of {found.cases} cases at POV level {level} "
+        f"({counted(found.regions, 'region')})"
+        for level, found in failing.items()
+    ]
+    text = f"Collides in {in_words(parts)}"
+    text += f", never at level {in_words(never)}." if never else "."
+    common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
+    if common:
+        kind, count = common[0]
+        share = "All are" if count == summary.failures else f"{count} of {summary.failures} are"
+        text += f" {share} of the kind “{kind}”: {MEANING[kind]}."
+    return text
+
+
+def _avoidable(worst: Sequence[Outcome]) -> str | None:
+    if not worst:
+        return None
+    count = sum(bool(o.measures.avoidable) for o in worst)
+    return f"{count} of {len(worst)} could have been avoided by the VUT."
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60.0)
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{seconds / 60.0:.1f} min"
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Any:
+    """Yield (name, value) of settings, nested ones with their path."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name} ")
+        else:
+            yield _shown(f"{prefix}{name}"), _shown(value)
+
+
+def _shown(value: object) -> str:
+    """Return a setting as a text that is fit to be shown; it may be a stranger's."""
+    text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return printable(text[:ERROR_CHARACTERS])
