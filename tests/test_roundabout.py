@@ -22,10 +22,12 @@ from merge_sumo.campaigns.journal import Run
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.reports.report import write_report
 from merge_sumo.scenarios.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.sumo.world import World
+from merge_sumo.training.env import MergeGame
+from merge_sumo.training.reward import Reward
 from merge_sumo.values.case import from_unit
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -126,6 +128,18 @@ def test_random_episodes_follow_the_equations_of_motion_to_the_digit(road):
         ):
             assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
             assert v[1:] == pytest.approx(np.maximum(v[:-1] + a[:-1] * 0.1, 0.0), abs=1e-9)
+
+
+def test_a_game_on_it_is_played_by_its_numbers(road):
+    game = MergeGame("pov", Level0Vut(1), Reward.of(ROUNDABOUT), road)
+    try:
+        game.begin(0, np.array([-60.0, 8.0, -50.0, 7.8]))
+        state, _, over = game.decide(np.array([1.0]))
+    finally:
+        game.close()
+    # 8, 8.1 ... 8.4 and 7.8, 7.9, 8, 8, 8 m/s for 0.1 s each: level 0 holds 8 m/s.
+    assert state[0] == pytest.approx([-60.0 + 4.1, 8.5, -50.0 + 3.97, 8.0], abs=1e-9)
+    assert not over[0]
 
 
 def call(*arguments: object):
