@@ -27,9 +27,9 @@ from lxml import etree
 from merge_sumo import cli
 from merge_sumo.api import open_run
 from merge_sumo.campaigns.conductor import SCENARIOS
-from merge_sumo.campaigns.experiments import Kept, Truth, ground_truth, read_truth
 from merge_sumo.campaigns.probability import LINES
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
+from merge_sumo.campaigns.truth import Kept, Truth, ground_truth, read_truth
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import write_junit

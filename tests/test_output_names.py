@@ -249,7 +249,7 @@ class TestAHundredNames:
         assert {"a b.svg", "-rf.html", "日本.svg"} <= set(appeared)
 
     def test_of_a_figure_are_refused_before_anything_runs(self, world, call, monkeypatch):
-        monkeypatch.setattr("merge_sumo.campaigns.experiments.ground_truth", lambda *_, **__: 1 / 0)
+        monkeypatch.setattr("merge_sumo.campaigns.truth.ground_truth", lambda *_, **__: 1 / 0)
         options = ("compare", "--vut", "design1", "--level", 0, "--workers", 1)
         for name in ("", ".", "..", "full/..", "figure.svg", "loop.svg/x.svg", "x" * 300 + ".svg"):
             code, said = call(*options, f"--figure={name}")

@@ -14,10 +14,10 @@ import pytest
 import merge_sumo as ms
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
-from merge_sumo.campaigns.experiments import Kept, ground_truth
 from merge_sumo.campaigns.ground import GroundPlan, runs_on
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.truth import Kept, ground_truth
 from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_of
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from vut_contract import cases_of, factory, run_cases
 
-from merge_sumo.campaigns.experiments import ground_truth
+from merge_sumo.campaigns.truth import ground_truth
 from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.onnx_export import export_onnx
 from merge_sumo.drivers.policies import NETWORKS, load_network

@@ -30,7 +30,8 @@ from merge_sumo.system.folders import dated
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, level_name
 
 if TYPE_CHECKING:
-    from merge_sumo.campaigns.experiments import Comparison, Quartiles, Truth
+    from merge_sumo.campaigns.experiments import Comparison, Quartiles
+    from merge_sumo.campaigns.truth import Truth
     from merge_sumo.drivers.povs import Povs
     from merge_sumo.drivers.vut import VutFactory
     from merge_sumo.drivers.vuts.base import VutOptions
@@ -63,8 +64,8 @@ def truth(
 
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
     """
-    from merge_sumo.campaigns import experiments
     from merge_sumo.campaigns.settings import one_level, povs_of
+    from merge_sumo.campaigns.truth import REAL_REGION
     from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.system.workers import open_workers
@@ -99,7 +100,7 @@ def truth(
     show(
         f"{vut} at level {level_name(chosen)}: {result['failures']} failures in "
         f"{result['cases']} cases, FMC {result['fmc']:.4f}, {result['real_regions']} regions with "
-        f"at least {experiments.REAL_REGION:.0%} of the failures"
+        f"at least {REAL_REGION:.0%} of the failures"
     )
 
 
@@ -373,16 +374,16 @@ def _truth(
     workers: Workers,
     scenario: Scenario,
 ) -> Truth:
-    from merge_sumo.campaigns import experiments
+    from merge_sumo.campaigns.truth import TRUTH_CASES, ground_truth
     from merge_sumo.reports.progress import Counter
 
-    total = experiments.TRUTH_CASES[level] if cases is None else cases
+    total = TRUTH_CASES[level] if cases is None else cases
     if total < 1:
         raise UserError(f"--cases is {total}: it must be 1 or more")
     with Counter(
         f"truth of {factory.spec} at level {level_name(level)}", total, "cases"
     ) as counter:
-        return experiments.ground_truth(
+        return ground_truth(
             factory,
             level,
             total,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.campaigns.conductor import SCENARIOS, case_name
-from merge_sumo.campaigns.experiments import Truth
+from merge_sumo.campaigns.truth import Truth
 from merge_sumo.reports.diagnosis import (
     Diagnosis,
     Kind,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from merge_sumo.campaigns.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.truth import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.errors import UserError
 from merge_sumo.reports.diagnosis import (
     Diagnosis,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from merge_sumo.campaigns.experiments import TRUTH_CASES
+from merge_sumo.campaigns.truth import TRUTH_CASES
 from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.reports.diagnosis import (
     CEDED_MPS,
