@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from textwrap import dedent
 
@@ -50,6 +51,7 @@ class Pov:
         near = np.abs(seen.x_pov_m - seen.x_vut_m) < 40.0
         return np.where(seen.active, np.where(near & (seen.x_vut_m < 0.0), -1.0, 0.3), np.nan)
 """
+LONG = partial(pytest.param, marks=pytest.mark.long)
 SMALL = {
     "vut": "design2",
     "levels": (OWN,),
@@ -210,7 +212,7 @@ class TestAPov:
         assert same(hosted, [found[k] for k in range(6)])
         assert any(trajectory.a_pov_mps2.min() == -1.0 for trajectory in hosted)
 
-    @pytest.mark.parametrize("corridors", [1, 3, 8])
+    @pytest.mark.parametrize("corridors", [1, 8])
     def test_drives_an_episode_whatever_runs_beside_it(self, corridors):
         cases = own(cases_of(9))
         assert same(run(pov(YIELDS), cases, corridors=corridors), run(pov(YIELDS), cases))
@@ -224,7 +226,9 @@ class TestAPov:
             assert motion.a_pov_mps2.min() == -4.0
             assert motion.clipped_steps == 0
 
-    @pytest.mark.parametrize("spec", ["my_pov.py:Pov", "design1", "sumo:IDM", "sumo:Krauss"])
+    @pytest.mark.parametrize(
+        "spec", ["my_pov.py:Pov", "sumo:IDM", *map(LONG, ("design1", "sumo:EIDM"))]
+    )
     def test_changes_nothing_at_the_other_levels(self, spec):
         pov(YIELDS)
         rng = np.random.default_rng(3)
@@ -247,7 +251,7 @@ class TestAPov:
 
 
 class TestSumosOwnPov:
-    @pytest.mark.parametrize("model", ["IDM", "Krauss", "EIDM", "ACC", "CACC"])
+    @pytest.mark.parametrize("model", ["IDM", *map(LONG, ("Krauss", "EIDM", "ACC", "CACC"))])
     def test_keeps_its_speed_where_nobody_is(self, model):
         # It starts so near to M that it is past it long before the VUT.
         case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=31.0)
@@ -280,18 +284,7 @@ class TestSumosOwnPov:
 
 
 CASES = own([case for k, case in enumerate(cases_of(6)) if k != 4])
-SOME = (
-    "os._exit 0",
-    "segfault",
-    "loops",
-    "a BaseException",
-    "a class that raises",
-    "a thread that hangs",
-    "blames another",
-    "batched: dies",
-    "batched: is broken from then on",
-    "loading: dies",
-)
+SOME = ("os._exit 0", "loops", "batched: dies", "loading: dies")
 
 
 class TestWhatItDoesWrong:
@@ -323,7 +316,7 @@ class TestWhatItDoesWrong:
             else:
                 assert trajectory.error is None
 
-    @pytest.mark.parametrize("answer", ["float('nan')", "float('inf')", "None", "'1'"])
+    @pytest.mark.parametrize("answer", ["float('nan')", "None"])
     def test_is_no_number_for_an_answer(self, answer):
         spec = pov(f"def Pov(seen):\n    return {answer} if seen.t_s == 1.0 else 0.0\n")
         for trajectory in run(spec, own(cases_of(3))):
