@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from merges import HALF, LIKE_A_ROUNDABOUT
 
 from merge_sumo.training import reward
+from merge_sumo.values.scenario import US23
 
 R = reward.Reward(reward.RewardWeights(
     pov_acc=0.1, pov_v_hw=0.2, vut_acc=0.04, vut_v_min=0.3, vut_v_end=0.5,
@@ -73,3 +75,38 @@ def test_orientation_turns_from_egoistic_to_altruistic():
     assert reward.pov_reward(*parts, np.array([math.pi / 6])) == pytest.approx(
         [-1.0 - 2.0 * math.sqrt(0.75) - 1.5]
     )
+
+
+def test_the_paper_s_weights_are_those_of_its_scenario_to_the_last_bit():
+    assert reward.RewardWeights.of(US23) == reward.RewardWeights()
+
+
+def test_a_merge_of_half_the_size_pays_the_same_to_the_last_bit():
+    rng = np.random.default_rng(0)
+    dx, dv = rng.normal(0.0, 30.0, 500), rng.normal(0.0, 5.0, 500)
+    v, a = rng.uniform(0.0, 45.0, 500), rng.uniform(-4.0, 2.0, 500)
+    whole, half = reward.Reward.of(US23), reward.Reward.of(HALF)
+    assert np.array_equal(whole.safety(dx, dv), half.safety(dx / 2, dv / 2))
+    for name in ("pov_step", "vut_step"):
+        assert np.array_equal(getattr(whole, name)(v, a), getattr(half, name)(v / 2, a / 2))
+    assert np.array_equal(whole.vut_end(v), half.vut_end(v / 2))
+
+
+def test_the_weights_of_a_short_and_slow_merge_by_hand():
+    found = reward.RewardWeights.of(LIKE_A_ROUNDABOUT)
+    # 40.02 m at 9 m/s take (40.02 / 182) / (9 / 28) of the time that 182 m at 28 m/s take.
+    time, speed = (40.02 / 182) / (9 / 28), 9 / 28
+    assert found.pov_acc == pytest.approx(0.1 / time)
+    assert found.vut_acc == pytest.approx(0.15 / time)
+    assert found.pov_v_hw == found.vut_v_min == pytest.approx(0.1 / time / speed)
+    assert found.vut_v_end == pytest.approx(1.5 / speed)
+    assert found.gap_full_m == pytest.approx(12.0 + 45.0 * 9.0 / 28.0)
+    assert (found.ttc, found.gap, found.critical, found.crash) == (0.2, 1.0, 0.5, 20.0)
+
+
+def test_what_is_slow_near_or_short_is_said_by_the_scenario():
+    found = reward.Reward.of(LIKE_A_ROUNDABOUT)
+    assert of(found.phi_v_min, 1.5) == -0.5
+    assert [of(found.phi_v_hw, v) for v in (4.0, 5.0, 12.0, 13.5)] == [-1.0, 0.0, 0.0, -1.5]
+    assert of(found.phi_ttc, 3.0, -2.0) == -0.5
+    assert of(found.phi_dx, 6.0) == pytest.approx(6.0 / found.weights.gap_full_m - 0.25)

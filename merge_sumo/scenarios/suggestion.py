@@ -92,7 +92,8 @@ def about(road: Corridor) -> list[str]:
 
 ALIKE: Final = 0.25
 """What a number may differ from those of training, as a share of them, and a range be exceeded by,
-as a share of its width. The shipped POV-1 and VUT-1 lose 2 % of what they gain at this distance."""
+as a share of its width. In random scenarios as near as this the shipped POV-1 and VUT-1 had a mean
+regret of up to 4 % and collided nowhere avoidably; farther away, of up to 136 %."""
 
 
 def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
