@@ -6,7 +6,6 @@ import os
 import shutil
 import stat
 import subprocess
-import sys
 from pathlib import Path
 from unicodedata import category
 
@@ -117,15 +116,12 @@ def guarded(world, monkeypatch):
 
 
 @pytest.fixture
-def call(monkeypatch, capfd, guarded):
-    """Run the command line in this process; return its exit code and what it said."""
+def call(guarded, command_line):
+    """Return a function that runs the command line; it returns the exit code and the errors."""
 
     def main(*arguments: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return end.value.code or 0, capfd.readouterr().err
+        code, _, err = command_line(*arguments)
+        return code, err
 
     return main
 
