@@ -19,12 +19,13 @@ from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.training import check as checking
-from merge_sumo.training.reward import RewardWeights
+from merge_sumo.training.reward import Reward, RewardWeights
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
 
+REWARD = Reward(RewardWeights())
 REGRET_BOUNDS = {
     "pov1": (0.01, 0.05),
     "vut1": (0.01, 0.05),
@@ -148,7 +149,7 @@ class TestRationality:
         cases = checking.check_cases(name, 10_000, seed=5)
         network, opponent = load_network(name), checking.opponents(name, None)
         pair = (network, opponent) if name.startswith("pov") else (opponent, network)
-        returns = checking.returns_of(checking.play(cases, *pair), RewardWeights())
+        returns = checking.returns_of(checking.play(cases, *pair), REWARD)
         assert returns.collided.sum() == 0
 
     @pytest.mark.parametrize("name", NETWORKS)
@@ -161,16 +162,16 @@ class TestRationality:
 
     def test_a_level0_driver_in_their_place_would_collide(self):
         cases = checking.check_cases("pov1", 2000, seed=5)
-        returns = checking.returns_of(checking.play(cases, Level0Pov, Level0Vut), RewardWeights())
+        returns = checking.returns_of(checking.play(cases, Level0Pov, Level0Vut), REWARD)
         assert returns.collided.sum() > 20
 
     def test_a_prosocial_pov_gives_up_its_own_return_for_the_vuts(self):
         cases = checking.check_cases("pov2", 4000, seed=6)
-        pov2, vut1, weights = load_network("pov2"), load_network("vut1"), RewardWeights()
+        pov2, vut1 = load_network("pov2"), load_network("vut1")
         vut_ego, pov_ego = [], []
         for svo_rad in (0.0, 0.375, 0.75, 1.125, 1.5):
             turned = [dataclasses.replace(case, svo_rad=svo_rad) for case in cases]
-            returns = checking.returns_of(checking.play(turned, pov2, vut1), weights)
+            returns = checking.returns_of(checking.play(turned, pov2, vut1), REWARD)
             vut_ego.append(returns.vut_ego)
             pov_ego.append(returns.pov_ego)
         for rising in (vut_ego, [-x for x in pov_ego]):

@@ -13,7 +13,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, QNetwork
+from merge_sumo.drivers.levelk import ACTIONS, FEATURES, QNetwork, actions_mps2
 from merge_sumo.drivers.policies import MANIFEST, load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
@@ -28,9 +28,11 @@ from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, US23
 
 WEIGHTS = reward.RewardWeights()
+REWARD = reward.Reward(WEIGHTS)
+ACTIONS_MPS2 = actions_mps2(US23)
 TINY = ddqn.DdqnSettings(transitions=6_000, warm_up=2_000, updates=1_000, width=16, batch=64)
 QUICK = refine.RefineSettings(rounds=2, starts=40, searched=10, beam=8, updates=50, batch=64)
 SMALL = helix.TrainingSettings(ddqn=TINY, refine=QUICK, check_cases=12)
@@ -86,7 +88,7 @@ class TestEnvironments:
         finally:
             games.close()
         cases = [Case(level=1, x_pov0_m=x, v_pov0_mps=v) for x, v in start[:, :2].tolist()]
-        played = returns_of(play(cases, Level0Pov, Level0Vut), WEIGHTS)
+        played = returns_of(play(cases, Level0Pov, Level0Vut), REWARD)
         assert returns == pytest.approx(played.safe + played.pov_ego, abs=1e-9)
 
     def test_games_of_a_vector_environment_begin_anew_by_themselves(self):
@@ -140,7 +142,7 @@ class TestEnvironments:
 
 class TestDdqn:
     def train(self, seed=0):
-        game = MergeGame("pov", Level0Vut(16), WEIGHTS)
+        game = MergeGame("pov", Level0Vut(16), REWARD)
         try:
             return ddqn.train(game, seed, TINY)
         finally:
@@ -178,27 +180,25 @@ class TestBestResponse:
             hold = actions[min(step // 5, len(actions) - 1)]
             level0 = float(level0_acceleration(np.array([vv]))[0])
             ap, av = (hold, level0) if role == "pov" else (0.0, hold)
-            ego = reward.pov_step(np.array([vp]), np.array([ap]), WEIGHTS)
+            ego = REWARD.pov_step(np.array([vp]), np.array([ap]))
             if role == "vut":
-                ego = reward.vut_step(np.array([vv]), np.array([av]), WEIGHTS)
+                ego = REWARD.vut_step(np.array([vv]), np.array([av]))
             total += float(ego[0])
             xp, vp = xp + vp * DT_S, max(vp + ap * DT_S, 0.0)
             xv, vv = xv + vv * DT_S, max(vv + av * DT_S, 0.0)
             if xv >= 0.0:
-                total += float(reward.safety(np.array([xp - xv]), np.array([vp - vv]), WEIGHTS)[0])
+                total += float(REWARD.safety(np.array([xp - xv]), np.array([vp - vv]))[0])
                 if role == "vut":
-                    total += float(reward.vut_end(np.array([vv]), WEIGHTS)[0])
+                    total += float(REWARD.vut_end(np.array([vv]))[0])
                 return total
         return -np.inf
 
-    @pytest.mark.parametrize(
-        ("role", "best_of"),
-        [("pov", best_response.best_response_pov1), ("vut", best_response.best_response_vut1)],
-    )
-    def test_no_sequence_that_changes_twice_beats_it_and_it_beats_level0(self, role, best_of):
+    @pytest.mark.parametrize("role", ["pov", "vut"])
+    def test_no_sequence_that_changes_twice_beats_it_and_it_beats_level0(self, role):
         rng = np.random.default_rng(4)
         x, v = rng.uniform(-340, -180, 2), rng.uniform(25, 35, 2)
-        best = best_of(x, v, WEIGHTS)
+        starts = np.stack([x, v, np.full(2, -182.0), np.full(2, 18.0)], axis=1)
+        best = best_response.best_response(Game(role, None, REWARD), starts)
         for x0, v0, bound in zip(x.tolist(), v.tolist(), best.tolist(), strict=True):
             case = Case(level=1, x_pov0_m=x0, v_pov0_mps=v0)
             tried = [
@@ -211,13 +211,13 @@ class TestBestResponse:
 
     def test_a_beam_search_against_a_driver_that_ignores_it_finds_the_exact_answer(self):
         # A network whose action +1 is always the best is the level-0 VUT until 28 m/s.
-        zeros = np.zeros((len(ACTIONS_MPS2), FEATURES))
+        zeros = np.zeros((ACTIONS, FEATURES))
         always_1 = QNetwork([(zeros, (ACTIONS_MPS2 == 1.0).astype(float))])
         rng = np.random.default_rng(5)
         x, v = rng.uniform(-340, -180, 6), rng.uniform(25, 35, 6)
-        exact = best_response.best_response_pov1(x, v, WEIGHTS)
         starts = np.stack([x, v, np.full(6, -182.0), np.full(6, 18.0)], axis=1)
-        game = Game("pov", always_1, WEIGHTS)
+        exact = best_response.best_response(Game("pov", None, REWARD), starts)
+        game = Game("pov", always_1, REWARD)
         found = best_response.beam_search(game, starts, np.zeros(6), always_1, width=400).returns
         assert (found <= exact + 1e-5).all()
         assert np.median(exact - found) < 0.02
@@ -229,10 +229,10 @@ class TestGame:
     @pytest.fixture
     def policy(self):
         torch.manual_seed(1)
-        return greedy(ddqn.export(ddqn.make_network(FEATURES, 32)))
+        return greedy(ddqn.export(ddqn.make_network(FEATURES, 32)), US23)
 
     def test_a_decision_is_half_a_second_of_eq_4(self):
-        game = Game("vut", None, WEIGHTS)
+        game = Game("vut", None, REWARD)
         state, rewards, over = game.advance(
             np.array([[-300.0, 33.0, -100.0, 20.0]]), np.zeros(1), np.array([-2.0])
         )
@@ -242,7 +242,7 @@ class TestGame:
         assert not over[0]
 
     def test_the_level0_vut_stops_accelerating_at_28_in_the_middle_of_a_decision(self):
-        game = Game("pov", None, WEIGHTS)
+        game = Game("pov", None, REWARD)
         state, _, _ = game.advance(
             np.array([[-300.0, 33.0, -100.0, 27.85]]), np.zeros(1), np.zeros(1)
         )
@@ -252,8 +252,8 @@ class TestGame:
     def test_its_returns_are_those_of_the_game_in_sumo(self, role, policy):
         rng = np.random.default_rng(2)
         start = pool_starts(8, rng)
-        expected = Game(role, None, WEIGHTS).play(start, np.zeros(8), policy)
-        game = MergeGame(role, Level0Vut(8) if role == "pov" else Level0Pov(8), WEIGHTS)
+        expected = Game(role, None, REWARD).play(start, np.zeros(8), policy)
+        game = MergeGame(role, Level0Vut(8) if role == "pov" else Level0Pov(8), REWARD)
         try:
             for corridor, state in enumerate(start):
                 game.begin(corridor, state)
@@ -269,7 +269,7 @@ class TestGame:
         assert over.any()
 
     def test_playing_every_action_out_is_never_worse_than_the_policy(self, policy):
-        game = Game("pov", None, WEIGHTS)
+        game = Game("pov", None, REWARD)
         start, svo_rad = pool_starts(40, np.random.default_rng(3)), np.zeros(40)
         before = game.play(start, svo_rad, policy)
         after = game.play(start, svo_rad, game.improved(policy))
@@ -279,7 +279,7 @@ class TestGame:
     def test_the_plan_of_a_beam_search_has_the_return_that_it_states(self, policy):
         torch.manual_seed(2)
         agent = ddqn.export(ddqn.make_network(FEATURES, 16))
-        game = Game("vut", None, WEIGHTS)
+        game = Game("vut", None, REWARD)
         start, svo_rad = pool_starts(5, np.random.default_rng(4)), np.zeros(5)
         found = best_response.beam_search(game, start, svo_rad, agent, width=16)
         for n in range(5):
@@ -293,10 +293,10 @@ class TestRefinement:
         torch.manual_seed(0)
         network = ddqn.export(ddqn.make_network(FEATURES, 32))
         settings = dataclasses.replace(QUICK, updates=200)
-        return network, refine.refine(Game("pov", None, WEIGHTS), network, seed, settings)
+        return network, refine.refine(Game("pov", None, REWARD), network, seed, settings)
 
     def test_it_lowers_the_regret(self):
-        regret = QuickRegret(Game("pov", None, WEIGHTS), sees_svo=False)
+        regret = QuickRegret(Game("pov", None, REWARD), sees_svo=False)
         before, after = map(regret, self.refined(seed=0))
         assert after < 0.5 * before
 
@@ -336,7 +336,7 @@ class TestHelix:
 
     def test_another_seed_does_not_overwrite_a_network(self, library):
         before = (library / "pov1.safetensors").read_bytes()
-        with pytest.raises(UserError, match=r"has a pov1 of another seed.*--out"):
+        with pytest.raises(UserError, match=r"has a pov1 of another scenario, seed.*--out"):
             train_library(library, ("pov1",), seed=1, settings=SMALL)
         assert (library / "pov1.safetensors").read_bytes() == before
 
@@ -365,5 +365,5 @@ class TestHelix:
             load_network("pov1", tmp_path)
 
     def test_a_missing_network_says_how_to_make_it(self, tmp_path):
-        with pytest.raises(UserError, match="run `merge-sumo train`"):
+        with pytest.raises(UserError, match="run `merge-sumo train --out"):
             load_network("vut1", tmp_path)

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.conductor import conduct, workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
+from merge_sumo.campaigns.settings import check_level
 from merge_sumo.campaigns.truth import Truth, factory_of
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.povs import Povs
@@ -154,6 +155,8 @@ def search(
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
     povs = povs or Povs(policies=policies_of(scenario))
+    for level in levels:
+        check_level(level, povs)
     plan = GroundPlan(
         vut=factory_of(vut, povs),
         corridors=min(MAX_CORRIDORS, batch),

@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Final, cast
@@ -15,7 +15,7 @@ import numpy as np
 
 from merge_sumo.campaigns.conductor import workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
-from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.settings import check_level, versions
 from merge_sumo.drivers.policies import policies_of, policies_sha256
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
@@ -28,10 +28,10 @@ from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.fmc import regions
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario import OWN, US23, Scenario
 from merge_sumo.values.score import FAILURE_SCORE
 
-TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000}
+TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
 PROGRESS_CASES: Final = 100
 """Cases after which a person is told."""
@@ -99,11 +99,14 @@ def ground_truth(
     if count < 1:
         raise UserError(f"--cases is {count}: it must be 1 or more")
     povs = povs or Povs(policies=policies_of(scenario))
+    check_level(level, povs)
+    povs = povs if level == OWN else replace(povs, own=None)
     factory = factory_of(vut, povs)
     options = factory.options
     kept = Kept(
         *(factory.spec, level, count, seed, options.command, options.deadline_s, scenario),
         policies=povs.sha256(),
+        pov=None if povs.own is None else povs.own.spec,
     )
     path = kept.path(cache)
     found = read_truth(path, level, count, scenario)
@@ -113,7 +116,7 @@ def ground_truth(
     check_own(path)
     points = np.random.default_rng([seed, level]).random((count, len(scenario.dimensions(level))))
     scores = np.full(count, np.nan)
-    files = dict(factory.files or {})
+    files = (factory.files or {}) | povs.files
     road = road_for(scenario)
     plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road, scenario=scenario, povs=povs)
     with workers_or_here(workers) as there:
@@ -161,6 +164,7 @@ class Kept:
     deadline_s: float
     scenario: Scenario = US23
     policies: Mapping[str, str] = field(default_factory=lambda: policies_sha256(policies_of()))
+    pov: str | None = None
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
@@ -170,7 +174,8 @@ class Kept:
             for source in sorted((package / part).rglob("*.py")) or [package / part]:
                 sources.update(source.read_bytes())
         # The same name may be another file in another folder.
-        here = str(Path.cwd()) if runs_code(self.vut, self.command) else None
+        code = runs_code(self.vut, self.command) or (self.pov and runs_code(self.pov, None))
+        here = str(Path.cwd()) if code else None
         depends = {
             **asdict(self),
             "here": here,
@@ -210,6 +215,5 @@ def _scores(
 ) -> Sequence[tuple[float, Files]]:
     pool = Pool(levels=(level,), scenario=scenario)
     ran = run_cases(plan, pool.cases(np.asarray(points), level))
-    return [
-        (np.nan if done.measures.score is None else done.measures.score, done.files) for done in ran
-    ]
+    scores = [np.nan if done.measures.score is None else done.measures.score for done in ran]
+    return [(score, done.files | done.pov_files) for score, done in zip(scores, ran, strict=True)]
