@@ -25,6 +25,7 @@ from merge_sumo.campaigns.settings import (
     parse_levels,
     povs_of,
 )
+from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.errors import UserError
 from merge_sumo.reports.summary import Summary, summarise
 from merge_sumo.reports.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
@@ -32,7 +33,7 @@ from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.system.folders import dated
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -134,7 +135,7 @@ class CampaignRun:
 
     def _repr_html_(self) -> str:
         rows = "".join(
-            f"<tr><td>{level}</td><td>{found.cases}</td><td>{found.failures}</td>"
+            f"<tr><td>{level_name(level)}</td><td>{found.cases}</td><td>{found.failures}</td>"
             f"<td>{found.regions}</td><td>{found.fmc:.4f}</td></tr>"
             for level, found in self.summary.levels.items()
         )
@@ -166,13 +167,14 @@ def campaign(
     net: Path | str | None = None,
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
+    pov: str | None = None,
     on_case: OnCase | None = None,
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
 
     Args:
         vut: vehicle under test, as after `--vut`.
-        level: POV level 0, 1 or 2, or "all".
+        level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         sampler: who chooses the cases.
         cases: number of cases.
         batch: cases per batch; 40, or all if fewer, when left out.
@@ -188,14 +190,16 @@ def campaign(
         net: SUMO net to use instead of the scenario's.
         scenario: a scenario, its name, or its TOML file.
         policies: folder of learned drivers in the place of the shipped ones.
+        pov: a POV of your own, as after `--pov`.
         on_case: told of every case as it ends.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
     """
     where = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
+    options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     settings = CampaignSettings(
         vut=vut,
-        levels=parse_levels(str(level), povs_of(policies, where)),
+        levels=parse_levels(str(level), povs_of(policies, where, pov, options)),
         sampler=sampler,
         cases=cases,
         batch=min(DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
@@ -207,11 +211,12 @@ def campaign(
         vut_memory_gib=vut_memory_gib,
         in_process=in_process,
         policies=None if policies is None else str(policies),
+        pov=pov,
         scenario=where,
     )
     folder = dated(vut) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))
-    with open_workers(settings.vut_factory.workers(workers)) as there:
+    with open_workers(settings.workers(workers)) as there:
         run_campaign(settings, folder, road, on_case, workers=there)
     run = CampaignRun(folder)
     run.report()

@@ -17,9 +17,9 @@ from attacks import World, tell
 from conftest import require
 
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.experiments import ground_truth
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.truth import ground_truth
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import TEMPORARY
 

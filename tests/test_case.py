@@ -35,7 +35,7 @@ def test_points_and_cases_are_inverse_to_each_other(level, coordinates):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"level": 3}, "level is 3"),
+        ({"level": 4}, "level is 4"),
         ({"svo_rad": 0.5}, "svo_rad belongs to level 2"),
         ({"level": 2}, "svo_rad belongs to level 2"),
         ({"level": 2, "svo_rad": 2.0}, "svo_rad is 2.0"),

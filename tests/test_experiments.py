@@ -13,15 +13,8 @@ import numpy as np
 import pytest
 from vut_contract import factory
 
-from merge_sumo.campaigns.experiments import (
-    Kept,
-    Search,
-    Truth,
-    compare,
-    ground_truth,
-    oracle,
-    search,
-)
+from merge_sumo.campaigns.experiments import Search, compare, oracle, search
+from merge_sumo.campaigns.truth import Kept, Truth, ground_truth
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import from_unit, to_unit

@@ -6,18 +6,16 @@ import dataclasses
 import json
 import os
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
 import merge_sumo as ms
-from merge_sumo import cli
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
-from merge_sumo.campaigns.experiments import Kept, ground_truth
 from merge_sumo.campaigns.ground import GroundPlan, runs_on
-from merge_sumo.campaigns.journal import OUTCOMES, SETTINGS, read_settings
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.truth import Kept, ground_truth
 from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_of
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
@@ -63,20 +61,9 @@ def one(home) -> Path:
 
 
 @pytest.fixture
-def call(monkeypatch, capfd, tmp_path):
+def call(monkeypatch, tmp_path, command_line):
     monkeypatch.chdir(tmp_path)
-
-    def main(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
-        capfd.readouterr()
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = end.code or 0
-        return code, *capfd.readouterr()
-
-    return main
+    return command_line
 
 
 def networks(folder: Path) -> dict:

@@ -12,8 +12,8 @@ import pytest
 from handmade import write_run
 from lxml import html
 
-from merge_sumo.campaigns.experiments import Truth
 from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.truth import Truth
 from merge_sumo.drivers.vuts.output import LINES, LOG
 from merge_sumo.reports import report_data, report_facts
 from merge_sumo.reports.report import report_page, write_report
@@ -25,7 +25,7 @@ from merge_sumo.reports.verdict import judge
 from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import dimensions, to_unit
 from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import DT_S, X_VUT0_M
+from merge_sumo.values.scenario import DT_S, US23, X_VUT0_M, Scenario
 from merge_sumo.values.trajectory import REASON_CHARACTERS
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
@@ -244,7 +244,7 @@ class TestTheTruth:
     def cached(self, monkeypatch):
         """Keep a truth where the left half of each pool fails."""
 
-        def truth(path: object, level: int, cases: int) -> Truth:
+        def truth(path: object, level: int, cases: int, scenario: Scenario = US23) -> Truth:
             points = np.random.default_rng(1).random((2000, len(dimensions(level))))
             return Truth(points, np.where(points[:, 0] < 0.5, -900.0, -10.0))
 

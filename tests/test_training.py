@@ -164,6 +164,7 @@ class TestEnvironments:
         with pytest.raises(UserError, match=sentence):
             MergeVectorEnv(1, **settings)
 
+    @pytest.mark.long
     def test_another_library_trains_on_it(self, env):
         from stable_baselines3 import DQN
 

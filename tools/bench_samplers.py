@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.campaigns.conductor import conduct
-from merge_sumo.campaigns.experiments import Truth, ground_truth
 from merge_sumo.campaigns.ground import GroundPlan, Ran, run_cases
+from merge_sumo.campaigns.truth import Truth, ground_truth
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.samplers import gpr

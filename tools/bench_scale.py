@@ -28,10 +28,10 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.experiments import _scores
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.truth import _scores
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.reports.report import write_report

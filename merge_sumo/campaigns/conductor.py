@@ -37,6 +37,9 @@ SCENARIOS: Final = "scenarios"
 FORCED: Final = "forced"
 """Key of `campaign.json`: what differed where a campaign went on with --force."""
 
+FILES: Final = ("vut_files", "pov_files")
+"""Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
+
 OnCase = Callable[[Outcome], None]
 """Told of every case as it ends, in the order in which cases end."""
 
@@ -145,7 +148,8 @@ def resume_campaign(
         moved = recorded.get("policies") != record["policies"]
         recorded["policies"] = record["policies"]
         # What was loaded while it ran must be the same, too, although it is not loaded yet.
-        record["vut_files"] = _files_again(recorded) | (record["vut_files"] or {}) or None
+        for name in FILES:
+            record[name] = _files_again(recorded, name) | (record[name] or {}) or None
         changes = differences(RECORDED_BY_DEFAULT | recorded, record)
         if changes and not force:
             name, (was, now) = next(iter(changes.items()))
@@ -168,9 +172,9 @@ def resume_campaign(
         return _go_on(settings, record, net, journal, run, before.outcomes, on_case, check)
 
 
-def _files_again(recorded: Mapping[str, Any]) -> Files:
+def _files_again(recorded: Mapping[str, Any], name: str) -> Files:
     """Return the files that a record names, as they are now."""
-    files = recorded.get("vut_files")
+    files = recorded.get(name)
     try:
         return {name: sha256_of(Path(name)) for name in files} if isinstance(files, dict) else {}
     except ValueError as error:
@@ -189,19 +193,20 @@ def _go_on(
 ) -> Run:
     sampler = make_sampler(settings.sampler, settings.pool, settings.seed)
     stop = settings.stopping_rule()
-    files: Files = dict(record["vut_files"] or {})
+    files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
 
     def noting_files(cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
         for place, done in run(cases):
-            for name, sha256 in done.files.items():
-                files.setdefault(name, sha256)
+            for name, loaded in zip(FILES, (done.files, done.pov_files), strict=True):
+                files[name] = loaded | files[name]  # what was known stays
             yield place, done
 
     batches = conduct(sampler, noting_files, settings.cases, settings.batch, on_case, history, stop)
     for ran in batches:
         journal.append(ran)
-        if len(files) > len(record["vut_files"] or {}):
-            record["vut_files"] = dict(files)
+        noted = {name: known or None for name, known in files.items()}
+        if noted != {name: record[name] for name in FILES}:
+            record |= noted
             journal.rewrite_settings(record)
         check()
     done = Run(journal.folder)
@@ -223,12 +228,13 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
 
 
 def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan:
+    log = folder.resolve() / LOG
     return GroundPlan(
-        vut=settings.vut_factory.with_log(folder.resolve() / LOG),
+        vut=settings.vut_factory.with_log(log),
         corridors=min(MAX_CORRIDORS, settings.batch),
         net=net,
         scenario=settings.scenario,
-        povs=settings.povs,
+        povs=settings.povs.with_log(log),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -43,17 +44,21 @@ class ProvingGround:
         scenario: Scenario = US23,
         povs: Povs | None = None,
     ) -> None:
-        """Start SUMO and the VUT, with fewer corridors where the VUT cannot serve as many."""
+        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many."""
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
+        povs = povs or Povs(policies=policies_of(scenario))
+        cars = scenario.vehicles - 1
         corridors = min(corridors, factory.vut.max_corridors or corridors)
-        self.world = World(corridors, net, factory.vut.vut_type, scenario)
-        try:
+        corridors = povs.corridors(corridors, cars)
+        with ExitStack() as opened:
+            car_type = None if povs.own is None else povs.own.vut.vut_type
+            self.world = World(corridors, net, factory.vut.vut_type, scenario, car_type)
+            opened.callback(self.world.close)
             self.vut = factory(corridors, self.world)
-            povs = povs or Povs(policies=policies_of(scenario))
-            self.pov = PovLibrary(corridors * (scenario.vehicles - 1), povs)
-        except BaseException:
-            self.world.close()
-            raise
+            opened.callback(self.vut.close)
+            self.pov = PovLibrary(corridors * cars, povs, self.world)
+            opened.callback(self.pov.close)
+            self._opened = opened.pop_all()
 
     def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
         """Run cases; yield (place in `cases`, trajectory) as they end."""
@@ -64,11 +69,8 @@ class ProvingGround:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the VUT, then SUMO."""
-        try:
-            self.vut.close()
-        finally:
-            self.world.close()
+        """Stop the POVs, the VUT, then SUMO."""
+        self._opened.close()
 
 
 def ground_of(settings: CampaignSettings, cases: int, net: Corridor) -> ProvingGround:
@@ -115,11 +117,19 @@ class GroundPlan:
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """What became of one case, and the files that had decided on the VUT's answers by then."""
+    """What became of one case, and the files that had decided on it by then.
+
+    Attributes:
+        measures: verdict and measures.
+        trajectory: what happened.
+        files: those of the user's that the VUT has loaded, with their hashes.
+        pov_files: those that a POV of the user's own has loaded.
+    """
 
     measures: Measures
     trajectory: Trajectory
     files: Files = field(default_factory=dict)
+    pov_files: Files = field(default_factory=dict)
 
 
 _kept: tuple[tuple[object, ...], ProvingGround] | None = None
@@ -134,11 +144,11 @@ def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
         ground = _opened_ground(plan)
         try:
             ran = dict(ground.run(cases))
-            files = hashed(ground.vut.files())
+            files = hashed(ground.vut.files()), hashed(ground.pov.files())
         except BaseException:
             _close_ground()  # it stands in the middle of episodes
             raise
-    return [Ran(measure(ran[place]), ran[place], files) for place in range(len(cases))]
+    return [Ran(measure(ran[place]), ran[place], *files) for place in range(len(cases))]
 
 
 def _opened_ground(plan: GroundPlan) -> ProvingGround:
@@ -174,7 +184,9 @@ def runs_on(workers: Workers, plan: GroundPlan) -> RunCases:
     """Return what runs cases on workers; `UserError` when the plan cannot be carried out there."""
 
     def died(_: None) -> None:
-        raise UserError(f"opening the VUT {plan.vut.spec} ended its process: look into the VUT")
+        own = plan.povs.own
+        pov = "" if own is None else f" or the POV {own.spec}"
+        raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
 
     for _ in workers.run(partial(_open_ground, plan), [None], died):
         pass

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import Following
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VUT
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
 from merge_sumo.values.trajectory import End, Trajectory
 
 RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
@@ -30,8 +30,8 @@ WRONGS: Final = (Exception, SystemExit)
 MAX_LOSSES: Final = 2
 """A case that made the driver lose its memory so often, on its own, is not tried again."""
 
-IDLE: Final = 2**62
-"""Steps left in a corridor without an episode: it never times out."""
+NEVER: Final = 2**62
+"""The step at which a corridor without an episode times out."""
 
 
 @dataclass(slots=True)
@@ -52,9 +52,9 @@ def rollout(
 
     Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
     episode does not depend on the number of corridors nor on its neighbours. What the VUT does
-    wrong ends its episode as VUT_ERROR; where that took the memory of the others' controllers with
-    it, they begin anew. When SUMO fails, the episodes that were running end as SIM_ERROR, SUMO is
-    started again, and the others go on.
+    wrong ends its episode as VUT_ERROR, what the POV does wrong as SIM_ERROR; where that took the
+    memory of the others' controllers with it, they begin anew. When SUMO fails, the episodes that
+    were running end as SIM_ERROR, SUMO is started again, and the others go on.
     """
     return _Rollout(world, pov, vut, cases).run()
 
@@ -72,16 +72,17 @@ class _Rollout:
         """Those that may have been at fault: each runs alone, so that a second loss is its own."""
         self.quarantine = False
         """Whether a suspect runs alone."""
-        self.losses: Counter[int] = Counter()
+        self.losses: Counter[tuple[int, End]] = Counter()
         self.episodes: list[_Episode | None] = [None] * corridors
         self.active = np.zeros(corridors, dtype=bool)
         self.step = np.zeros(corridors, dtype=np.int64)
         self.clipped = np.zeros(corridors, dtype=np.int64)
-        self.errors: dict[int, str] = {}
+        self.errors: dict[int, tuple[End, str]] = {}
         self.a_min = np.zeros((vehicles, corridors))
         self.a_max = np.zeros((vehicles, corridors))
-        self.left = np.full(corridors, IDLE)
-        """Steps until the timeout."""
+        self.timeout_at = np.full(corridors, NEVER)
+        """Rows of the record at which episodes time out."""
+        self.next_timeout = NEVER
         # One row per step of the world, shared by all corridors: x, v, a of every vehicle.
         self.record = np.zeros((RING_ROWS, vehicles, 3, corridors))
         self.row = 0
@@ -105,16 +106,15 @@ class _Rollout:
                 self.refill(everywhere)
                 continue
             self.step += 1
-            self.left -= 1
             x_vut_m = world.x_m[VUT]
             # Scalars first: in most steps no episode ends. Idle corridors stand before M.
-            if x_vut_m.max() >= 0.0 or self.left.min() <= 0 or self.errors:
-                ended = (x_vut_m >= 0.0) | (self.left <= 0)
+            if x_vut_m.max() >= 0.0 or self.row >= self.next_timeout or self.errors:
+                ended = (x_vut_m >= 0.0) | (self.row >= self.timeout_at)
                 ended[list(self.errors)] = True
                 corridors = np.flatnonzero(ended).tolist()
                 for corridor in corridors:
                     if corridor in self.errors:
-                        yield self.finish(corridor, End.VUT_ERROR, self.errors.pop(corridor))
+                        yield self.finish(corridor, *self.errors.pop(corridor))
                     else:
                         arrived = x_vut_m[corridor] >= 0.0
                         yield self.finish(corridor, End.MERGED if arrived else End.TIMEOUT)
@@ -124,17 +124,19 @@ class _Rollout:
         """Start over what was running; yield the episode that is known to be at fault, if any."""
         running = np.flatnonzero(self.active).tolist()
         alone = len(running) == 1
-        guilty = running[0] if alone else lost.corridor if lost.corridor in running else None
+        end = End.SIM_ERROR if isinstance(lost, PovLostError) else End.VUT_ERROR
+        named = None if lost.corridor is None else lost.corridor % self.world.corridors
+        guilty = running[0] if alone else named if named in running else None
         for corridor in running:
             episode = self.episodes[corridor]
             assert episode is not None, "it runs"  # noqa: S101
             if guilty is not None and corridor != guilty:
                 self.again.append((episode.index, episode.case))
                 continue
-            self.losses[episode.index] += guilty is not None
+            self.losses[episode.index, end] += guilty is not None
             # Beside others it may have been a thread of theirs that struck it.
-            if alone and (lost.final or self.losses[episode.index] >= MAX_LOSSES):
-                yield self.finish(corridor, End.VUT_ERROR, lost.reason)
+            if alone and (lost.final or self.losses[episode.index, end] >= MAX_LOSSES):
+                yield self.finish(corridor, end, lost.reason)
             else:
                 self.suspects.append((episode.index, episode.case))
         self.errors.clear()
@@ -151,6 +153,7 @@ class _Rollout:
             self.active[corridor] = False
         for corridor in corridors:
             self.begin(corridor, *self.next_case())
+        self.next_timeout = int(self.timeout_at.min())
 
     def next_case(self) -> tuple[int, Case | None]:
         """Return what is to run next; None where a corridor is to stay empty."""
@@ -167,15 +170,15 @@ class _Rollout:
         if case is None:
             self.episodes[corridor] = None
             self.world.park(corridor)
-            self.left[corridor] = IDLE
+            self.timeout_at[corridor] = NEVER
             self.a_min[:, corridor] = self.a_max[:, corridor] = 0.0
             return
         scenario = case.scenario
         self.a_min[:, corridor] = scenario.a_min_mps2
         self.a_max[:, corridor] = scenario.a_max_mps2
-        self.left[corridor] = scenario.max_steps
+        self.timeout_at[corridor] = self.row + scenario.max_steps
         self.episodes[corridor] = _Episode(index, case, self.row)
-        self.world.place(corridor, case.starts())
+        self.world.place(corridor, case.starts(), own=case.level == OWN)
         for car in range(len(self.mainline)):
             self.pov.begin(car * self.world.corridors + corridor, case)
         if self.following is not None:
@@ -183,7 +186,8 @@ class _Rollout:
         try:
             self.vut.begin(corridor, case)
         except WRONGS as error:
-            self.errors[corridor] = f"reset raised {type(error).__name__}: {error}"
+            said = f"reset raised {type(error).__name__}: {error}"
+            self.errors[corridor] = End.VUT_ERROR, said
 
     def observe(self) -> None:
         """Write the state into the next row of the record."""
@@ -196,7 +200,7 @@ class _Rollout:
         x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
         scene = Scene(self.active, self.step, x_m, v_mps)
         answer = np.empty(x_m.shape)
-        answer[self.mainline] = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
+        answer[self.mainline] = self.ask_pov(scene.of_mainline()).reshape(-1, x_m.shape[1])
         if following is None:
             answer[VUT] = self.ask_vut(scene)
         else:
@@ -207,6 +211,13 @@ class _Rollout:
         self.clipped += np.abs(acceleration[VUT] - answer[VUT]) > ROUNDING_MPS2
         self.record[(self.row - 1) % RING_ROWS, :, 2] = acceleration
         return acceleration
+
+    def ask_pov(self, scene: Scene) -> FloatArray:
+        """Return the answers of the mainline's cars, (C K,), with 0 where one was no number."""
+        answer = self.pov.act(scene)
+        if math.isfinite(answer.sum()):
+            return answer
+        return self.only_numbers(answer, self.pov, End.SIM_ERROR)
 
     def ask_vut(self, scene: Scene) -> FloatArray:
         """Return the VUT's answer, with 0 where it was no answer; note what was wrong."""
@@ -223,10 +234,18 @@ class _Rollout:
             raised = f"{type(error).__name__}: {error}"
         if math.isfinite(answer.sum()):
             return answer
+        return self.only_numbers(answer, self.vut, End.VUT_ERROR, raised)
+
+    def only_numbers(
+        self, answer: FloatArray, driver: Driver, end: End, raised: str | None = None
+    ) -> FloatArray:
+        """Return answers with 0 where they are not finite; note why, and how the episodes end."""
         finite = np.isfinite(answer)
-        for corridor in np.flatnonzero(~finite & self.active).tolist():
-            reason = raised or self.vut.reason(corridor) or f"answered {answer[corridor]}"
-            self.errors.setdefault(corridor, reason)
+        for place in np.flatnonzero(~finite).tolist():
+            corridor = place % self.world.corridors
+            if self.active[corridor]:
+                reason = raised or driver.reason(place) or f"answered {answer[place]}"
+                self.errors.setdefault(corridor, (end, reason))
         return np.where(finite, answer, 0.0)
 
     def finish(self, corridor: int, end: End, error: str | None = None) -> tuple[int, Trajectory]:

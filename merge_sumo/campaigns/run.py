@@ -67,6 +67,11 @@ class Run:
         """The name of the VUT, fit to be shown anywhere: it may be a stranger's."""
         return printable(str(self.settings.get("vut"))[:NAME_CHARACTERS])
 
+    @property
+    def pov(self) -> str:
+        """The name of a POV of the tester's own, fit to be shown anywhere."""
+        return printable(str(self.settings.get("pov"))[:NAME_CHARACTERS])
+
     def outcome(self, index: int) -> Outcome:
         """Return the outcome of a case; `UserError` when the campaign has no such case."""
         if not 0 <= index < len(self.outcomes):

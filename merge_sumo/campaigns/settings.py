@@ -13,7 +13,7 @@ from typing import Any, Final, get_args, get_origin, get_type_hints
 from merge_sumo.campaigns.convergence import StoppingRule
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.drivers.policies import how_to_train, policies_in, policies_of
-from merge_sumo.drivers.povs import POLICIES, Povs
+from merge_sumo.drivers.povs import POLICIES, Povs, own_pov
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.errors import UserError
@@ -22,7 +22,15 @@ from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.trust import is_own
 from merge_sumo.values.case import Pool
-from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, US23, Scenario
+from merge_sumo.values.scenario import (
+    ALL_LEVELS,
+    DEADLINE_S,
+    MEMORY_GIB,
+    OWN,
+    US23,
+    Scenario,
+    level_name,
+)
 from merge_sumo.values.score import Outcome
 
 DEFAULT_CASES: Final = 800
@@ -46,6 +54,7 @@ class CampaignSettings:
     vut_memory_gib: float = MEMORY_GIB
     in_process: bool = False
     policies: str | None = None
+    pov: str | None = None
     scenario: Scenario = US23
 
     def __post_init__(self) -> None:
@@ -63,6 +72,7 @@ class CampaignSettings:
             ("--vut", self.vut),
             ("--vut-command", self.vut_command),
             ("--policies", self.policies),
+            ("--pov", self.pov),
         ):
             if text is not None and not _is_text(text):
                 raise UserError(
@@ -72,8 +82,9 @@ class CampaignSettings:
         _ = self.vut_factory
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
+        povs = self.povs
         for level in self.levels:
-            check_level(level, self.povs)
+            check_level(level, povs)
         make_sampler(self.sampler, self.pool, self.seed)
         for name in ("cases", "batch"):
             if getattr(self, name) < 1:
@@ -100,19 +111,26 @@ class CampaignSettings:
     @property
     def vut_factory(self) -> VutFactory:
         """What makes the VUT."""
-        options = VutOptions(
-            command=self.vut_command,
-            deadline_s=self.deadline_s,
-            memory_gib=self.vut_memory_gib,
-            in_process=self.in_process,
-            policies=self.povs.policies,
-        )
-        return vut_factory(self.vut, options)
+        return vut_factory(self.vut, self._options)
 
     @property
     def povs(self) -> Povs:
         """Who drives the POV."""
-        return Povs(policies=Path(self.policies) if self.policies else policies_of(self.scenario))
+        return povs_of(self.policies, self.scenario, self.pov, self._options)
+
+    def workers(self, asked: int | None) -> int:
+        """Return in how many processes the cases run: see `VutFactory.workers`."""
+        return self.povs.workers(self.vut_factory, asked)
+
+    @property
+    def _options(self) -> VutOptions:
+        return VutOptions(
+            command=self.vut_command,
+            deadline_s=self.deadline_s,
+            memory_gib=self.vut_memory_gib,
+            in_process=self.in_process,
+            policies=policies_folder(self.policies, self.scenario),
+        )
 
     @property
     def pool(self) -> Pool:
@@ -137,25 +155,51 @@ def _is_text(text: str) -> bool:
     return True
 
 
-def povs_of(policies: str | Path | None, scenario: Scenario) -> Povs:
-    """Return the POVs with the policies that a person names, else with those of a scenario."""
-    return Povs(policies=policies_of(scenario) if policies is None else policies_in(policies))
+def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:
+    """Return the folder of the policies that a person names, else of those for a scenario."""
+    return policies_of(scenario) if policies is None else policies_in(policies)
+
+
+def povs_of(
+    policies: str | Path | None,
+    scenario: Scenario,
+    pov: str | None = None,
+    options: VutOptions | None = None,
+) -> Povs:
+    """Return the POVs by the policies and the own POV that a person names, if any.
+
+    One of their own is hosted with the options of the VUT.
+    """
+    own = None if pov is None else own_pov(pov, options or VutOptions())
+    return Povs(policies=policies_folder(policies, scenario), own=own)
 
 
 def parse_levels(text: str, povs: Povs) -> tuple[int, ...]:
-    """Return the levels that `--level` names: one, or all for which there is a POV."""
+    """Return the levels that `--level` names: one, or all for which there is a POV.
+
+    Raises `UserError` for a name of none, and where a POV of a person's own would not drive.
+    """
     if text == "all":
         return povs.levels
-    if text not in map(str, LEVELS):
-        raise UserError(f"there is no POV level {text!r}: choose 0, 1, 2 or all")
-    check_level(int(text), povs)
-    return (int(text),)
+    by_name = {level_name(level): level for level in ALL_LEVELS}
+    if text not in by_name:
+        raise UserError(f"there is no POV level {text!r}: choose {CHOICE}")
+    level = by_name[text]
+    check_level(level, povs)
+    if povs.own is not None and level != OWN:
+        raise UserError(f"--pov drives at --level own or all, not at --level {text}")
+    return (level,)
+
+
+CHOICE: Final = "0, 1, 2 or all, or own with --pov"
 
 
 def check_level(level: int, povs: Povs) -> None:
     """Raise `UserError` when there is no POV of a level."""
-    if level not in LEVELS:
-        raise UserError(f"there is no POV level {level}: choose 0, 1, 2 or all")
+    if level not in ALL_LEVELS:
+        raise UserError(f"there is no POV level {level}: choose {CHOICE}")
+    if level == OWN and povs.own is None:
+        raise UserError("--level own is a POV that you bring: name it with --pov")
     if level not in povs.levels:
         raise UserError(
             f"there is no policy for a POV of level {level}{how_to_train(povs.policies)}"
@@ -165,7 +209,7 @@ def check_level(level: int, povs: Povs) -> None:
 def one_level(text: str, povs: Povs) -> int:
     """Return the one level that `--level` names."""
     if text == "all":
-        raise UserError("--level all does not go here: choose 0, 1 or 2")
+        raise UserError("--level all does not go here: choose 0, 1 or 2, or own with --pov")
     return parse_levels(text, povs)[0]
 
 
@@ -187,19 +231,25 @@ def software(povs: Povs | None = None) -> dict[str, str]:
 
 def record_of(settings: CampaignSettings, net: Corridor) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
+    povs = settings.povs
     return {
         **asdict(settings),
         "versions": versions(),
         "vut_files": settings.vut_factory.files or None,
+        "pov_files": povs.files or None,
         "net_sha256": net.sha256,
-        "policies_sha256": settings.povs.sha256(),
+        "policies_sha256": povs.sha256(),
     }
 
 
-def pov_of(recorded: Mapping[str, Any], level: int) -> object:
-    """Return what decided on the POV of a level where a campaign was recorded."""
-    hashes = recorded.get("policies_sha256")
-    return hashes.get(POLICIES.get(level)) if isinstance(hashes, dict) else None
+def same_pov(a: Mapping[str, Any], b: Mapping[str, Any], level: int) -> bool:
+    """Return whether two campaigns had the same POV at a level, by what both have recorded."""
+    name = "pov_files" if level == OWN else "policies_sha256"
+    one, other = (known if isinstance(known := r.get(name), dict) else {} for r in (a, b))
+    both = one.keys() & other.keys()
+    deciding = both if level == OWN else both & {POLICIES.get(level)}
+    same_name = level != OWN or a.get("pov") == b.get("pov")
+    return same_name and all(one[key] == other[key] for key in deciding)
 
 
 def settings_of(
@@ -216,13 +266,8 @@ def settings_of(
     it.
     """
     record = {**recorded, **(given or {})}
-    vut, command = record.get("vut"), record.get("vut_command")
-    named = ("vut" if command is None else "vut_command") in (given or {})
-    if not (trust or named or is_own(record)) and runs_code(str(vut), command):
-        raise UserError(
-            f"{folder} was not made here, and to go on is to run the controller that it names, "
-            f"{command or vut}: say --trust-vut if you trust it"
-        )
+    if not (trust or is_own(recorded)):
+        _check_strangers(folder, record, given or {})
     hints = get_type_hints(CampaignSettings)
     values: dict[str, Any] = {}
     for spec in fields(CampaignSettings):
@@ -238,6 +283,18 @@ def settings_of(
     if values["policies"] is not None and "policies" not in (given or {}):
         _check_still_there(folder, values["policies"])
     return CampaignSettings(**values)
+
+
+def _check_strangers(folder: Path, record: Mapping[str, Any], given: Mapping[str, object]) -> None:
+    """Raise `UserError` where a record has code run that nobody here has named."""
+    vut, command, pov = (record.get(name) for name in ("vut", "vut_command", "pov"))
+    vut_named = ("vut" if command is None else "vut_command") in given
+    for spec, started, named in ((vut, command, vut_named), (pov, None, "pov" in given)):
+        if spec is not None and not named and runs_code(str(spec), started):
+            raise UserError(
+                f"{folder} was not made here, and to go on is to run the controller that it names, "
+                f"{started or spec}: say --trust-vut if you trust it"
+            )
 
 
 def _check_still_there(folder: Path, policies: str) -> None:

@@ -16,6 +16,7 @@ from merge_sumo.commands.shared import (
     JsonOption,
     NetOption,
     PoliciesOption,
+    PovOption,
     ScenarioOption,
     TrustOption,
     VutCommandOption,
@@ -29,7 +30,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.system.folders import dated
 from merge_sumo.system.printable import quoted
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
+from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, level_name
 
 if TYPE_CHECKING:
     from merge_sumo.campaigns.run import Run
@@ -48,7 +49,8 @@ def campaign(
             "`merge-sumo vuts` lists the kinds."
         ),
     ] = "",
-    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2 or all.")] = "all",
+    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2, own or all.")] = "all",
+    pov: PovOption = None,
     sampler: Annotated[
         str, typer.Option(help="Who chooses: uniform, annealing, subset, gpr or coverage.")
     ] = DEFAULT_SAMPLER,
@@ -123,6 +125,7 @@ def campaign(
         povs_of,
         settings_of,
     )
+    from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.reports.junit import check_junit
     from merge_sumo.reports.progress import CampaignPanel
     from merge_sumo.reports.report import check_report
@@ -135,7 +138,8 @@ def campaign(
     gates = parse_gates(gate or ())
     if resume is None:
         where = named_scenario(scenario)
-        levels = parse_levels(level, povs_of(policies, where))
+        options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
+        levels = parse_levels(level, povs_of(policies, where, pov, options))
         settings = CampaignSettings(
             vut=vut,
             levels=levels,
@@ -150,6 +154,7 @@ def campaign(
             vut_memory_gib=vut_memory,
             in_process=in_process,
             policies=None if policies is None else str(policies),
+            pov=pov,
             scenario=where,
         )
         folder = out or dated(vut)
@@ -164,16 +169,16 @@ def campaign(
     if junit is not None:
         check_junit(junit, folder)
     road = road_for(settings.scenario, net)
-    if max(levels) > 0 and unseen(settings.scenario):
+    if {1, 2} & set(levels) and unseen(settings.scenario):
         say(
             f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
             f"`merge-sumo scenario check {quoted(scenario)}` says in what it differs"
         )
-    title = f"{settings.vut} v level {'/'.join(map(str, levels))}"
+    title = f"{settings.vut} v level {'/'.join(map(level_name, levels))}"
     try:
         with (
             Interrupt("finishing the running batch; once more stops at once") as interrupt,
-            open_workers(settings.vut_factory.workers(workers), dask) as there,
+            open_workers(settings.workers(workers), dask) as there,
             CampaignPanel(title, settings.cases, levels, quiet=quiet) as progress,
         ):
             if resume is None:
@@ -200,8 +205,8 @@ def campaign(
     except Stopped:
         say(_how_to_go_on(folder, net, [gate.name for gate in gates], junit))
         raise
-    if resume is None and level == "all" and len(levels) < 3:
-        named = ", ".join(map(str, levels))
+    if resume is None and level == "all" and not set(levels) >= set(LEVELS):
+        named = ", ".join(map(level_name, levels))
         say(f"--level all: policies are there for level {named}; `merge-sumo train` makes others")
     raise typer.Exit(0 if _conclude(run, settings, gates, junit, as_json=as_json) else 1)
 
@@ -273,6 +278,7 @@ def _given(context: typer.Context) -> dict[str, object]:
             "vut_command",
             "in_process",
             "policies",
+            "pov",
             "scenario",
         )
     }
@@ -310,10 +316,10 @@ def _print_summary(run: Run, summary: Summary, verdict: Verdict, report_file: Pa
     print_troubles(verdict)
     for level, found in summary.levels.items():
         if found.cases and not found.tested:
-            show(f"  level {level}: nothing was tested in {found.cases} cases")
+            show(f"  level {level_name(level)}: nothing was tested in {found.cases} cases")
             continue
         show(
-            f"  level {level}: {found.failures} failures in {found.cases} cases, "
+            f"  level {level_name(level)}: {found.failures} failures in {found.cases} cases, "
             f"FMC {found.fmc:.4f}, {found.regions} regions"
         )
     show(f"report: {report_file}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +15,7 @@ from merge_sumo.commands.shared import (
     JsonOption,
     NetOption,
     PoliciesOption,
+    PovOption,
     RunArgument,
     ScenarioOption,
     TrustOption,
@@ -26,12 +27,14 @@ from merge_sumo.commands.shared import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import dated
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, level_name
 
 if TYPE_CHECKING:
-    from merge_sumo.campaigns.experiments import Comparison, Quartiles, Truth
+    from merge_sumo.campaigns.experiments import Comparison, Quartiles
+    from merge_sumo.campaigns.truth import Truth
     from merge_sumo.drivers.povs import Povs
     from merge_sumo.drivers.vut import VutFactory
+    from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.system.workers import Workers
     from merge_sumo.values.scenario import Scenario
 
@@ -39,13 +42,14 @@ if TYPE_CHECKING:
 @app.command()
 def truth(
     vut: Annotated[str, typer.Option(help="Vehicle under test.")],
-    level: Annotated[str, typer.Option(help="POV level: 0, 1 or 2.")],
+    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2 or own.")],
     cases: Annotated[
         int | None, typer.Option(help="Uniform cases.  [default: 10000, at level 2 20000]")
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
+    pov: PovOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -60,17 +64,19 @@ def truth(
 
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
     """
-    from merge_sumo.campaigns import experiments
     from merge_sumo.campaigns.settings import one_level, povs_of
+    from merge_sumo.campaigns.truth import REAL_REGION
+    from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.system.workers import open_workers
     from merge_sumo.values.fmc import fmc, regions
 
     where = named_scenario(scenario)
-    povs = povs_of(policies, where)
+    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
+    povs = povs_of(policies, where, pov, options)
     chosen = one_level(level, povs)
-    factory = _factory(vut, povs, vut_command, deadline, vut_memory)
-    with open_workers(factory.workers(workers), dask) as there:
+    factory = _factory(vut, povs, vut_command, options)
+    with open_workers(povs.workers(factory, workers), dask) as there:
         found = _truth(factory, povs, chosen, cases, seed, there, where)
     if factory.vut.named_only:
         say(
@@ -92,16 +98,16 @@ def truth(
         typer.echo(json.dumps(result))
         return
     show(
-        f"{vut} at level {chosen}: {result['failures']} failures in {result['cases']} cases, "
-        f"FMC {result['fmc']:.4f}, {result['real_regions']} regions with at least "
-        f"{experiments.REAL_REGION:.0%} of the failures"
+        f"{vut} at level {level_name(chosen)}: {result['failures']} failures in "
+        f"{result['cases']} cases, FMC {result['fmc']:.4f}, {result['real_regions']} regions with "
+        f"at least {REAL_REGION:.0%} of the failures"
     )
 
 
 @app.command()
 def compare(
     vut: Annotated[str, typer.Option(help="Vehicle under test.")],
-    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2 or all.")],
+    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2, own or all.")],
     samplers: Annotated[
         str, typer.Option(help="Names, separated by commas.")
     ] = "uniform,annealing,subset,gpr,coverage",
@@ -113,6 +119,7 @@ def compare(
     ] = None,
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
+    pov: PovOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -132,6 +139,7 @@ def compare(
     """
     from merge_sumo.campaigns import experiments
     from merge_sumo.campaigns.settings import CampaignSettings, parse_levels, povs_of
+    from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.reports import figures
     from merge_sumo.reports.progress import Counter
     from merge_sumo.scenarios.scenario_file import named_scenario
@@ -139,10 +147,11 @@ def compare(
     from merge_sumo.values.fmc import fmc
 
     where = named_scenario(scenario)
-    povs = povs_of(policies, where)
+    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
+    povs = povs_of(policies, where, pov, options)
     levels = parse_levels(level, povs)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
-    factory = _factory(vut, povs, vut_command, deadline, vut_memory)
+    factory = _factory(vut, povs, vut_command, options)
     for name in names:
         CampaignSettings(
             vut=vut,
@@ -152,15 +161,16 @@ def compare(
             cases=cases,
             batch=batch,
             policies=None if policies is None else str(policies),
+            pov=pov,
             scenario=where,
         )
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")
     if figure is not None:
         figures.check_figure(figure)
-    title = f"{vut} v level {'/'.join(map(str, levels))}"
+    title = f"{vut} v level {'/'.join(map(level_name, levels))}"
     with (
-        open_workers(factory.workers(workers), dask) as there,
+        open_workers(povs.workers(factory, workers), dask) as there,
         Counter(title, len(names) * seeds, "runs") as counter,
     ):
         truths = {
@@ -349,19 +359,10 @@ def probability(
     show(f"written: {target}")
 
 
-def _factory(
-    vut: str, povs: Povs, command: str | None, deadline_s: float, memory_gib: float
-) -> VutFactory:
+def _factory(vut: str, povs: Povs, command: str | None, options: VutOptions) -> VutFactory:
     from merge_sumo.drivers.vut import vut_factory
-    from merge_sumo.drivers.vuts.base import VutOptions
 
-    options = VutOptions(
-        command=command,
-        deadline_s=deadline_s,
-        memory_gib=memory_gib,
-        policies=povs.policies,
-    )
-    return vut_factory(vut, options)
+    return vut_factory(vut, replace(options, command=command, policies=povs.policies))
 
 
 def _truth(
@@ -373,14 +374,16 @@ def _truth(
     workers: Workers,
     scenario: Scenario,
 ) -> Truth:
-    from merge_sumo.campaigns import experiments
+    from merge_sumo.campaigns.truth import TRUTH_CASES, ground_truth
     from merge_sumo.reports.progress import Counter
 
-    total = experiments.TRUTH_CASES[level] if cases is None else cases
+    total = TRUTH_CASES[level] if cases is None else cases
     if total < 1:
         raise UserError(f"--cases is {total}: it must be 1 or more")
-    with Counter(f"truth of {factory.spec} at level {level}", total, "cases") as counter:
-        return experiments.ground_truth(
+    with Counter(
+        f"truth of {factory.spec} at level {level_name(level)}", total, "cases"
+    ) as counter:
+        return ground_truth(
             factory,
             level,
             total,

@@ -84,6 +84,13 @@ PoliciesOption = Annotated[
         "ones.",
     ),
 ]
+PovOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SPEC",
+        help="A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 

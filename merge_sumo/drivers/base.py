@@ -105,6 +105,10 @@ class VutLostError(Exception):
         self.reason, self.corridor, self.final = reason, corridor, final
 
 
+class PovLostError(VutLostError):
+    """It was the driver of the POV that lost it."""
+
+
 class Driver(ABC):
     """Drives the same vehicle in K corridors at once; the corridors are independent."""
 
@@ -119,7 +123,7 @@ class Driver(ABC):
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration in each corridor, (K,), m/s2, until the next step.
 
-        A value that is not finite ends the episode of its corridor as VUT_ERROR. Raises
+        A value that is not finite ends the episode of its corridor as an error. Raises
         `VutLostError` where the episodes of all corridors have to begin anew.
         """
 

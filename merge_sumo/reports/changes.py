@@ -11,6 +11,7 @@ from typing import Final
 
 from merge_sumo.reports.verdict import counted
 from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.trajectory import End
 
 FIRST_LOOKS: Final = 10
@@ -135,7 +136,7 @@ class RunComparison:
 
 
 def _worse(level: int, found: LevelChange, tolerance: float) -> list[str]:
-    at, a, b = f"at POV level {level}", found.untested_a, found.untested_b
+    at, a, b = f"at POV level {level_name(level)}", found.untested_a, found.untested_b
     why = []
     if b.nothing_tested:
         why.append(f"{at} B reached the merge point in no case of its campaign")

@@ -15,13 +15,14 @@ from typing import Final
 
 from merge_sumo.campaigns.ground import ground_of, road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
-from merge_sumo.campaigns.settings import pov_of, settings_of
+from merge_sumo.campaigns.settings import same_pov, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports.changes import Change, ComparedCase, LevelChange, RunComparison, Untested
 from merge_sumo.reports.verdict import Verdict, counted, judge
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import FAILURE_SCORE, Measures, Outcome, measure
 from merge_sumo.values.trajectory import End
 
@@ -110,10 +111,10 @@ def _common_levels(a: Run, b: Run) -> list[int]:
             f"{b.folder}: compare campaigns with the same --v-vut0"
         )
     for level in common:
-        if pov_of(a.settings, level) != pov_of(b.settings, level):
+        if not same_pov(a.settings, b.settings, level):
             raise UserError(
-                f"the POV of level {level} is another in {a.folder} than in {b.folder}: compare "
-                "campaigns with the same --policies"
+                f"the POV of level {level_name(level)} is another in {a.folder} than in "
+                f"{b.folder}: compare campaigns with the same --policies and --pov"
             )
     return common
 

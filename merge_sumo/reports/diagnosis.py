@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -179,7 +179,8 @@ class FailureBox:
     @property
     def sentence(self) -> str:
         """Return the box as a sentence."""
-        text = f"POV level {self.level}, {self.where}: {self.failures} of {self.cases} cases fail"
+        text = f"POV level {level_name(self.level)}, {self.where}: "
+        text += f"{self.failures} of {self.cases} cases fail"
         return f"{text} ({self.what})." if self.kinds else f"{text}."
 
 

@@ -22,7 +22,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
 from merge_sumo.values.fmc import RADIUS
-from merge_sumo.values.scenario import Dimension
+from merge_sumo.values.scenario import OWN, Dimension, level_name
 from merge_sumo.values.score import FAILURE_SCORE
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ COLOURS: Final = {
     "coverage": "#D55E00",
 }
 OTHER_COLOUR: Final = "#7B3294"
-LEVEL_COLOURS: Final = {0: "#000000", 1: "#CC79A7", 2: "#56B4E9"}
-LEVEL_MARKERS: Final = {0: "o", 1: "s", 2: "^"}
+LEVEL_COLOURS: Final = {0: "#000000", 1: "#CC79A7", 2: "#56B4E9", OWN: "#009E73"}
+LEVEL_MARKERS: Final = {0: "o", 1: "s", 2: "^", OWN: "D"}
 SAFE_COLOUR: Final = "#c4c9cf"
 DPI: Final = 150
 KINDS: Final = (".png", ".svg", ".html")
@@ -379,6 +379,8 @@ def _band(axes: Axes, values: FloatArray, level: int) -> None:
     parts[:, some] = np.nanquantile(values[:, some], [0.25, 0.5, 0.75], axis=0)
     ink = LEVEL_COLOURS[level]
     axes.fill_between(batches, parts[0], parts[2], color=ink, alpha=0.18, linewidth=0)
-    axes.plot(batches, parts[1], color=ink, marker=LEVEL_MARKERS[level], ms=4, label=str(level))
+    axes.plot(
+        batches, parts[1], color=ink, marker=LEVEL_MARKERS[level], ms=4, label=level_name(level)
+    )
     axes.set_xlim(1, max(len(batches), 2))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -22,6 +22,7 @@ from merge_sumo.reports.verdict import (
     message_of,
 )
 from merge_sumo.system.folders import check_new, check_new_file, write_new
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
@@ -63,7 +64,7 @@ def junit(
     root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
     _gates(root, verdict, gates)
     for level in levels:
-        suite = etree.SubElement(root, "testsuite", name=f"POV level {level}")
+        suite = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
         for outcome in run.outcomes:
             if outcome.case.level == level:
                 _case(suite, outcome)
@@ -92,7 +93,7 @@ def _case(suite: etree._Element, outcome: Outcome) -> None:
     name = (
         f"case {outcome.index}: x_POV0 {case.x_pov0_m:.1f} m, v_POV0 {case.v_pov0_mps:.2f} m/s"
     ) + ("" if case.svo_rad is None else f", psi {case.svo_rad:.2f} rad")
-    test = _test(suite, name, f"{CLASS}.level{case.level}", measures.t_end_s)
+    test = _test(suite, name, f"{CLASS}.level{level_name(case.level)}", measures.t_end_s)
     if measures.end.is_error:
         _wrong(test, "error", measures.end.value, message_of(measures))
     elif not measures.end.is_tested:

@@ -25,6 +25,7 @@ from merge_sumo.reports.verdict import in_counts
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
@@ -192,7 +193,8 @@ class CampaignPanel:
             failing = len(self._failing[level])
             style = "bold dark_orange" if failing else ""
             table.add_row(
-                str(level), str(cases), Text(str(failing), style), f"{self._fmc[level]:.4f}"
+                *(level_name(level), str(cases), Text(str(failing), style)),
+                f"{self._fmc[level]:.4f}",
             )
         title = Text(self._title)
         return Panel(Group(head, "", table), title=title, title_align="left", expand=False)

@@ -20,6 +20,7 @@ from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_facts import Facts
 from merge_sumo.reports.report_words import page_words
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
+from merge_sumo.values.scenario import level_name
 
 REPORT: Final = "report.html"
 GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
@@ -75,6 +76,7 @@ def report_page(run: Run) -> str:
         style_hash=_policy_hash(style),
         script_hash=_policy_hash(script),
         data=Markup(data),  # noqa: S704 (JSON without "<")
+        level_name=level_name,
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.campaigns.conductor import SCENARIOS, case_name
-from merge_sumo.campaigns.experiments import Truth
+from merge_sumo.campaigns.truth import Truth
 from merge_sumo.reports.diagnosis import (
     Diagnosis,
     Kind,
@@ -24,7 +24,7 @@ from merge_sumo.reports.verdict import shortened
 from merge_sumo.sumo.corridor import Corridor, LanePath
 from merge_sumo.values.case import FloatArray, dimensions, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
-from merge_sumo.values.scenario import DT_S, POV, VUT
+from merge_sumo.values.scenario import ALL_LEVELS, DT_S, POV, VUT, level_name
 from merge_sumo.values.score import FAILURE_SCORE
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -49,6 +49,7 @@ def page_data(facts: Facts) -> dict[str, Any]:
         "dt": DT_S,
         "crash_m": facts.run.scenario.dx_crash_m,
         "radius": RADIUS,
+        "level_names": {level: level_name(level) for level in ALL_LEVELS},
         "x_vut0_m": facts.run.scenario.x_vut0_m,
         "speed_unit_mps": SPEED_UNIT_MPS,
         "dimensions": {

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from merge_sumo.campaigns.experiments import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.truth import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.errors import UserError
 from merge_sumo.reports.diagnosis import (
     Diagnosis,
@@ -20,7 +20,7 @@ from merge_sumo.reports.surface import learn_surface
 from merge_sumo.reports.verdict import Trouble, judge
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
-from merge_sumo.values.scenario import DEADLINE_S, LEVELS
+from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, OWN
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -38,7 +38,7 @@ class Facts:
     def __init__(self, run: Run) -> None:
         """Read what the page shows; raises `UserError` where settings have no list of levels."""
         levels = run.settings.get("levels")
-        if not isinstance(levels, list) or any(level not in LEVELS for level in levels):
+        if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
             raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
         self.run = run
         self.road = _road_of(run)
@@ -115,5 +115,6 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         settings.get("deadline_s", DEADLINE_S),
         run.scenario,
         policies=settings.get("policies_sha256", {}),
+        pov=settings.get("pov") if level == OWN else None,
     )
     return read_truth(kept.path(), level, kept.cases, kept.scenario)

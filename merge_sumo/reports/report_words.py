@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from merge_sumo.campaigns.experiments import TRUTH_CASES
+from merge_sumo.campaigns.truth import TRUTH_CASES
 from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.reports.diagnosis import (
     CEDED_MPS,
@@ -21,6 +21,7 @@ from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.reports.verdict import Verdict, counted, in_words
 from merge_sumo.system.printable import printable
 from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import OWN, level_name
 from merge_sumo.values.score import Outcome
 
 
@@ -29,6 +30,8 @@ class Level:
     """What the page says of a level; bars are shares of 100."""
 
     level: int
+    name: str
+    caption: str
     about: str
     cases: int
     failures: int
@@ -97,7 +100,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "driven": _duration(sum(o.measures.t_end_s for o in facts.run.outcomes)),
         "sentences": [box.sentence for box in boxes],
         "scattered": ", ".join(
-            f"{counted(count, 'failure')} at level {level}"
+            f"{counted(count, 'failure')} at level {level_name(level)}"
             for level, count in left.items()
             if count > 0
         ),
@@ -138,6 +141,8 @@ def _levels(facts: Facts) -> list[Level]:
         share = 100.0 / (most_share * found.cases) if most_share > 0.0 and found.cases else 0.0
         return Level(
             level=level,
+            name=level_name(level),
+            caption=f"own: {facts.run.pov}" if level == OWN else str(level),
             about=ABOUT.get(level, ""),
             cases=found.cases,
             failures=found.failures,
@@ -197,7 +202,7 @@ def headline(
     if verdict.tested:
         for level, found in summary.levels.items():
             if found.cases and not found.tested:
-                said.append(f"At POV level {level} nothing was tested.")
+                said.append(f"At POV level {level_name(level)} nothing was tested.")
         said.append(_collisions(verdict, summary, worst, kinds))
     return " ".join(said)
 
@@ -212,9 +217,10 @@ def _collisions(
             "search saw these cases and no others."
         )
     failing = {level: found for level, found in summary.levels.items() if found.failures}
-    never = [str(n) for n, found in summary.levels.items() if found.tested and not found.failures]
+    tested = {level: found for level, found in summary.levels.items() if found.tested}
+    never = [level_name(level) for level, found in tested.items() if not found.failures]
     parts = [
-        f"{found.failures} of {found.cases} cases at POV level {level} "
+        f"{found.failures} of {found.cases} cases at POV level {level_name(level)} "
         f"({counted(found.regions, 'region')})"
         for level, found in failing.items()
     ]

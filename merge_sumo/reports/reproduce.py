@@ -13,15 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.experiments import (
-    Search,
-    Truth,
-    compare,
-    ground_truth,
-    oracle,
-    search,
-)
+from merge_sumo.campaigns.experiments import Search, compare, oracle, search
 from merge_sumo.campaigns.settings import check_level, versions
+from merge_sumo.campaigns.truth import Truth, ground_truth
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.reports import figures
 from merge_sumo.reports.figures import Levels, Panel, Surface

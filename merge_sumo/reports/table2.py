@@ -9,11 +9,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from merge_sumo.campaigns.experiments import (
-    TRUTH_CASES,
-    Comparison,
-)
+from merge_sumo.campaigns.experiments import Comparison
 from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.truth import TRUTH_CASES
 from merge_sumo.errors import UserError
 
 SAMPLERS: Final = ("uniform", "annealing", "subset", "gpr", "coverage")

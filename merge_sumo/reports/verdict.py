@@ -16,6 +16,7 @@ from typing import Any, Final
 from merge_sumo.errors import UserError
 from merge_sumo.reports.summary import Summary
 from merge_sumo.system.printable import printable
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
@@ -204,7 +205,8 @@ class Gate:
                 key=lambda pair: pair[1],
                 default=(0, 0.0),
             )
-            return GateResult(self.name, most > self.above, f"FMC {most:.4f} at level {level}")
+            said = f"FMC {most:.4f} at level {level_name(level)}"
+            return GateResult(self.name, most > self.above, said)
         number: int = getattr(verdict, self.what)
         return GateResult(self.name, number > 0, counted(number, self.what.removesuffix("s")))
 

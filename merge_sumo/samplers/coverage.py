@@ -134,15 +134,17 @@ class _Search:
             return of.of(cases) * trust[_far(cases, failing)]
 
         candidates = _candidates(history, belief, rng, n)
-        probability = trusted(belief, candidates)
-        worth = probability * self._ground.new(self._ground.balls(candidates))
+        probability, balls = trusted(belief, candidates), self._ground.balls(candidates)
+        worth = probability * self._ground.new(balls)
         best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
         refined = _around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
         candidates = np.concatenate([candidates, refined])
         probability = np.concatenate([probability, trusted(belief, refined)])
-        worth = probability * (self._ground.new(self._ground.balls(candidates)) + EVEN_IF_COVERED)
+        balls = np.concatenate([balls, self._ground.balls(refined)])
+        worth = probability * (self._ground.new(balls) + EVEN_IF_COVERED)
         kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
         self._candidates, self._aim = candidates[kept], probability[kept]
+        self._balls = balls[kept]
         self._probability = (
             self._aim if limit is None else trusted(Belief(history), self._candidates)
         )
@@ -154,7 +156,7 @@ class _Search:
         covered, and if it does not, picks near it would mostly have been as wrong. What is aimed
         at may be a near miss, but only a failure is a gain.
         """
-        balls = self._ground.balls(self._candidates)
+        balls = self._balls
         picks: list[int] = []
         gains: list[float] = []
         free = np.ones(len(balls), dtype=bool)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -47,8 +48,12 @@ COLOURS: Final = {
     "behind": "0.95,0.60,0.15",
 }
 WINDOW: Final = (1280, 800)
-SEEN_M: Final = 700.0
-"""Width of the picture on the road."""
+SEEN: Final = 1.6
+"""Width of the picture, as a multiple of where the cars drove."""
+SMALLEST_M: Final = 100.0
+"""Of such a width."""
+EXAGGERATED: Final = 1.0 / 175.0
+"""How much larger cars are drawn than they are, for a metre of the picture's width."""
 SURROUNDINGS_COLOUR: Final = "0.70,0.70,0.68"
 LANE_WIDTH_M: Final = 3.2
 MAX_SURROUNDINGS: Final = 2_000
@@ -126,7 +131,7 @@ def write_files(folder: Path, road: Road, types: etree._Element, record: etree._
     if road.surroundings is not None:
         (folder / SURROUNDINGS).write_bytes(received.serialize(road.surroundings))
     (folder / RECORD).write_bytes(received.serialize(record))
-    (folder / VIEW).write_bytes(received.serialize(_view(road)))
+    (folder / VIEW).write_bytes(received.serialize(_view(road, record)))
     (folder / CONFIG).write_bytes(received.serialize(_config(road, len(record))))
 
 
@@ -194,48 +199,48 @@ def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
     return root
 
 
-def _view(road: Road) -> etree._Element:
+def _view(road: Road, record: etree._Element) -> etree._Element:
+    if road.surroundings is None:
+        exaggeration, viewport = "4", ("440", "-110", "-20")
+    else:
+        exaggeration, viewport = _viewport(road.corridor, record)
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
     etree.SubElement(
         scheme,
         "vehicles",
         vehicleQuality="3",
-        vehicle_exaggeration="4",
+        vehicle_exaggeration=exaggeration,
         vehicleName_show="1",
         vehicleName_size="60",
         vehicleName_color="0.1,0.1,0.1",
     )
     etree.SubElement(scheme, "background", backgroundColor="0.93,0.93,0.90", showGrid="0")
-    zoom, x, y = ("440", "-110", "-20") if road.surroundings is None else _viewport(road.corridor)
+    zoom, x, y = viewport
     etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
     etree.SubElement(root, "delay", value="100")
     return root
 
 
-def _viewport(road: Corridor) -> tuple[str, str, str]:
-    """Return zoom and centre of a picture of the last 300 m of both paths before M.
+def _viewport(road: Corridor, record: etree._Element) -> tuple[str, tuple[str, str, str]]:
+    """Return how cars are enlarged, and zoom and centre of a picture of where they drove.
 
     At a zoom of 100 the picture has the whole net.
     """
-    points = [
-        point for path in (road.mainline, road.ramp) for p in path.pieces for point in p.shape
-    ]
-    width_m, height_m = (
-        max(values) - min(values)
-        for values in ([x for x, *_ in points], [y for _, y, *_ in points])
-    )
-    whole_m = max(width_m, height_m * WINDOW[0] / WINDOW[1])
-    seen = [
-        path.point(max(x_m, -path.before_m))
-        for path in (road.mainline, road.ramp)
-        for x_m in (-300.0, 50.0)
-    ]
-    x, y = (
-        (min(values) + max(values)) / 2.0
-        for values in ([at.x_m for at in seen], [at.y_m for at in seen])
-    )
-    return f"{100.0 * whole_m / SEEN_M:.0f}", f"{x:.0f}", f"{y:.0f}"
+    paths = (road.mainline, road.ramp)
+    net = [point[:2] for path in paths for piece in path.pieces for point in piece.shape]
+    cars = [(float(car.get("x", "0")), float(car.get("y", "0"))) for car in record.iter("vehicle")]
+
+    def box(points: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
+        """Return the width of a picture of points, and its centre."""
+        xs, ys = zip(*points, strict=True)
+        width_m = max(max(xs) - min(xs), (max(ys) - min(ys)) * WINDOW[0] / WINDOW[1])
+        return width_m, (min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0
+
+    whole_m, (driven_m, x, y) = box(net)[0], box(cars or net)
+    seen_m = SEEN * max(driven_m, SMALLEST_M)
+    exaggeration = f"{max(EXAGGERATED * seen_m, 1.0):.1f}"
+    return exaggeration, (f"{100.0 * whole_m / seen_m:.0f}", f"{x:.0f}", f"{y:.0f}")
 
 
 def _config(road: Road, timesteps: int) -> etree._Element:
@@ -245,6 +250,7 @@ def _config(road: Road, timesteps: int) -> etree._Element:
         "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
         "processing": {
             "collision.action": "none",
+            "insertion-checks": "none",
             "time-to-teleport": "-1",
             "default.speeddev": "0",
         },

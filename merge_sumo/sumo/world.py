@@ -7,8 +7,9 @@ SUMO holds the state: positions and speeds are read back from it after every ste
 
 is had by stepping at v(t) and then telling SUMO that the speed now is v(t+1).
 
-Where SUMO itself drives the VUTs, its car-following model and its junction logic decide v(t+1) from
-the state at t. SUMO then moves by v(t+1) instead of v(t), so the VUT is put where eq. (4) has it.
+Where SUMO itself drives a vehicle, its car-following model and its junction logic decide v(t+1)
+from the state at t. SUMO then moves by v(t+1) instead of v(t), so the vehicle is put where eq. (4)
+has it.
 """
 
 from __future__ import annotations
@@ -44,8 +45,11 @@ MAX_SPEED_MPS: Final = 200.0
 CAR: Final = "car"
 COMMANDED_VUT: Final = "commanded"
 VUT_TYPE: Final = "vut"
-"""Ids of the vTypes of the cars of the mainline, of VUTs that hold the speed that they are told,
-and of VUTs that SUMO drives."""
+OWN_CAR: Final = "own"
+"""Ids of the vTypes of the cars of the mainline and of VUTs that hold the speed that they are told,
+and of VUTs and of cars of the mainline that SUMO drives."""
+SLOWEST_MPS: Final = 0.1
+"""SUMO has no driver who wants to stand."""
 
 SUMO_OPTIONS: Final = (
     *("--step-length", str(DT_S)),
@@ -82,6 +86,7 @@ class World:
         road: Corridor | None = None,
         vut_type: Mapping[str, str] | None = None,
         scenario: Scenario = US23,
+        car_type: Mapping[str, str] | None = None,
     ) -> None:
         """Start SUMO; raises `UserError` when it cannot start, or when a world is open already.
 
@@ -89,12 +94,14 @@ class World:
         `scenario` says how many vehicles there are, and how long.
         `vut_type` are attributes of a SUMO vType: with them SUMO's own models decide on the speed
         of the VUTs, and `wanted_v_mps` tells what they want.
+        `car_type` are those of cars of the mainline in the episodes in which they are the tester's
+        own; without a `maxSpeed` they want the speed with which they start.
         """
         if World._open:
             raise UserError("libsumo holds one simulation per process: close the other World first")
         self.corridors = corridors
         self.road = road or road_of()
-        self.vut_type = vut_type
+        self.vut_type, self.car_type = vut_type, car_type
         self.scenario = scenario
         self.vehicles = scenario.vehicles
         self._libsumo = load_libsumo()
@@ -127,7 +134,7 @@ class World:
             net_file = folder / "corridors.net.xml"
             net_file.write_bytes(hosted_net(self.road, self.corridors))
             types_file = folder / "types.add.xml"
-            types_file.write_bytes(_types(self.vut_type, self.scenario))
+            types_file.write_bytes(_types(self.vut_type, self.car_type, self.scenario))
             messages = folder / "messages"
             files = ("--net-file", str(net_file), "--additional-files", str(types_file))
             try:
@@ -157,12 +164,13 @@ class World:
         # Bound once: attribute look-ups cost as much as the calls themselves.
         self._step_simulation = libsumo.simulation.step
         self._move_to, self._set_lane_change_mode = vehicle.moveTo, vehicle.setLaneChangeMode
+        self._set_speed_mode, self._set_max_speed = vehicle.setSpeedMode, vehicle.setMaxSpeed
         self._set_speed, self._set_previous_speed = _raw(libsumo, "setSpeed", "setPreviousSpeed")
         self._get_position, self._get_speed = _raw(libsumo, "getLanePosition", "getSpeed")
         self._get_lane = vehicle.getLaneID
-        rows = np.repeat(np.arange(self.vehicles), self.corridors)
-        self._commanded = ((rows != VUT) | (self.vut_type is None)).tolist()
-        """Which of `_ids` hold the speed that they are told."""
+        vuts = range(VUT * self.corridors, (VUT + 1) * self.corridors)
+        self._driven = set() if self.vut_type is None else set(vuts)
+        """Indices in `_ids` of those that SUMO drives; the others hold the speed they are told."""
         World._open = True
         self._expected_m = np.full_like(self.x_m, np.nan)
         self.read()
@@ -177,25 +185,35 @@ class World:
             departSpeed="0",
         )
 
-    def place(self, corridor: int, starts: Sequence[tuple[float, float]]) -> None:
+    def place(
+        self, corridor: int, starts: Sequence[tuple[float, float]], *, own: bool = False
+    ) -> None:
         """Put the vehicles of a corridor where an episode starts, and read them back.
 
-        `starts` are (x in m, v in m/s) of the vehicles in the order of their rows.
+        `starts` are (x in m, v in m/s) of the vehicles in the order of their rows; `own` is whether
+        the cars of the mainline are the tester's own.
         """
         for row, (x, v) in enumerate(starts):
-            name = self._ids[row * self.corridors + corridor]
+            index = row * self.corridors + corridor
+            name = self._ids[index]
             lane, start_m = self._lane_at(row, corridor, x)
-            driven_by_sumo = row == VUT and self.vut_type is not None
-            if driven_by_sumo:
+            by_sumo = self.vut_type is not None if row == VUT else own and self.car_type is not None
+            renewed = by_sumo or index in self._driven
+            if renewed:
                 # A new vehicle: some of SUMO's models remember how they drove.
                 self._remove(name)
-                self._enter(name, VUT_TYPE)
+                self._enter(name, (VUT_TYPE if row == VUT else OWN_CAR) if by_sumo else CAR)
+                (self._driven.add if by_sumo else self._driven.discard)(index)
             self._move_to(name, lane, x - start_m)
             self._set_previous_speed(name, v, 0.0)
-            if driven_by_sumo:
+            if renewed:
                 self._set_lane_change_mode(name, 0)
-            else:
+            if not by_sumo:
+                if renewed:
+                    self._set_speed_mode(name, SPEED_MODE_COMMANDED)
                 self._set_speed(name, v)
+            elif row != VUT and self.car_type is not None and "maxSpeed" not in self.car_type:
+                self._set_max_speed(name, max(v, SLOWEST_MPS))
             self._start_m[row, corridor] = start_m
             self.x_m[row, corridor] = self._get_position(name) + start_m
             self._expected_m[row, corridor] = self.x_m[row, corridor]
@@ -234,13 +252,14 @@ class World:
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
 
-    def wanted_v_mps(self) -> FloatArray:
-        """Return the speeds that SUMO's own models chose for the VUTs in its step, (corridors,)."""
-        return np.fromiter(map(self._get_speed, self._vut_ids), float, self.corridors)
+    def wanted_v_mps(self, rows: Sequence[int] = (VUT,)) -> FloatArray:
+        """Return the speeds that SUMO's own models chose in its step, (R corridors,), row by row.
 
-    @property
-    def _vut_ids(self) -> list[str]:
-        return self._ids[VUT * self.corridors : (VUT + 1) * self.corridors]
+        They mean something of vehicles that SUMO drives.
+        """
+        k = self.corridors
+        names = [name for row in rows for name in self._ids[row * k : (row + 1) * k]]
+        return np.fromiter(map(self._get_speed, names), float, len(names))
 
     def command(self, a_mps2: FloatArray) -> None:
         """Set the speeds that follow from accelerations, (A, corridors), and read the state.
@@ -252,16 +271,16 @@ class World:
         changed = v_next != self.v_mps
         self._expected_m = self.x_m + self.v_mps * DT_S
         try:
-            if self.vut_type is not None:
-                self._put_vuts(self._expected_m[VUT])
-                changed[VUT] = True
+            if self._driven:
+                self._put_driven()
+                changed.flat[list(self._driven)] = True
             speeds, accelerations = v_next.ravel().tolist(), a_mps2.ravel().tolist()
             ids, set_previous_speed = self._ids, self._set_previous_speed
-            set_speed, commanded = self._set_speed, self._commanded
+            set_speed, driven = self._set_speed, self._driven
             for index in np.flatnonzero(changed).tolist():
                 name, speed = ids[index], speeds[index]
                 set_previous_speed(name, speed, accelerations[index])
-                if commanded[index]:
+                if index not in driven:
                     set_speed(name, speed)
             if not self.read():
                 off_m = np.abs(self.x_m - self._expected_m).max()
@@ -269,11 +288,13 @@ class World:
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
 
-    def _put_vuts(self, x_m: FloatArray) -> None:
-        """Put the VUTs at lane coordinates, (corridors,)."""
-        for k, (name, x) in enumerate(zip(self._vut_ids, x_m.tolist(), strict=True)):
-            lane, start_m = self._lane_at(VUT, k, x)
-            self._move_to(name, lane, x - start_m)
+    def _put_driven(self) -> None:
+        """Put the vehicles that SUMO drives where eq. (4) leads."""
+        for index in sorted(self._driven):
+            row, k = divmod(index, self.corridors)
+            x = float(self._expected_m[row, k])
+            lane, start_m = self._lane_at(row, k, x)
+            self._move_to(self._ids[index], lane, x - start_m)
 
     def read(self) -> bool:
         """Read positions and speeds of all vehicles from SUMO into `x_m` and `v_mps`.
@@ -321,21 +342,28 @@ class World:
         self.close()
 
 
-def _types(vut_type: Mapping[str, str] | None, scenario: Scenario) -> bytes:
+def _types(
+    vut_type: Mapping[str, str] | None, car_type: Mapping[str, str] | None, scenario: Scenario
+) -> bytes:
     """Return the additional file with the vTypes."""
     root = etree.Element("additional")
     told = {"minGap": "0", "maxSpeed": repr(MAX_SPEED_MPS)}
     for name, length_m in ((CAR, scenario.pov_length_m), (COMMANDED_VUT, scenario.vut_length_m)):
         etree.SubElement(root, "vType", {"id": name, "length": repr(length_m), **told})
-    if vut_type is not None:
-        etree.SubElement(root, "vType", {"id": VUT_TYPE, **_careful(scenario), **vut_type})
+    for name, length_m, model in (
+        (VUT_TYPE, scenario.vut_length_m, vut_type),
+        (OWN_CAR, scenario.pov_length_m, car_type),
+    ):
+        if model is not None:
+            careful = _careful(scenario, length_m)
+            etree.SubElement(root, "vType", {"id": name, **careful, **model})
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
 
 
-def _careful(scenario: Scenario) -> dict[str, str]:
+def _careful(scenario: Scenario, length_m: float) -> dict[str, str]:
     """Return the attributes of a driver who knows the limits and wants the level-0 speed."""
     return {
-        "length": repr(scenario.vut_length_m),
+        "length": repr(length_m),
         "maxSpeed": repr(scenario.level0_v_mps),
         "accel": repr(scenario.a_max_mps2),
         "decel": repr(-scenario.a_min_mps2),

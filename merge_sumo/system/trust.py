@@ -27,12 +27,14 @@ KEY_BYTES: Final = 32
 
 
 def seal(settings: Mapping[str, Any]) -> str | None:
-    """Return the seal of what a campaign's settings run; None where no key can be kept."""
+    """Return the seal of whose code a campaign's settings run; None where no key can be kept."""
     key = _key(cache_folder() / KEY)
     if key is None:
         return None
-    named = json.dumps([settings.get(name) for name in ("vut", "vut_command")])
-    return hmac.new(key, named.encode(), hashlib.sha256).hexdigest()
+    named = [settings.get(name) for name in ("vut", "vut_command")]
+    if settings.get("pov") is not None:  # a folder without is sealed as it was before there were
+        named.append(settings["pov"])
+    return hmac.new(key, json.dumps(named).encode(), hashlib.sha256).hexdigest()
 
 
 def is_own(settings: Mapping[str, Any]) -> bool:

@@ -82,6 +82,7 @@ class MergeGame:
             level=level,
             x_pov0_m=self.scenario.x_pov0_m[0],
             v_pov0_mps=self.scenario.v_pov0_mps[0],
+            v_vut0_mps=self.scenario.bounds("v_vut0_mps")[0],
             svo_rad=svo_rad,
             scenario=self.scenario,
         )

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from merge_sumo.errors import UserError
 from merge_sumo.values.scenario import (
     AHEAD,
+    ALL_LEVELS,
     BEHIND,
-    LEVELS,
+    OWN,
     POV,
     SVO,
     US23,
@@ -60,8 +61,8 @@ class Case:
 
     def __post_init__(self) -> None:
         """Check that the numbers describe a scenario."""
-        if self.level not in LEVELS:
-            raise UserError(f"level is {self.level}: choose 0, 1 or 2")
+        if self.level not in ALL_LEVELS:
+            raise UserError(f"level is {self.level}: choose 0, 1 or 2, or {OWN} for a POV's own")
         if (self.svo_rad is None) == (self.level == 2):
             raise UserError("svo_rad belongs to level 2, and only there: give it or leave it out")
         reach_m, most_mps = self.scenario.reach_m, self.scenario.v_start_max_mps

@@ -19,6 +19,9 @@ DT_S: Final = 0.1
 """Step of the equations of motion, eq. (4)."""
 LEVELS: Final = (0, 1, 2)
 """Levels of reasoning of the POV."""
+OWN: Final = 3
+"""Stands for a level where a person's own controller is the POV; people write and read "own"."""
+ALL_LEVELS: Final = (*LEVELS, OWN)
 DEADLINE_S: Final = 5.0
 """A VUT that takes longer than this for one step, or for one reset, is a VUT_ERROR."""
 MEMORY_GIB: Final = 4.0
@@ -30,6 +33,11 @@ ROOM_AFTER_M: Final = 2000.0
 """Length behind M that the road has at least."""
 
 Bounds = tuple[float, float]
+
+
+def level_name(level: int) -> str:
+    """Return a level as people write it."""
+    return "own" if level == OWN else str(level)
 
 
 @dataclass(frozen=True, slots=True)

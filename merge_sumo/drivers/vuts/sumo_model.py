@@ -9,6 +9,7 @@ any other, and eq. (4) moves the car.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 from merge_sumo.drivers.base import Driver, Scene
@@ -17,7 +18,7 @@ from merge_sumo.drivers.vuts.options import split_options
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, VUT
 
 SHARED_OPTIONS: Final = {
     *("maxSpeed", "accel", "decel", "emergencyDecel"),
@@ -96,12 +97,16 @@ def _number(text: str, name: str, spec: str) -> float:
 class SumoVut(Driver):
     """Answers what SUMO decided in its step."""
 
-    def __init__(self, corridors: int, world: World) -> None:
-        """Drive the VUTs of a world that was opened with a `vut_type`."""
+    def __init__(self, corridors: int, world: World, rows: Sequence[int] = (VUT,)) -> None:
+        """Drive the vehicles in rows of a world that was opened with a vType for them.
+
+        These are the VUTs, or the cars of the mainline: then `corridors` are those of all cars.
+        """
         super().__init__(corridors)
-        self._world = world
+        self.world, self._rows = world, list(rows)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the accelerations to the speeds that SUMO decided on."""
-        acceleration: FloatArray = (self._world.wanted_v_mps() - scene.v_vut_mps) / DT_S
+        v_mps = self.world.v_mps[self._rows].ravel()
+        acceleration: FloatArray = (self.world.wanted_v_mps(self._rows) - v_mps) / DT_S
         return acceleration

@@ -47,7 +47,7 @@ const psiText = (psi) => `${fixed(psi, 2)} rad`;
 
 function title(i) {
   const psi = cases.psi[i];
-  return `Case ${cases.index[i]} · POV level ${cases.level[i]}, x_POV0 ${fixed(cases.x[i], 1)} m, v_POV0 ${fixed(cases.v[i], 2)} m/s` +
+  return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, x_POV0 ${fixed(cases.x[i], 1)} m, v_POV0 ${fixed(cases.v[i], 2)} m/s` +
     (psi === null ? "" : `, psi ${psiText(psi)}`);
 }
 function words(i) {

@@ -1,0 +1,219 @@
+"""The ground truth of a VUT: thousands of uniform cases, run once and kept in a cache."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Final, cast
+
+import numpy as np
+
+from merge_sumo.campaigns.conductor import workers_or_here
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
+from merge_sumo.campaigns.settings import check_level, versions
+from merge_sumo.drivers.policies import policies_of, policies_sha256
+from merge_sumo.drivers.povs import Povs
+from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
+from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.drivers.vuts.files import Files, changed
+from merge_sumo.errors import UserError
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
+from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
+from merge_sumo.system.resources import cache_folder
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import FloatArray, Pool
+from merge_sumo.values.fmc import regions
+from merge_sumo.values.scenario import OWN, US23, Scenario
+from merge_sumo.values.score import FAILURE_SCORE
+
+TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
+"""Uniform cases of the ground truth at each level, as in the paper."""
+PROGRESS_CASES: Final = 100
+"""Cases after which a person is told."""
+REAL_REGION: Final = 0.03
+"""A region of the truth counts when it holds at least this share of its failures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The ground truth of a VUT at a level: n uniform cases and what became of them.
+
+    Attributes:
+        points: cases in the unit cube, (n, d).
+        score: P, (n,), NaN without a verdict.
+    """
+
+    points: FloatArray
+    score: FloatArray
+
+    @property
+    def failures(self) -> FloatArray:
+        """Points of the failing cases, (m, d)."""
+        return self.points[self.score < FAILURE_SCORE]
+
+    def real_regions(self) -> list[FloatArray]:
+        """Return the points of each disjoint region with a real share of the failures."""
+        points = self.failures
+        labels = regions(points)
+        groups = [points[labels == label] for label in np.unique(labels)]
+        return [group for group in groups if len(group) >= REAL_REGION * len(points)]
+
+
+DECIDES_OUTCOMES: Final = (
+    "values",
+    "campaigns/rollout.py",
+    "sumo",
+    "drivers",
+)
+"""Sources of this package that decide what becomes of a case."""
+
+OnCases = Callable[[int], None]
+"""Told how many cases have just ended."""
+
+
+def ground_truth(
+    vut: str | VutFactory,
+    level: int,
+    cases: int | None = None,
+    seed: int = 0,
+    *,
+    workers: Workers | None = None,
+    cache: Path | None = None,
+    on_cases: OnCases | None = None,
+    scenario: Scenario = US23,
+    povs: Povs | None = None,
+) -> Truth:
+    """Return the ground truth of a VUT at a level, from the cache where it is there.
+
+    The cache's key is a hash of what was asked for and of what is ours to know: VUT, cases, seed,
+    net, policies, versions, and the sources that decide outcomes. What the VUT itself loaded while
+    it drove is kept with the truth, and a truth is only used while those files are the same. Cases
+    run on `workers`, by default in this process.
+    """
+    count = cases or TRUTH_CASES[level]
+    if count < 1:
+        raise UserError(f"--cases is {count}: it must be 1 or more")
+    povs = povs or Povs(policies=policies_of(scenario))
+    check_level(level, povs)
+    povs = povs if level == OWN else replace(povs, own=None)
+    factory = factory_of(vut, povs)
+    options = factory.options
+    kept = Kept(
+        *(factory.spec, level, count, seed, options.command, options.deadline_s, scenario),
+        policies=povs.sha256(),
+        pov=None if povs.own is None else povs.own.spec,
+    )
+    path = kept.path(cache)
+    found = read_truth(path, level, count, scenario)
+    if found is not None:
+        return found
+    check_place(path.parent, "MERGE_SUMO_CACHE")
+    check_own(path)
+    points = np.random.default_rng([seed, level]).random((count, len(scenario.dimensions(level))))
+    scores = np.full(count, np.nan)
+    files = (factory.files or {}) | povs.files
+    road = road_for(scenario)
+    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road, scenario=scenario, povs=povs)
+    with workers_or_here(workers) as there:
+        rows = cast("Sequence[FloatArray]", points)
+        scored = there.run(partial(_scores, plan, level, scenario), rows, lambda _: (np.nan, {}))
+        for ended, (place, (score, loaded)) in enumerate(scored, start=1):
+            scores[place] = score
+            for name, sha256 in loaded.items():
+                files.setdefault(name, sha256)
+            if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
+                on_cases((ended - 1) % PROGRESS_CASES + 1)
+    truth = Truth(points, scores)
+    arrays = io.BytesIO()
+    np.savez(
+        arrays,
+        points=truth.points,
+        score=truth.score,
+        files=json.dumps(files),
+        of=path.stem,
+    )
+    make_place(path.parent, "MERGE_SUMO_CACHE")
+    replace_own(path, arrays.getvalue())
+    return truth
+
+
+def factory_of(vut: str | VutFactory, povs: Povs) -> VutFactory:
+    """Return what opens a VUT that may be named only; learned ones come from where the POVs do."""
+    return (
+        vut if isinstance(vut, VutFactory) else vut_factory(vut, VutOptions(policies=povs.policies))
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What a truth in the cache is of; nothing of the VUT is loaded to look for it.
+
+    Of the learned drivers the hashes count, and not where they are.
+    """
+
+    vut: str
+    level: int
+    cases: int
+    seed: int
+    command: str | None
+    deadline_s: float
+    scenario: Scenario = US23
+    policies: Mapping[str, str] = field(default_factory=lambda: policies_sha256(policies_of()))
+    pov: str | None = None
+
+    def path(self, cache: Path | None = None) -> Path:
+        """Return the file of the cache that such a truth is in."""
+        package = Path(__file__).resolve().parents[1]
+        sources = hashlib.sha256()
+        for part in DECIDES_OUTCOMES:
+            for source in sorted((package / part).rglob("*.py")) or [package / part]:
+                sources.update(source.read_bytes())
+        # The same name may be another file in another folder.
+        code = runs_code(self.vut, self.command) or (self.pov and runs_code(self.pov, None))
+        here = str(Path.cwd()) if code else None
+        depends = {
+            **asdict(self),
+            "here": here,
+            "versions": versions(),
+            "sources": sources.hexdigest(),
+            "net": road_for(self.scenario).sha256,
+        }
+        key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
+        return (cache or cache_folder()) / f"truth-{key}.npz"
+
+
+def read_truth(path: Path, level: int, cases: int, scenario: Scenario = US23) -> Truth | None:
+    """Return what a file of the cache holds.
+
+    None where there is none, or it is torn or something else, such as another truth under this
+    name, or a file that the VUT loaded is not what it was.
+    """
+    try:
+        data = read_arrays(path, "points", "score", "files", "of")
+        points, score, files = data["points"], data["score"], json.loads(str(data["files"]))
+        if str(data["of"]) != path.stem or not isinstance(files, dict) or changed(files):
+            return None
+    except UNREADABLE_NPZ:
+        return None
+    shape = cases, len(scenario.dimensions(level))
+    fits = points.shape == shape and score.shape == (cases,)
+    numbers = points.dtype == score.dtype == np.float64
+    if not (fits and numbers):
+        return None
+    inside = bool(((points >= 0.0) & (points <= 1.0)).all())
+    scores = not (np.isinf(score) | (score > 0.0)).any()
+    return Truth(points, score) if inside and scores else None
+
+
+def _scores(
+    plan: GroundPlan, level: int, scenario: Scenario, points: Sequence[FloatArray]
+) -> Sequence[tuple[float, Files]]:
+    pool = Pool(levels=(level,), scenario=scenario)
+    ran = run_cases(plan, pool.cases(np.asarray(points), level))
+    scores = [np.nan if done.measures.score is None else done.measures.score for done in ran]
+    return [(score, done.files | done.pov_files) for score, done in zip(scores, ran, strict=True)]
