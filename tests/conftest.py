@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 
 import pytest
+from foreign_nets import corridor_of
 
+from merge_sumo import cli
 from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.sumo.corridor import Corridor
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
 
@@ -29,6 +33,36 @@ def run(tmp_path_factory) -> Run:
     """Return a small finished campaign with failures: design1 against level 0."""
     settings = CampaignSettings(vut="design1", levels=(0,), cases=60, batch=20, seed=1)
     return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
+
+
+@pytest.fixture(scope="session")
+def corridor(tmp_path_factory):
+    """Return a function that builds a foreign net once and gives its corridor."""
+    built = {}
+
+    def get(name: str) -> Corridor:
+        if name not in built:
+            built[name] = corridor_of(name, tmp_path_factory.mktemp("net"))
+        return built[name]
+
+    return get
+
+
+@pytest.fixture
+def command_line(monkeypatch, capfd):
+    """Return a function that runs the command line in this process.
+
+    It returns the exit code, the output and the errors; SUMO's own output counts too.
+    """
+
+    def main(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return int(end.value.code or 0), *capfd.readouterr()
+
+    return main
 
 
 @pytest.fixture

@@ -6,6 +6,8 @@ import math
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.finder import find_corridor
 from merge_sumo.sumo.netfile import NetFile
@@ -192,6 +194,11 @@ FOREIGN = {
     "ring": (roundabout, "ring270 ring0 ring90 ring180 ring270 ring0", "in270 ring270"),
 }
 """Name, builder, edges of the mainline and of the ramp; the first six are the kinds that count."""
+
+SIX = list(FOREIGN)[:6]
+OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(FOREIGN)[6:]]
+ALL = [*SIX, *OTHERS]
+"""Names for tests of each kind of road; those that vary another one take longer in all."""
 
 
 def corridor_of(name: str, folder: Path):

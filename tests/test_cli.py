@@ -38,21 +38,12 @@ Call = Callable[..., Said]
 
 
 @pytest.fixture
-def call(monkeypatch, capfd, tmp_path) -> Call:
-    """Run the command line in this process, in an empty folder; SUMO's own output counts too."""
+def call(monkeypatch, tmp_path, command_line) -> Call:
+    """Return what runs the command line, from an empty folder."""
     folder = tmp_path / "cwd"
     folder.mkdir()
     monkeypatch.chdir(folder)
-
-    def main(*arguments: object) -> Said:
-        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        code = end.value.code
-        return Said(0 if code is None else int(code), *capfd.readouterr())
-
-    return main
+    return lambda *arguments: Said(*command_line(*arguments))
 
 
 @pytest.fixture

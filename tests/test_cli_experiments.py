@@ -4,29 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 
 import pytest
 
-from merge_sumo import cli
 from merge_sumo.reports.reproduce import TABLE_JSON
 from merge_sumo.reports.table2 import TABLE_II, Scale
 
 
 @pytest.fixture
-def call(monkeypatch, capfd, tmp_path):
-    """Run the command line in this process; return its exit code, its output and its errors."""
+def call(monkeypatch, tmp_path, command_line):
+    """Return what runs the command line, from a folder of its own."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
-
-    def main(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return (end.value.code or 0, *capfd.readouterr())
-
-    return main
+    return command_line
 
 
 def refused(said: tuple[int, str, str], *parts: str) -> bool:

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_nets import (
+    ALL,
     AUXILIARY,
-    FOREIGN,
-    corridor_of,
     edge,
     lane_drop,
     node,
@@ -36,22 +35,6 @@ from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, POV, VUT
 
 EXACT = 1e-9
-SIX = list(FOREIGN)[:6]
-OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(FOREIGN)[6:]]
-ALL = [*SIX, *OTHERS]
-
-
-@pytest.fixture(scope="module")
-def corridor(tmp_path_factory):
-    """Return a function that builds a foreign net once and gives its corridor."""
-    built = {}
-
-    def get(name):
-        if name not in built:
-            built[name] = corridor_of(name, tmp_path_factory.mktemp("net"))
-        return built[name]
-
-    return get
 
 
 @pytest.fixture(scope="module")

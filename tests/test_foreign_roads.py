@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import traci
-from foreign_nets import FOREIGN, corridor_of
+from foreign_nets import ALL, FOREIGN, OTHERS, SIX, corridor_of
 from handmade import write_run
 from lxml import etree
 
@@ -50,24 +50,8 @@ from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
-SIX = list(FOREIGN)[:6]
-OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(FOREIGN)[6:]]
-ALL = [*SIX, *OTHERS]
 FILES = {CONFIG, HOSTED_NET, SURROUNDINGS, TYPES, RECORD, VIEW, CASE}
 LANE_WIDTH_M = 3.2
-
-
-@pytest.fixture(scope="module")
-def corridor(tmp_path_factory):
-    """Return a function that builds a foreign net once and gives its corridor."""
-    built = {}
-
-    def get(name):
-        if name not in built:
-            built[name] = corridor_of(name, tmp_path_factory.mktemp("net"))
-        return built[name]
-
-    return get
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from handmade import write_run
 
-from merge_sumo import cli
 from merge_sumo.campaigns import conductor
 from merge_sumo.campaigns.conductor import export_case, run_campaign
 from merge_sumo.campaigns.ground import ProvingGround
@@ -45,18 +44,10 @@ def made(tmp_path_factory) -> Run:
 
 
 @pytest.fixture
-def call(monkeypatch, capfd, tmp_path):
-    """Run the command line in this process; return its exit code, its output and its errors."""
+def call(monkeypatch, tmp_path, command_line):
+    """Return what runs the command line, from a folder of its own."""
     monkeypatch.chdir(tmp_path)
-
-    def main(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return (end.value.code or 0, *capfd.readouterr())
-
-    return main
+    return command_line
 
 
 def in_a_process(terminal: dict[str, str], *arguments: object) -> tuple[int, str, str]:

@@ -6,13 +6,11 @@ import dataclasses
 import json
 import os
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
 import merge_sumo as ms
-from merge_sumo import cli
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
 from merge_sumo.campaigns.ground import GroundPlan, runs_on
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
@@ -63,20 +61,9 @@ def one(home) -> Path:
 
 
 @pytest.fixture
-def call(monkeypatch, capfd, tmp_path):
+def call(monkeypatch, tmp_path, command_line):
     monkeypatch.chdir(tmp_path)
-
-    def main(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
-        capfd.readouterr()
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = end.code or 0
-        return code, *capfd.readouterr()
-
-    return main
+    return command_line
 
 
 def networks(folder: Path) -> dict:

@@ -9,22 +9,29 @@ from itertools import pairwise
 import make_scenarios
 import numpy as np
 import pytest
+from merges import HALF, LIKE_A_ROUNDABOUT, SMALLER
 
 from merge_sumo.campaigns.rollout import rollout
-from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
-from merge_sumo.drivers.levelk import FEATURES, QNetwork, features
-from merge_sumo.drivers.policies import NETWORKS, load_network, read_manifest
+from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
+from merge_sumo.drivers.levelk import FEATURES, QNetwork, actions_mps2, features
+from merge_sumo.drivers.policies import NETWORKS, load_driver, load_network, read_manifest
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.training import check as checking
-from merge_sumo.training.reward import RewardWeights
+from merge_sumo.training.best_response import best_response
+from merge_sumo.training.env import pool_starts
+from merge_sumo.training.game import Game, greedy
+from merge_sumo.training.reward import Reward, RewardWeights
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc, regions
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
 
+REWARD = Reward(RewardWeights())
 REGRET_BOUNDS = {
     "pov1": (0.01, 0.05),
     "vut1": (0.01, 0.05),
@@ -73,8 +80,9 @@ def test_the_library_is_complete_and_its_manifest_says_how_it_was_made():
         assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
 
 
-def test_1000_learned_episodes_are_the_same_in_1_and_in_32_corridors():
-    cases = [case for level in (1, 2) for case in uniform_cases(level, 500, seed=3)]
+@pytest.mark.parametrize("episodes", [100, pytest.param(1000, marks=pytest.mark.long)])
+def test_learned_episodes_are_the_same_in_1_and_in_32_corridors(episodes):
+    cases = [case for level in (1, 2) for case in uniform_cases(level, episodes // 2, seed=3)]
     one, many = (played("level1", cases, corridors)[1] for corridors in (1, 32))
     for alone, beside in zip(one, many, strict=True):
         assert np.array_equal(alone.motion, beside.motion)
@@ -104,6 +112,84 @@ def test_features_are_finite_and_bounded_wherever_a_vut_may_take_a_driver():
     assert np.isfinite(found).all()
     standing = features(*(np.array([x]) for x in (-200.0, 0.0, -100.0, 0.0)))
     assert np.isfinite(standing).all()
+
+
+def papers_features(x_pov, v_pov, x_vut, v_vut):
+    """Return what a network of the paper's scenario sees, with its numbers written out."""
+    distance = np.maximum(-x_vut, 0.0)
+    t_level0 = np.minimum(level0_time_to(distance, v_vut), 20.0)
+    t_constant = np.minimum(distance / np.maximum(v_vut, 0.5), 20.0)
+    t_full = (np.sqrt(v_vut * v_vut + 4.0 * distance) - v_vut) / 2.0
+    t_brake = np.minimum(t_level0, v_pov / 4.0)
+    gaps = (
+        x_pov + v_pov * t_level0,
+        x_pov + (v_pov + t_level0) * t_level0,
+        x_pov + (v_pov - 2.0 * t_brake) * t_brake,
+        x_pov + v_pov * t_constant,
+        x_pov + v_pov * t_full,
+    )
+    v_level0 = np.maximum(v_vut, np.minimum(v_vut + t_level0, 28.0))
+    columns = [
+        x_pov / 100.0 + 1.0,
+        (v_pov - 28.0) / 6.0,
+        x_vut / 100.0 + 1.0,
+        (v_vut - 22.0) / 6.0,
+        t_level0 / 5.0 - 1.0,
+        t_constant / 5.0 - 1.0,
+        t_full / 5.0 - 1.0,
+        *(np.tanh(gap / scale) for gap in gaps for scale in (80.0, 25.0, 8.0)),
+        (v_level0 - 24.6) / 4.0,
+        (v_vut + 2.0 * t_full - 24.6) / 8.0,
+        np.tanh((v_pov - v_level0) / 3.0),
+        (v_pov - 24.6) / 4.0,
+    ]
+    return np.stack(columns, axis=-1)
+
+
+def states(n):
+    rng = np.random.default_rng(1)
+    return rng.uniform((-900.0, 0.0, -182.0, 0.0), (200.0, 60.0, 20.0, 60.0), (n, 4))
+
+
+class TestOtherScenarios:
+    def test_the_shipped_networks_see_the_paper_s_numbers_to_the_last_bit(self):
+        assert np.array_equal(features(*states(20_000).T), papers_features(*states(20_000).T))
+        assert actions_mps2(US23).tolist() == [-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0]
+
+    def test_in_a_merge_of_half_the_size_they_see_the_same_and_act_half(self):
+        half = features(*(states(20_000) / 2).T, scenario=HALF)
+        assert np.array_equal(half, features(*states(20_000).T))
+        assert np.array_equal(actions_mps2(HALF), actions_mps2(US23) / 2)
+
+    def test_a_driver_of_corridors_with_two_scenarios_acts_in_each_as_if_alone(self):
+        scenarios = [US23, HALF, LIKE_A_ROUNDABOUT, US23, HALF, LIKE_A_ROUNDABOUT]
+        cases = [from_unit(np.array([[0.4, 0.6]]), 1, scenario=s)[0] for s in scenarios]
+        rows = np.array([[*zip(*case.starts(), strict=True)] for case in cases])
+        every = np.ones(1, dtype=bool), np.zeros(1, dtype=np.int64)
+
+        def act(which):
+            driver = load_driver("vut1", len(which))
+            for corridor, number in enumerate(which):
+                driver.begin(corridor, cases[number])
+            x_m, v_mps = rows[which].transpose(1, 2, 0)
+            active, step = (np.repeat(one, len(which)) for one in every)
+            return driver.act(Scene(active, step, x_m, v_mps)).tolist()
+
+        together = act(list(range(6)))
+        assert together == [act([number])[0] for number in range(6)]
+        assert together[1] == together[0] / 2 != 0.0
+
+    @pytest.mark.parametrize("name", ["pov1", "vut1"])
+    def test_on_a_ramp_like_ours_they_are_nearly_rational_as_they_would_not_be_unscaled(self, name):
+        role = name[:3]
+        game, network = Game(role, None, Reward.of(SMALLER)), load_network(name)
+        start = pool_starts(60, np.random.default_rng(2), SMALLER)
+        psi = np.zeros(len(start))
+        best = best_response(game, start)
+        scaled = best - game.play(start, psi, greedy(network, SMALLER))
+        unscaled = best - game.play(start, psi, greedy(network, US23))
+        assert scaled.mean() < 0.02
+        assert unscaled.mean() > 5.0 * scaled.mean()
 
 
 class TestTheExampleRuns:
@@ -147,7 +233,7 @@ class TestRationality:
         cases = checking.check_cases(name, 10_000, seed=5)
         network, opponent = load_network(name), checking.opponents(name, None)
         pair = (network, opponent) if name.startswith("pov") else (opponent, network)
-        returns = checking.returns_of(checking.play(cases, *pair), RewardWeights())
+        returns = checking.returns_of(checking.play(cases, *pair), REWARD)
         assert returns.collided.sum() == 0
 
     @pytest.mark.parametrize("name", NETWORKS)
@@ -160,16 +246,16 @@ class TestRationality:
 
     def test_a_level0_driver_in_their_place_would_collide(self):
         cases = checking.check_cases("pov1", 2000, seed=5)
-        returns = checking.returns_of(checking.play(cases, Level0Pov, Level0Vut), RewardWeights())
+        returns = checking.returns_of(checking.play(cases, Level0Pov, Level0Vut), REWARD)
         assert returns.collided.sum() > 20
 
     def test_a_prosocial_pov_gives_up_its_own_return_for_the_vuts(self):
         cases = checking.check_cases("pov2", 4000, seed=6)
-        pov2, vut1, weights = load_network("pov2"), load_network("vut1"), RewardWeights()
+        pov2, vut1 = load_network("pov2"), load_network("vut1")
         vut_ego, pov_ego = [], []
         for svo_rad in (0.0, 0.375, 0.75, 1.125, 1.5):
             turned = [dataclasses.replace(case, svo_rad=svo_rad) for case in cases]
-            returns = checking.returns_of(checking.play(turned, pov2, vut1), weights)
+            returns = checking.returns_of(checking.play(turned, pov2, vut1), REWARD)
             vut_ego.append(returns.vut_ego)
             pov_ego.append(returns.pov_ego)
         for rising in (vut_ego, [-x for x in pov_ego]):

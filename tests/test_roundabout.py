@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.journal import Run
 from merge_sumo.campaigns.rollout import rollout
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to

@@ -11,11 +11,22 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from merges import HALF, LIKE_A_ROUNDABOUT
+from typer.testing import CliRunner
 
+from merge_sumo.cli import app
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
-from merge_sumo.drivers.levelk import ACTIONS_MPS2, FEATURES, QNetwork
-from merge_sumo.drivers.policies import MANIFEST, load_network, read_manifest
+from merge_sumo.drivers.levelk import ACTIONS, FEATURES, QNetwork, actions_mps2
+from merge_sumo.drivers.policies import (
+    MANIFEST,
+    load_network,
+    plays_as,
+    read_manifest,
+    scenario_of,
+)
 from merge_sumo.errors import UserError
+from merge_sumo.scenarios.scenario_file import to_toml
+from merge_sumo.scenarios.suggestion import unseen
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
 from merge_sumo.training.check import QuickRegret, play, returns_of
 from merge_sumo.training.env import (
@@ -28,9 +39,11 @@ from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, US23
 
 WEIGHTS = reward.RewardWeights()
+REWARD = reward.Reward(WEIGHTS)
+ACTIONS_MPS2 = actions_mps2(US23)
 TINY = ddqn.DdqnSettings(transitions=6_000, warm_up=2_000, updates=1_000, width=16, batch=64)
 QUICK = refine.RefineSettings(rounds=2, starts=40, searched=10, beam=8, updates=50, batch=64)
 SMALL = helix.TrainingSettings(ddqn=TINY, refine=QUICK, check_cases=12)
@@ -86,7 +99,7 @@ class TestEnvironments:
         finally:
             games.close()
         cases = [Case(level=1, x_pov0_m=x, v_pov0_mps=v) for x, v in start[:, :2].tolist()]
-        played = returns_of(play(cases, Level0Pov, Level0Vut), WEIGHTS)
+        played = returns_of(play(cases, Level0Pov, Level0Vut), REWARD)
         assert returns == pytest.approx(played.safe + played.pov_ego, abs=1e-9)
 
     def test_games_of_a_vector_environment_begin_anew_by_themselves(self):
@@ -109,6 +122,30 @@ class TestEnvironments:
             one, two = (starts(50, np.random.default_rng(7)) for _ in range(2))
             assert np.array_equal(one, two)
 
+    def test_starts_of_half_the_size_are_half_of_the_paper_s(self):
+        for starts in (pool_starts, exploring_starts):
+            one = starts(500, np.random.default_rng(7))
+            half = starts(500, np.random.default_rng(7), scenario=HALF)
+            assert half == pytest.approx(one / 2, rel=1e-12)
+
+    def test_a_pool_with_a_range_of_speeds_of_the_vut_starts_in_all_of_it(self):
+        ranged = dataclasses.replace(LIKE_A_ROUNDABOUT, v_vut0_mps=(3.0, 9.0))
+        speeds = pool_starts(500, np.random.default_rng(7), ranged)[:, 3]
+        assert 3.0 <= speeds.min() < 3.1
+        assert 8.9 < speeds.max() < 9.0
+
+    def test_another_scenario_is_played_in_its_units(self):
+        games = MergeVectorEnv(2, role="vut", opponent="level0", scenario=LIKE_A_ROUNDABOUT)
+        try:
+            start, _ = games.reset(seed=0)
+            assert (start[:, 2:] == (-40.02, 8.0)).all()
+            state, r, _, _, _ = games.step(np.full(2, 6))  # +2 m/s2
+            assert state[:, 3] == pytest.approx(9.0)
+            weights = reward.RewardWeights.of(LIKE_A_ROUNDABOUT)
+            assert r == pytest.approx(-0.5 * 4.0 * weights.vut_acc)
+        finally:
+            games.close()
+
     def test_exploring_starts_are_in_the_game_and_near_conflict(self):
         starts = exploring_starts(4000, np.random.default_rng(0))
         assert (starts[:, 2] < 0.0).all()
@@ -127,6 +164,7 @@ class TestEnvironments:
         with pytest.raises(UserError, match=sentence):
             MergeVectorEnv(1, **settings)
 
+    @pytest.mark.long
     def test_another_library_trains_on_it(self, env):
         from stable_baselines3 import DQN
 
@@ -139,7 +177,7 @@ class TestEnvironments:
 
 class TestDdqn:
     def train(self, seed=0):
-        game = MergeGame("pov", Level0Vut(16), WEIGHTS)
+        game = MergeGame("pov", Level0Vut(16), REWARD)
         try:
             return ddqn.train(game, seed, TINY)
         finally:
@@ -177,27 +215,25 @@ class TestBestResponse:
             hold = actions[min(step // 5, len(actions) - 1)]
             level0 = float(level0_acceleration(np.array([vv]))[0])
             ap, av = (hold, level0) if role == "pov" else (0.0, hold)
-            ego = reward.pov_step(np.array([vp]), np.array([ap]), WEIGHTS)
+            ego = REWARD.pov_step(np.array([vp]), np.array([ap]))
             if role == "vut":
-                ego = reward.vut_step(np.array([vv]), np.array([av]), WEIGHTS)
+                ego = REWARD.vut_step(np.array([vv]), np.array([av]))
             total += float(ego[0])
             xp, vp = xp + vp * DT_S, max(vp + ap * DT_S, 0.0)
             xv, vv = xv + vv * DT_S, max(vv + av * DT_S, 0.0)
             if xv >= 0.0:
-                total += float(reward.safety(np.array([xp - xv]), np.array([vp - vv]), WEIGHTS)[0])
+                total += float(REWARD.safety(np.array([xp - xv]), np.array([vp - vv]))[0])
                 if role == "vut":
-                    total += float(reward.vut_end(np.array([vv]), WEIGHTS)[0])
+                    total += float(REWARD.vut_end(np.array([vv]))[0])
                 return total
         return -np.inf
 
-    @pytest.mark.parametrize(
-        ("role", "best_of"),
-        [("pov", best_response.best_response_pov1), ("vut", best_response.best_response_vut1)],
-    )
-    def test_no_sequence_that_changes_twice_beats_it_and_it_beats_level0(self, role, best_of):
+    @pytest.mark.parametrize("role", ["pov", "vut"])
+    def test_no_sequence_that_changes_twice_beats_it_and_it_beats_level0(self, role):
         rng = np.random.default_rng(4)
         x, v = rng.uniform(-340, -180, 2), rng.uniform(25, 35, 2)
-        best = best_of(x, v, WEIGHTS)
+        starts = np.stack([x, v, np.full(2, -182.0), np.full(2, 18.0)], axis=1)
+        best = best_response.best_response(Game(role, None, REWARD), starts)
         for x0, v0, bound in zip(x.tolist(), v.tolist(), best.tolist(), strict=True):
             case = Case(level=1, x_pov0_m=x0, v_pov0_mps=v0)
             tried = [
@@ -208,15 +244,52 @@ class TestBestResponse:
             assert max(tried) <= bound + 1e-5
             assert max(tried) > bound - 0.3, "the bound is near what simple sequences reach"
 
+    @pytest.mark.parametrize("role", ["pov", "vut"])
+    @pytest.mark.parametrize("v_vut0", [6.0, (5.0, 7.0)])
+    def test_it_is_the_best_of_all_sequences_also_where_actions_have_no_common_unit(
+        self, role, v_vut0
+    ):
+        tiny = dataclasses.replace(
+            LIKE_A_ROUNDABOUT,
+            x_pov0_m=(-18.0, -4.0),
+            x_vut0_m=-9.0,
+            v_vut0_mps=v_vut0,
+            a_min_mps2=-3.1,
+            a_max_mps2=2.3,
+            timeout_s=2.5,
+        )
+        game = Game(role, None, reward.Reward.of(tiny))
+        start = pool_starts(12, np.random.default_rng(6), tiny)
+        sequences = list(itertools.product(range(ACTIONS), repeat=game.max_decisions))
+        index, state = np.arange(len(start) * len(sequences)), np.repeat(start, len(sequences), 0)
+        returns, arrived = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
+        for actions in np.tile(sequences, (len(start), 1)).T:
+            a = game.actions_mps2[actions[index]]
+            state, gained, over = game.advance(state, np.zeros(len(index)), a)
+            returns[index] += gained
+            arrived[index[over]] = True
+            index, state = index[~over], state[~over]
+        returns[~arrived] = -np.inf
+        every = returns.reshape(len(start), -1)
+        assert best_response.best_response(game, start) == pytest.approx(every.max(axis=1))
+        assert (every.argmax(axis=1) > 0).any()
+
+    def test_that_of_half_the_size_is_the_same(self):
+        start = pool_starts(8, np.random.default_rng(3))
+        for role in ("pov", "vut"):
+            one = best_response.best_response(Game(role, None, reward.Reward.of(US23)), start)
+            half = best_response.best_response(Game(role, None, reward.Reward.of(HALF)), start / 2)
+            assert one == pytest.approx(half, rel=1e-12)
+
     def test_a_beam_search_against_a_driver_that_ignores_it_finds_the_exact_answer(self):
         # A network whose action +1 is always the best is the level-0 VUT until 28 m/s.
-        zeros = np.zeros((len(ACTIONS_MPS2), FEATURES))
+        zeros = np.zeros((ACTIONS, FEATURES))
         always_1 = QNetwork([(zeros, (ACTIONS_MPS2 == 1.0).astype(float))])
         rng = np.random.default_rng(5)
         x, v = rng.uniform(-340, -180, 6), rng.uniform(25, 35, 6)
-        exact = best_response.best_response_pov1(x, v, WEIGHTS)
         starts = np.stack([x, v, np.full(6, -182.0), np.full(6, 18.0)], axis=1)
-        game = Game("pov", always_1, WEIGHTS)
+        exact = best_response.best_response(Game("pov", None, REWARD), starts)
+        game = Game("pov", always_1, REWARD)
         found = best_response.beam_search(game, starts, np.zeros(6), always_1, width=400).returns
         assert (found <= exact + 1e-5).all()
         assert np.median(exact - found) < 0.02
@@ -226,12 +299,30 @@ class TestGame:
     """The game as a function of states, beside the one in SUMO."""
 
     @pytest.fixture
-    def policy(self):
+    def network(self):
         torch.manual_seed(1)
-        return greedy(ddqn.export(ddqn.make_network(FEATURES, 32)))
+        return ddqn.export(ddqn.make_network(FEATURES, 32))
+
+    @pytest.fixture
+    def policy(self, network):
+        return greedy(network, US23)
+
+    @pytest.mark.parametrize("role", ["pov", "vut"])
+    @pytest.mark.parametrize("learned", [False, True])
+    def test_a_merge_of_half_the_size_is_the_same_game_to_the_last_bit(
+        self, role, network, learned
+    ):
+        torch.manual_seed(3)
+        opponent = ddqn.export(ddqn.make_network(FEATURES, 16)) if learned else None
+        start, psi = pool_starts(200, np.random.default_rng(9)), np.zeros(200)
+        one, half = (
+            Game(role, opponent, reward.Reward.of(s)).play(start * size, psi, greedy(network, s))
+            for s, size in ((US23, 1.0), (HALF, 0.5))
+        )
+        assert np.array_equal(one, half)
 
     def test_a_decision_is_half_a_second_of_eq_4(self):
-        game = Game("vut", None, WEIGHTS)
+        game = Game("vut", None, REWARD)
         state, rewards, over = game.advance(
             np.array([[-300.0, 33.0, -100.0, 20.0]]), np.zeros(1), np.array([-2.0])
         )
@@ -241,24 +332,26 @@ class TestGame:
         assert not over[0]
 
     def test_the_level0_vut_stops_accelerating_at_28_in_the_middle_of_a_decision(self):
-        game = Game("pov", None, WEIGHTS)
+        game = Game("pov", None, REWARD)
         state, _, _ = game.advance(
             np.array([[-300.0, 33.0, -100.0, 27.85]]), np.zeros(1), np.zeros(1)
         )
         assert state[0, 3] == 28.0
 
     @pytest.mark.parametrize("role", ["pov", "vut"])
-    def test_its_returns_are_those_of_the_game_in_sumo(self, role, policy):
+    @pytest.mark.parametrize("scenario", [US23, LIKE_A_ROUNDABOUT], ids=lambda s: s.name)
+    def test_its_returns_are_those_of_the_game_in_sumo(self, role, network, scenario):
         rng = np.random.default_rng(2)
-        start = pool_starts(8, rng)
-        expected = Game(role, None, WEIGHTS).play(start, np.zeros(8), policy)
-        game = MergeGame(role, Level0Vut(8) if role == "pov" else Level0Pov(8), WEIGHTS)
+        policy, played = greedy(network, scenario), reward.Reward.of(scenario)
+        start = pool_starts(8, rng, scenario)
+        expected = Game(role, None, played).play(start, np.zeros(8), policy)
+        game = MergeGame(role, Level0Vut(8) if role == "pov" else Level0Pov(8), played)
         try:
             for corridor, state in enumerate(start):
                 game.begin(corridor, state)
             returns, over = np.zeros(8), np.zeros(8, dtype=bool)
             for _ in range(60):
-                actions = ACTIONS_MPS2[policy(game.state(), np.zeros(8))]
+                actions = game.actions_mps2[policy(game.state(), np.zeros(8))]
                 _, parts, ended = game.decide(np.where(over, 0.0, actions))
                 returns += np.where(over, 0.0, parts.of(role, np.zeros(8)))
                 over |= ended
@@ -268,7 +361,7 @@ class TestGame:
         assert over.any()
 
     def test_playing_every_action_out_is_never_worse_than_the_policy(self, policy):
-        game = Game("pov", None, WEIGHTS)
+        game = Game("pov", None, REWARD)
         start, svo_rad = pool_starts(40, np.random.default_rng(3)), np.zeros(40)
         before = game.play(start, svo_rad, policy)
         after = game.play(start, svo_rad, game.improved(policy))
@@ -278,7 +371,7 @@ class TestGame:
     def test_the_plan_of_a_beam_search_has_the_return_that_it_states(self, policy):
         torch.manual_seed(2)
         agent = ddqn.export(ddqn.make_network(FEATURES, 16))
-        game = Game("vut", None, WEIGHTS)
+        game = Game("vut", None, REWARD)
         start, svo_rad = pool_starts(5, np.random.default_rng(4)), np.zeros(5)
         found = best_response.beam_search(game, start, svo_rad, agent, width=16)
         for n in range(5):
@@ -292,10 +385,10 @@ class TestRefinement:
         torch.manual_seed(0)
         network = ddqn.export(ddqn.make_network(FEATURES, 32))
         settings = dataclasses.replace(QUICK, updates=200)
-        return network, refine.refine(Game("pov", None, WEIGHTS), network, seed, settings)
+        return network, refine.refine(Game("pov", None, REWARD), network, seed, settings)
 
     def test_it_lowers_the_regret(self):
-        regret = QuickRegret(Game("pov", None, WEIGHTS), sees_svo=False)
+        regret = QuickRegret(Game("pov", None, REWARD), sees_svo=False)
         before, after = map(regret, self.refined(seed=0))
         assert after < 0.5 * before
 
@@ -335,7 +428,7 @@ class TestHelix:
 
     def test_another_seed_does_not_overwrite_a_network(self, library):
         before = (library / "pov1.safetensors").read_bytes()
-        with pytest.raises(UserError, match=r"has a pov1 of another seed.*--out"):
+        with pytest.raises(UserError, match=r"has a pov1 of another scenario, seed.*--out"):
             train_library(library, ("pov1",), seed=1, settings=SMALL)
         assert (library / "pov1.safetensors").read_bytes() == before
 
@@ -364,5 +457,82 @@ class TestHelix:
             load_network("pov1", tmp_path)
 
     def test_a_missing_network_says_how_to_make_it(self, tmp_path):
-        with pytest.raises(UserError, match="run `merge-sumo train`"):
+        with pytest.raises(UserError, match="run `merge-sumo train --out"):
             load_network("vut1", tmp_path)
+
+
+class TestTrainingForAnotherScenario:
+    """`merge-sumo train --scenario`, end to end and very small."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def ring(cls, tmp_path_factory):
+        """Write the scenario as a file; it lies on the shipped road."""
+        file = tmp_path_factory.mktemp("scenario") / "ring.toml"
+        file.write_text(to_toml(LIKE_A_ROUNDABOUT, []))
+        return file
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def trained(cls, ring, tmp_path_factory):
+        """Train its first level."""
+        out = tmp_path_factory.mktemp("own") / "policies"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(helix, "LEVEL_SETTINGS", {1: SMALL, 2: SMALL})
+            only = ("--only", "pov1", "--only", "vut1")
+            done = call("train", "--scenario", ring, "--out", out, *only)
+        assert done.exit_code == 0, done.output
+        return out, done.output
+
+    def test_the_regret_is_printed_and_the_manifest_has_the_scenario(self, trained):
+        folder, said = trained
+        assert "pov1: mean regret" in said
+        entry = read_manifest(folder)["pov1"]
+        assert entry["command"] == "merge-sumo train --only pov1 --seed 0 --scenario ring"
+        assert entry["scenario"]["x_vut0_m"] == -40.02
+        assert plays_as(scenario_of(entry), LIKE_A_ROUNDABOUT)
+        assert not plays_as(scenario_of(entry), US23)
+        expected = dataclasses.asdict(reward.RewardWeights.of(LIKE_A_ROUNDABOUT))
+        assert entry["reward_weights"] == expected
+
+    def test_its_drivers_know_the_scenario_and_the_shipped_ones_do_not(self, trained, ring):
+        assert unseen(LIKE_A_ROUNDABOUT, trained[0]) == []
+        said = call("scenario", "check", ring, "--policies", trained[0]).output
+        assert "were trained on such starts" in said
+        said = call("scenario", "check", ring).output
+        assert "a_min_mps2 -4 is like -8.51 in us23 (trained on -4)" in said
+        assert f"merge-sumo train --scenario {ring} --out ring-policies" in said
+
+    def test_a_check_measures_the_regret_on_the_scenario(self, trained, ring):
+        words = ("train", "--check", "--scenario", ring, "--only", "pov1", "--cases", 12, "--json")
+        done = call(*words, "--out", trained[0])
+        assert json.loads(done.stdout)["pov1"] == read_manifest(trained[0])["pov1"]["check"]
+
+    def test_a_check_without_the_scenario_says_what_is_missing(self, trained):
+        done = call("train", "--check", "--out", trained[0], "--only", "pov1")
+        assert "was trained for ring: say with --scenario" in str(done.exception)
+
+    def test_without_a_folder_nothing_is_written_into_the_shipped_policies(self, ring):
+        done = call("train", "--scenario", ring)
+        assert "the shipped policies are for us23: say with --out" in str(done.exception)
+
+    def test_networks_of_two_scenarios_do_not_mix_in_a_folder(self, trained):
+        with pytest.raises(UserError, match=r"vut1 .* was trained for another scenario, ring"):
+            train_library(trained[0], ("pov2",), settings=SMALL)
+        with pytest.raises(UserError, match="has a pov1 of another scenario"):
+            train_library(trained[0], ("pov1",), settings=SMALL)
+
+    @pytest.mark.parametrize(
+        "record",
+        [7, {"x_vut0_m": "far"}, {"x_vut0_m": -40.0, "mainline": ["e"]}, {"a_min_mps2": 4.0}],
+    )
+    def test_a_manifest_with_no_such_scenario_is_refused(self, trained, tmp_path, record):
+        manifest = json.loads((trained[0] / MANIFEST).read_text())
+        manifest["networks"]["pov1"]["scenario"] = record
+        (tmp_path / MANIFEST).write_text(json.dumps(manifest))
+        with pytest.raises(UserError, match="is not a readable manifest of policies"):
+            read_manifest(tmp_path)
+
+
+def call(*words):
+    return CliRunner().invoke(app, list(map(str, words)))

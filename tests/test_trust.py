@@ -6,11 +6,11 @@ import hashlib
 import json
 import shutil
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from merge_sumo import cli
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
 from merge_sumo.campaigns.run import CHECKSUM, SETTINGS
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -38,27 +38,47 @@ def stranger(monkeypatch, tmp_path):
     return lambda: monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
 
 
-@pytest.fixture
-def call(monkeypatch, capfd):
-    def main(*arguments: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return end.value.code or 0, capfd.readouterr().err
+@dataclass(frozen=True)
+class Made:
+    """A campaign of a VUT that leaves a file where it ran."""
 
-    return main
+    run: Path
+    telltale: Path
+
+    def ran(self) -> bool:
+        return self.telltale.exists()
 
 
-def campaign(folder: Path, answer: float = 1.0, cases: int = 12) -> Path:
-    """Run a campaign of a VUT that leaves a file where it ran, and take that file away."""
+def campaign(folder: Path, answer: float = 1.0) -> Made:
     folder.mkdir()
     (folder / "my_vut.py").write_text(TELLTALE.format(answer=answer))
     spec = f"{folder / 'my_vut.py'}:Vut"
-    settings = CampaignSettings(vut=spec, levels=(0,), cases=cases, batch=6, sampler="uniform")
-    run = run_campaign(settings, folder / "run").folder
-    (folder / "it-ran").unlink()
-    return run
+    settings = CampaignSettings(vut=spec, levels=(0,), cases=12, batch=6, sampler="uniform")
+    return Made(run_campaign(settings, folder / "run").folder, folder / "it-ran")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> dict[str, Made]:
+    """Return two campaigns of one user, whose cache is beside them."""
+    folder = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MERGE_SUMO_CACHE", str(folder / "mine"))
+        return {
+            name: campaign(folder / name, answer) for name, answer in (("one", 1.0), ("two", 2.0))
+        }
+
+
+@pytest.fixture
+def copied(made, tmp_path, monkeypatch):
+    """Return a function that gives a copy of one of them, made by the user who is here."""
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(made["one"].run.parents[1] / "mine"))
+
+    def copy(name: str = "one") -> Made:
+        telltale = made[name].telltale
+        telltale.unlink(missing_ok=True)
+        return Made(Path(shutil.copytree(made[name].run, tmp_path / name)), telltale)
+
+    return copy
 
 
 def edit(run: Path, **changes: object) -> None:
@@ -67,55 +87,57 @@ def edit(run: Path, **changes: object) -> None:
     (run / SETTINGS).write_text(json.dumps(settings | changes))
 
 
-def refuses(said: tuple[int, str]) -> bool:
-    code, err = said
+def refuses(said: tuple[int, str, str]) -> bool:
+    code, _, err = said
     return code == 2 and "--trust-vut" in err and err.count("\n") == 1
 
 
-def test_what_a_received_folder_names_is_not_run(tmp_path, stranger, call):
-    one = campaign(tmp_path / "one")
-    other = campaign(tmp_path / "other", answer=2.0)
+def test_what_a_received_folder_names_is_not_run(tmp_path, copied, stranger, command_line):
+    one, two = copied("one"), copied("two")
     stranger()
-    assert refuses(call("campaign", "--resume", one, "--quiet"))
-    assert refuses(call("compare-runs", one, other))
-    assert refuses(call("probability", one, "--cases", 10, "--out", tmp_path / "p.json"))
-    assert not (tmp_path / "one" / "it-ran").exists()
-    assert not (tmp_path / "other" / "it-ran").exists()
+    assert refuses(command_line("campaign", "--resume", one.run, "--quiet"))
+    assert refuses(command_line("compare-runs", one.run, two.run))
+    assert refuses(
+        command_line("probability", one.run, "--cases", 10, "--out", tmp_path / "p.json")
+    )
+    assert not one.ran()
+    assert not two.ran()
 
 
 def test_reports_exports_and_replays_of_a_received_folder_run_none_of_its_code(
-    tmp_path, stranger, call
+    tmp_path, copied, stranger, command_line
 ):
-    run = campaign(tmp_path / "one")
+    one = copied()
+    run = one.run
     stranger()
     out = tmp_path / "out"
-    assert call("report", run)[0] == 0
+    assert command_line("report", run)[0] == 0
     for form in ("sumo", "openscenario", "csv"):
-        assert call("export", run, 0, "--format", form, "--out", out / form)[0] == 0
-    assert call("replay", out / "sumo" / "case-00000")[0] == 0
-    assert call("compare-runs", run, run, "--no-rerun")[0] == 0
-    assert not (tmp_path / "one" / "it-ran").exists()
+        assert command_line("export", run, 0, "--format", form, "--out", out / form)[0] == 0
+    assert command_line("replay", out / "sumo" / "case-00000")[0] == 0
+    assert command_line("compare-runs", run, run, "--no-rerun")[0] == 0
+    assert not one.ran()
 
 
-def test_a_person_may_trust_it(tmp_path, stranger, call):
-    run = campaign(tmp_path / "one")
+def test_a_person_may_trust_it(copied, stranger):
+    one = copied()
     stranger()
-    resume_campaign(run, trust=True)
-    assert (tmp_path / "one" / "it-ran").exists()
+    resume_campaign(one.run, trust=True)
+    assert one.ran()
 
 
-def test_who_names_the_controller_again_trusts_it(tmp_path, stranger):
-    run = campaign(tmp_path / "one")
-    vut = json.loads((run / SETTINGS).read_text())["vut"]
+def test_who_names_the_controller_again_trusts_it(copied, stranger):
+    one = copied()
+    vut = json.loads((one.run / SETTINGS).read_text())["vut"]
     stranger()
-    resume_campaign(run, given={"vut": vut})
-    assert (tmp_path / "one" / "it-ran").exists()
+    resume_campaign(one.run, given={"vut": vut})
+    assert one.ran()
 
 
-def test_a_folder_of_ones_own_goes_on_wherever_it_is(tmp_path):
-    run = campaign(tmp_path / "one")
-    shutil.move(run, tmp_path / "elsewhere")
-    assert len(resume_campaign(tmp_path / "elsewhere").outcomes) == 12
+def test_a_folder_of_ones_own_goes_on_wherever_it_is(copied):
+    one = copied()
+    assert len(resume_campaign(one.run).outcomes) == 12
+    assert one.ran()
 
 
 @pytest.mark.parametrize(
@@ -137,21 +159,22 @@ def test_a_folder_of_ones_own_goes_on_wherever_it_is(tmp_path):
         {SEAL: hashlib.sha256(b"").hexdigest()},
     ],
 )
-def test_a_folder_of_ones_own_that_somebody_changed_is_a_strangers(tmp_path, forged):
-    run = campaign(tmp_path / "one")
-    edit(run, **forged)
+def test_a_folder_of_ones_own_that_somebody_changed_is_a_strangers(copied, forged):
+    one = copied()
+    edit(one.run, **forged)
     with pytest.raises(UserError, match=r"--trust-vut|--vut-command goes|not readable JSON"):
-        resume_campaign(run)
-    assert not (tmp_path / "one" / "it-ran").exists()
+        resume_campaign(one.run)
+    assert not one.ran()
 
 
-def test_a_command_in_a_received_folder_is_not_started(tmp_path, stranger, call):
-    run = campaign(tmp_path / "one")
+def test_a_command_in_a_received_folder_is_not_started(tmp_path, copied, stranger, command_line):
+    run = copied().run
     file = tmp_path / "started"
     edit(run, vut="traci", vut_command=COMMAND.format(python=sys.executable, file=file))
     stranger()
-    assert refuses(call("campaign", "--resume", run, "--quiet"))
-    assert refuses(call("probability", run, "--cases", 10, "--out", tmp_path / "p.json"))
+    assert refuses(command_line("campaign", "--resume", run, "--quiet"))
+    into = ("--out", tmp_path / "p.json")
+    assert refuses(command_line("probability", run, "--cases", 10, *into))
     assert not file.exists()
 
 
@@ -191,6 +214,6 @@ def test_a_cache_that_cannot_be_written_seals_nothing_and_stops_nobody(tmp_path,
     (tmp_path / "file").touch()
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "file"))
     assert seal({"vut": "x"}) is None
-    run = campaign(tmp_path / "one")
+    made = campaign(tmp_path / "one")
     with pytest.raises(UserError, match="--trust-vut"):
-        resume_campaign(run)
+        resume_campaign(made.run)

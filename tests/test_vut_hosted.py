@@ -63,7 +63,7 @@ def campaign(spec: str, out: Path, *more: str) -> subprocess.Popen:
     return subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
+@pytest.mark.parametrize("workers", ["2", pytest.param("1", marks=pytest.mark.long)])
 def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_and_ignores_signals(
     spec, tmp_path, workers
 ):

@@ -70,7 +70,7 @@ def network(path, *, answer, dtype=None, width=4):
     return path
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.long)])
 def test_one_number_is_an_acceleration_and_seven_are_values_of_actions(tmp_path, dtype):
     one = network(tmp_path / "one.onnx", answer=[0.5], dtype=dtype)
     seven = network(tmp_path / "seven.onnx", answer=[0, 0, 0, 0, 0, 3, 1], dtype=dtype)
@@ -105,7 +105,14 @@ def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
     assert not np.array_equal(*truth)
 
 
-@pytest.mark.parametrize("answer", [[np.nan], [np.inf], [0, 0, 0, 0, np.nan, 0, 0]])
+@pytest.mark.parametrize(
+    "answer",
+    [
+        [np.nan],
+        pytest.param([np.inf], marks=pytest.mark.long),
+        [0, 0, 0, 0, np.nan, 0, 0],
+    ],
+)
 def test_an_answer_that_is_no_number_is_a_vut_error(tmp_path, answer):
     path = network(tmp_path / "bad.onnx", answer=answer)
     assert run_cases(factory(f"onnx:{path}"), cases_of(1))[0].end is End.VUT_ERROR

@@ -7,8 +7,9 @@
     step     the same vehicles at constant speeds, and nothing at all but simulation steps
     process  a TraCI server started for every case, with the same drivers
 
-Host, bare and step take turns, several rounds for each number of corridors K; the figures are
-medians over the rounds, with the spread in brackets.
+Host, bare and step take turns, several rounds for each number of corridors K, and for K = 32 also
+in traffic, with A = 4 vehicles in a corridor; the figures are medians over the rounds, with the
+spread in brackets. A step is that of a corridor with all its vehicles.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.hosting import HostedPath, hosted_net, hosted_paths
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import MAX_SPEED_MPS, SPEED_MODE_COMMANDED, SUMO_OPTIONS, World
 from merge_sumo.values.case import Case, from_unit
-from merge_sumo.values.scenario import DT_S, MAX_STEPS, X_VUT0_M
+from merge_sumo.values.scenario import DT_S, MAX_STEPS, US23, VEHICLES, X_VUT0_M, Scenario
 from merge_sumo.values.trajectory import Trajectory
 
 KS = (1, 8, 32, 64)
@@ -45,21 +47,22 @@ VUT = "design1"
 
 def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     """Return the seconds that the host takes for cases, and the trajectories."""
-    pov, vut = PovLibrary(world.corridors), vut_factory(VUT)(world.corridors)
+    pov = PovLibrary(world.corridors * (world.vehicles - 1))
+    vut = vut_factory(VUT)(world.corridors)
     start = time.perf_counter()
     trajectories = [trajectory for _, trajectory in rollout(world, pov, vut, cases)]
     return time.perf_counter() - start, trajectories
 
 
-def bare_s_per_pair_step(world: World, trajectories: list[Trajectory]) -> float:
-    """Return the seconds per pair-step of a plain loop that moves vehicles as recorded."""
+def bare_s_per_step(world: World, trajectories: list[Trajectory]) -> float:
+    """Return the seconds per step and corridor of a plain loop that moves vehicles as recorded."""
     # The same functions that the host calls: without the Python wrappers around them.
     raw = libsumo._libsumo
     set_speed, set_previous_speed = raw.vehicle_setSpeed, raw.vehicle_setPreviousSpeed
     get_position, get_speed = raw.vehicle_getLanePosition, raw.vehicle_getSpeed
     step = libsumo.simulation.step
     corridors = world.corridors
-    names = [f"{who}.{k}" for who in ("pov", "vut") for k in range(corridors)]
+    names = [f"{who}.{k}" for who in VEHICLES[: world.vehicles] for k in range(corridors)]
     spent = 0.0
     waves = [
         trajectories[i : i + corridors]
@@ -67,11 +70,11 @@ def bare_s_per_pair_step(world: World, trajectories: list[Trajectory]) -> float:
     ]
     for wave in waves:
         for k, trajectory in enumerate(wave):
-            (x_pov, v_pov, _), (x_vut, v_vut, _) = trajectory.motion[0].tolist()
-            world.place(k, [(x_pov, v_pov), (x_vut, v_vut)])
-        motion = np.stack([trajectory.motion[: STEPS + 1] for trajectory in wave])
-        speeds = np.concatenate([motion[:, :, 0, 1], motion[:, :, 1, 1]]).T.tolist()
-        accelerations = np.concatenate([motion[:, :, 0, 2], motion[:, :, 1, 2]]).T.tolist()
+            world.place(k, trajectory.case.starts())
+        # By step, then vehicle by vehicle, each in all corridors.
+        motion = np.stack([trajectory.motion[: STEPS + 1] for trajectory in wave], axis=2)
+        speeds = motion[..., 1].reshape(STEPS + 1, -1).tolist()
+        accelerations = motion[..., 2].reshape(STEPS + 1, -1).tolist()
         start = time.perf_counter()
         for t in range(STEPS):
             for name, v in zip(names, speeds[t], strict=True):
@@ -86,8 +89,8 @@ def bare_s_per_pair_step(world: World, trajectories: list[Trajectory]) -> float:
     return spent / (len(waves) * corridors * STEPS)
 
 
-def step_s_per_pair_step(world: World, cases: list[Case]) -> float:
-    """Return the seconds per pair-step of SUMO alone."""
+def step_s_per_step(world: World, cases: list[Case]) -> float:
+    """Return the seconds per step and corridor of SUMO alone."""
     step = libsumo.simulation.step
     spent = 0.0
     for wave in range(WAVES):
@@ -164,6 +167,28 @@ def _episode_by_traci(
             vehicle.setPreviousSpeed(name, max(v[name] + a[name] * DT_S, 0.0), a[name])
 
 
+def cases_of(scenario: Scenario, count: int) -> list[Case]:
+    """Return random cases at level 0."""
+    points = np.random.default_rng(0).random((count, len(scenario.dimensions(0))))
+    return from_unit(points, 0, scenario=scenario)
+
+
+def measured(scenario: Scenario, k: int, count: int, rounds: int) -> dict[str, list[float]]:
+    """Return the figures of each round in a world with `k` corridors."""
+    row: dict[str, list[float]] = {"us": [], "cases_per_s": [], "to_bare": [], "to_step": []}
+    cases = cases_of(scenario, count * min(k, 32) // 32)
+    with World(k, scenario=scenario) as world:
+        host_s(world, cases[:k])
+        for _ in range(rounds):
+            seconds, trajectories = host_s(world, cases)
+            us = seconds / sum(len(t.motion) - 1 for t in trajectories) * 1e6
+            row["us"].append(us)
+            row["cases_per_s"].append(len(cases) / seconds)
+            row["to_bare"].append(us / bare_s_per_step(world, trajectories) / 1e6)
+            row["to_step"].append(us / step_s_per_step(world, cases) / 1e6)
+    return row
+
+
 def main() -> None:
     """Print a table, or with --json one object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
@@ -173,45 +198,38 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=5, help="cases with a process each")
     options = parser.parse_args()
 
-    rng = np.random.default_rng(0)
-    cases = from_unit(rng.random((options.cases, 2)), level=0)
-    rows: dict[int, dict[str, list[float]]] = {}
-    for k in KS:
-        rows[k] = {"us": [], "cases_per_s": [], "to_bare": [], "to_step": []}
-        some = cases[: options.cases * min(k, 32) // 32]
-        with World(k) as world:
-            host_s(world, some[:k])
-            for _ in range(options.rounds):
-                seconds, trajectories = host_s(world, some)
-                us = seconds / sum(len(t.motion) - 1 for t in trajectories) * 1e6
-                rows[k]["us"].append(us)
-                rows[k]["cases_per_s"].append(len(some) / seconds)
-                rows[k]["to_bare"].append(us / bare_s_per_pair_step(world, trajectories) / 1e6)
-                rows[k]["to_step"].append(us / step_s_per_pair_step(world, some) / 1e6)
-    process = statistics.median(process_s(cases[: options.processes]))
+    traffic = named_scenario("us23-traffic")
+    rows = {
+        (scenario.vehicles, k): measured(scenario, k, options.cases, options.rounds)
+        for scenario, ks in ((US23, KS), (traffic, (32,)))
+        for k in ks
+    }
+    process = statistics.median(process_s(cases_of(US23, options.processes)))
     medians = {
         k: {name: statistics.median(x) for name, x in row.items()} for k, row in rows.items()
     }
-    ratio_to_process = process * medians[32]["cases_per_s"]
+    ratio_to_process = process * medians[2, 32]["cases_per_s"]
     if options.json:
+        alone = {k: row for (vehicles, k), row in medians.items() if vehicles == 2}
         result = {
-            "us_per_pair_step": {k: row["us"] for k, row in medians.items()},
-            "cases_per_s": {k: row["cases_per_s"] for k, row in medians.items()},
-            "ratio_to_bare": medians[32]["to_bare"],
-            "ratio_to_bare_by_k": {k: row["to_bare"] for k, row in medians.items()},
-            "ratio_to_step_by_k": {k: row["to_step"] for k, row in medians.items()},
+            "us_per_pair_step": {k: row["us"] for k, row in alone.items()},
+            "cases_per_s": {k: row["cases_per_s"] for k, row in alone.items()},
+            "ratio_to_bare": alone[32]["to_bare"],
+            "ratio_to_bare_by_k": {k: row["to_bare"] for k, row in alone.items()},
+            "ratio_to_step_by_k": {k: row["to_step"] for k, row in alone.items()},
+            "in_traffic": medians[traffic.vehicles, 32],
             "ratio_to_traci_process": ratio_to_process,
             "s_per_traci_process_case": process,
         }
         print(json.dumps(result))
         return
     print(
-        f"{'K':>4} {'us per pair-step':>24} {'cases per s':>24} "
+        f"{'A':>2} {'K':>4} {'us per step':>24} {'cases per s':>24} "
         f"{'ratio to bare':>20} {'to step':>20}"
     )
-    for k, row in rows.items():
+    for (vehicles, k), row in rows.items():
         cells = [f"{statistics.median(x):.2f} [{min(x):.2f}, {max(x):.2f}]" for x in row.values()]
-        print(f"{k:>4} {cells[0]:>24} {cells[1]:>24} {cells[2]:>20} {cells[3]:>20}")
+        print(f"{vehicles:>2} {k:>4} {cells[0]:>24} {cells[1]:>24} {cells[2]:>20} {cells[3]:>20}")
     print(f"a TraCI process per case: {process:.3f} s, {ratio_to_process:.0f} times K = 32")
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands.shared import app, show
+from merge_sumo.commands.shared import PoliciesOption, app, show
 from merge_sumo.errors import UserError
 
 scenario = typer.Typer(help="The road and the numbers of a merge.", no_args_is_help=True)
@@ -68,22 +68,30 @@ def new_scenario(
 @scenario.command("check")
 def check_scenario(
     name: Annotated[str, typer.Argument(metavar="NAME|FILE", help="Scenario to check.")],
+    policies: PoliciesOption = None,
 ) -> None:
-    """Say whether a scenario can be hosted, and what to know before it is run.
+    """Say whether a scenario can be hosted, and whether the learned drivers know it.
 
     Example:  merge-sumo scenario check us23
     """
     from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.drivers.policies import policies_in
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.scenarios.suggestion import about, unseen
+    from merge_sumo.system.printable import quoted
 
+    if policies is not None:
+        policies = policies_in(policies)
     found = named_scenario(name)
     for line in about(road_for(found)):
         show(line)
-    outside = unseen(found)
+    outside = unseen(found, policies)
     if outside:
         show("the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:")
         for sentence in outside:
             show(f"  {sentence}")
+        folder = quoted(f"{found.name}-policies")
+        show(f"train them: merge-sumo train --scenario {quoted(name)} --out {folder}")
+        show(f"then add to a campaign: --policies {folder}")
     else:
-        show("the learned drivers (levels 1 and 2) were trained on such starts")
+        show("the learned drivers (levels 1 and 2) were trained on such starts, or on like ones")

@@ -41,13 +41,18 @@ def train(
 
     Example:  merge-sumo train --out my-policies --seed 1
     """
-    from merge_sumo.drivers.policies import NETWORKS, plays_as, read_manifest, scenario_of
+    from merge_sumo.drivers.policies import (
+        NETWORKS,
+        plays_as,
+        policies_of,
+        read_manifest,
+        scenario_of,
+    )
     from merge_sumo.scenarios.scenario_file import named_scenario
-    from merge_sumo.system.resources import resource
     from merge_sumo.values.scenario import US23
 
-    folder = out or resource("policies")
     played = US23 if scenario is None else named_scenario(scenario)
+    folder = out or policies_of(played)
     if out is None and not check and not plays_as(played, US23):
         raise UserError(
             f"the shipped policies are for {US23.name}: say with --out where those for "

@@ -27,6 +27,8 @@ PLAYED: Final = (
     *("level0_a_mps2", "level0_v_mps", "timeout_s"),
 )
 """Numbers of a scenario that decide what a driver learns; the road and other cars do not."""
+LIMITS: Final = ("reach_m", "v_start_max_mps")
+"""Of what these numbers may be."""
 MOST_BYTES: Final = 1 << 26
 """No network and no manifest is larger."""
 
@@ -79,7 +81,7 @@ def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
 
 def scenario_record(scenario: Scenario) -> dict[str, Any]:
     """Return what a manifest says of the scenario that a network was trained for."""
-    values = {name: getattr(scenario, name) for name in PLAYED}
+    values = {name: getattr(scenario, name) for name in (*PLAYED, *LIMITS)}
     return {
         "name": scenario.name,
         **{k: list(v) if isinstance(v, tuple) else v for k, v in values.items()},
@@ -92,7 +94,7 @@ def scenario_of(entry: dict[str, Any]) -> Scenario:
     Raises `UserError` when the manifest describes none.
     """
     record = entry.get("scenario", scenario_record(US23))
-    if not isinstance(record, dict) or not set(record) <= {"name", *PLAYED}:
+    if not isinstance(record, dict) or not set(record) <= {"name", *PLAYED, *LIMITS}:
         raise UserError("the scenario of a policy is a table of its numbers")
     return Scenario.from_record(record)
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
+from merge_sumo.drivers.units import Units
 from merge_sumo.sumo.corridor import Corridor, LanePath
 from merge_sumo.values.scenario import US23, V_VUT0_MPS, Scenario
 
@@ -87,31 +90,66 @@ def about(road: Corridor) -> list[str]:
     return lines
 
 
-TRAINED_ON: Final = (
-    *("x_vut0_m", "v_vut0_mps", "a_min_mps2", "a_max_mps2", "level0_a_mps2", "level0_v_mps"),
-)
-"""Numbers of a scenario that had one value in training."""
+ALIKE: Final = 0.25
+"""What a number may differ from those of training, as a share of them, and a range be exceeded by,
+as a share of its width. In random scenarios as near as this the shipped POV-1 and VUT-1 had a mean
+regret of up to 4 % and collided nowhere avoidably; farther away, of up to 136 %."""
 
 
-def unseen(scenario: Scenario) -> list[str]:
-    """Return in what a scenario lies outside of what the shipped learned drivers were trained on.
+def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
+    """Return in what a scenario lies outside of what the learned drivers were trained on.
 
-    They were trained on the paper's pool: elsewhere levels 1 and 2 are extrapolations.
+    `policies` is the folder of these drivers, by default of the shipped ones for the scenario. They
+    measure in the units of the scenario that they play, so what counts is what its numbers are like
+    in the one that they were trained for. Outside, levels 1 and 2 are extrapolations.
     """
-    found = []
-    for name in ("x_pov0_m", "v_pov0_mps"):
-        (low, high), (known_low, known_high) = getattr(scenario, name), getattr(US23, name)
-        if low < known_low or high > known_high:
-            found.append(f"{name} {low:g} to {high:g} (trained on {known_low:g} to {known_high:g})")
-    for name in (
-        "x_vut0_m",
-        "v_vut0_mps",
-        "a_min_mps2",
-        "a_max_mps2",
-        "level0_a_mps2",
-        "level0_v_mps",
+    folder = policies or policies_of(scenario)
+    trained = {scenario_of(entry) for entry in read_manifest(folder).values()}
+    if not trained:
+        return [f"{folder} has no learned drivers"]
+    found = [sentence for known in trained for sentence in _differences(scenario, known)]
+    return list(dict.fromkeys(found))
+
+
+def _differences(scenario: Scenario, trained: Scenario) -> list[str]:
+    """Return the numbers of a scenario that are not like those of training, in sentences."""
+    unit, known = Units.of(scenario), Units.of(trained)
+    length, speed, gap = (
+        getattr(known, name) / getattr(unit, name) for name in ("length", "speed", "gap")
+    )
+    time = known.time / unit.time
+    slowest = trained.v_hw_min_mps, scenario.v_hw_min_mps
+    pool = trained.v_pov0_mps[1] - trained.v_pov0_mps[0]
+    sentences = []
+
+    def compare(name: str, low: float, high: float, margin: float) -> None:
+        known_low, known_high = trained.bounds(name)
+        if low < known_low - margin or high > known_high + margin:
+            sentences.append(
+                f"{name} {_range(*scenario.bounds(name))} is like {_range(low, high)} in "
+                f"{trained.name} (trained on {_range(known_low, known_high)})"
+            )
+
+    low, high = (length * x for x in scenario.x_pov0_m)
+    compare("x_pov0_m", low, high, ALIKE * (trained.x_pov0_m[1] - trained.x_pov0_m[0]))
+    for name in ("v_pov0_mps", "v_vut0_mps"):
+        low, high = (slowest[0] + speed * (v - slowest[1]) for v in scenario.bounds(name))
+        compare(name, low, high, ALIKE * pool)
+    for name, factor in (
+        ("v_hw_min_mps", speed),
+        ("v_hw_max_mps", speed),
+        ("v_min_mps", speed),
+        ("a_min_mps2", speed / time),
+        ("a_max_mps2", speed / time),
+        ("level0_a_mps2", speed / time),
+        ("ttc_min_s", time),
+        ("dx_crash_m", length),
+        ("dx_critical_m", gap),
     ):
-        value, known = getattr(scenario, name), getattr(US23, name)
-        if value != known:
-            found.append(f"{name} {value:g} (trained on {known:g})")
-    return found
+        like = factor * getattr(scenario, name)
+        compare(name, like, like, ALIKE * abs(getattr(trained, name)))
+    return sentences
+
+
+def _range(low: float, high: float) -> str:
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"

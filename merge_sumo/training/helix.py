@@ -153,8 +153,7 @@ def train_library(
         tasks = []
         for name, plan in plans.items():
             known = read_manifest(folder).get(name, {})
-            of_paper = {"scenario": scenario_record(US23)} if known else {}
-            if {key: {**of_paper, **known}.get(key) for key in plan} != plan:
+            if not _is_of(known, plan):
                 if known:
                     raise UserError(
                         f"{folder} has a {name} of another scenario, seed, opponent or setting: "
@@ -191,6 +190,13 @@ def _take(folder: Path) -> None:
     except OSError as error:
         raise cannot_write(folder, error) from error
     write_new(manifest, _manifest({}))
+
+
+def _is_of(known: dict[str, Any], plan: dict[str, Any]) -> bool:
+    """Return whether what a manifest says of a network, if anything, is of a plan."""
+    others = plan.keys() - {"scenario"}
+    same = all(known.get(key) == plan[key] for key in others)
+    return same and plays_as(scenario_of(known), scenario_of(plan))
 
 
 def _plan(
