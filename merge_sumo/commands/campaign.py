@@ -169,10 +169,12 @@ def campaign(
     if junit is not None:
         check_junit(junit, folder)
     road = road_for(settings.scenario, net)
-    if {1, 2} & set(levels) and unseen(settings.scenario):
+    learned = {1, 2} & set(levels)
+    if resume is None and learned and unseen(settings.scenario, settings.povs.policies):
+        named = "" if policies is None else f" --policies {quoted(policies)}"
         say(
             f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
-            f"`merge-sumo scenario check {quoted(scenario)}` says in what it differs"
+            f"`merge-sumo scenario check {quoted(scenario)}{named}` says in what it differs"
         )
     title = f"{settings.vut} v level {'/'.join(map(level_name, levels))}"
     try:

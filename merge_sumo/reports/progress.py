@@ -139,11 +139,12 @@ class CampaignPanel:
                 self._live.start()
         level = outcome.case.level
         self._ran += 1
-        self._cases[level] += 1
+        # A campaign that was forced on may have cases of a level that it has no more.
+        self._cases[level] = self._cases.get(level, 0) + 1
         self._errors += outcome.measures.end.is_error
         self._timeouts += outcome.measures.end is End.TIMEOUT
         if outcome.failed:
-            self._failing[level].append(outcome.case)
+            self._failing.setdefault(level, []).append(outcome.case)
             self._stale.add(level)
         if self._live is not None:
             if time.monotonic() - self._fresh_s > FRESH_S:
@@ -190,11 +191,11 @@ class CampaignPanel:
         for name in ("cases", "failures", "FMC so far"):
             table.add_column(name, justify="right")
         for level, cases in self._cases.items():
-            failing = len(self._failing[level])
+            failing = len(self._failing.get(level, ()))
             style = "bold dark_orange" if failing else ""
             table.add_row(
                 *(level_name(level), str(cases), Text(str(failing), style)),
-                f"{self._fmc[level]:.4f}",
+                f"{self._fmc.get(level, 0.0):.4f}",
             )
         title = Text(self._title)
         return Panel(Group(head, "", table), title=title, title_align="left", expand=False)

@@ -62,7 +62,9 @@ class Case:
     def __post_init__(self) -> None:
         """Check that the numbers describe a scenario."""
         if self.level not in ALL_LEVELS:
-            raise UserError(f"level is {self.level}: choose 0, 1 or 2, or {OWN} for a POV's own")
+            raise UserError(
+                f"level is {self.level}: choose 0, 1 or 2, or {OWN} for a POV of your own"
+            )
         if (self.svo_rad is None) == (self.level == 2):
             raise UserError("svo_rad belongs to level 2, and only there: give it or leave it out")
         reach_m, most_mps = self.scenario.reach_m, self.scenario.v_start_max_mps

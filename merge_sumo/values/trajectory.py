@@ -28,7 +28,7 @@ class End(StrEnum):
 
     @property
     def is_error(self) -> bool:
-        """Whether the VUT or the simulation went wrong."""
+        """Whether the VUT or the simulation went wrong; the POV is of the simulation."""
         return self in (End.VUT_ERROR, End.SIM_ERROR)
 
 

@@ -94,6 +94,8 @@ class Car(NamedTuple):
 class Seen(NamedTuple):
     """What a VUT sees at a step: time and state, and nothing about who drives the POV.
 
+    A controller in the POV's seat (`--pov`) is shown itself as the VUT, and the VUT as the POV.
+
     In traffic the car that the VUT will meet counts as POV: the one that would be nearest to M when
     the VUT is there, if the car kept its speed and the VUT drove the scenario's level-0 profile
     (`drivers.following.car_met`). `others` has all cars.
