@@ -8,6 +8,7 @@ from dataclasses import asdict, fields, replace
 import numpy as np
 import pytest
 from foreign_nets import FOREIGN
+from merges import SMALLER
 from typer.testing import CliRunner
 
 from merge_sumo import cli
@@ -235,11 +236,17 @@ def test_the_pool_that_us23_itself_suggests_is_about_that_of_the_paper():
     assert found.v_pov0_mps == pytest.approx(US23.v_pov0_mps, abs=0.6)
 
 
-def test_where_the_learned_drivers_extrapolate_is_said():
+def test_where_the_learned_drivers_extrapolate_is_said_in_numbers_of_their_training():
     assert unseen(US23) == []
-    said = unseen(OTHER)
-    assert "v_pov0_mps 10 to 20 (trained on 25 to 35)" in said
-    assert any(sentence.startswith("x_vut0_m -100") for sentence in said)
+    assert unseen(SMALLER) == [], "a ramp a tenth shorter and slower is like ours"
+    said = unseen(replace(US23, x_vut0_m=-364.0, x_pov0_m=(-680.0, -400.0), a_max_mps2=2.4))
+    assert said == [
+        "a_min_mps2 -4 is like -8 in us23 (trained on -4)",
+        "a_max_mps2 2.4 is like 4.8 in us23 (trained on 2)",
+        "level0_a_mps2 1 is like 2 in us23 (trained on 1)",
+        "ttc_min_s 7 is like 3.5 in us23 (trained on 7)",
+        "dx_crash_m 6 is like 3 in us23 (trained on 6)",
+    ]
 
 
 def test_points_of_one_scenario_are_cases_of_it():

@@ -138,7 +138,7 @@ class TestEnvironments:
         games = MergeVectorEnv(2, role="vut", opponent="level0", scenario=LIKE_A_ROUNDABOUT)
         try:
             start, _ = games.reset(seed=0)
-            assert (start[:, 2:] == (-40.02, 8.0)).all()
+            assert start[:, 2:] == pytest.approx(np.array([[-40.02, 8.0]] * 2))
             state, r, _, _, _ = games.step(np.full(2, 6))  # +2 m/s2
             assert state[:, 3] == pytest.approx(9.0)
             weights = reward.RewardWeights.of(LIKE_A_ROUNDABOUT)
@@ -475,12 +475,11 @@ class TestTrainingForAnotherScenario:
     @pytest.fixture(scope="class")
     @classmethod
     def trained(cls, ring, tmp_path_factory):
-        """Train its first level."""
+        """Train one network."""
         out = tmp_path_factory.mktemp("own") / "policies"
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(helix, "LEVEL_SETTINGS", {1: SMALL, 2: SMALL})
-            only = ("--only", "pov1", "--only", "vut1")
-            done = call("train", "--scenario", ring, "--out", out, *only)
+            done = call("train", "--scenario", ring, "--out", out, "--only", "pov1")
         assert done.exit_code == 0, done.output
         return out, done.output
 
@@ -517,8 +516,8 @@ class TestTrainingForAnotherScenario:
         assert "the shipped policies are for us23: say with --out" in str(done.exception)
 
     def test_networks_of_two_scenarios_do_not_mix_in_a_folder(self, trained):
-        with pytest.raises(UserError, match=r"vut1 .* was trained for another scenario, ring"):
-            train_library(trained[0], ("pov2",), settings=SMALL)
+        with pytest.raises(UserError, match=r"pov1 .* was trained for another scenario, ring"):
+            train_library(trained[0], ("vut2",), settings=SMALL)
         with pytest.raises(UserError, match="has a pov1 of another scenario"):
             train_library(trained[0], ("pov1",), settings=SMALL)
 

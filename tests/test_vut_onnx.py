@@ -6,14 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from merges import HALF, SMALLER
+from typer.testing import CliRunner
 from vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.campaigns.truth import ground_truth
+from merge_sumo.cli import app
 from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.onnx_export import export_onnx
 from merge_sumo.drivers.policies import NETWORKS, load_network
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import from_unit
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
 onnx = pytest.importorskip("onnx")
@@ -40,13 +44,26 @@ def test_an_exported_policy_gives_the_values_of_the_policy(exported, name):
     assert values == pytest.approx(expected, abs=1e-12)
 
 
-def test_an_exported_policy_as_vut_drives_like_the_built_in_one(exported):
-    cases = from_unit(np.random.default_rng(1).random((40, 3)), level=2)
+@pytest.mark.parametrize("scenario", [US23, SMALLER], ids=["us23", "smaller"])
+def test_an_exported_policy_as_vut_drives_like_the_built_in_one(tmp_path, scenario):
+    export_onnx("vut1", tmp_path / "vut1.onnx", scenario=scenario)
+    cases = from_unit(np.random.default_rng(1).random((40, 3)), level=2, scenario=scenario)
     by_onnx, built_in = (
-        run_cases(factory(vut), cases) for vut in (f"onnx:{exported / 'vut1.onnx'}", "level1")
+        run_cases(factory(vut), cases) for vut in (f"onnx:{tmp_path / 'vut1.onnx'}", "level1")
     )
     for one, other in zip(by_onnx, built_in, strict=True):
         assert np.array_equal(one.motion, other.motion)
+
+
+def test_an_export_says_for_which_scenario_it_is_and_what_its_actions_are(exported, tmp_path):
+    done = CliRunner().invoke(app, ["policies", "export", "vut1", "--out", str(tmp_path / "a")])
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "a").read_bytes() == (exported / "vut1.onnx").read_bytes()
+    export_onnx("vut1", tmp_path / "b", scenario=HALF)
+    for path, expected in (("a", "-4 -3 -2 -1 0 1 2"), ("b", "-2 -1.5 -1 -0.5 0 0.5 1")):
+        said = ort.InferenceSession(tmp_path / path).get_modelmeta().custom_metadata_map
+        assert said["actions_mps2"] == expected
+        assert said["scenario"] == ("us23" if path == "a" else "multiple")
 
 
 def network(path, *, answer, dtype=None, width=4):

@@ -19,7 +19,7 @@ from merge_sumo.commands.shared import (
     app,
     show,
 )
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23
 
 policies = typer.Typer(help="The learned drivers as files for others.", no_args_is_help=True)
 app.add_typer(policies, name="policies")
@@ -99,13 +99,23 @@ def export_policy(
     name: Annotated[str, typer.Argument(help="pov1, vut1, pov2 or vut2.")],
     out: Annotated[Path, typer.Option(help="ONNX file to write.")],
     policies: PoliciesOption = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Scenario that it is to drive in.  [default: the one it was trained for]",
+        ),
+    ] = None,
 ) -> None:
     """Write a learned driver as an ONNX network, from the state to the action values.
 
     Example:  merge-sumo policies export vut1 --out vut1.onnx
     """
     from merge_sumo.drivers.onnx_export import export_onnx
-    from merge_sumo.drivers.policies import policies_in
+    from merge_sumo.drivers.policies import policies_in, policies_of
+    from merge_sumo.scenarios.scenario_file import named_scenario
 
-    export_onnx(name, out, None if policies is None else policies_in(policies))
+    played = None if scenario is None else named_scenario(scenario)
+    folder = policies_of(played or US23) if policies is None else policies_in(policies)
+    export_onnx(name, out, folder, played)
     show(out)

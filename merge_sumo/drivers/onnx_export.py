@@ -1,4 +1,4 @@
-"""The shipped policies as ONNX networks, from the state to the action values.
+"""Learned drivers as ONNX networks, from the state to the action values.
 
 The features are part of the graph. They are not written down a second time: the very function that
 computes them runs on columns that record what is done to them.
@@ -12,12 +12,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from merge_sumo.drivers.levelk import DECISION_STEPS, features
-from merge_sumo.drivers.policies import NETWORKS, load_network
+from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, features
+from merge_sumo.drivers.policies import NETWORKS, load_network, read_manifest, scenario_of
 from merge_sumo.drivers.vuts.onnx import PERIOD, STATE
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_new_file, write_new
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, Scenario
 
 OPSET: Final = 17
 IR_VERSION: Final = 8
@@ -38,12 +38,16 @@ _OPERATORS: Final = {
 }
 
 
-def export_onnx(name: str, path: Path, folder: Path | None = None) -> None:
+def export_onnx(
+    name: str, path: Path, folder: Path | None = None, scenario: Scenario | None = None
+) -> None:
     """Write a policy as an ONNX file; `UserError` when it is not there or cannot be written.
 
     Input `state`, double (N, 4): x_pov_m, v_pov_mps, x_vut_m, v_vut_mps; for a policy with a
     social value orientation also `svo_rad`, double (N, 1). Output `values`, double (N, 7): the
-    values of the accelerations -4 to +2 m/s2. The metadata hold the period of decisions.
+    values of the accelerations from the hardest braking to the hardest acceleration. The numbers of
+    a scenario are in the graph, by default of the one that the policy was trained for. The metadata
+    hold the period of decisions, the name of the scenario and the accelerations.
     """
     try:
         import onnx
@@ -54,6 +58,7 @@ def export_onnx(name: str, path: Path, folder: Path | None = None) -> None:
         raise UserError(f"there is no policy {name!r}: choose one of {', '.join(NETWORKS)}")
     check_new_file(path)
     network = load_network(name, folder)
+    played = scenario or scenario_of(read_manifest(folder)[name])
     graph = _Graph(helper, numpy_helper)
     # Typed as anything: what `features` takes for arrays are columns that record.
     state: list[Any] = [_Column(graph, c) for c in graph.node("Split", "state", outputs=4, axis=1)]
@@ -63,7 +68,7 @@ def export_onnx(name: str, path: Path, folder: Path | None = None) -> None:
         inputs.append(helper.make_tensor_value_info("svo_rad", TensorProto.DOUBLE, ["N", 1]))
         orientation = _Column(graph, "svo_rad")
     x_pov, v_pov, x_vut, v_vut = state
-    traced: Any = features(x_pov, v_pov, x_vut, v_vut, orientation)
+    traced: Any = features(x_pov, v_pov, x_vut, v_vut, orientation, played)
     hidden = traced.name
     last = len(network.layers) - 1
     for place, (weight, bias) in enumerate(network.layers):
@@ -81,7 +86,12 @@ def export_onnx(name: str, path: Path, folder: Path | None = None) -> None:
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
     )
-    helper.set_model_props(model, {PERIOD: f"{DECISION_STEPS * DT_S:g}"})
+    properties = {
+        PERIOD: f"{DECISION_STEPS * DT_S:g}",
+        "scenario": played.name,
+        "actions_mps2": " ".join(f"{a:g}" for a in actions_mps2(played)),
+    }
+    helper.set_model_props(model, properties)
     onnx.checker.check_model(model)
     write_new(path, model.SerializeToString())
 

@@ -88,7 +88,7 @@ def from_json(content: bytes, kind: type[Any]) -> Any:
     return value
 
 
-_BEGIN: Final = struct.Struct("<I8d")
+_BEGIN: Final = struct.Struct("<I10d")
 _HEAD: Final = struct.Struct("<IIII")
 """Episodes that begin, corridors, vehicles, and whether the cars that are met are told."""
 
@@ -103,9 +103,10 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
     for corridor, case in begun:
         scenario = case.scenario
         profile = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
+        limits = scenario.a_min_mps2, scenario.a_max_mps2
         headways = case.headway_ahead_s or math.nan, case.headway_behind_s or math.nan
         state = case.x_pov0_m, case.v_pov0_mps, case.v_vut0_mps
-        parts.append(_BEGIN.pack(corridor, *state, *headways, *profile))
+        parts.append(_BEGIN.pack(corridor, *state, *headways, *profile, *limits))
     arrays = [scene.active, scene.step, scene.x_m, scene.v_mps]
     if scene.facing is not None:
         arrays.append(scene.facing)
@@ -120,7 +121,13 @@ TINY_M: Final = 1e-9
 
 @lru_cache(maxsize=8)
 def _any_scenario(
-    x_vut0_m: float, level0_a_mps2: float, level0_v_mps: float, *, in_traffic: bool
+    x_vut0_m: float,
+    level0_a_mps2: float,
+    level0_v_mps: float,
+    a_min_mps2: float,
+    a_max_mps2: float,
+    *,
+    in_traffic: bool,
 ) -> Scenario:
     """Return a scenario with what a VUT is told of its own; of the rest it is told nothing."""
     headways_s = (1.0, 2.0) if in_traffic else None
@@ -129,7 +136,8 @@ def _any_scenario(
         x_vut0_m=x_vut0_m,
         level0_a_mps2=level0_a_mps2,
         level0_v_mps=level0_v_mps,
-        a_max_mps2=ANYTHING,
+        a_min_mps2=a_min_mps2,
+        a_max_mps2=a_max_mps2,
         headway_ahead_s=headways_s,
         headway_behind_s=headways_s,
         pov_length_m=TINY_M,
@@ -145,7 +153,7 @@ def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     begun = []
     for _ in range(count):
         corridor, x_pov0_m, v_pov0_mps, v_vut0_mps, *told = _BEGIN.unpack_from(content, at)
-        ahead_s, behind_s, *profile = told
+        ahead_s, behind_s, *of_scenario = told
         in_traffic = vehicles > 2
         case = Case(
             level=0,
@@ -154,7 +162,7 @@ def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
             v_vut0_mps=v_vut0_mps,
             headway_ahead_s=ahead_s if in_traffic else None,
             headway_behind_s=behind_s if in_traffic else None,
-            scenario=_any_scenario(*profile, in_traffic=in_traffic),
+            scenario=_any_scenario(*of_scenario, in_traffic=in_traffic),
         )
         begun.append((corridor, case))
         at += _BEGIN.size
