@@ -27,6 +27,9 @@ ROUNDING_MPS2: Final = 1e-9
 WRONGS: Final = (Exception, SystemExit)
 """A black box may raise anything; only a person's own interruption is not its doing."""
 
+OF_THE_POV: Final = "the POV: "
+"""Begins the reason of an error that is the doing of a POV."""
+
 MAX_LOSSES: Final = 2
 """A case that made the driver lose its memory so often, on its own, is not tried again."""
 
@@ -126,7 +129,9 @@ class _Rollout:
         """Start over what was running; yield the episode that is known to be at fault, if any."""
         running = np.flatnonzero(self.active).tolist()
         alone = len(running) == 1
-        end = End.SIM_ERROR if isinstance(lost, PovLostError) else End.VUT_ERROR
+        end, reason = End.VUT_ERROR, lost.reason
+        if isinstance(lost, PovLostError):
+            end, reason = End.SIM_ERROR, OF_THE_POV + lost.reason
         named = None if lost.corridor is None else lost.corridor % self.world.corridors
         guilty = running[0] if alone else named if named in running else None
         for corridor in running:
@@ -138,7 +143,7 @@ class _Rollout:
             self.losses[episode.index, end] += guilty is not None
             # Beside others it may have been a thread of theirs that struck it.
             if alone and (lost.final or self.losses[episode.index, end] >= MAX_LOSSES):
-                yield self.finish(corridor, end, lost.reason)
+                yield self.finish(corridor, end, reason)
             else:
                 self.suspects.append((episode.index, episode.case))
         self.errors.clear()
@@ -235,14 +240,13 @@ class _Rollout:
         """Return answers, (A, K), with 0 where one is no number; note whose doing that was."""
         finite = np.isfinite(answer)
         for row, corridor in np.argwhere(~finite & self.active).tolist():
+            said = f"answered {answer[row, corridor]}"
             if row == VUT:
-                end, reason = End.VUT_ERROR, self.raised or self.vut.reason(corridor)
+                error = End.VUT_ERROR, self.raised or self.vut.reason(corridor) or said
             else:
-                car = self.mainline.index(row)
-                place = car * self.world.corridors + corridor
-                end, reason = End.SIM_ERROR, self.pov.reason(place)
-            said = reason or f"answered {answer[row, corridor]}"
-            self.errors.setdefault(corridor, (end, said))
+                place = self.mainline.index(row) * self.world.corridors + corridor
+                error = End.SIM_ERROR, OF_THE_POV + (self.pov.reason(place) or said)
+            self.errors.setdefault(corridor, error)
         return np.where(finite, answer, 0.0)
 
     def finish(self, corridor: int, end: End, error: str | None = None) -> tuple[int, Trajectory]:

@@ -50,11 +50,11 @@ class OtherSeat(Driver):
         try:
             return self._driver.act(other)
         except VutLostError as lost:
-            raise PovLostError(_said(lost.reason), lost.corridor, final=lost.final) from lost
+            raise PovLostError(lost.reason, lost.corridor, final=lost.final) from lost
 
     def reason(self, corridor: int) -> str | None:
         """Return what the driver did wrong in a corridor."""
-        return _said(self._driver.reason(corridor) or "answered no number")
+        return self._driver.reason(corridor)
 
     def files(self) -> tuple[Path, ...]:
         """Return the files that the driver has loaded so far."""
@@ -63,10 +63,6 @@ class OtherSeat(Driver):
     def close(self) -> None:
         """Close the driver."""
         self._driver.close()
-
-
-def _said(reason: str) -> str:
-    return f"the POV: {reason}"
 
 
 def seen_from(case: Case, car: int) -> Case:
