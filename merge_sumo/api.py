@@ -27,6 +27,7 @@ from merge_sumo.campaigns.settings import (
 )
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.errors import UserError
+from merge_sumo.reports.coordinates import coordinates
 from merge_sumo.reports.summary import Summary, summarise
 from merge_sumo.reports.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
 from merge_sumo.samplers import DEFAULT_SAMPLER
@@ -39,11 +40,10 @@ from merge_sumo.values.trajectory import End, Trajectory
 
 MOST_ROWS: Final = 20
 """Rows that a notebook shows of a table."""
-IN_A_NOTEBOOK: Final = (
-    *("index", "level", "x_pov0_m", "v_pov0_mps", "svo_rad", "end"),
-    *("score", "dx_m", "dv_mps", "avoidable", "error"),
-)
-"""Columns that it shows; the rows hold all of `outcomes.jsonl`."""
+PLACE: Final = ("index", "level")
+VERDICT: Final = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
+"""Columns that it shows before and behind the coordinates of the case; the rows hold all of
+`outcomes.jsonl`."""
 
 
 class Table(list[dict[str, Any]]):
@@ -51,12 +51,15 @@ class Table(list[dict[str, Any]]):
 
     def __init__(self, outcomes: Iterable[Outcome]) -> None:
         """Take the rows of outcomes, in their order."""
-        super().__init__(outcome.to_record() for outcome in outcomes)
+        taken = list(outcomes)
+        super().__init__(outcome.to_record() for outcome in taken)
+        scenario = taken[0].case.scenario if taken else US23
+        self._columns = (*PLACE, *(c.field for c in coordinates(scenario)), *VERDICT)
 
     def _repr_html_(self) -> str:
-        head = "".join(f"<th>{name}</th>" for name in IN_A_NOTEBOOK)
+        head = "".join(f"<th>{name}</th>" for name in self._columns)
         body = "".join(
-            "<tr>" + "".join(f"<td>{_cell(row[name])}</td>" for name in IN_A_NOTEBOOK) + "</tr>"
+            "<tr>" + "".join(f"<td>{_cell(row[name])}</td>" for name in self._columns) + "</tr>"
             for row in self[:MOST_ROWS]
         )
         more = f"<p>{len(self) - MOST_ROWS} more rows</p>" if len(self) > MOST_ROWS else ""

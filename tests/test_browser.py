@@ -14,6 +14,8 @@ from handmade import write_run
 
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.reports import report, report_facts
+from merge_sumo.reports.coordinates import WRITTEN
+from merge_sumo.scenarios.scenario_file import named_scenario
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
@@ -36,6 +38,18 @@ def made(tmp_path_factory) -> Run:
     run = write_run(tmp_path_factory.mktemp("browser") / "run", error=None)
     report.write_report(run)
     return run
+
+
+FIELDS = {name: field for field, (name, *_) in WRITTEN.items()}
+INSIDE = """() => {
+    const all = road.getBoundingClientRect();
+    return Object.values(cars).map(({ group }) => {
+        const car = group.getBoundingClientRect();
+        return car.left >= all.left && car.right <= all.right
+            && car.top >= all.top && car.bottom <= all.bottom;
+    });
+}"""
+"""Whether each car is in the picture."""
 
 
 @contextmanager
@@ -99,15 +113,17 @@ def test_it_starts_with_the_worst_case(page, made):
 
 
 def test_the_slider_shows_the_cases_near_a_psi(page, made):
-    page.locator("#psi").fill("0.2")
-    assert "0.20 rad" in page.inner_text("#psi-value")
+    third = page.locator(".map[data-level='2'] .third")
+    slider, value = third.locator("input[type=range]"), third.locator("output")
+    slider.fill("0.2")
+    assert value.inner_text() == "0.20 rad (11°)"
     all_of_level = sum(o.case.level == 2 for o in made.outcomes)
     near = sum(o.case.level == 2 and abs(o.case.svo_rad - 0.2) <= 0.1 for o in made.outcomes)
     assert marks(page, ".mark.faint") == all_of_level - near
-    page.locator("#psi").focus()
+    slider.focus()
     page.keyboard.press("ArrowRight")
-    assert "0.21 rad" in page.inner_text("#psi-value")
-    page.locator("#psi-all").check()
+    assert value.inner_text().startswith("0.21 rad")
+    third.locator("input[type=checkbox]").check()
     assert marks(page, ".mark.faint") == 0
 
 
@@ -246,15 +262,72 @@ def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch
     run = write_run(tmp_path / "run", per_level=3, error=None)
     with shown(browser, report.write_report(run)) as page:
         for step in ("0", "0.5 * moving.rows", "moving.rows - 1"):
-            inside = page.evaluate(
-                f"""() => {{
-                    at({step});
-                    const all = road.getBoundingClientRect();
-                    return Object.values(cars).map(({{ group }}) => {{
-                        const car = group.getBoundingClientRect();
-                        return car.left >= all.left && car.right <= all.right
-                            && car.top >= all.top && car.bottom <= all.bottom;
-                    }});
-                }}"""
-            )
-            assert inside == [True, True]
+            page.evaluate(f"at({step})")
+            assert page.evaluate(INSIDE) == [True, True]
+
+
+@pytest.fixture(scope="module")
+def in_traffic(tmp_path_factory) -> Run:
+    folder = tmp_path_factory.mktemp("traffic") / "run"
+    run = write_run(folder, per_level=40, error=None, scenario=named_scenario("us23-traffic"))
+    report.write_report(run)
+    return run
+
+
+def drawn_at(page, outcome, axes: tuple[str, str]) -> tuple[float, float]:
+    """Return how far a mark is from where a case is in two coordinates, as shares of the map."""
+    level = outcome.case.level
+    dims = {d.field: d for d in outcome.case.scenario.dimensions(level)}
+    frame = page.locator(f".map[data-level='{level}'] .frame").bounding_box()
+    box = page.locator(f".map [data-case='{outcome.index}'].mark").bounding_box()
+    x = (box["x"] + box["width"] / 2 - frame["x"]) / frame["width"]
+    y = 1.0 - (box["y"] + box["height"] / 2 - frame["y"]) / frame["height"]
+    u, v = (
+        (getattr(outcome.case, name) - dims[name].low) / (dims[name].high - dims[name].low)
+        for name in axes
+    )
+    return x - u, y - v
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"viewport": {"width": 1280, "height": 900}},
+        {"viewport": {"width": 380, "height": 800}},
+        {"color_scheme": "dark"},
+    ],
+    ids=["wide", "narrow", "dark"],
+)
+def test_a_campaign_in_traffic_fits_the_window_too(browser, in_traffic, options):
+    with shown(browser, in_traffic.folder / report.REPORT, **options) as page:
+        width = page.evaluate("document.documentElement.scrollWidth")
+        assert width <= page.viewport_size["width"]
+        assert page.locator(".map .mark").count() == len(in_traffic.outcomes)
+
+
+def test_of_more_coordinates_the_reader_chooses_a_pair(browser, in_traffic):
+    worst = failures(in_traffic.outcomes)[0]
+    level = worst.case.level
+    with shown(browser, in_traffic.folder / report.REPORT) as page:
+        for choice in page.locator(f".map[data-level='{level}'] option").all_inner_texts():
+            page.locator(f".map[data-level='{level}'] select").select_option(choice)
+            axes = [name.strip() for name in choice.partition(":")[0].split("×")]
+            fields = tuple(FIELDS[name] for name in axes)
+            assert drawn_at(page, worst, fields) == pytest.approx((0.0, 0.0), abs=0.02)
+            words = page.locator(f".map[data-level='{level}'] > svg text").all_text_contents()
+            assert [w.partition(",")[0] for w in words[-2:]] == axes
+
+
+def test_all_cars_are_drawn_and_say_which_one_the_vut_meets(browser, in_traffic):
+    index = next(o.index for o in in_traffic.outcomes if o.measures.nearest == "behind")
+    with shown(browser, in_traffic.folder / report.REPORT) as page:
+        page.evaluate(f"show(place.get({index}))")
+        inside = page.evaluate(INSIDE)
+        assert inside == [True] * 4
+        labels = page.locator("#road text").all_text_contents()
+        assert [label.split()[0] for label in labels] == ["POV", "VUT", "ahead", "behind"]
+        for chart in ("speed", "position"):
+            assert page.locator(f"#chart-{chart} .line").count() == 4
+        assert page.locator("#chart-gap .line.behind").count() == 1
+        assert "headway behind" in page.inner_text("#case-title")
+        assert "car behind" in page.inner_text("#case-words")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from merge_sumo.reports.diagnosis import MEANING, Diagnosis, Kind, diagnose, failure_boxes
-from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import BEHIND, DT_S, POV, VUT
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -66,6 +69,25 @@ class TestWhoYields:
     def test_a_pov_from_when_it_brakes(self):
         found = diagnosed(meeting(BRAKES, LEVEL0))
         assert (found.pov_yields_s, found.vut_yields_s) == (3.0, None)
+
+    def test_in_traffic_the_car_that_the_vut_meets(self):
+        pair = meeting(BRAKES, LEVEL0)
+        ahead = pair.motion[:, POV] + [60.0, 0.0, 0.0]
+        # The POV keeps its speed far away; the car behind is the one that arrives with the VUT.
+        pov = drive(-400.0, 30.0, KEEP)
+        motion = np.stack([pov, pair.motion[:, VUT], ahead, pair.motion[:, POV]], axis=1)
+        case = Case(
+            level=1,
+            x_pov0_m=-400.0,
+            v_pov0_mps=30.0,
+            headway_ahead_s=2.0,
+            headway_behind_s=2.0,
+            scenario=named_scenario("us23-traffic"),
+        )
+        met = Trajectory(case, motion, End.MERGED)
+        assert measure(met).nearest == "behind"
+        assert diagnosed(met).pov_yields_s == 3.0
+        assert kind(met) is Kind.FORCED_MERGE
 
     def test_a_vut_from_when_it_coasts(self):
         found = diagnosed(meeting(KEEP, COASTS))
@@ -190,3 +212,18 @@ class TestRegions:
     def test_of_a_level_where_everything_fails_are_the_whole_pool(self):
         (box,) = failure_boxes(over_the_pool(lambda x, v: True), 1, {})
         assert (box.where, box.failures) == ("anywhere", box.cases)
+
+
+def test_regions_in_traffic_speak_of_when_other_cars_are_due():
+    scenario = named_scenario("us23-traffic")
+    rng = np.random.default_rng(0)
+    outcomes = []
+    for index, case in enumerate(from_unit(rng.random((400, 4)), 0, scenario=scenario)):
+        x_m, v_mps = case.starts()[BEHIND]
+        fails = 11.0 < -x_m / v_mps < 11.7
+        score = -900.0 if fails else -10.0
+        trajectory = Trajectory(case, np.zeros((2, 4, 3)), End.MERGED)
+        outcomes.append(Outcome(index, 0, case, replace(measure(trajectory), score=score)))
+    first, *_ = failure_boxes(outcomes, 0, {})
+    assert first.where == "car behind due at M (at constant speed) between 10.99 and 11.70 s"
+    assert first.failures > 0.8 * sum(o.failed for o in outcomes)

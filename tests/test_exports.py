@@ -21,9 +21,10 @@ from merge_sumo import cli
 from merge_sumo.campaigns.conductor import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
-from merge_sumo.reports.exports import COLUMNS, write_folders, write_openscenario, write_table
+from merge_sumo.reports.exports import columns_of, write_folders, write_openscenario, write_table
+from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.road import road_of
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import BEHIND, DT_S, US23
 
 
 @pytest.fixture(scope="module")
@@ -132,19 +133,43 @@ class TestATable:
         path = write_table(made, [0, 3], tmp_path, "csv")
         with path.open(newline="") as file:
             header, *rows = csv.reader(file)
-        assert tuple(header) == COLUMNS
+        assert header == [
+            *("case", "level", "time_s", "x_pov_m", "v_pov_mps", "a_pov_mps2"),
+            *("x_vut_m", "v_vut_mps", "a_vut_mps2", "x_pov0_m", "v_pov0_mps", "svo_rad"),
+        ]
         motion = np.concatenate([made.trajectory(i).motion for i in (0, 3)])
         assert np.array_equal(
-            np.array([row[3:] for row in rows], dtype=float), motion.reshape(-1, 6)
+            np.array([row[3:9] for row in rows], dtype=float), motion.reshape(-1, 6)
         )
+        case = made.outcome(0).case
+        assert [float(cell) for cell in rows[5][9:11]] == [case.x_pov0_m, case.v_pov0_mps]
+        assert rows[5][11] == "", "level 0 has no psi"
         assert {row[0] for row in rows} == {"0", "3"}
         assert float(rows[5][2]) == pytest.approx(5 * DT_S)
 
     def test_is_the_same_in_parquet(self, made, tmp_path):
         frame = polars.read_parquet(write_table(made, [0, 3], tmp_path, "parquet"))
         text = polars.read_csv(write_table(made, [0, 3], tmp_path, "csv"))
-        assert frame.columns == list(COLUMNS)
+        assert frame.columns == list(columns_of(US23))
         assert frame.rows() == text.rows()
+
+    @pytest.mark.parametrize("file_format", ["csv", "parquet"])
+    def test_has_all_cars_and_all_coordinates_of_the_case(self, tmp_path, file_format):
+        scenario = named_scenario("us23-traffic")
+        run = write_run(tmp_path / "run", 2, levels=(1, 2), error=None, scenario=scenario)
+        path = write_table(run, [0, 1], tmp_path / "table", file_format)
+        frame = (polars.read_csv if file_format == "csv" else polars.read_parquet)(path)
+        assert frame.columns[9:15] == [
+            *("x_ahead_m", "v_ahead_mps", "a_ahead_mps2"),
+            *("x_behind_m", "v_behind_mps", "a_behind_mps2"),
+        ]
+        first, second = frame.filter(time_s=0.0).to_dicts()
+        for row, outcome in zip((first, second), run.outcomes, strict=False):
+            case = outcome.case
+            for name in ("x_pov0_m", "v_pov0_mps", "headway_ahead_s", "headway_behind_s"):
+                assert row[name] == getattr(case, name)
+            assert row["svo_rad"] == case.svo_rad
+            assert row["x_behind_m"] == case.starts()[BEHIND][0]
 
     def test_is_not_written_over(self, made, tmp_path):
         (tmp_path / "trajectories.csv").write_text("mine")

@@ -18,7 +18,6 @@ from merge_sumo.drivers.levelk import FEATURES, QNetwork, actions_mps2, features
 from merge_sumo.drivers.policies import NETWORKS, load_driver, load_network, read_manifest
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.training import check as checking
 from merge_sumo.training.best_response import best_response
@@ -198,10 +197,7 @@ class TestTheExampleRuns:
     @pytest.fixture(scope="class")
     @classmethod
     def examples(cls):
-        with World(1, road_of()) as world:
-            return {
-                name: make_scenarios.play(e, world) for name, e in make_scenarios.EXAMPLES.items()
-            }
+        return {name: make_scenarios.play(e) for name, e in make_scenarios.EXAMPLES.items()}
 
     def test_1_the_level1_pov_slows_and_the_level0_vut_merges_first(self, examples):
         run = examples["pov-yields"]

@@ -21,7 +21,6 @@ from merge_sumo.campaigns.settings import CampaignSettings, software
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
-from merge_sumo.samplers.base import uniform_points
 from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import (
     InProcess,
@@ -131,7 +130,7 @@ class TestAWorkerThatDies:
         assert found == [(place, -7 if place == 7 else place * place) for place in range(20)]
 
     def test_at_a_case_makes_it_a_sim_error_with_a_reason(self):
-        cases = from_unit(uniform_points(4, 0, np.random.default_rng(0)), 0)
+        cases = from_unit(np.random.default_rng(0).random((4, 2)), 0)
         plan = GroundPlan(vut=vut_factory("design1"), corridors=4, net=road_of(), povs=Povs())
         with open_workers(2) as workers:
             work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})

@@ -1,6 +1,6 @@
 """Make the folders of scenarios/ again: `python tools/make_scenarios.py`.
 
-Plays each case in SUMO, writes it as a replay folder, and draws positions and speeds of both
+Plays each case in SUMO, writes it as a replay folder, and draws positions and speeds of all
 vehicles into `motion.png` beside it. Needs matplotlib.
 """
 
@@ -9,20 +9,25 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
-from merge_sumo.campaigns.rollout import rollout
-from merge_sumo.drivers.pov import PovLibrary
-from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.campaigns.ground import ProvingGround, road_for
+from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.sumo.road import road_of
-from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import RECORDED_IN_TRAFFIC, Case
 from merge_sumo.values.scenario import DT_S
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import Trajectory
 
+STYLES: dict[str, dict[str, Any]] = {
+    "POV": {"color": "#d62728"},
+    "VUT": {"color": "#1f77b4"},
+    "car ahead": {"color": "#e69f00", "linestyle": "--"},
+    "car behind": {"color": "#e69f00", "linestyle": ":"},
+}
+"""Lines of the vehicles, in the order of their rows."""
 SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
 
 
@@ -34,8 +39,24 @@ class Example:
     case: Case
 
 
-def _case(level: int, x_pov0_m: float, v_pov0_mps: float, svo_rad: float | None = None) -> Case:
-    return Case(level=level, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, svo_rad=svo_rad)
+def _case(
+    level: int,
+    x_pov0_m: float,
+    v_pov0_mps: float,
+    svo_rad: float | None = None,
+    headways_s: tuple[float, float] | None = None,
+) -> Case:
+    """Return a case of us23, or with headways ahead and behind one of us23-traffic."""
+    case: dict[str, Any] = {
+        "level": level,
+        "x_pov0_m": x_pov0_m,
+        "v_pov0_mps": v_pov0_mps,
+        "svo_rad": svo_rad,
+    }
+    if headways_s is not None:
+        case |= dict(zip(RECORDED_IN_TRAFFIC, headways_s, strict=True))
+        case |= {"scenario": named_scenario("us23-traffic")}
+    return Case(**case)
 
 
 EXAMPLES = {
@@ -43,27 +64,27 @@ EXAMPLES = {
     "vut-waits": Example("level1", _case(2, -273.0, 33.0, 0.6)),
     "stalemate": Example("design2", _case(2, -294.5, 34.125, 0.6)),
     "no-reaction": Example("design1", _case(0, -269.0, 31.0)),
+    "queue": Example("design2", _case(0, -204.0, 26.4, headways_s=(1.2, 1.3))),
 }
 
 
-def play(example: Example, world: World) -> Trajectory:
+def play(example: Example) -> Trajectory:
     """Play one example in SUMO."""
-    vut = vut_factory(example.vut)(world.corridors)
-    ((_, trajectory),) = rollout(world, PovLibrary(world.corridors), vut, [example.case])
+    with ProvingGround(example.vut, 1, scenario=example.case.scenario) as ground:
+        ((_, trajectory),) = ground.run([example.case])
     return trajectory
 
 
 def draw(trajectory: Trajectory, title: str, path: Path) -> None:
-    """Draw positions and speeds of both vehicles over time."""
+    """Draw positions and speeds of all vehicles over time."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     time_s = [step * DT_S for step in range(len(trajectory.motion))]
-    for axes, unit, pov, vut in (
-        (left, "distance to M in m", trajectory.x_pov_m, trajectory.x_vut_m),
-        (right, "speed in m/s", trajectory.v_pov_mps, trajectory.v_vut_mps),
-    ):
-        axes.plot(time_s, pov, color="#d62728", label="POV")
-        axes.plot(time_s, vut, color="#1f77b4", label="VUT")
+    vehicles = trajectory.motion.shape[1]
+    for axes, column, unit in ((left, 0, "distance to M in m"), (right, 1, "speed in m/s")):
+        for row, (label, style) in enumerate(STYLES.items()):
+            if row < vehicles:
+                axes.plot(time_s, trajectory.motion[:, row, column], label=label, **style)
         axes.set_xlabel("time in s")
         axes.set_ylabel(unit)
         axes.grid(alpha=0.3)
@@ -78,24 +99,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=SCENARIOS)
     out = parser.parse_args().out
-    road = road_of()
-    with World(1, road) as world:
-        for name, example in EXAMPLES.items():
-            trajectory = play(example, world)
-            measures = measure(trajectory)
-            folder = out / name
-            write_scenario(folder, road, Outcome(0, 0, example.case, measures), trajectory)
-            case = example.case
-            pov = f"POV level {case.level}" + (
-                "" if case.svo_rad is None else f" psi {case.svo_rad}"
-            )
-            dx = "" if measures.dx_m is None else f", dx {measures.dx_m:.1f} m"
-            title = f"{pov}, VUT {example.vut}: {measures.end.lower()}{dx}"
-            draw(trajectory, title, folder / "motion.png")
-            print(
-                f"{name}: {title}; hardest braking of the VUT {measures.vut_max_brake_mps2:.1f}, "
-                f"of the POV {measures.pov_max_brake_mps2:.1f} m/s2"
-            )
+    for name, example in EXAMPLES.items():
+        case, folder = example.case, out / name
+        trajectory = play(example)
+        measures = measure(trajectory)
+        outcome = Outcome(0, 0, case, measures)
+        write_scenario(folder, road_for(case.scenario), outcome, trajectory)
+        pov = f"POV level {case.level}" + ("" if case.svo_rad is None else f" psi {case.svo_rad}")
+        dx = "" if measures.dx_m is None else f", dx {measures.dx_m:.1f} m"
+        if case.scenario.vehicles > 2:
+            dx += f" to the car {measures.nearest}" if measures.nearest != "pov" else " to the POV"
+        title = f"{pov}, VUT {example.vut}: {measures.end.lower()}{dx}"
+        draw(trajectory, title, folder / "motion.png")
+        print(
+            f"{name}: {title}; hardest braking of the VUT {measures.vut_max_brake_mps2:.1f}, "
+            f"of the POV {measures.pov_max_brake_mps2:.1f} m/s2"
+        )
 
 
 if __name__ == "__main__":

@@ -78,6 +78,8 @@ class _Rollout:
         self.step = np.zeros(corridors, dtype=np.int64)
         self.clipped = np.zeros(corridors, dtype=np.int64)
         self.errors: dict[int, tuple[End, str]] = {}
+        self.raised: str | None = None
+        """What the VUT raised instead of its last answer."""
         self.a_min = np.zeros((vehicles, corridors))
         self.a_max = np.zeros((vehicles, corridors))
         self.timeout_at = np.full(corridors, NEVER)
@@ -200,52 +202,47 @@ class _Rollout:
         x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
         scene = Scene(self.active, self.step, x_m, v_mps)
         answer = np.empty(x_m.shape)
-        answer[self.mainline] = self.ask_pov(scene.of_mainline()).reshape(-1, x_m.shape[1])
+        answer[self.mainline] = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
         if following is None:
             answer[VUT] = self.ask_vut(scene)
         else:
             following.limit(answer, x_m, v_mps)
             met = following.met(x_m, v_mps)
             answer[VUT] = self.ask_vut(Scene(self.active, self.step, x_m, v_mps, met))
+        if not math.isfinite(answer.sum()):
+            answer = self.only_numbers(answer)
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
         self.clipped += np.abs(acceleration[VUT] - answer[VUT]) > ROUNDING_MPS2
         self.record[(self.row - 1) % RING_ROWS, :, 2] = acceleration
         return acceleration
 
-    def ask_pov(self, scene: Scene) -> FloatArray:
-        """Return the answers of the mainline's cars, (C K,), with 0 where one was no number."""
-        answer = self.pov.act(scene)
-        if math.isfinite(answer.sum()):
-            return answer
-        return self.only_numbers(answer, self.pov, End.SIM_ERROR)
-
     def ask_vut(self, scene: Scene) -> FloatArray:
-        """Return the VUT's answer, with 0 where it was no answer; note what was wrong."""
+        """Return the VUT's answer, (K,); no numbers, and a note, where it has raised something."""
         corridors = self.world.corridors
-        raised: str | None = None
+        self.raised = None
         try:
             answer = np.asarray(self.vut.act(scene), dtype=np.float64)
             if answer.shape != (corridors,):
                 raise ValueError(f"answered shape {answer.shape} instead of ({corridors},)")
+            return answer
         except (SimulationError, VutLostError):
             raise
         except WRONGS as error:
-            answer = np.full(corridors, np.nan)
-            raised = f"{type(error).__name__}: {error}"
-        if math.isfinite(answer.sum()):
-            return answer
-        return self.only_numbers(answer, self.vut, End.VUT_ERROR, raised)
+            self.raised = f"{type(error).__name__}: {error}"
+            return np.full(corridors, np.nan)
 
-    def only_numbers(
-        self, answer: FloatArray, driver: Driver, end: End, raised: str | None = None
-    ) -> FloatArray:
-        """Return answers with 0 where they are not finite; note why, and how the episodes end."""
+    def only_numbers(self, answer: FloatArray) -> FloatArray:
+        """Return answers, (A, K), with 0 where one is no number; note whose doing that was."""
         finite = np.isfinite(answer)
-        for place in np.flatnonzero(~finite).tolist():
-            corridor = place % self.world.corridors
-            if self.active[corridor]:
-                reason = raised or driver.reason(place) or f"answered {answer[place]}"
-                self.errors.setdefault(corridor, (end, reason))
+        for row, corridor in np.argwhere(~finite & self.active).tolist():
+            if row == VUT:
+                end, reason = End.VUT_ERROR, self.raised or self.vut.reason(corridor)
+            else:
+                car = self.mainline.index(row)
+                place = car * self.world.corridors + corridor
+                end, reason = End.SIM_ERROR, self.pov.reason(place)
+            said = reason or f"answered {answer[row, corridor]}"
+            self.errors.setdefault(corridor, (end, said))
         return np.where(finite, answer, 0.0)
 
     def finish(self, corridor: int, end: End, error: str | None = None) -> tuple[int, Trajectory]:

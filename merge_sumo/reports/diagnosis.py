@@ -17,8 +17,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.reports.coordinates import Coordinate, coordinates
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, level_name
+from merge_sumo.values.scenario import (
+    AHEAD,
+    BEHIND,
+    DT_S,
+    POV,
+    VEHICLES,
+    VUT,
+    Scenario,
+    level_name,
+)
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -64,7 +74,11 @@ class Diagnosis:
 
 
 def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
-    """Return who yielded in an episode and which kind of failure it was."""
+    """Return who yielded in an episode and which kind of failure it was.
+
+    In traffic the POV is the car that the measures are of: the one that the VUT meets.
+    """
+    trajectory = trajectory.facing(VEHICLES.index(measures.nearest))
     time_s = np.arange(len(trajectory.motion)) * DT_S
     v_vut, v_pov = trajectory.v_vut_mps, trajectory.v_pov_mps
     scenario = trajectory.case.scenario
@@ -116,24 +130,37 @@ class Feature:
     value: Callable[[Case], float]
 
 
-X_FEATURE: Final = Feature("x_POV0", "m", 0, lambda case: case.x_pov0_m)
-V_FEATURE: Final = Feature("v_POV0", "m/s", 1, lambda case: case.v_pov0_mps)
-DUE_FEATURE: Final = Feature(
-    "POV due at M (at constant speed)",
-    "s",
-    2,
-    lambda case: (
-        -case.x_pov0_m / case.v_pov0_mps if case.v_pov0_mps > 0.0 else case.scenario.timeout_s
-    ),
-)
-"""Failures lie in bands along which the POV would reach M at the same time."""
-SVO_FEATURE: Final = Feature("psi", "rad", 2, lambda case: case.svo_rad or 0.0)
+DECIMALS: Final = {"m": 0, "m/s": 1, "s": 2, "rad": 2}
+"""With which bounds of regions are written, by unit."""
+NAMED: Final = {POV: "POV", AHEAD: "car ahead", BEHIND: "car behind"}
 
 
-def features(level: int) -> tuple[Feature, ...]:
-    """Return what sentences on a level speak of."""
-    common = (DUE_FEATURE, V_FEATURE, X_FEATURE)
-    return (*common, SVO_FEATURE) if level == 2 else common
+def features(scenario: Scenario, level: int) -> tuple[Feature, ...]:
+    """Return what sentences on a level speak of.
+
+    Beside the coordinates it is the time at which a car would reach M at constant speed: failures
+    lie in bands along which it is the same.
+    """
+    x, v, *others = (_of_coordinate(c) for c in coordinates(scenario, (level,)))
+    cars = [row for row in range(scenario.vehicles) if row != VUT]
+    return (*(_due(row) for row in cars), v, x, *others)
+
+
+def _of_coordinate(coordinate: Coordinate) -> Feature:
+    return Feature(
+        coordinate.name,
+        coordinate.unit,
+        DECIMALS[coordinate.unit],
+        lambda case: coordinate.of(case) or 0.0,
+    )
+
+
+def _due(row: int) -> Feature:
+    def due_s(case: Case) -> float:
+        x_m, v_mps = case.starts()[row]
+        return -x_m / v_mps if v_mps > 0.0 else case.scenario.timeout_s
+
+    return Feature(f"{NAMED[row]} due at M (at constant speed)", "s", 2, due_s)
 
 
 MOST_BOXES: Final = 10
@@ -204,7 +231,7 @@ def failure_boxes(
     failed = np.array([o.failed for o in told], dtype=bool)
     if failed.sum() < FEWEST_FAILURES:
         return []
-    told_of = features(level)
+    told_of = features(told[0].case.scenario, level)
     places = np.array([[feature.value(o.case) for feature in told_of] for o in told])
     tree = DecisionTreeClassifier(
         max_leaf_nodes=MOST_BOXES,

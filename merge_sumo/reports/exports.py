@@ -19,6 +19,7 @@ import numpy as np
 from merge_sumo.campaigns.conductor import case_name
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
+from merge_sumo.reports.coordinates import coordinates
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
@@ -26,10 +27,6 @@ from merge_sumo.system.folders import check_new, check_place, make_place, new_fi
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
 TABLE: Final = "trajectories"
-COLUMNS: Final = (
-    *("case", "level", "time_s", "x_pov_m", "v_pov_mps", "a_pov_mps2"),
-    *("x_vut_m", "v_vut_mps", "a_vut_mps2"),
-)
 ROAD: Final = "road.xodr"
 _EPOCH: Final = datetime(2000, 1, 1)
 MINOR_VERSION: Final = 2
@@ -63,6 +60,16 @@ def write_sumo(run: Run, index: int, folder: Path, road: Corridor) -> Path:
     return write_scenario(folder, road, run.outcome(index), run.trajectory(index))
 
 
+def columns_of(scenario: Scenario) -> tuple[str, ...]:
+    """Return the columns of a table: time and motion of all vehicles, then the case again."""
+    motion = [
+        f"{what}_{who}_{unit}"
+        for who in VEHICLES[: scenario.vehicles]
+        for what, unit in (("x", "m"), ("v", "mps"), ("a", "mps2"))
+    ]
+    return ("case", "level", "time_s", *motion, *(c.field for c in coordinates(scenario)))
+
+
 def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str) -> Path:
     """Write the motion of cases as one table, "csv" or "parquet", one row a step; return its path.
 
@@ -73,32 +80,35 @@ def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str
     check_new(path)
     if file_format == "parquet":
         polars = _need("polars")
-    rows = _rows(run, indices)
+    columns, rows = columns_of(run.scenario), _rows(run, indices)
     make_place(folder)
     with new_file(path) as file:
         if file_format == "parquet":
             # Not into the file: where that cannot be written, polars raises an error of its own.
             content = io.BytesIO()
-            polars.DataFrame(rows, schema=list(COLUMNS), orient="row").write_parquet(content)
+            numbers = dict.fromkeys(columns, polars.Float64)
+            schema = numbers | dict.fromkeys(("case", "level"), polars.Int64)
+            polars.DataFrame(rows, schema, orient="row").write_parquet(content)
             file.write(content.getbuffer())
         else:
             text = io.TextIOWrapper(file, encoding="utf-8", newline="")
             writer = csv.writer(text)
-            writer.writerow(COLUMNS)
+            writer.writerow(columns)
             writer.writerows(rows)
             text.flush()
             text.detach()
     return path
 
 
-def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float, ...]]:
-    rows: list[tuple[float, ...]] = []
+def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float | None, ...]]:
+    rows: list[tuple[float | None, ...]] = []
     for index in indices:
         trajectory = run.trajectory(index)
-        level = trajectory.case.level
+        case = trajectory.case
+        place = [c.of(case) for c in coordinates(run.scenario)]
         motion = trajectory.motion.reshape(len(trajectory.motion), -1)
         for step, state in enumerate(motion.tolist()):
-            rows.append((index, level, round(step * DT_S, 1), *state))
+            rows.append((index, case.level, round(step * DT_S, 1), *state, *place))
     return rows
 
 

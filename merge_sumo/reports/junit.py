@@ -15,6 +15,7 @@ from lxml import etree
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
+from merge_sumo.reports.coordinates import described
 from merge_sumo.reports.verdict import (
     NOTHING_TESTED,
     GateResult,
@@ -90,9 +91,7 @@ def _gates(root: etree._Element, verdict: Verdict, gates: Sequence[GateResult]) 
 
 def _case(suite: etree._Element, outcome: Outcome) -> None:
     case, measures = outcome.case, outcome.measures
-    name = (
-        f"case {outcome.index}: x_POV0 {case.x_pov0_m:.1f} m, v_POV0 {case.v_pov0_mps:.2f} m/s"
-    ) + ("" if case.svo_rad is None else f", psi {case.svo_rad:.2f} rad")
+    name = f"case {outcome.index}: {described(case)}"
     test = _test(suite, name, f"{CLASS}.level{level_name(case.level)}", measures.t_end_s)
     if measures.end.is_error:
         _wrong(test, "error", measures.end.value, message_of(measures))

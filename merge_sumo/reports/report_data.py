@@ -10,31 +10,26 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.campaigns.conductor import SCENARIOS, case_name
-from merge_sumo.campaigns.truth import Truth
+from merge_sumo.reports.coordinates import Coordinate
 from merge_sumo.reports.diagnosis import (
     Diagnosis,
     Kind,
 )
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, Facts
-from merge_sumo.reports.surface import Surface
+from merge_sumo.reports.report_maps import maps_of
 from merge_sumo.reports.verdict import shortened
 from merge_sumo.sumo.corridor import Corridor, LanePath
-from merge_sumo.values.case import FloatArray, dimensions, to_unit
-from merge_sumo.values.fmc import RADIUS, fmc
-from merge_sumo.values.scenario import ALL_LEVELS, DT_S, POV, VUT, level_name
-from merge_sumo.values.score import FAILURE_SCORE
+from merge_sumo.values.case import to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
 from merge_sumo.values.trajectory import End, Trajectory
 
-COUNT_GRID: Final = (32, 20)
+SVO_NEAR_RAD: Final = 0.1
+NEAR_SHARE: Final = 1.0 / 16.0
 SPEED_UNIT_MPS: Final = 0.002
 """Speeds are kept as whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
-GRID: Final = {2: (97, 97, 1), 3: (49, 49, 17)}
-"""Nodes of the maps in x_POV0, v_POV0 and psi, by the level's number of dimensions."""
-NEIGHBOURS: Final = 3
-"""Cases of the truth that decide whether a node of the map fails."""
 MOST_STEPS: Final = 40
 """Batches, or groups of batches, in the charts of the search."""
 MOST_BALLS: Final = 20_000
@@ -48,14 +43,10 @@ def page_data(facts: Facts) -> dict[str, Any]:
     return {
         "dt": DT_S,
         "crash_m": facts.run.scenario.dx_crash_m,
-        "radius": RADIUS,
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
-        "x_vut0_m": facts.run.scenario.x_vut0_m,
         "speed_unit_mps": SPEED_UNIT_MPS,
-        "dimensions": {
-            name: [round(d.low, 4), round(d.high, 4)]
-            for name, d in zip(("x", "v", "psi"), facts.run.scenario.dimensions(2), strict=True)
-        },
+        "coordinates": [_coordinate(c) for c in facts.coordinates],
+        "vehicles": VEHICLES[: facts.run.scenario.vehicles],
         "ends": [end.value for end in End],
         "kinds": [kind.value for kind in Kind],
         "cases": _columns(facts, offsets),
@@ -65,15 +56,7 @@ def page_data(facts: Facts) -> dict[str, Any]:
             if o.measures.error
         },
         "speeds": speeds,
-        "counts": _counts(facts),
-        "chance": {
-            level: None if surface is None else _chance_grid(surface, level)
-            for level, surface in facts.surfaces.items()
-        },
-        "truth": {
-            level: None if truth is None else _truth_grid(truth, level)
-            for level, truth in facts.truths.items()
-        },
+        "maps": _maps(facts),
         "search": _search(facts),
         "commands": _commands(facts),
         "export": f"merge-sumo export {_quoted(facts.run.folder)}",
@@ -90,9 +73,9 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
         row = {
             "index": o.index,
             "level": o.case.level,
-            "x": round(o.case.x_pov0_m, 3),
-            "v": round(o.case.v_pov0_mps, 4),
-            "psi": _rounded(o.case.svo_rad, 4),
+            **{c.field: _rounded(c.of(o.case), c.digits + 2) for c in facts.coordinates},
+            "starts": [round(x_m, 3) for x_m, _ in o.case.starts()],
+            "nearest": VEHICLES.index(o.measures.nearest),
             "end": ends.index(o.measures.end),
             "failed": int(o.failed),
             "score": _rounded(o.measures.score, 1),
@@ -111,23 +94,33 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
     return columns or {"index": []}
 
 
-def _counts(facts: Facts) -> dict[int, dict[str, Any]]:
-    """Return how many cases that are not shown one by one lie where, by level."""
+def _coordinate(c: Coordinate) -> dict[str, Any]:
+    low, high = c.dimension.low, c.dimension.high
+    return {
+        "field": c.field,
+        "name": c.name,
+        "unit": c.unit,
+        "digits": c.digits,
+        "low": round(low, 4),
+        "high": round(high, 4),
+        # Cases are shown in full this near to where the reader is in a third coordinate.
+        "near": SVO_NEAR_RAD if c.unit == "rad" else NEAR_SHARE * (high - low),
+    }
+
+
+def _maps(facts: Facts) -> dict[int, dict[str, Any]]:
     shown = {o.index for o in facts.shown}
     others = [o for o in facts.run.outcomes if o.index not in shown]
-    nx, ny = COUNT_GRID
-    counts = {}
-    for level in facts.levels if others else ():
-        grid: dict[str, Any] = {"nx": nx, "ny": ny}
-        for name, failing in (("safe", False), ("failing", True)):
-            at = [o for o in others if o.case.level == level and o.failed is failing]
-            points = to_unit((o.case for o in at), level)[:, :2]
-            cells, _, _ = np.histogram2d(
-                points[:, 1], points[:, 0], bins=(ny, nx), range=((0, 1), (0, 1))
-            )
-            grid[name] = cells.astype(int).ravel().tolist()
-        counts[level] = grid
-    return counts
+    return {
+        level: maps_of(
+            facts.run.scenario,
+            level,
+            [o for o in others if o.case.level == level],
+            facts.surfaces[level],
+            facts.truths[level],
+        )
+        for level in facts.levels
+    }
 
 
 def _search(facts: Facts) -> dict[str, Any]:
@@ -141,7 +134,7 @@ def _search(facts: Facts) -> dict[str, Any]:
         group = np.array([o.batch // width for o in at], dtype=np.int64)
         score = np.array([o.measures.score for o in at], dtype=np.float64)
         failed = np.array([o.failed for o in at], dtype=bool)
-        points = to_unit((o.case for o in at), level)
+        points = to_unit((o.case for o in at), level, facts.run.scenario)
         counted: list[int] = []
         means: list[float | None] = []
         covered: list[float | None] = []
@@ -169,39 +162,16 @@ def _commands(facts: Facts) -> dict[int, str]:
 
 
 def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:
-    """Return the speeds of POV and VUT at every step in base64, and the first row of each case."""
+    """Return the speeds of all vehicles at every step in base64, and the first row of a case."""
     offsets, first = {}, 0
-    parts = [np.empty((0, 2), dtype="<u2")]
+    parts = [np.empty(0, dtype="<u2")]
     for index, trajectory in motion.items():
-        speeds = trajectory.motion[:, (POV, VUT), 1]
-        parts.append(np.rint(np.clip(speeds / SPEED_UNIT_MPS, 0, 65535)).astype("<u2"))
+        speeds = trajectory.motion[:, :, 1]
+        packed = np.rint(np.clip(speeds / SPEED_UNIT_MPS, 0, 65535)).astype("<u2")
+        parts.append(packed.ravel())
         offsets[index] = first
         first += len(speeds)
     return base64.b64encode(np.concatenate(parts).tobytes()).decode(), offsets
-
-
-def _nodes(level: int) -> FloatArray:
-    """Return the nodes of a level's map, (n, d), x_POV0 running fastest and psi slowest."""
-    axes = [np.linspace(0.0, 1.0, n) for n in GRID[len(dimensions(level))] if n > 1]
-    mesh = np.meshgrid(*axes[::-1], indexing="ij")
-    return np.stack([axis.ravel() for axis in mesh[::-1]], axis=1)
-
-
-def _grid(level: int, share: NDArray[Any]) -> dict[str, Any]:
-    nx, ny, np_ = GRID[len(dimensions(level))]
-    values = np.rint(255.0 * share).astype(np.uint8)
-    return {"nx": nx, "ny": ny, "np": np_, "data": base64.b64encode(values.tobytes()).decode()}
-
-
-def _chance_grid(surface: Surface, level: int) -> dict[str, Any]:
-    return _grid(level, surface.chance(_nodes(level)))
-
-
-def _truth_grid(truth: Truth, level: int) -> dict[str, Any]:
-    from scipy.spatial import cKDTree
-
-    _, near = cKDTree(truth.points).query(_nodes(level), k=NEIGHBOURS)
-    return _grid(level, (truth.score < FAILURE_SCORE)[near].mean(axis=1))
 
 
 def _road(road: Corridor) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import versions
 from merge_sumo.campaigns.truth import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.errors import UserError
+from merge_sumo.reports.coordinates import Coordinate, coordinates
 from merge_sumo.reports.diagnosis import (
     Diagnosis,
     Kind,
@@ -45,6 +46,7 @@ class Facts:
         self.summary = summarise(run.outcomes, levels)
         self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
+        self.coordinates = coordinates(run.scenario)
         self.worst = failures(run.outcomes)
         self.near = sorted(
             (o for o in run.outcomes if _is_told(o) and not o.failed),
@@ -66,6 +68,10 @@ class Facts:
         }
         self.surfaces = {level: learn_surface(run.outcomes, level) for level in self.levels}
         self.truths = {level: _truth(run, self.road, level) for level in self.levels}
+
+    def coordinates_of(self, level: int) -> tuple[Coordinate, ...]:
+        """Return the coordinates of a level, in the pool's order."""
+        return coordinates(self.run.scenario, (level,))
 
     def troubles(self) -> Sequence[Trouble]:
         """Return the errors and timeouts that are listed, by message."""

@@ -16,13 +16,23 @@ from merge_sumo.reports.diagnosis import (
     failure_boxes,
 )
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
+from merge_sumo.reports.report_maps import pairs_of
 from merge_sumo.reports.summary import LevelSummary, Summary
 from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.reports.verdict import Verdict, counted, in_words
 from merge_sumo.system.printable import printable
-from merge_sumo.values.fmc import fmc
+from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.scenario import OWN, level_name
 from merge_sumo.values.score import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Third:
+    """A coordinate that the reader of a map moves through, and its bounds."""
+
+    name: str
+    low: float
+    high: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +55,9 @@ class Level:
     truth: float | None
     truth_bar: float
     note: str
+    dims: int
+    third: Third | None
+    pairs: list[str]
 
 
 ABOUT: Final = {
@@ -107,6 +120,10 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "kinds": _kinds(facts),
         "ceded": f"{CEDED_MPS:g}",
         "scenario": facts.run.scenario,
+        "traffic": facts.run.scenario.vehicles > 2,
+        "coordinates": facts.coordinates,
+        "covered": any(level.dims <= 3 for level in levels),
+        "radii": _radii(levels),
         "printed": end_of(facts.run.folder / LOG),
         "tables": tables,
         "settings": {name: _shown(value) for name, value in settings.items() if value},
@@ -156,9 +173,41 @@ def _levels(facts: Facts) -> list[Level]:
             truth=truth[level],
             truth_bar=round(scale * (truth[level] or 0.0), 1),
             note=_note(facts, level, found),
+            dims=len(facts.run.scenario.dimensions(level)),
+            third=_third(facts, level),
+            pairs=_pairs(facts, level),
         )
 
     return [row(level, found) for level, found in facts.summary.levels.items()]
+
+
+def _third(facts: Facts, level: int) -> Third | None:
+    if len(facts.run.scenario.dimensions(level)) != 3:
+        return None
+    found = facts.coordinates_of(level)[2]
+    return Third(found.name, round(found.dimension.low, 2), round(found.dimension.high, 2))
+
+
+def _pairs(facts: Facts, level: int) -> list[str]:
+    """Return the pairs of coordinates that a level's map may show, the first one first."""
+    found = facts.coordinates_of(level)
+    return [
+        " × ".join(found[axis].name for axis in pair.axes)
+        + ("" if pair.share is None else f": {pair.share:.0%}")
+        for pair in pairs_of(len(found), facts.surfaces[level])
+    ]
+
+
+def _radii(levels: Sequence[Level]) -> str:
+    """Return what to know of the radius where there are more than three coordinates."""
+    more = sorted({level.dims for level in levels if level.dims > 3})
+    if not more:
+        return ""
+    parts = [f"{radius_for(dims):.2f} for {dims} coordinates" for dims in more]
+    return (
+        f"It is {in_words(parts)}: there a ball is as large as in three. Then the volume is "
+        "integrated by quasi-Monte Carlo, to within some tenths of a percent."
+    )
 
 
 def _note(facts: Facts, level: int, found: LevelSummary) -> str:

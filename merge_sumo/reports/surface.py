@@ -35,6 +35,7 @@ class Surface:
         self._dims = failing.shape[1]
         self._failing = failing
         self._chance = chance
+        self._pool: tuple[FloatArray, FloatArray] | None = None
 
     def chance(self, points: FloatArray) -> FloatArray:
         """Return the chance that cases at points, (n, d), of the unit cube fail: (n,)."""
@@ -52,9 +53,15 @@ class Surface:
         `PLAUSIBLE`, together with the failures found. No confidence bound: a region of which the
         surrogate knows nothing is not in it.
         """
-        points = np.random.default_rng(0).random((POOL_POINTS[self._dims], self._dims))
-        plausible = points[self.chance(points) >= PLAUSIBLE]
-        return fmc(np.concatenate([self._failing, plausible]))
+        points, chance = self.pool()
+        return fmc(np.concatenate([self._failing, points[chance >= PLAUSIBLE]]))
+
+    def pool(self) -> tuple[FloatArray, FloatArray]:
+        """Return uniform points of the unit cube, (n, d), and the chance of each to fail, (n,)."""
+        if self._pool is None:
+            points = np.random.default_rng(0).random((POOL_POINTS[self._dims], self._dims))
+            self._pool = points, self.chance(points)
+        return self._pool
 
 
 def learn_surface(outcomes: Sequence[Outcome], level: int) -> Surface | None:

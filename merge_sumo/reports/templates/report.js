@@ -3,8 +3,10 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 const namespace = document.querySelector("svg").namespaceURI;
-const DT = data.dt, CRASH = data.crash_m, RADIUS = data.radius;
-const dims = data.dimensions; // x, v, psi: [low, high]
+const DT = data.dt, CRASH = data.crash_m;
+const coordinates = data.coordinates; // of all levels; the last ones are those of some levels only
+const vehicles = data.vehicles, POV = vehicles.indexOf("pov"), VUT = vehicles.indexOf("vut");
+const NAMES = { pov: "POV", vut: "VUT", ahead: "car ahead", behind: "car behind" };
 const cases = data.cases;
 const place = new Map(cases.index.map((index, i) => [index, i]));
 
@@ -27,38 +29,34 @@ const speedAt = (k) => speeds.getUint16(2 * k, true) * data.speed_unit_mps;
 
 function motion(i) {
   // Speeds are kept; positions follow by x' = x + v dt, as the vehicles moved.
-  const rows = cases.rows[i];
+  const rows = cases.rows[i], first = cases.offset[i];
   if (!rows) return null;
-  const first = cases.offset[i];
-  const vPov = [], vVut = [], xPov = [cases.x[i]], xVut = [data.x_vut0_m];
-  for (let t = 0; t < rows; t++) {
-    vPov.push(speedAt(2 * (first + t)));
-    vVut.push(speedAt(2 * (first + t) + 1));
-  }
-  for (let t = 1; t < rows; t++) {
-    xPov.push(xPov[t - 1] + vPov[t - 1] * DT);
-    xVut.push(xVut[t - 1] + vVut[t - 1] * DT);
-  }
-  return { rows, vPov, vVut, xPov, xVut };
+  const v = vehicles.map((_, who) => Array.from({ length: rows }, (_, t) => speedAt((first + t) * vehicles.length + who)));
+  const x = v.map((speed, who) => {
+    const places = [cases.starts[i][who]];
+    for (let t = 1; t < rows; t++) places.push(places[t - 1] + speed[t - 1] * DT);
+    return places;
+  });
+  return { rows, v, x, met: cases.nearest[i] };
 }
 const failed = (i) => cases.failed[i] === 1;
 const tested = (i) => ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
-const psiText = (psi) => `${fixed(psi, 2)} rad`;
+const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
 function title(i) {
-  const psi = cases.psi[i];
-  return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, x_POV0 ${fixed(cases.x[i], 1)} m, v_POV0 ${fixed(cases.v[i], 2)} m/s` +
-    (psi === null ? "" : `, psi ${psiText(psi)}`);
+  const place = coordinates.filter((c) => cases[c.field][i] !== null).map((c) => `${c.name} ${valueText(c, cases[c.field][i])}`);
+  return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, ${place.join(", ")}`;
 }
 function words(i) {
   const end = data.ends[cases.end[i]], parts = [];
   const vut = cases.vut_yields[i], pov = cases.pov_yields[i];
-  const yields = [[vut, "VUT"], [pov, "POV"]].filter(([t]) => t !== null).sort((a, b) => a[0] - b[0]);
+  const met = NAMES[vehicles[cases.nearest[i]]], whom = cases.nearest[i] === POV ? "" : ` with the ${met}`;
+  const yields = [[vut, "VUT"], [pov, met]].filter(([t]) => t !== null).sort((a, b) => a[0] - b[0]);
   if (end === "COLLISION") {
     const kind = cases.kind[i] === null ? "" : ` (${data.kinds[cases.kind[i]]})`;
-    parts.push(`Collision${kind} at ${fixed(cases.t_end[i], 1)} s: gap ${fixed(cases.dx[i], 1)} m, difference in speed ${fixed(Math.abs(cases.dv[i]), 1)} m/s.`);
+    parts.push(`Collision${whom}${kind} at ${fixed(cases.t_end[i], 1)} s: gap ${fixed(cases.dx[i], 1)} m, difference in speed ${fixed(Math.abs(cases.dv[i]), 1)} m/s.`);
   } else if (end === "MERGED") {
-    parts.push(`No collision: the ${cases.dx[i] < 0 ? "VUT" : "POV"} goes first, gap ${fixed(cases.dx[i], 1)} m when the VUT arrives.`);
+    parts.push(`No collision: the ${cases.dx[i] < 0 ? "VUT" : met} goes first, gap ${fixed(cases.dx[i], 1)} m when the VUT arrives.`);
   } else if (end === "TIMEOUT") {
     parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
   } else {
@@ -75,17 +73,16 @@ function words(i) {
 }
 
 /* ---------- grids: the surrogate's chance, the truth's outline ---------- */
-function slice(grid, level, psi) {
+function slice(grid, at) { // `at` a share of the third coordinate; null for all of it at once
   if (!grid.values) grid.values = bytes(grid.data);
   const { nx, ny, np, values } = grid, size = nx * ny;
-  if (level !== 2) return values;
+  if (np === 1) return values;
   const out = new Float32Array(size);
-  if (psi === null) { // all at once: the highest over psi
+  if (at === null) { // the highest of all
     for (let k = 0; k < np; k++) for (let n = 0; n < size; n++) out[n] = Math.max(out[n], values[k * size + n]);
     return out;
   }
-  const at = clamp((psi - dims.psi[0]) / (dims.psi[1] - dims.psi[0]), 0, 1) * (np - 1);
-  const low = Math.min(Math.floor(at), np - 2), share = at - low;
+  const place = clamp(at, 0, 1) * (np - 1), low = Math.min(Math.floor(place), np - 2), share = place - low;
   for (let n = 0; n < size; n++) out[n] = (1 - share) * values[low * size + n] + share * values[(low + 1) * size + n];
   return out;
 }
@@ -123,59 +120,79 @@ function shade(svg, values, nx, ny, box) {
 
 /* ---------- maps ---------- */
 const BOX = [44, 8, 346, 286]; // x, y, width, height of the plot in a map
-const PSI_NEAR = 0.1; // rad: cases this near to the slider are shown in full
-let psi = 0, psiAll = false, chosen = -1;
+const unit = (c, value) => (value - c.low) / (c.high - c.low);
+let chosen = -1;
 const maps = [...document.querySelectorAll(".map")].map((figure) => new FailureMap(figure));
 
 function FailureMap(figure) {
-  const svg = figure.querySelector("svg"), level = Number(figure.dataset.level);
+  const svg = figure.querySelector("svg"), level = Number(figure.dataset.level), of = data.maps[level];
   const [left, top, width, height] = BOX;
   const X = (u) => left + u * width, Y = (u) => top + (1 - u) * height;
-  const unit = (value, [low, high]) => (value - low) / (high - low);
-  const marks = cases.index.map((_, i) => i).filter((i) => cases.level[i] === level)
-    .map((i) => ({ i, x: X(unit(cases.x[i], dims.x)), y: Y(unit(cases.v[i], dims.v)) }))
-    .sort((a, b) => failed(a.i) - failed(b.i));
-  const apart = (i) => (level === 2 && !psiAll ? Math.abs(cases.psi[i] - psi) : 0);
+  const own = cases.index.map((_, i) => i).filter((i) => cases.level[i] === level);
+  const third = of.through === null ? null : coordinates[of.through]; // the reader moves through it
+  const slider = figure.querySelector("input[type=range]"), check = figure.querySelector("input[type=checkbox]");
+  const pairs = figure.querySelector("select");
+  let pair = 0, at = 0, all = third === null, axes = [], marks = [];
+  const apart = (i) => (all ? 0 : Math.abs(cases[third.field][i] - at));
+  const near = (i) => all || apart(i) <= third.near;
 
+  const place = () => {
+    axes = of.pairs[pair].axes.map((k) => coordinates[k]);
+    const [across, up] = axes;
+    marks = own.map((i) => ({ i, x: X(unit(across, cases[across.field][i])), y: Y(unit(up, cases[up.field][i])) }))
+      .sort((a, b) => failed(a.i) - failed(b.i));
+  };
   this.level = level;
   this.draw = () => {
+    const { chance, truth } = of.grids[pair], share = all ? null : unit(third, at);
     svg.replaceChildren();
     const clip = draw(draw(svg, "defs"), "clipPath", { id: "clip" });
     draw(clip, "rect", { x: left, y: top, width, height });
-    const at = level === 2 && psiAll ? null : psi;
-    if (data.chance[level]) { const g = data.chance[level]; shade(svg, slice(g, level, at), g.nx, g.ny, BOX); }
-    for (const [name, range, step] of [["x", dims.x, 40], ["v", dims.v, 2]]) {
-      for (let value = Math.ceil(range[0] / step) * step; value <= range[1] + 1e-9; value += step) {
-        const u = unit(value, range), vertical = name === "x";
+    if (chance) shade(svg, slice(chance, share), chance.nx, chance.ny, BOX);
+    for (const [n, c] of axes.entries()) {
+      const vertical = n === 0, step = ticks((c.high - c.low) / (vertical ? 4 : 5));
+      for (let value = Math.ceil(c.low / step - 1e-9) * step; value <= c.high + 1e-9; value += step) {
+        const u = unit(c, value);
         draw(svg, "line", vertical ? { class: "grid", x1: X(u), x2: X(u), y1: top, y2: top + height } : { class: "grid", x1: left, x2: left + width, y1: Y(u), y2: Y(u) });
-        draw(svg, "text", vertical ? { x: X(u), y: top + height + 15, "text-anchor": "middle" } : { x: left - 6, y: Y(u) + 4, "text-anchor": "end" }, fixed(value, 0));
+        draw(svg, "text", vertical ? { x: X(u), y: top + height + 15, "text-anchor": "middle" } : { x: left - 6, y: Y(u) + 4, "text-anchor": "end" }, fixed(value, digits(step)));
       }
     }
-    draw(svg, "text", { x: left + width / 2, y: top + height + 32, "text-anchor": "middle" }, "x_POV0, m");
-    draw(svg, "text", { transform: `translate(12 ${top + height / 2}) rotate(-90)`, "text-anchor": "middle" }, "v_POV0, m/s");
+    const [across, up] = axes.map((c) => `${c.name}, ${c.unit}`);
+    draw(svg, "text", { x: left + width / 2, y: top + height + 32, "text-anchor": "middle" }, across);
+    draw(svg, "text", { transform: `translate(12 ${top + height / 2}) rotate(-90)`, "text-anchor": "middle" }, up);
     counts();
     const balls = draw(svg, "g", { class: "balls", "clip-path": "url(#clip)" });
-    for (const { i, x, y } of marks) if (failed(i)) {
-      const off = apart(i) / (dims.psi[1] - dims.psi[0]);
-      if (off >= RADIUS) continue;
-      const r = Math.sqrt(RADIUS ** 2 - off ** 2); // the slice of the ball at this psi
+    for (const { i, x, y } of of.radius === null ? [] : marks) if (failed(i)) {
+      const off = all ? 0 : apart(i) / (third.high - third.low);
+      if (off >= of.radius) continue;
+      const r = Math.sqrt(of.radius ** 2 - off ** 2); // the slice of the ball here
       draw(balls, "ellipse", { cx: x, cy: y, rx: r * width, ry: r * height });
     }
-    if (data.truth[level]) {
-      const g = data.truth[level], values = slice(g, level, at);
-      draw(svg, "path", { class: "outline", d: contour(values, g.nx, g.ny, 127.5, X, Y) });
-    }
+    if (truth) draw(svg, "path", { class: "outline", d: contour(slice(truth, share), truth.nx, truth.ny, 127.5, X, Y) });
     draw(svg, "rect", { class: "frame", x: left, y: top, width, height });
     for (const { i, x, y } of marks) {
-      const faint = apart(i) > PSI_NEAR ? " faint" : "";
+      const faint = near(i) ? "" : " faint";
       if (failed(i)) draw(svg, "path", { class: `mark fail${faint}`, d: `M${x} ${y - 5}l5 5l-5 5l-5 -5Z`, "data-case": cases.index[i] });
       else if (!tested(i)) draw(svg, "rect", { class: `mark error${faint}`, x: x - 3, y: y - 3, width: 6, height: 6, "data-case": cases.index[i] });
       else draw(svg, "circle", { class: `mark safe${faint}`, cx: x, cy: y, r: 2.4, "data-case": cases.index[i] });
     }
+    const most = figure.querySelector(".most");
+    if (most) most.textContent = chance ? `${Math.round(100 * chance.most)} %` : "–";
     this.choose();
   };
+  this.move = (value, everything) => {
+    at = value; all = everything;
+    slider.value = value;
+    slider.disabled = all;
+    check.checked = all;
+    const degrees = third.unit === "rad" ? ` (${Math.round(value * 180 / Math.PI)}°)` : "";
+    figure.querySelector("output").textContent = all ? "all values" : valueText(third, value) + degrees;
+    this.draw();
+  };
+  this.begin = () => (third ? this.move(at, false) : this.draw());
+  this.lookAt = (i) => { if (cases.level[i] === level && !near(i)) this.move(cases[third.field][i], false); };
   const counts = () => { // of a long campaign: the cases that are not listed one by one
-    const grid = data.counts[level];
+    const grid = of.grids[pair].counts;
     if (!grid) return;
     const most = Math.max(...grid.safe, ...grid.failing, 1);
     for (let n = 0; n < grid.nx * grid.ny; n++) {
@@ -190,34 +207,40 @@ function FailureMap(figure) {
     const mark = marks.find((m) => m.i === chosen);
     if (mark) draw(svg, "circle", { class: "chosen", cx: mark.x, cy: mark.y, r: 8 });
   };
-  const visible = () => marks.filter((m) => apart(m.i) <= PSI_NEAR);
-  const at = (event) => {
+  const visible = () => marks.filter((m) => near(m.i));
+  const under = (event) => {
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
-    let best = null, near = 14;
+    let best = null, least = 14;
     for (const mark of visible()) {
       const distance = Math.hypot(mark.x - point.x, mark.y - point.y) - (failed(mark.i) ? 3 : 0);
-      if (distance < near) [best, near] = [mark, distance];
+      if (distance < least) [best, least] = [mark, distance];
     }
     return best;
   };
-  svg.addEventListener("click", (event) => { const mark = at(event); if (mark) show(mark.i); });
-  svg.addEventListener("pointermove", (event) => { const mark = at(event); mark ? tip(event, title(mark.i)) : tip(null); });
+  svg.addEventListener("click", (event) => { const mark = under(event); if (mark) show(mark.i); });
+  svg.addEventListener("pointermove", (event) => { const mark = under(event); mark ? tip(event, title(mark.i)) : tip(null); });
   svg.addEventListener("pointerleave", () => tip(null));
   svg.addEventListener("keydown", (event) => {
     const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     if (!way) return;
     event.preventDefault();
     const here = marks.find((m) => m.i === chosen);
-    const near = visible();
-    if (!here) { if (near.length) show(near[near.length - 1].i); return; }
+    const open = visible();
+    if (!here) { if (open.length) show(open[open.length - 1].i); return; }
     let best = null, least = Infinity;
-    for (const mark of near) {
+    for (const mark of open) {
       const dx = mark.x - here.x, dy = mark.y - here.y;
       const along = dx * way[0] + dy * way[1], aside = Math.abs(dx * way[1]) + Math.abs(dy * way[0]);
       if (along > 0.01 && along + 3 * aside < least) [best, least] = [mark, along + 3 * aside];
     }
     if (best) show(best.i);
   });
+  slider?.addEventListener("input", () => this.move(Number(slider.value), false));
+  check?.addEventListener("change", () => this.move(at, check.checked));
+  pairs?.addEventListener("change", () => { pair = pairs.selectedIndex; place(); this.draw(); });
+  place();
+  const worst = own.find(failed);
+  if (third) at = worst === undefined ? (third.low + third.high) / 2 : cases[third.field][worst];
 }
 const tipBox = document.createElement("div");
 tipBox.className = "tip"; tipBox.hidden = true;
@@ -229,18 +252,8 @@ function tip(event, text) {
   tipBox.style.left = `${Math.max(4, Math.min(event.pageX + 12, document.documentElement.clientWidth - tipBox.offsetWidth - 8))}px`;
   tipBox.style.top = `${event.pageY + 14}px`;
 }
-function setPsi(value, all) {
-  psi = value; psiAll = all;
-  const slider = byId("psi");
-  slider.value = value;
-  slider.disabled = all;
-  byId("psi-all").checked = all;
-  byId("psi-value").textContent = all ? "all values" : `${psiText(psi)} (${Math.round(psi * 180 / Math.PI)}°)`;
-  for (const map of maps) if (map.level === 2) map.draw();
-}
-
 /* ---------- plots over time ---------- */
-function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags = [], xTicks = 4, digits = null }) {
+function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags = [], xTicks = 4, decimals = null }) {
   const [, , w, h] = svg.getAttribute("viewBox").split(" ").map(Number);
   const left = 40, right = w - 8, top = 8, bottom = h - 28;
   const X = (x) => left + (x - xRange[0]) / (xRange[1] - xRange[0] || 1) * (right - left);
@@ -253,7 +266,7 @@ function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags
   const step = nice((yRange[1] - yRange[0]) / 5);
   for (let y = Math.ceil(yRange[0] / step) * step; y <= yRange[1] + 1e-12; y += step) {
     draw(svg, "line", { class: "grid", x1: left, x2: right, y1: Y(y), y2: Y(y) });
-    draw(svg, "text", { x: left - 5, y: Y(y) + 4, "text-anchor": "end" }, fixed(Math.abs(y) < step / 1e6 ? 0 : y, digits ?? Math.max(0, -Math.floor(Math.log10(step) + 1e-9))));
+    draw(svg, "text", { x: left - 5, y: Y(y) + 4, "text-anchor": "end" }, fixed(Math.abs(y) < step / 1e6 ? 0 : y, decimals ?? digits(step)));
   }
   const xStep = Math.max(1, nice((xRange[1] - xRange[0]) / xTicks));
   for (let x = Math.ceil(xRange[0] / xStep) * xStep; x <= xRange[1] + 1e-9; x += xStep) {
@@ -273,6 +286,11 @@ function nice(step) {
   const power = 10 ** Math.floor(Math.log10(step));
   return power * [1, 2, 5, 10].find((f) => f * power >= step);
 }
+function ticks(step) {
+  const power = 10 ** Math.floor(Math.log10(step));
+  return power * [1, 2, 4, 5, 10].find((f) => f * power >= step - 1e-9);
+}
+const digits = (step) => Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
 function range(values, pad = 0.06) {
   const low = Math.min(...values), high = Math.max(...values), more = pad * (high - low) || 1;
   return [low - more, high + more];
@@ -284,7 +302,7 @@ let moving = null, step = 0, playing = false, last = 0, charts = [];
 
 function show(i, scroll = false) {
   chosen = i;
-  if (cases.psi[i] !== null && !psiAll && Math.abs(cases.psi[i] - psi) > PSI_NEAR) setPsi(cases.psi[i], false);
+  for (const map of maps) map.lookAt(i);
   byId("case-title").textContent = title(i);
   byId("case-words").textContent = words(i);
   byId("command").textContent = data.commands[cases.index[i]] || `${data.export} ${cases.index[i]} && ${data.replay.replace("NNNNN", String(cases.index[i]).padStart(5, "0"))}`;
@@ -300,16 +318,22 @@ function show(i, scroll = false) {
   if (scroll) byId("case").scrollIntoView({ block: "nearest" });
 }
 function showMotion(i) {
-  const { rows, vPov, vVut, xPov, xVut } = moving, end = (rows - 1) * DT;
+  const { rows, v, x, met } = moving, end = (rows - 1) * DT;
   const over = (values) => values.map((value, t) => [t * DT, value]);
-  const gap = xPov.map((x, t) => x - xVut[t]);
-  const flags = (pov, vut) => [["pov", cases.pov_yields[i], pov], ["vut", cases.vut_yields[i], vut]]
-    .filter(([, t]) => t !== null).map(([name, t, values]) => ({ name, x: t, y: values[Math.round(t / DT)] }));
+  const lines = (values) => vehicles.map((name, who) => ({ name, points: over(values[who]) }));
+  const others = vehicles.map((_, who) => who).filter((who) => who !== VUT);
+  const gap = x.map((places) => places.map((place, t) => place - x[VUT][t]));
+  const inView = range([...gap[met], -12, 12]); // of the car that the VUT meets
+  const flags = [[met, cases.pov_yields[i]], [VUT, cases.vut_yields[i]]]
+    .filter(([, t]) => t !== null).map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] }));
   const common = { xRange: [0, end], xLabel: "time, s" };
   charts = [
-    plot(byId("chart-speed"), { ...common, yRange: range([...vPov, ...vVut], 0.14), lines: [{ name: "pov", points: over(vPov) }, { name: "vut", points: over(vVut) }], flags: flags(vPov, vVut) }),
-    plot(byId("chart-position"), { ...common, yRange: range([...xPov, ...xVut]), lines: [{ name: "pov", points: over(xPov) }, { name: "vut", points: over(xVut) }] }),
-    plot(byId("chart-gap"), { ...common, yRange: range([...gap, -12, 12]), lines: [{ name: "gap", points: over(gap) }], bands: [[-CRASH, CRASH]] }),
+    plot(byId("chart-speed"), { ...common, yRange: range(v.flat(), 0.14), lines: lines(v), flags }),
+    plot(byId("chart-position"), { ...common, yRange: range(x.flat()), lines: lines(x) }),
+    plot(byId("chart-gap"), {
+      ...common, yRange: inView, bands: [[-CRASH, CRASH]],
+      lines: others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) })),
+    }),
   ];
   slider.max = rows - 1;
   drawRoad();
@@ -322,14 +346,15 @@ function drawRoad() {
   for (const lane of data.lanes) draw(road, "path", { class: "lane", d: path(lane.map(([x, y]) => [x, -y])), "stroke-width": 3.05 });
   draw(road, "line", { class: "merge", x1: 0, x2: 0, y1: -5.4, y2: 2.4, "stroke-width": 0.25 });
   cars = {};
-  for (const who of ["pov", "vut"]) {
+  for (const who of vehicles) {
     const group = draw(road, "g");
     draw(group, "rect", { class: who, x: -5, y: -1, width: 5, height: 2, rx: 0.6 });
     const brake = draw(group, "rect", { class: "brake", x: -5.3, y: -1, width: 0.6, height: 2 });
-    const label = draw(road, "text", { "text-anchor": "middle" }, who.toUpperCase());
+    const label = draw(road, "text", { "text-anchor": "middle" });
     cars[who] = { group, brake, label };
   }
 }
+const extent = (values) => [Math.min(...values), Math.max(...values)];
 function pose(path, along) { // front bumper at a lane coordinate of a path
   let k = path.findIndex(([at], i) => i > 0 && along < at);
   if (k < 0) k = path.length - 1;
@@ -343,23 +368,24 @@ function at(t) {
   step = clamp(t, 0, moving.rows - 1);
   const k = Math.min(Math.floor(step), Math.max(moving.rows - 2, 0)), share = step - k, next = Math.min(k + 1, moving.rows - 1);
   const mix = (values) => (1 - share) * values[k] + share * values[next];
-  const places = { pov: pose(data.main, mix(moving.xPov)), vut: pose(data.ramp, mix(moving.xVut)) };
-  const low = Math.min(places.pov.x, places.vut.x), high = Math.max(places.pov.x, places.vut.x);
-  const apart = Math.abs(places.pov.y - places.vut.y), upper = places.pov.y >= places.vut.y ? "pov" : "vut";
-  // The view follows both, never closer than 90 m; cars keep a size that can be seen.
+  const places = vehicles.map((_, who) => pose(who === VUT ? data.ramp : data.main, mix(moving.x[who])));
+  const [low, high] = extent(places.map(({ x }) => x)), [bottom, top] = extent(places.map(({ y }) => y));
+  const vutAbove = places[VUT].y > places[POV].y;
+  // The view follows all of them, never closer than 90 m; cars keep a size that can be seen.
   const ratio = road.clientHeight / (road.clientWidth || 1) || 0.25;
-  const width = Math.max(high - low + 50, (1.7 * apart + 22) / ratio, 90), middle = (low + high) / 2;
+  const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 22) / ratio, 90), middle = (low + high) / 2;
   const size = Math.max(1, width / 90), height = width * ratio;
-  const centre = -(Math.min(places.pov.y, places.vut.y) + Math.max(places.pov.y, places.vut.y)) / 2;
-  road.setAttribute("viewBox", `${middle - width / 2} ${centre - height / 2} ${width} ${height}`);
-  for (const [who, v] of [["pov", moving.vPov], ["vut", moving.vVut]]) {
-    const { x, y, angle } = places[who], a = (v[next] - v[k]) / DT;
-    cars[who].group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
-    cars[who].brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
-    const label = cars[who].label, side = who === upper ? -1 : 1;
-    label.setAttribute("x", x - 2.5); label.setAttribute("y", -y + side * (side < 0 ? 6.4 : 5.4) * Math.min(size, 2));
+  road.setAttribute("viewBox", `${middle - width / 2} ${-(bottom + top) / 2 - height / 2} ${width} ${height}`);
+  for (const [who, name] of vehicles.entries()) {
+    const { x, y, angle } = places[who], v = moving.v[who], a = (v[next] - v[k]) / DT;
+    const { group, brake, label } = cars[name];
+    group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
+    brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
+    // The POV's own line of text is between it and that of the other cars.
+    const up = (who === VUT) === vutAbove, tier = who === VUT || who === POV ? 0 : 2.6 * size;
+    label.setAttribute("x", clamp(x - 2.5, middle - 0.36 * width, middle + 0.36 * width)); label.setAttribute("y", -y + (up ? -6.4 * Math.min(size, 2) - tier : 5.4 * Math.min(size, 2) + tier));
     label.style.fontSize = `${2.6 * size}px`;
-    label.textContent = `${who.toUpperCase()} ${fixed(mix(v), 1)} m/s`;
+    label.textContent = `${who === VUT || who === POV ? NAMES[name] : name} ${fixed(mix(v), 1)} m/s`;
   }
   slider.value = Math.round(step);
   slider.setAttribute("aria-valuetext", `${fixed(step * DT, 1)} seconds`);
@@ -446,14 +472,8 @@ function search() {
   plot(byId("chart-fmc"), { ...common, yRange: [0, Math.max(...coverage.flatMap(({ points }) => points.map(([, y]) => y)), 0.001) * 1.1], lines: coverage });
 }
 
-if (byId("psi")) {
-  byId("psi").addEventListener("input", (event) => setPsi(Number(event.target.value), false));
-  byId("psi-all").addEventListener("change", (event) => setPsi(psi, event.target.checked));
-}
 const worst = document.querySelector(".list button");
-const worst2 = cases.index.findIndex((_, i) => cases.level[i] === 2 && failed(i));
-if (byId("psi")) setPsi(worst2 < 0 ? (dims.psi[0] + dims.psi[1]) / 2 : cases.psi[worst2], false);
-for (const map of maps) map.draw();
+for (const map of maps) map.begin();
 search();
 if (worst) show(place.get(Number(worst.dataset.case)));
 addEventListener("resize", () => at(step));

@@ -1,0 +1,58 @@
+"""The coordinates of a case as people read them: names, units and digits, in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import LEVELS, Dimension, Scenario
+
+WRITTEN: Final[dict[str, tuple[str, str, int]]] = {
+    "x_pov0_m": ("x_POV0", "m", 1),
+    "v_pov0_mps": ("v_POV0", "m/s", 2),
+    "v_vut0_mps": ("v_VUT0", "m/s", 2),
+    "headway_ahead_s": ("headway ahead", "s", 2),
+    "headway_behind_s": ("headway behind", "s", 2),
+    "svo_rad": ("psi", "rad", 2),
+}
+"""Name, unit and digits after the point, by the field of a case."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coordinate:
+    """A coordinate of a pool: its bounds, and how a value of it is written."""
+
+    dimension: Dimension
+    name: str
+    unit: str
+    digits: int
+
+    @property
+    def field(self) -> str:
+        """Name of the field of a case."""
+        return self.dimension.field
+
+    def of(self, case: Case) -> float | None:
+        """Return the value of a case; None where its level has no such coordinate."""
+        value: float | None = getattr(case, self.field)
+        return value
+
+    def text(self, case: Case) -> str:
+        """Return the value as it stands in a table; empty where there is none."""
+        value = self.of(case)
+        return "" if value is None else f"{value:.{self.digits}f}"
+
+
+def coordinates(scenario: Scenario, levels: Sequence[int] = LEVELS) -> tuple[Coordinate, ...]:
+    """Return the coordinates that a scenario has at any of some levels, in the pool's order."""
+    most = max((scenario.dimensions(level) for level in levels), key=len)
+    return tuple(Coordinate(d, *WRITTEN[d.field]) for d in most)
+
+
+def described(case: Case) -> str:
+    """Return the coordinates of a case in one line."""
+    return ", ".join(
+        f"{c.name} {c.text(case)} {c.unit}" for c in coordinates(case.scenario, (case.level,))
+    )
