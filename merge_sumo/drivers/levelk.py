@@ -176,6 +176,8 @@ class LevelKDriver(Driver):
     def act(self, scene: Scene) -> FloatArray:
         """Return the held accelerations, decided anew where a decision is due."""
         due = np.flatnonzero((scene.step % DECISION_STEPS == 0) & scene.active)
+        if not due.size:
+            return self._held
         for number, scenario in enumerate(self._scenarios):
             mine = due[self._scenario[due] == number]
             if mine.size:
