@@ -15,7 +15,8 @@ from merge_sumo.values.fmc import RADIUS, fmc, fmc_and_error, radius_for, region
 
 FloatArray = np.ndarray
 BALL = 4 / 3 * math.pi * RADIUS**3
-DIMENSIONS = pytest.mark.parametrize("dimension", [4, 5, 6])
+SIX = pytest.param(6, marks=pytest.mark.long)
+DIMENSIONS = pytest.mark.parametrize("dimension", [4, 5, SIX])
 
 
 def lens(distance: float, dimension: int) -> float:
@@ -111,7 +112,10 @@ class TestTheDefinition:
         assert error < its_error < 0.02 * expected
         assert abs(volume - expected) < 4 * math.hypot(its_error, error)
 
-    @pytest.mark.parametrize(("dimension", "bound"), [(4, 2e-3), (5, 4e-3), (6, 1e-2)])
+    @pytest.mark.parametrize(
+        ("dimension", "bound"),
+        [(4, 2e-3), (5, 4e-3), pytest.param(6, 1e-2, marks=pytest.mark.long)],
+    )
     def test_by_monte_carlo_where_there_are_many(self, dimension, bound):
         points = np.random.default_rng(3).random((ball_union.MOST_STARS + 1, dimension))
         points[:, 0] *= 0.2

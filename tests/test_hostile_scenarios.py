@@ -126,7 +126,14 @@ def scene(tmp_path, monkeypatch) -> Iterator[Scene]:
 
 ELEMENTS = {
     *("configuration", "input", "net-file", "additional-files", "time", "begin", "end"),
-    *("step-length", "processing", "collision.action", "time-to-teleport", "default.speeddev"),
+    *(
+        "step-length",
+        "processing",
+        "collision.action",
+        "insertion-checks",
+        "time-to-teleport",
+        "default.speeddev",
+    ),
     *("fcd_replay_device", "device.fcd-replay.files", "report", "no-warnings", "xml-validation"),
     *("gui_only", "gui-settings-file", "start", "delay", "window-size"),
     *("viewsettings", "scheme", "vehicles", "background", "viewport"),

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from merge_sumo.reports.summary import summarise
 from merge_sumo.reports.surface import learn_surface
 from merge_sumo.reports.verdict import judge
 from merge_sumo.sumo.road import road_of
-from merge_sumo.values.case import dimensions, to_unit
+from merge_sumo.values.case import to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import DT_S, US23, Scenario
 from merge_sumo.values.trajectory import REASON_CHARACTERS
@@ -246,7 +247,7 @@ class TestTheTruth:
         """Keep a truth where the left half of each pool fails."""
 
         def truth(path: object, level: int, cases: int, scenario: Scenario = US23) -> Truth:
-            points = np.random.default_rng(1).random((2000, len(dimensions(level))))
+            points = np.random.default_rng(1).random((2000, len(scenario.dimensions(level))))
             return Truth(points, np.where(points[:, 0] < 0.5, -900.0, -10.0))
 
         monkeypatch.setattr(report_facts, "read_truth", truth)
@@ -261,6 +262,17 @@ class TestTheTruth:
         assert (values[:, :46] == 255).all()
         assert (values[:, -46:] == 0).all()
         assert f"{fmc(cached(None, 0, 0).failures):.4f}" in text_of(page)
+
+    def test_of_a_pool_with_a_range_of_speeds_is_drawn_too(self, tmp_path, cached):
+        net, ranged = road_of().sha256, replace(US23, v_vut0_mps=(14.0, 22.0))
+        run = write_run(
+            *(tmp_path / "run", 10, (0, 2)),
+            scenario=ranged,
+            net_sha256=net,
+            v_vut0_mps=None,
+        )
+        maps = data_of(report_page(run))["maps"]
+        assert {grid["truth"] is None for of in maps.values() for grid in of["grids"]} == {False}
 
     @pytest.mark.parametrize(
         "settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}, {"v_vut0_mps": 10.0}]

@@ -28,7 +28,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenarios.scenario_file import to_toml
 from merge_sumo.scenarios.suggestion import unseen
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
-from merge_sumo.training.check import QuickRegret, play, returns_of
+from merge_sumo.training.check import QuickRegret, check_cases, play, returns_of
 from merge_sumo.training.env import (
     MergeGame,
     MergeVectorEnv,
@@ -510,6 +510,12 @@ class TestTrainingForAnotherScenario:
     def test_a_check_without_the_scenario_says_what_is_missing(self, trained):
         done = call("train", "--check", "--out", trained[0], "--only", "pov1")
         assert "was trained for ring: say with --scenario" in str(done.exception)
+
+    def test_other_cars_are_not_trained_for(self):
+        traffic = dataclasses.replace(US23, headway_ahead_s=(1.0, 3.0), headway_behind_s=(1.0, 3.0))
+        assert plays_as(traffic, US23)
+        assert unseen(traffic) == []
+        assert {len(case.starts()) for case in check_cases("pov2", 3, scenario=traffic)} == {2}
 
     def test_without_a_folder_nothing_is_written_into_the_shipped_policies(self, ring):
         done = call("train", "--scenario", ring)

@@ -104,11 +104,11 @@ def _road_of(run: Run) -> Corridor:
 
 def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
     """Return the ground truth that is cached for what this run tested, if there is one."""
-    settings = run.settings
+    settings, fixed = run.settings, run.scenario.v_vut0_mps
     same = (
         settings.get("net_sha256") == road.sha256
         and settings.get("versions") == versions()
-        and settings.get("v_vut0_mps") == run.scenario.v_vut0_mps
+        and settings.get("v_vut0_mps") == (fixed if isinstance(fixed, float) else None)
     )
     if not same:
         return None

@@ -29,7 +29,10 @@ _WAYS: Final = 4096
 """Ways to M that are compared in all cases at once."""
 _SAME: Final = 1e-2
 """States nearer than this, in m and m/s, are one: finer than the lattice where the accelerations
-are multiples of 0.2 m/s2, and nothing was lost by it where they have no such unit."""
+are multiples of 0.2 m/s2."""
+_MOST: Final = 200_000
+"""Where there are more states, as on a long ramp where the accelerations have no common unit, those
+nearer than twice as much are one, and so on. Nothing was lost by 0.2 m and m/s."""
 _SPEEDS: Final = 1 << 16
 _PLACES: Final = 1 << 20
 """More than there are of them."""
@@ -94,7 +97,7 @@ def _follow(
     last states. It returns what a way from each first state must have so far to go on, (n,).
     """
     own = slice(0, 2) if game.role == "pov" else slice(2, 4)
-    cases, so_far = np.arange(len(state)), np.zeros(len(state))
+    cases, so_far, same = np.arange(len(state)), np.zeros(len(state)), _SAME
     for _ in range(game.max_decisions):
         action = np.tile(game.actions_mps2, len(state))
         cases, so_far = np.repeat(cases, ACTIONS), np.repeat(so_far, ACTIONS)
@@ -105,11 +108,20 @@ def _follow(
         alive = np.flatnonzero(~over & (so_far > needed[cases]))
         if not alive.size:
             break
-        x, v = np.rint(state[alive, own].T / _SAME).astype(np.int64)
-        key = (cases[alive] * _SPEEDS + v) * _PLACES + (x + _PLACES // 2)
-        order = np.lexsort((-so_far[alive], key))
-        alive = alive[order[np.r_[True, np.diff(key[order]) != 0]]]
+        kept = _best_of_each(cases[alive], state[alive, own], so_far[alive], same)
+        while len(kept) > _MOST:
+            same *= 2.0
+            kept = _best_of_each(cases[alive], state[alive, own], so_far[alive], same)
+        alive = alive[kept]
         cases, state, so_far = cases[alive], state[alive], so_far[alive]
+
+
+def _best_of_each(cases: IntArray, own: FloatArray, so_far: FloatArray, same: float) -> IntArray:
+    """Return the places of the best of the ways that led to each state [x, v], (n, 2)."""
+    x, v = np.rint(own.T / same).astype(np.int64)
+    key = (cases * _SPEEDS + v) * _PLACES + (x + _PLACES // 2)
+    order = np.lexsort((-so_far, key))
+    return order[np.r_[True, np.diff(key[order]) != 0]]
 
 
 def _simple_returns(game: Game, state: FloatArray) -> FloatArray:

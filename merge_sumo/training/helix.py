@@ -205,7 +205,7 @@ def _plan(
     """Return everything that decides the weights of a network."""
     role, opponent = OPPONENTS[name]
     scenario = reward.scenario
-    of_scenario = "" if scenario.name == US23.name else f" --scenario {quoted(scenario.name)}"
+    of_scenario = "" if plays_as(scenario, US23) else f" --scenario {quoted(scenario.name)}"
     opponent_sha256 = None
     if opponent != "level0":
         entry = read_manifest(folder).get(opponent)

@@ -381,11 +381,13 @@ function at(t) {
     const { group, brake, label } = cars[name];
     group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
     brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
-    // The POV's own line of text is between it and that of the other cars.
-    const up = (who === VUT) === vutAbove, tier = who === VUT || who === POV ? 0 : 2.6 * size;
-    label.setAttribute("x", clamp(x - 2.5, middle - 0.36 * width, middle + 0.36 * width)); label.setAttribute("y", -y + (up ? -6.4 * Math.min(size, 2) - tier : 5.4 * Math.min(size, 2) + tier));
+    const up = (who === VUT) === vutAbove, named = who === VUT || who === POV;
+    label.setAttribute("x", clamp(x - 2.5, middle - 0.38 * width, middle + 0.38 * width));
+    label.setAttribute("y", -y + (up ? -6.4 : 5.4) * Math.min(size, 2));
     label.style.fontSize = `${2.6 * size}px`;
-    label.textContent = `${who === VUT || who === POV ? NAMES[name] : name} ${fixed(mix(v), 1)} m/s`;
+    label.textContent = named ? `${NAMES[name]} ${fixed(mix(v), 1)} m/s` : name;
+    // The POV's own label has the room where two would lie on each other.
+    label.setAttribute("visibility", named || Math.abs(x - places[POV].x) > 0.14 * width ? "visible" : "hidden");
   }
   slider.value = Math.round(step);
   slider.setAttribute("aria-valuetext", `${fixed(step * DT, 1)} seconds`);
