@@ -72,7 +72,8 @@ def reproduce(
     work = _Work(folder, scale, povs, workers, on_run or (lambda *_: None))
     table = {column.title: work.column(column) for column in TABLE_II}
     work.all_levels()
-    _write(folder / TABLE_JSON, json.dumps(table_record(table, scale), allow_nan=False) + "\n")
+    record = {**table_record(table, scale), "policies_sha256": povs.sha256()}
+    _write(folder / TABLE_JSON, json.dumps(record, allow_nan=False) + "\n")
     _write(folder / TABLE_MARKDOWN, table_markdown(table))
     index = folder / PAGE
     _write(index, _page(table, scale, work.pictures))
