@@ -28,11 +28,15 @@ def due_s(x_vut_m, v_vut_mps):
     return float(level0_time_to(np.array(-x_vut_m), np.array(v_vut_mps), 1.0, 8.0))
 
 
+def scene(*state):
+    """Return the scene of one corridor: x and v of the POV, x and v of the VUT."""
+    return Scene.of_pair(np.array([True]), np.array([0]), *(np.array([value]) for value in state))
+
+
 def answer(vut, x_vut_m, v_vut_mps, later_s):
     """Return the acceleration where a POV of 8 m/s is due at M so much later than the VUT."""
     x_pov_m = -8.0 * (due_s(x_vut_m, v_vut_mps) + later_s)
-    one = (np.array([value]) for value in (x_pov_m, 8.0, x_vut_m, v_vut_mps))
-    return float(vut.act(Scene.of_pair(np.array([True]), np.array([0]), *one))[0])
+    return float(vut.act(scene(x_pov_m, 8.0, x_vut_m, v_vut_mps))[0])
 
 
 class TestAGap:
@@ -54,8 +58,7 @@ class TestAGap:
         assert answer(vut, -50.0, 6.0, 0.0) == 0.0
 
     def test_is_there_before_a_pov_that_stands(self, vut):
-        still = (np.array([value]) for value in (-3.0, 0.0, -7.0, 0.0))
-        assert vut.act(Scene.of_pair(np.array([True]), np.array([0]), *still))[0] == 1.0
+        assert vut.act(scene(-3.0, 0.0, -7.0, 0.0))[0] == 1.0
 
 
 class TestWithoutOne:
@@ -76,6 +79,10 @@ class TestWithoutOne:
         assert answer(vut, x, v, -2.5) == 1.0
 
 
+def test_behind_m_where_a_pov_may_get_it_goes_on(vut):
+    assert vut.act(scene(0.0, 8.0, 40.0, 6.0))[0] == 1.0
+
+
 def test_corridors_do_not_know_of_each_other():
     vut = GapAcceptanceVut(2)
     for corridor in (0, 1):
@@ -83,8 +90,8 @@ def test_corridors_do_not_know_of_each_other():
     due = due_s(-50.0, 6.0)
     x_pov_m = np.array([-8.0 * (due + 5.0), -8.0 * due])
     both = (np.full(2, value) for value in (8.0, -50.0, 6.0))
-    scene = Scene.of_pair(np.ones(2, dtype=bool), np.zeros(2, dtype=int), x_pov_m, *both)
-    assert vut.act(scene).tolist() == [1.0, 0.0]
+    seen = Scene.of_pair(np.ones(2, dtype=bool), np.zeros(2, dtype=int), x_pov_m, *both)
+    assert vut.act(seen).tolist() == [1.0, 0.0]
 
 
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])

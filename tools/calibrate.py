@@ -1,7 +1,8 @@
-"""Search what the paper does not give: the designs of the rule-based VUT, and reward weights.
+"""Search what the paper does not give: the designs of the rule-based VUTs, and reward weights.
 
     python tools/calibrate.py designs                  designs against the policies
     python tools/calibrate.py designs --around JSON    beginning near one
+    python tools/calibrate.py gaps                     of the VUT that accepts gaps
     python tools/calibrate.py weights FILE             reward weights, one JSON object a line
 
 A design2 passes when it shows the paper's picture: no failure against the level-0 POV, at least
@@ -9,6 +10,8 @@ three failure regions well apart at level 1, few failures at level 2. Those rank
 region is not small, whose failures at level 2 are many and in few regions, and around whose
 failures dx grows step by step: a design that is close to failing before it fails, as controllers
 are.
+A design that accepts gaps passes when it never fails in the roundabout at level 0; all that do are
+printed, with where they fail at the other levels.
 For each set of weights, POV-1, VUT-1 and POV-2 are trained briefly in SUMO, and the first two
 example runs are played. Designs are played in thousands of cases at once by eq. (4), which SUMO
 follows to 1e-9. One JSON object per result, on standard output.
@@ -17,6 +20,7 @@ follows to 1e-9. One JSON object per result, on standard output.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import tempfile
@@ -27,20 +31,14 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.gap_acceptance import GapAcceptanceVut, GapDesign
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
-from merge_sumo.drivers.policies import load_driver
+from merge_sumo.drivers.policies import load_driver, policies_of
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
+from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.values.case import Case, FloatArray, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc, regions
-from merge_sumo.values.scenario import (
-    A_MAX_MPS2,
-    A_MIN_MPS2,
-    DT_S,
-    DX_CRASH_M,
-    MAX_STEPS,
-    V_VUT0_MPS,
-    X_VUT0_M,
-)
+from merge_sumo.values.scenario import DT_S, US23, Scenario
 
 YIELDING = Case(level=1, x_pov0_m=-273.0, v_pov0_mps=33.0)
 """The first example run of the paper."""
@@ -51,20 +49,20 @@ STALEMATE = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6)
 def gaps_at_m(cases: list[Case], pov: Driver, vut: Driver) -> tuple[FloatArray, FloatArray]:
     """Play cases side by side by eq. (4); return dx at M and the VUT's lowest acceleration, (n,).
 
-    dx is infinite where the VUT does not arrive.
+    The cases are of one scenario. dx is infinite where the VUT does not arrive.
     """
-    n = len(cases)
+    n, scenario = len(cases), cases[0].scenario
     for k, case in enumerate(cases):
         pov.begin(k, case)
         vut.begin(k, case)
     x_pov = np.array([case.x_pov0_m for case in cases])
     v_pov = np.array([case.v_pov0_mps for case in cases])
-    x_vut, v_vut = np.full(n, X_VUT0_M), np.full(n, V_VUT0_MPS)
+    x_vut, v_vut = np.full(n, scenario.x_vut0_m), np.array([case.v_vut0_mps for case in cases])
     active, dx, lowest = np.ones(n, dtype=bool), np.full(n, np.inf), np.zeros(n)
-    for step in range(MAX_STEPS):
+    for step in range(scenario.max_steps):
         scene = Scene.of_pair(active, np.full(n, step), x_pov, v_pov, x_vut, v_vut)
         a_pov = pov.act(scene) * active
-        a_vut = np.clip(vut.act(scene), A_MIN_MPS2, A_MAX_MPS2) * active
+        a_vut = np.clip(vut.act(scene), scenario.a_min_mps2, scenario.a_max_mps2) * active
         lowest = np.minimum(lowest, a_vut)
         x_pov, x_vut = x_pov + v_pov * DT_S * active, x_vut + v_vut * DT_S * active
         v_pov = np.maximum(v_pov + a_pov * DT_S, 0.0)
@@ -107,13 +105,22 @@ class Picture:
 class Bench:
     """The cases and POVs that designs are tried on."""
 
-    def __init__(self, cases: int, policies: Path | None, levels: tuple[int, ...]) -> None:
+    def __init__(
+        self,
+        cases: int,
+        policies: Path | None,
+        levels: tuple[int, ...],
+        scenario: Scenario = US23,
+        seed: int = 0,
+    ) -> None:
         """Draw cases for each level, twice as many at level 2, and load the POVs."""
-        rng = np.random.default_rng(0)
+        rng = np.random.default_rng(seed)
+        policies = policies or policies_of(scenario)
         self.cases = {
             level: from_unit(
                 rng.random((cases * 2, 3) if level == 2 else (cases, 2)),  # as many as truths have
                 level,
+                scenario=scenario,
             )
             for level in levels
         }
@@ -123,15 +130,22 @@ class Bench:
                 self.povs[level] = load_driver(f"pov{level}", len(self.cases[level]), policies)
         self.one_pov = load_driver("pov2", 1, policies) if 2 in levels else None
 
-    def at_level(self, design: RuleBasedDesign, level: int, apart: float = RADIUS) -> Picture:
+    def at_level(
+        self, design: RuleBasedDesign | GapDesign, level: int, apart: float = RADIUS
+    ) -> Picture:
         """Return where a design fails at a level; regions are `apart` from each other."""
         cases = self.cases[level]
-        dx, _ = gaps_at_m(cases, self.povs[level], RuleBasedVut(len(cases), design))
-        gap_m = np.abs(dx)
-        failed = gap_m < DX_CRASH_M
+        vut: Driver
+        if isinstance(design, GapDesign):
+            vut = GapAcceptanceVut(len(cases), design)
+        else:
+            vut = RuleBasedVut(len(cases), design)
+        dx, _ = gaps_at_m(cases, self.povs[level], vut)
+        gap_m, crash_m = np.abs(dx), cases[0].scenario.dx_crash_m
+        failed = gap_m < crash_m
         points = to_unit((c for c, fails in zip(cases, failed, strict=True) if fails), level)
         sizes = np.bincount(regions(points, apart)) if len(points) else np.zeros(0, np.int64)
-        near = ((gap_m >= DX_CRASH_M) & (gap_m < NEAR_MISS_M)).sum()
+        near = ((gap_m >= crash_m) & (gap_m < NEAR_MISS_M)).sum()
         return Picture(
             failures=len(points),
             fmc=round(fmc(points), 4) if len(points) else 0.0,
@@ -179,7 +193,7 @@ def draw(rng: np.random.Generator, around: RuleBasedDesign | None) -> RuleBasedD
 def try_design2(bench: Bench, design: RuleBasedDesign) -> dict[str, Any] | None:
     """Return the figures of a design that has the picture of design2 so far, else None."""
     level0 = bench.at_level(design, 0)
-    if level0.smallest_gap_m < DX_CRASH_M + 0.4:
+    if level0.smallest_gap_m < US23.dx_crash_m + 0.4:
         return None
     # Regions that stay apart in every sample of cases.
     level1 = bench.at_level(design, 1, apart=1.5 * RADIUS)
@@ -219,6 +233,32 @@ def search_designs(options: argparse.Namespace) -> None:
             print(json.dumps(found), flush=True)
         sys.stderr.write(f"\r{number + 1} designs, the best {best[0][0] if best else '-'}")
     sys.stderr.write("\n")
+
+
+LINES_M: Final = (5.0, 6.0, 7.0, 9.0, 11.0)
+"""The last is the yield line; at the first, the nose is in the lane of the ring."""
+LEADS_S: Final = (1.6, 1.8, 2.0, 2.5)
+LAGS_S: Final = (1.5, 2.0)
+BRAKES_MPS2: Final = (1.0, 1.5, 2.0)
+
+
+def search_gaps(options: argparse.Namespace) -> None:
+    """Print where designs that accept gaps fail in the roundabout, if nowhere at level 0."""
+    scenario = named_scenario("roundabout")
+    bench = Bench(options.cases, options.policies, (0, 1, 2), scenario, options.seed)
+    for numbers in itertools.product(LINES_M, LEADS_S, LAGS_S, BRAKES_MPS2):
+        design = GapDesign(**dict(zip(GapDesign.__slots__, numbers, strict=True)))
+        level0 = bench.at_level(design, 0)
+        if level0.failures:
+            continue
+        found: dict[str, Any] = {
+            "design": asdict(design),
+            "level0_smallest_gap_m": level0.smallest_gap_m,
+        }
+        for level in (1, 2):
+            picture = bench.at_level(design, level)
+            found[f"level{level}"] = asdict(replace(picture, regions=picture.regions[:6]))
+        print(json.dumps(found), flush=True)
 
 
 def search_weights(options: argparse.Namespace) -> None:
@@ -262,6 +302,11 @@ def main() -> None:
     designs.add_argument("--around", help="JSON of a design to draw near")
     designs.add_argument("--levels", default="0,1,2")
     designs.set_defaults(search=search_designs)
+    gaps = commands.add_parser("gaps", help="designs that accept gaps, in the roundabout")
+    gaps.add_argument("--cases", type=int, default=4_000, help="cases per level")
+    gaps.add_argument("--seed", type=int, default=31, help="not that of a truth")
+    gaps.add_argument("--policies", type=Path, help="folder of policies")
+    gaps.set_defaults(search=search_gaps)
     weights = commands.add_parser("weights", help="screen sets of reward weights")
     weights.add_argument("file", type=Path, help="one JSON object of weights a line")
     weights.add_argument("--updates", type=int, default=15_000, help="of each brief training")

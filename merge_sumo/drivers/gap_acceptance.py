@@ -70,10 +70,12 @@ class GapAcceptanceVut(Level0Vut):
     def act(self, scene: Scene) -> FloatArray:
         """Return the level-0 acceleration where it goes, else what it takes to stop at the line."""
         design, v = self.design, scene.v_vut_mps
-        due_s = level0_time_to(-scene.x_vut_m, v, self.a_mps2, self.v_cruise_mps)
+        # In the seat of a POV it drives on behind M.
+        distance_m = np.maximum(-scene.x_vut_m, 0.0)
+        due_s = level0_time_to(distance_m, v, self.a_mps2, self.v_cruise_mps)
         later_s = -scene.x_pov_m / np.maximum(scene.v_pov_mps, STANDS_MPS) - due_s
         # Eq. (4) moves by the speed before the step: to stop takes half a step's way more.
-        room_m = -scene.x_vut_m - design.line_m - 0.5 * DT_S * v
+        room_m = distance_m - design.line_m - 0.5 * DT_S * v
         needed = 0.5 * v * v / np.maximum(room_m, 1e-9)
         self._goes |= (later_s >= design.lead_s) | (later_s <= -design.lag_s)
         self._goes |= needed > -self._a_min
