@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import make_scenarios
 import numpy as np
 import pytest
 from lxml import etree
@@ -17,18 +19,32 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.ground import ProvingGround, road_for
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
+from merge_sumo.drivers.policies import (
+    NETWORKS,
+    load_network,
+    plays_as,
+    policies_of,
+    read_manifest,
+    scenario_of,
+)
+from merge_sumo.reports.diagnosis import Kind, diagnose
 from merge_sumo.reports.report import write_report
 from merge_sumo.scenarios.scenario_file import named_scenario, shipped_scenarios
+from merge_sumo.scenarios.suggestion import unseen
 from merge_sumo.sumo.world import World
+from merge_sumo.training import check as checking
 from merge_sumo.training.env import MergeGame
-from merge_sumo.training.reward import Reward
-from merge_sumo.values.case import from_unit
+from merge_sumo.training.reward import Reward, RewardWeights
+from merge_sumo.values.case import from_unit, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End
 
 ROOT = Path(__file__).resolve().parent.parent
 ROUNDABOUT = named_scenario("roundabout")
@@ -128,6 +144,95 @@ def test_random_episodes_follow_the_equations_of_motion_to_the_digit(road):
         ):
             assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
             assert v[1:] == pytest.approx(np.maximum(v[:-1] + a[:-1] * 0.1, 0.0), abs=1e-9)
+
+
+class TestItsDrivers:
+    def test_are_its_own_and_rational(self):
+        folder = policies_of(ROUNDABOUT)
+        assert folder == policies_of() / "roundabout"
+        manifest = read_manifest(folder)
+        assert tuple(manifest) == NETWORKS
+        for name, entry in manifest.items():
+            assert load_network(name, folder).sees_svo == (name == "pov2")
+            assert plays_as(scenario_of(entry), ROUNDABOUT)
+            weights = RewardWeights.of(ROUNDABOUT)
+            assert entry["reward_weights"] == pytest.approx(dataclasses.asdict(weights))
+            assert entry["check"]["mean_regret"] <= 0.02
+            assert entry["check"]["avoidable_collisions"] == 0
+        for name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
+            assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
+
+    def test_have_seen_its_starts(self):
+        assert unseen(ROUNDABOUT) == []
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("name", ["pov1", "vut1"])
+    def test_of_level_1_collide_in_none_of_3000_cases(self, name):
+        cases = checking.check_cases(name, 3000, seed=5, scenario=ROUNDABOUT)
+        network, level0 = (
+            load_network(name, policies_of(ROUNDABOUT)),
+            checking.opponents(name, None),
+        )
+        pair = (network, level0) if name == "pov1" else (level0, network)
+        returns = checking.returns_of(checking.play(cases, *pair), Reward.of(ROUNDABOUT))
+        assert returns.collided.sum() == 0
+        unmoved = checking.play(cases, Level0Pov, Level0Vut)
+        assert checking.returns_of(unmoved, Reward.of(ROUNDABOUT)).collided.sum() > 300
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("name", NETWORKS)
+    def test_lose_little_over_300_cases_that_training_never_saw(self, name):
+        found = checking.check_policy(name, policies_of(ROUNDABOUT), scenario=ROUNDABOUT)
+        assert found.mean_regret <= 0.02
+        assert found.avoidable_collisions == 0
+
+
+class TestItsVut:
+    @pytest.mark.long
+    @pytest.mark.parametrize(
+        ("level", "count", "bounds", "kinds"),
+        [
+            (0, 10_000, (0.0, 0.0), set()),
+            (1, 10_000, (0.05, 0.13), {Kind.STALEMATE}),
+            (2, 20_000, (0.005, 0.02), {Kind.SQUEEZE}),
+        ],
+    )
+    def test_fails_only_against_drivers_who_react(self, level, count, bounds, kinds):
+        cases = uniform_cases(count, level, seed=1)
+        with ProvingGround("roundabout", scenario=ROUNDABOUT) as ground:
+            failing = [
+                trajectory
+                for _, trajectory in ground.run(cases)
+                if measure(trajectory).end is End.COLLISION
+            ]
+        points = to_unit((trajectory.case for trajectory in failing), level)
+        assert bounds[0] <= (fmc(points) if failing else 0.0) <= bounds[1]
+        assert {diagnose(trajectory, measure(trajectory)).kind for trajectory in failing} == kinds
+
+
+class TestTheExampleRuns:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def runs(cls):
+        names = ("roundabout-yields", "roundabout-stalemate")
+        return [make_scenarios.play(make_scenarios.EXAMPLES[name]) for name in names]
+
+    def test_begin_alike(self, runs):
+        assert np.array_equal(runs[0].motion[0, :, :2], runs[1].motion[0, :, :2])
+
+    def test_in_one_the_pov_slows_and_the_vut_merges_first(self, runs):
+        run = runs[0]
+        assert run.v_pov_mps[-1] < run.v_pov_mps[0] - 3.0
+        assert (measure(run).end, measure(run).merged_first) == (End.MERGED, "VUT")
+
+    def test_in_the_other_both_nearly_stop_go_at_the_same_moment_and_collide(self, runs):
+        run = runs[1]
+        assert measure(run).end is End.COLLISION
+        assert diagnose(run, measure(run)).kind is Kind.STALEMATE
+        slowest = run.v_pov_mps.argmin(), run.v_vut_mps.argmin()
+        assert abs(slowest[0] - slowest[1]) <= 2
+        assert (run.v_pov_mps.min(), run.v_vut_mps.min()) < (2.0, 2.0)
+        assert -12.0 < run.x_pov_m[slowest[0]] < run.x_vut_m[slowest[1]] < -6.0
 
 
 def test_a_game_on_it_is_played_by_its_numbers(road):

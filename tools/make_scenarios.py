@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from merge_sumo.campaigns.ground import ProvingGround, road_for
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.values.case import RECORDED_IN_TRAFFIC, Case
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S, US23, Scenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import Trajectory
 
@@ -39,32 +39,38 @@ class Example:
     case: Case
 
 
+US23_TRAFFIC, ROUNDABOUT = map(named_scenario, ("us23-traffic", "roundabout"))
+
+
 def _case(
     level: int,
     x_pov0_m: float,
     v_pov0_mps: float,
     svo_rad: float | None = None,
-    headways_s: tuple[float, float] | None = None,
+    scenario: Scenario = US23,
+    **headways_s: float,
 ) -> Case:
-    """Return a case of us23, or with headways ahead and behind one of us23-traffic."""
-    case: dict[str, Any] = {
-        "level": level,
-        "x_pov0_m": x_pov0_m,
-        "v_pov0_mps": v_pov0_mps,
-        "svo_rad": svo_rad,
-    }
-    if headways_s is not None:
-        case |= dict(zip(RECORDED_IN_TRAFFIC, headways_s, strict=True))
-        case |= {"scenario": named_scenario("us23-traffic")}
-    return Case(**case)
+    """Return a case with the VUT's own speed in its scenario."""
+    return Case(
+        level=level,
+        x_pov0_m=x_pov0_m,
+        v_pov0_mps=v_pov0_mps,
+        svo_rad=svo_rad,
+        v_vut0_mps=scenario.bounds("v_vut0_mps")[0],
+        scenario=scenario,
+        **headways_s,
+    )
 
 
+QUEUE = {"headway_ahead_s": 1.2, "headway_behind_s": 1.3}
 EXAMPLES = {
     "pov-yields": Example("level0", _case(1, -273.0, 33.0)),
     "vut-waits": Example("level1", _case(2, -273.0, 33.0, 0.6)),
     "stalemate": Example("design2", _case(2, -294.5, 34.125, 0.6)),
     "no-reaction": Example("design1", _case(0, -269.0, 31.0)),
-    "queue": Example("design2", _case(0, -204.0, 26.4, headways_s=(1.2, 1.3))),
+    "queue": Example("design2", _case(0, -204.0, 26.4, scenario=US23_TRAFFIC, **QUEUE)),
+    "roundabout-yields": Example("level0", _case(1, -66.5, 10.625, scenario=ROUNDABOUT)),
+    "roundabout-stalemate": Example("roundabout", _case(1, -66.5, 10.625, scenario=ROUNDABOUT)),
 }
 
 
