@@ -92,7 +92,15 @@ class Vut:
 """
 
 
-@pytest.mark.parametrize("name", ["my_vut.py", "gain_of_mine.py", "late_gain.py", "gain.txt"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("my_vut.py", marks=pytest.mark.long),
+        pytest.param("gain_of_mine.py", marks=pytest.mark.long),
+        "late_gain.py",
+        "gain.txt",
+    ],
+)
 def test_a_truth_is_of_every_file_that_the_vut_loaded_also_while_it_drove(tmp_path, name):
     for file, content in {
         "my_vut.py": READER,

@@ -172,7 +172,7 @@ class TestAReplay:
                     [at.x_m, at.y_m, at.angle_deg, at.position_m], abs=1e-6
                 )
 
-    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("by", [0.5, pytest.param(-0.5, marks=pytest.mark.long)])
     @pytest.mark.parametrize("column", ["x", "y", "pos", "speed"])
     @pytest.mark.parametrize("who", ["pov", "vut"])
     def test_is_not_identical_when_a_number_was_changed(self, folder, who, column, by):

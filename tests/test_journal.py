@@ -215,7 +215,7 @@ class TestReading:
             ("batch", None),
             ("batch", 1.0),
             ("level", "0"),
-            ("level", 3),
+            ("level", 4),
             ("level", None),
             ("x_pov0_m", "-200"),
             ("x_pov0_m", None),

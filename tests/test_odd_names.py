@@ -61,7 +61,14 @@ def in_a_process(terminal: dict[str, str], *arguments: object) -> tuple[int, str
 
 
 class TestAVutFile:
-    @pytest.mark.parametrize("name", ["my vut%41, ${HOME}", "日本 'é' [red]", "a\nb:\x1b[31m"])
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "my vut%41, ${HOME}",
+            pytest.param("日本 'é' [red]", marks=pytest.mark.long),
+            pytest.param("a\nb:\x1b[31m", marks=pytest.mark.long),
+        ],
+    )
     def test_with_an_odd_name_is_tested(self, call, tmp_path, name):
         (tmp_path / f"{name}.py").write_text(VUT)
         options = ("--level", 0, "--cases", 2, "--sampler", "uniform", "--workers", 1)

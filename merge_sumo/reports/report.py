@@ -11,8 +11,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
@@ -21,6 +22,9 @@ from merge_sumo.reports.report_facts import Facts
 from merge_sumo.reports.report_words import page_words
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
 from merge_sumo.values.scenario import level_name
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 REPORT: Final = "report.html"
 GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
@@ -56,11 +60,8 @@ def check_report(folder: Path) -> None:
 
 def report_page(run: Run) -> str:
     """Return the report of a run as HTML."""
-    from jinja2 import Environment, PackageLoader
     from markupsafe import Markup
 
-    loader = PackageLoader("merge_sumo.reports")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
     style, script = (
         (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
         for name in ("report.css", "report.js")
@@ -69,7 +70,7 @@ def report_page(run: Run) -> str:
     data = json.dumps(page_data(facts), allow_nan=False, separators=(",", ":"))
     # No "<" in the JSON: nothing in it can end its element.
     data = data.replace("<", "\\u003c")
-    return environment.get_template("report.html.jinja").render(
+    return _template().render(
         **page_words(facts),
         style=Markup(style),  # noqa: S704 (our own file)
         script=Markup(script),  # noqa: S704 (our own file)
@@ -78,6 +79,16 @@ def report_page(run: Run) -> str:
         data=Markup(data),  # noqa: S704 (JSON without "<")
         level_name=level_name,
     )
+
+
+@cache
+def _template() -> Template:
+    """Return the template, which is compiled once."""
+    from jinja2 import Environment, PackageLoader
+
+    loader = PackageLoader("merge_sumo.reports")
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
+    return environment.get_template("report.html.jinja")
 
 
 def _policy_hash(source: str) -> str:
