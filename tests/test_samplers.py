@@ -85,7 +85,13 @@ POOLS = {
 }
 
 
-@pytest.fixture(scope="module", params=POOLS)
+LONG = ("4-d", "6-d")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in POOLS],
+)
 def pool(request) -> Pool:
     return POOLS[request.param]
 
@@ -157,7 +163,9 @@ class TestEverySampler:
                 known, now = (getattr(s.history(level), column) for s in (sampler, other))
                 assert np.array_equal(known, now, equal_nan=True)
 
-    @pytest.mark.parametrize("end", [End.VUT_ERROR, End.SIM_ERROR])
+    @pytest.mark.parametrize(
+        "end", [End.VUT_ERROR, pytest.param(End.SIM_ERROR, marks=pytest.mark.long)]
+    )
     @pytest.mark.parametrize("with_history", [False, True])
     def test_proposes_other_cases_after_a_batch_without_a_verdict(
         self, name, pool, played, end, with_history
