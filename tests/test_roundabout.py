@@ -308,19 +308,26 @@ def test_a_shipped_scenario_is_one_data_file_and_no_code(tmp_path):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
     (tmp_path / "sumo_net" / "another-arm.toml").write_text(ANOTHER_ARM)
 
-    def merge_sumo(*words: str) -> str:
-        command = [sys.executable, "-m", "merge_sumo.cli", *words]
-        env = {**os.environ, "PYTHONPATH": str(tmp_path)}
-        done = subprocess.run(
-            command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    assert "another-arm: POV from -60 to -25 m at 5 to 10 m/s" in merge_sumo("scenario", "list")
-    assert "mainline: in_w ring_ws" in merge_sumo("scenario", "check", "another-arm")
     options = ("--vut", "level0", "--level", "0", "--cases", "20", "--batch", "20", "--quiet")
-    merge_sumo("campaign", "--scenario", "another-arm", *options, "--out", "run")
+    commands = [
+        ("scenario", "list"),
+        ("scenario", "check", "another-arm"),
+        ("campaign", "--scenario", "another-arm", *options, "--out", "run"),
+    ]
+    script = "from merge_sumo.cli import app\n" + "".join(
+        f"app({words!r}, standalone_mode=False)\n" for words in commands
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "another-arm: POV from -60 to -25 m at 5 to 10 m/s" in done.stdout
+    assert "mainline: in_w ring_ws" in done.stdout
     run = Run(tmp_path / "run")
     assert run.scenario.name == "another-arm"
     assert any(outcome.failed for outcome in run.outcomes)
