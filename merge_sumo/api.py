@@ -34,6 +34,7 @@ from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.system.folders import dated
 from merge_sumo.system.workers import open_workers
+from merge_sumo.values.criterion import COLLISION
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
@@ -171,6 +172,7 @@ def campaign(
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
     pov: str | None = None,
+    fail_when: str = COLLISION.fail_when,
     on_case: OnCase | None = None,
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
@@ -194,6 +196,7 @@ def campaign(
         scenario: a scenario, its name, or its TOML file.
         policies: folder of learned drivers in the place of the shipped ones.
         pov: a POV of your own, as after `--pov`.
+        fail_when: what counts as a failure, as after `--fail-when`.
         on_case: told of every case as it ends.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
@@ -216,6 +219,7 @@ def campaign(
         policies=None if policies is None else str(policies),
         pov=pov,
         scenario=where,
+        fail_when=fail_when,
     )
     folder = dated(vut) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))

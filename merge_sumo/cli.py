@@ -9,12 +9,22 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands import campaign, experiments, runs, scenarios, training, vuts
+from merge_sumo.commands import (
+    campaign,
+    experiments,
+    probability,
+    runs,
+    scenarios,
+    training,
+    vuts,
+)
 from merge_sumo.commands.shared import app, say
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 
-__all__ = ["app", "campaign", "experiments", "main", "runs", "scenarios", "training", "vuts"]
+__all__ = ["app", "main"]
+COMMANDS = (campaign, experiments, probability, runs, scenarios, training, vuts)
+"""Importing these is what adds their commands to the app."""
 
 
 @app.callback(invoke_without_command=True)

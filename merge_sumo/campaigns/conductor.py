@@ -66,7 +66,9 @@ def conduct(
             return
         ran: list[tuple[Outcome, Trajectory]] = []
         for place, done in run(sampler.ask(min(batch, cases - first))):
-            outcome = Outcome(first + place, number, done.trajectory.case, done.measures)
+            outcome = Outcome(
+                first + place, number, done.trajectory.case, done.measures, done.margin
+            )
             ran.append((outcome, done.trajectory))
             if on_case is not None:
                 on_case(outcome)
@@ -151,6 +153,12 @@ def resume_campaign(
         for name in FILES:
             record[name] = _files_again(recorded, name) | (record[name] or {}) or None
         changes = differences(RECORDED_BY_DEFAULT | recorded, record)
+        if "fail_when" in changes:
+            was, now = changes["fail_when"]
+            raise UserError(
+                f"{folder} counts as a failure when {was}, and not when {now}: a campaign has one "
+                "criterion; begin another campaign for another"
+            )
         if changes and not force:
             name, (was, now) = next(iter(changes.items()))
             raise UserError(
@@ -235,6 +243,7 @@ def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan
         net=net,
         scenario=settings.scenario,
         povs=settings.povs.with_log(log),
+        criterion=settings.criterion,
     )
 
 

@@ -27,6 +27,7 @@ from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool, to_unit
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
@@ -148,6 +149,7 @@ def search(
     on_search: Callable[[str, int], None] | None = None,
     scenario: Scenario = US23,
     povs: Povs | None = None,
+    criterion: Criterion = COLLISION,
 ) -> dict[str, list[Search]]:
     """Let samplers search a pool, with the seeds 0 to `seeds` - 1 each.
 
@@ -162,6 +164,7 @@ def search(
         corridors=min(MAX_CORRIDORS, batch),
         net=road_for(scenario),
         povs=povs,
+        criterion=criterion,
     )
     found: dict[int, Search] = {}
     with workers_or_here(workers) as there:

@@ -29,7 +29,7 @@ from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import Case
-from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.score import Outcome
 
 RESULT: Final = "probability.json"
 LINES: Final = ".jsonl"
@@ -90,7 +90,7 @@ def failure_probability(
     draws = proposal.draw(cases, np.random.default_rng([seed, STREAM]))
     outcomes = _run(settings, net, stated, draws, lines, on_case)
     failed = np.array([outcome.failed for outcome in outcomes])
-    judged = np.array([outcome.measures.score is not None for outcome in outcomes])
+    judged = np.array([outcome.score is not None for outcome in outcomes])
     result = estimate(draws, failed, judged, proposal.bound, confidence)
     record = {
         **asdict(result),
@@ -134,9 +134,7 @@ def _run(
         for first in range(0, len(cases), WRITTEN):
             ran = []
             for place, trajectory in ground.run(cases[first : first + WRITTEN]):
-                outcome = Outcome(
-                    first + place, first // WRITTEN, trajectory.case, measure(trajectory)
-                )
+                outcome = settings.criterion.outcome(first + place, first // WRITTEN, trajectory)
                 ran.append(outcome)
                 if on_case is not None:
                     on_case(outcome)

@@ -22,6 +22,7 @@ from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.trust import is_own
 from merge_sumo.values.case import Pool
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import (
     ALL_LEVELS,
     DEADLINE_S,
@@ -56,6 +57,7 @@ class CampaignSettings:
     policies: str | None = None
     pov: str | None = None
     scenario: Scenario = US23
+    fail_when: str = COLLISION.fail_when
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels; the scenario says what is left out."""
@@ -79,6 +81,7 @@ class CampaignSettings:
                     f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
                     "rename it"
                 )
+        object.__setattr__(self, "fail_when", self.criterion.fail_when)
         _ = self.vut_factory
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
@@ -117,6 +120,11 @@ class CampaignSettings:
     def povs(self) -> Povs:
         """Who drives the POV."""
         return povs_of(self.policies, self.scenario, self.pov, self._options)
+
+    @property
+    def criterion(self) -> Criterion:
+        """What counts as a failure."""
+        return Criterion(self.fail_when)
 
     def workers(self, asked: int | None) -> int:
         """Return in how many processes the cases run: see `VutFactory.workers`."""

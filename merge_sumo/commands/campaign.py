@@ -12,6 +12,7 @@ import typer
 from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
+    FailWhenOption,
     InProcessOption,
     JsonOption,
     NetOption,
@@ -61,6 +62,7 @@ def campaign(
     seed: Annotated[int, typer.Option(help="Same seed, same outcomes.")] = 0,
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
+    fail_when: FailWhenOption = "collision",
     v_vut0: Annotated[
         float | None,
         typer.Option(help="Initial speed of the VUT in m/s.  [default: the scenario's, 18]"),
@@ -156,6 +158,7 @@ def campaign(
             policies=None if policies is None else str(policies),
             pov=pov,
             scenario=where,
+            fail_when=fail_when,
         )
         folder = out or dated(vut)
     else:
@@ -267,6 +270,7 @@ def _given(context: typer.Context) -> dict[str, object]:
     Levels are not among them: which there are, the other settings say.
     """
     from merge_sumo.scenarios.scenario_file import named_scenario
+    from merge_sumo.values.criterion import Criterion
 
     names = {
         name: name
@@ -282,6 +286,7 @@ def _given(context: typer.Context) -> dict[str, object]:
             "policies",
             "pov",
             "scenario",
+            "fail_when",
         )
     }
     names |= {"v_vut0": "v_vut0_mps", "deadline": "deadline_s", "vut_memory": "vut_memory_gib"}
@@ -292,6 +297,8 @@ def _given(context: typer.Context) -> dict[str, object]:
     }
     if "policies" in given:
         given["policies"] = str(given["policies"])
+    if "fail_when" in given:
+        given["fail_when"] = Criterion(str(given["fail_when"])).fail_when
     if "scenario" in given:
         given["scenario"] = named_scenario(given["scenario"])
     if context.params["out"] is not None:

@@ -1,4 +1,4 @@
-"""Commands that measure: truth, compare, reproduce, probability."""
+"""Commands that measure: truth, compare, reproduce."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ import typer
 from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
+    FailWhenOption,
     JsonOption,
-    NetOption,
     PoliciesOption,
     PovOption,
-    RunArgument,
     ScenarioOption,
-    TrustOption,
     VutCommandOption,
     VutMemoryOption,
     app,
@@ -36,6 +34,7 @@ if TYPE_CHECKING:
     from merge_sumo.drivers.vut import VutFactory
     from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.system.workers import Workers
+    from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.scenario import Scenario
 
 
@@ -50,6 +49,7 @@ def truth(
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     pov: PovOption = None,
+    fail_when: FailWhenOption = "collision",
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -69,15 +69,17 @@ def truth(
     from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.system.workers import open_workers
+    from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.fmc import fmc, regions
 
     where = named_scenario(scenario)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
+    criterion = Criterion(fail_when)
     povs = povs_of(policies, where, pov, options)
     chosen = one_level(level, povs)
     factory = _factory(vut, povs, vut_command, options)
     with open_workers(povs.workers(factory, workers), dask) as there:
-        found = _truth(factory, povs, chosen, cases, seed, there, where)
+        found = _truth(factory, povs, chosen, cases, seed, there, where, criterion)
     if factory.vut.named_only:
         say(
             "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
@@ -120,6 +122,7 @@ def compare(
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     pov: PovOption = None,
+    fail_when: FailWhenOption = "collision",
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -144,12 +147,13 @@ def compare(
     from merge_sumo.reports.progress import Counter
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.system.workers import open_workers
+    from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.fmc import fmc
 
     where = named_scenario(scenario)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
     povs = povs_of(policies, where, pov, options)
-    levels = parse_levels(level, povs)
+    levels, criterion = parse_levels(level, povs), Criterion(fail_when)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
     factory = _factory(vut, povs, vut_command, options)
     for name in names:
@@ -174,7 +178,8 @@ def compare(
         Counter(title, len(names) * seeds, "runs") as counter,
     ):
         truths = {
-            level: _truth(factory, povs, level, truth_cases, 0, there, where) for level in levels
+            level: _truth(factory, povs, level, truth_cases, 0, there, where, criterion)
+            for level in levels
         }
         searches = experiments.search(
             factory,
@@ -187,6 +192,7 @@ def compare(
             on_search=lambda name, _: counter.ended(1, name),
             scenario=where,
             povs=povs,
+            criterion=criterion,
         )
     compared = {name: experiments.compare(found, truths) for name, found in searches.items()}
     truth_fmc = sum(fmc(found.failures) for found in truths.values())
@@ -289,76 +295,6 @@ def reproduce(
     show(f"all of it: {index}")
 
 
-@app.command()
-def probability(
-    run: RunArgument,
-    cases: Annotated[int, typer.Option(help="Fresh cases to run.")] = 4000,
-    distribution: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="JSON: how often cases occur.  [default: uniform]"),
-    ] = None,
-    confidence: Annotated[
-        float, typer.Option(help="Chance that the interval holds the probability.")
-    ] = 0.95,
-    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="New file to write.  [default: RUN/probability.json]"),
-    ] = None,
-    net: NetOption = None,
-    policies: PoliciesOption = None,
-    trust_vut: TrustOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Estimate how likely a VUT is to fail, with an interval that is valid.
-
-    The cases of the campaign were chosen to fail: they only say where fresh cases are worth most.
-    These are drawn independently, run in SUMO, and weighted; the interval is by betting, and holds
-    for any number of cases.
-
-    Example:  merge-sumo probability runs/design2 --cases 4000
-    """
-    from merge_sumo.campaigns import probability as estimates
-    from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports.progress import Counter
-
-    campaign = Run(run)
-    target = out or run / estimates.RESULT
-    with Counter("fresh cases", cases, "cases") as counter:
-        found = estimates.failure_probability(
-            campaign,
-            target,
-            cases=cases,
-            distribution=distribution,
-            confidence=confidence,
-            seed=seed,
-            net=road_for(campaign.scenario, net),
-            given={} if policies is None else {"policies": str(policies)},
-            trust=trust_vut,
-            on_case=lambda _: counter.ended(1),
-        )
-    if as_json:
-        typer.echo(json.dumps({**asdict(found), "file": str(target)}, allow_nan=False))
-        return
-    how = "under the stated distribution" if distribution else "under uniform cases"
-    show(
-        f"P(fail) {how}: {found.probability:.3g}, {100.0 * confidence:g} % interval "
-        f"[{found.low:.3g}, {found.high:.3g}] ({found.failures} failures in {cases} fresh cases)"
-    )
-    if found.without_verdict:
-        show(
-            f"  {found.without_verdict} cases without a verdict: safe for the lower end, failures "
-            "for the upper end"
-        )
-    arm = found.uniform_arm
-    show(
-        f"  for comparison, the {arm.cases} plain cases among them alone: {arm.failures} failures, "
-        f"[{arm.low:.3g}, {arm.high:.3g}]"
-    )
-    show(f"written: {target}")
-
-
 def _factory(vut: str, povs: Povs, command: str | None, options: VutOptions) -> VutFactory:
     from merge_sumo.drivers.vut import vut_factory
 
@@ -373,6 +309,7 @@ def _truth(
     seed: int,
     workers: Workers,
     scenario: Scenario,
+    criterion: Criterion,
 ) -> Truth:
     from merge_sumo.campaigns.truth import TRUTH_CASES, ground_truth
     from merge_sumo.reports.progress import Counter
@@ -392,4 +329,5 @@ def _truth(
             on_cases=counter.ended,
             scenario=scenario,
             povs=povs,
+            criterion=criterion,
         )

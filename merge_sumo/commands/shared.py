@@ -91,6 +91,14 @@ PovOption = Annotated[
         help="A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
     ),
 ]
+FailWhenOption = Annotated[
+    str,
+    typer.Option(
+        metavar="EXPR",
+        help="What counts as a failure: collision (the paper's), contact, unsafe, or a condition "
+        "over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 

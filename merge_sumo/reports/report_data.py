@@ -78,7 +78,7 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "nearest": VEHICLES.index(o.measures.nearest),
             "end": ends.index(o.measures.end),
             "failed": int(o.failed),
-            "score": _rounded(o.measures.score, 1),
+            "score": _rounded(o.score, 1),
             "dx": _rounded(o.measures.dx_m, 2),
             "dv": _rounded(o.measures.dv_mps, 2),
             "t_end": o.measures.t_end_s,
@@ -89,6 +89,8 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "offset": offsets.get(o.index, 0),
             "rows": len(facts.motion[o.index].motion) if o.index in facts.motion else 0,
         }
+        if not facts.run.criterion.is_papers:
+            row["margin"] = _rounded(o.margin, 3)
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
     return columns or {"index": []}
@@ -132,7 +134,7 @@ def _search(facts: Facts) -> dict[str, Any]:
     for level in facts.levels:
         at = [o for o in facts.run.outcomes if o.case.level == level]
         group = np.array([o.batch // width for o in at], dtype=np.int64)
-        score = np.array([o.measures.score for o in at], dtype=np.float64)
+        score = np.array([o.score for o in at], dtype=np.float64)
         failed = np.array([o.failed for o in at], dtype=bool)
         points = to_unit((o.case for o in at), level, facts.run.scenario)
         counted: list[int] = []

@@ -50,7 +50,7 @@ class Facts:
         self.worst = failures(run.outcomes)
         self.near = sorted(
             (o for o in run.outcomes if _is_told(o) and not o.failed),
-            key=lambda o: (o.measures.score, o.index),
+            key=lambda o: (o.score, o.index),
         )
         self.untested = [o for o in run.outcomes if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
@@ -83,7 +83,7 @@ class Facts:
 
 
 def _is_told(outcome: Outcome) -> bool:
-    return outcome.measures.end.is_tested and outcome.measures.score is not None
+    return outcome.is_tested and outcome.score is not None
 
 
 def _motion(run: Run, index: int) -> Trajectory | None:
@@ -122,5 +122,6 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         run.scenario,
         policies=settings.get("policies_sha256", {}),
         pov=settings.get("pov") if level == OWN else None,
+        criterion=run.criterion,
     )
     return read_truth(kept.path(), level, kept.cases, kept.scenario)

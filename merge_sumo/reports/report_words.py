@@ -21,6 +21,7 @@ from merge_sumo.reports.summary import LevelSummary, Summary
 from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.reports.verdict import Verdict, counted, in_words
 from merge_sumo.system.printable import printable
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.scenario import OWN, level_name
 from merge_sumo.values.score import Outcome
@@ -70,6 +71,7 @@ ABOUT: Final = {
 def page_words(facts: Facts) -> dict[str, Any]:
     """Return what the template needs for text and tables."""
     settings, summary = facts.run.settings, facts.summary
+    criterion = facts.run.criterion
     wanted = settings.get("cases")
     boxes = [
         box
@@ -92,7 +94,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
     ]
     return {
         "vut": facts.run.vut,
-        "headline": headline(facts.verdict, summary, facts.worst, facts.kinds),
+        "headline": headline(facts.verdict, summary, facts.worst, facts.kinds, criterion),
         "counts": facts.verdict.counts,
         "found": facts.verdict,
         "troubles": facts.troubles(),
@@ -120,6 +122,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "kinds": _kinds(facts),
         "ceded": f"{CEDED_MPS:g}",
         "scenario": facts.run.scenario,
+        "criterion": None if criterion.is_papers else criterion.words,
         "traffic": facts.run.scenario.vehicles > 2,
         "coordinates": facts.coordinates,
         "covered": any(level.dims <= 3 for level in levels),
@@ -242,7 +245,11 @@ def _avoidable_kind(facts: Facts, outcome: Outcome) -> bool:
 
 
 def headline(
-    verdict: Verdict, summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]
+    verdict: Verdict,
+    summary: Summary,
+    worst: Sequence[Outcome],
+    kinds: Mapping[int, Kind],
+    criterion: Criterion = COLLISION,
 ) -> str:
     """Return the result of a campaign in a few sentences: what was not tested comes first."""
     if not verdict.cases:
@@ -252,18 +259,23 @@ def headline(
         for level, found in summary.levels.items():
             if found.cases and not found.tested:
                 said.append(f"At POV level {level_name(level)} nothing was tested.")
-        said.append(_collisions(verdict, summary, worst, kinds))
+        said.append(_failures(verdict, summary, worst, kinds, criterion))
     return " ".join(said)
 
 
-def _collisions(
-    verdict: Verdict, summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]
+def _failures(
+    verdict: Verdict,
+    summary: Summary,
+    worst: Sequence[Outcome],
+    kinds: Mapping[int, Kind],
+    criterion: Criterion,
 ) -> str:
     if not summary.failures:
+        what = "collision" if criterion.is_papers else "failure"
         others = "the other " if verdict.tested < verdict.cases else ""
         return (
-            f"No collision in {others}{counted(verdict.tested, 'case')}. That is no proof: the "
-            "search saw these cases and no others."
+            f"No {what} in {others}{counted(verdict.tested, 'case')}. That is no proof: the search "
+            "saw these cases and no others."
         )
     failing = {level: found for level, found in summary.levels.items() if found.failures}
     tested = {level: found for level, found in summary.levels.items() if found.tested}
@@ -273,7 +285,7 @@ def _collisions(
         f"({counted(found.regions, 'region')})"
         for level, found in failing.items()
     ]
-    text = f"Collides in {in_words(parts)}"
+    text = f"{'Collides' if criterion.is_papers else 'Fails'} in {in_words(parts)}"
     text += f", never at level {in_words(never)}." if never else "."
     common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
     if common:
@@ -284,10 +296,9 @@ def _collisions(
 
 
 def _avoidable(worst: Sequence[Outcome]) -> str | None:
-    if not worst:
-        return None
-    count = sum(bool(o.measures.avoidable) for o in worst)
-    return f"{count} of {len(worst)} could have been avoided by the VUT."
+    """Return how many collisions need not have been, among those that count as failures."""
+    told = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
+    return f"{sum(told)} of {len(told)} could have been avoided by the VUT." if told else None
 
 
 def _duration(seconds: float) -> str:

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
-from merge_sumo.values.scenario import DT_S, POV, US23, VEHICLES, VUT, Scenario
+from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
@@ -86,17 +86,50 @@ class Measures:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A case that was run: its place in the campaign and its measures."""
+    """A case that was run: its place in the campaign and its measures.
+
+    Attributes:
+        index: its place in the campaign.
+        batch: the batch in which it ran.
+        case: the case.
+        measures: what was measured.
+        margin: how far it is from failing under the campaign's criterion, below 0 where it fails;
+            None under the paper's, which has the score P, and after an error.
+    """
 
     index: int
     batch: int
     case: Case
     measures: Measures
+    margin: float | None = None
+
+    @property
+    def score(self) -> float | None:
+        """The score under the campaign's criterion: it fails below lambda; None after an error."""
+        return self.measures.score if self.margin is None else score_of(self.margin)
 
     @property
     def failed(self) -> bool:
-        """Whether this case is a failure of the VUT: P < lambda."""
-        return self.measures.score is not None and self.measures.score < FAILURE_SCORE
+        """Whether this case is a failure of the VUT: its score is below lambda."""
+        return self.score is not None and self.score < FAILURE_SCORE
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether this case says something of the VUT: it reached the merge point, or failed."""
+        return self.measures.end.is_tested or self.failed
+
+    @property
+    def signed_gap_m(self) -> float | None:
+        """The gap dx at M that a sampler learns; a case fails where it is within 6 m.
+
+        Under another criterion than the paper's it is what stands for it: 6 m times 1 + m at a
+        margin m of 0 or more, and 6 m / (1 - m) below; negative where the VUT goes first.
+        """
+        dx, margin = self.measures.dx_m, self.margin
+        if margin is None:
+            return dx
+        gap = DX_CRASH_M * (1.0 + margin if margin >= 0.0 else 1.0 / (1.0 - margin))
+        return -gap if dx is not None and dx < 0.0 else gap
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
@@ -107,7 +140,8 @@ class Outcome:
         else:
             del measures["nearest"]
         place = {"index": self.index, "batch": self.batch}
-        return place | {name: getattr(case, name) for name in names} | measures
+        margin = {} if self.margin is None else {"margin": self.margin}
+        return place | {name: getattr(case, name) for name in names} | measures | margin
 
     @classmethod
     def from_record(cls, record: dict[str, Any], scenario: Scenario = US23) -> Outcome:
@@ -116,6 +150,9 @@ class Outcome:
         index, batch = values.pop("index"), values.pop("batch")
         if type(index) is not int or type(batch) is not int:
             raise TypeError("index and batch must be whole numbers")
+        margin = values.pop("margin", None)
+        if margin is not None and not (type(margin) is float and math.isfinite(margin)):
+            raise ValueError(f"margin is {margin!r}")
         in_traffic = scenario.vehicles > 2
         names = (*RECORDED, *RECORDED_IN_TRAFFIC) if in_traffic else RECORDED
         case = Case(**{name: values.pop(name) for name in names}, scenario=scenario)
@@ -129,7 +166,7 @@ class Outcome:
                 raise TypeError(f"{name} is {value!r}")
             if type(value) is float and not math.isfinite(value):
                 raise ValueError(f"{name} is {value!r}")
-        return cls(index=index, batch=batch, case=case, measures=Measures(**values))
+        return cls(index, batch, case, Measures(**values), margin)
 
 
 _JSON_TYPES: Final = {"None": type(None), "float": float, "str": str, "bool": bool, "int": int}
@@ -139,6 +176,11 @@ _TYPES: Final = {
     if name != "end"
 }
 """What the fields of `Measures` may hold when they are read from JSON."""
+
+
+def score_of(margin: float) -> float:
+    """Return the score that a margin stands for, in the same order; lambda at a margin of 0."""
+    return FAILURE_SCORE * (1.0 - margin / (1.0 + abs(margin)))
 
 
 def measure(trajectory: Trajectory) -> Measures:

@@ -40,7 +40,7 @@ function motion(i) {
   return { rows, v, x, met: cases.nearest[i] };
 }
 const failed = (i) => cases.failed[i] === 1;
-const tested = (i) => ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
+const tested = (i) => failed(i) || ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
 function title(i) {
@@ -61,6 +61,9 @@ function words(i) {
     parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
   } else {
     parts.push(`${end}: ${data.errors[cases.index[i]] || "no reason given"}`);
+  }
+  if (cases.margin && cases.margin[i] !== null) {
+    parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
   if (yields.length) {
     parts.push(yields.map(([t, who], n) => `${n ? "the" : "The"} ${who} begins to yield at ${fixed(t, 1)} s`).join(", ") + ".");

@@ -1,0 +1,123 @@
+"""What counts as a failure: a criterion that is named, or a condition on the measures of a case.
+
+A criterion gives every case a margin: below 0 it fails, above 0 it does not, and how far from 0
+is said in units of the thresholds (`expression.py`). Samplers, truths and reports know scores:
+a margin m is the score lambda (1 - m / (1 + |m|)), which is below lambda exactly where m is below
+0. The criterion of the paper has its own score, P, and needs no margin.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import lru_cache
+from typing import Final
+
+from merge_sumo.errors import UserError
+from merge_sumo.system.printable import printable
+from merge_sumo.values.expression import Condition, Value, Vocabulary, parse_condition
+from merge_sumo.values.merge import brake_after_mps2, bumper_gap_m
+from merge_sumo.values.scenario import VEHICLES, VUT
+from merge_sumo.values.score import Measures, Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
+
+PAPER: Final = "collision"
+NAMED: Final = {
+    PAPER: "score < -500",
+    "contact": "gap_m < 0",
+    "unsafe": "gap_m < 0 or brake_after_mps2 > 3",
+}
+"""Criteria by name, and the condition that each one is."""
+
+NUMBERS: Final = (
+    *("ttc_s", "gap_m", "dx_m", "dv_mps", "drac_mps2", "brake_after_mps2", "pet_s", "t_end_s"),
+    *("impact_speed_mps", "vut_max_brake_mps2", "pov_max_brake_mps2", "last_avoidable_s"),
+    *("clipped_steps", "score"),
+)
+TEXTS: Final = {
+    "end": frozenset({End.MERGED.value, End.COLLISION.value, End.TIMEOUT.value}),
+    "merged_first": frozenset({"VUT", "POV"}),
+    "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
+}
+"""What may be said of measures that are texts. Errors have no verdict under any criterion."""
+VOCABULARY: Final[Vocabulary] = {**dict.fromkeys(NUMBERS), **TEXTS}
+NEVER: Final[dict[str, Value]] = {
+    **dict.fromkeys(("dx_m", "ttc_s", "pet_s", "last_avoidable_s"), math.inf),
+    **dict.fromkeys(("dv_mps", "drac_mps2", "impact_speed_mps", "score"), 0.0),
+    "merged_first": "",
+}
+"""What a measure without a value counts as: those two never meet."""
+IN_COLLISION: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
+"""What it counts as in a collision: no braking would do, and there was no way out at any time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Criterion:
+    """What counts as a failure; `UserError` for what is no criterion.
+
+    Attributes:
+        fail_when: the name of a criterion, or a condition over measures, as Python writes it.
+    """
+
+    fail_when: str = PAPER
+
+    def __post_init__(self) -> None:
+        """Check the condition; however it is spaced, it is the same."""
+        name = self.fail_when.strip()
+        if name not in NAMED:
+            if name.isidentifier() and (near := get_close_matches(name, NAMED, n=1)):
+                raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
+            _, name = parse_condition(self.fail_when, VOCABULARY, "--fail-when")
+        object.__setattr__(self, "fail_when", name)
+
+    @property
+    def is_papers(self) -> bool:
+        """Whether it is that of the paper, which needs no margin."""
+        return self.fail_when == PAPER
+
+    @property
+    def text(self) -> str:
+        """What a person would write."""
+        return self.fail_when
+
+    @property
+    def words(self) -> str:
+        """Return when a case fails, as a condition."""
+        return NAMED.get(self.fail_when, self.fail_when)
+
+    def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
+        """Return the margin of an episode; None under the paper's criterion and after an error."""
+        if self.is_papers or measures.end.is_error:
+            return None
+        return _condition(self.words).margin(values_of(trajectory, measures))
+
+    def outcome(self, index: int, batch: int, trajectory: Trajectory) -> Outcome:
+        """Return the outcome of an episode at a place in a campaign."""
+        measures = measure(trajectory)
+        margin = self.margin(trajectory, measures)
+        return Outcome(index, batch, trajectory.case, measures, margin)
+
+
+COLLISION: Final = Criterion()
+"""The paper's."""
+
+
+@lru_cache
+def _condition(text: str) -> Condition:
+    return parse_condition(text, VOCABULARY, "--fail-when")[0]
+
+
+def values_of(trajectory: Trajectory, measures: Measures) -> dict[str, Value]:
+    """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
+    missing: dict[str, Value] = NEVER | (IN_COLLISION if measures.end is End.COLLISION else {})
+    found: dict[str, Value] = {
+        "gap_m": bumper_gap_m(trajectory),
+        "brake_after_mps2": brake_after_mps2(trajectory),
+    }
+    for name in VOCABULARY:
+        if name not in found:
+            value = getattr(measures, name)
+            value = missing[name] if value is None else value
+            found[name] = value if isinstance(value, str) else float(value)
+    return found
