@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from test_score import CASE, ending
 
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
+from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.truth import Kept, ground_truth
@@ -19,6 +21,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison import compare_runs
 from merge_sumo.reports.verdict import judge
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.sumo.centre_lines import centre_lines
+from merge_sumo.values.bodies import SPACING_M, CentreLines, clearance_before_m
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import COLLISION, VOCABULARY, Criterion
 from merge_sumo.values.expression import MOST_MARGIN, parse_condition
@@ -101,7 +105,7 @@ class TestRefused:
         ("text", "said"),
         [
             ("tcc_s < 1.5", "no measure 'tcc_s': did you mean ttc_s"),
-            ("zzzzzzzz < 1.5", "choose ttc_s, gap_m"),
+            ("zzzzzzzz < 1.5", "choose ttc_s, clearance_m"),
             ("colision", "did you mean collision?"),
             ('end == "TIMEOT"', "never 'TIMEOT', but COLLISION, MERGED or TIMEOUT"),
             ('end == "VUT_ERROR"', "never 'VUT_ERROR'"),
@@ -179,12 +183,41 @@ class TestMeasures:
         # 7 m are gone in 0.75 s at 10 m/s.
         assert of("brake_after_mps2 > 8", ending(-12.0, v_pov=36.0)) == -MOST_MARGIN
 
+    def test_what_a_merge_asks_by_hand(self):
+        # 20 m between bumpers: 4 m/s2 at 10 m/s, 2.86 at 8.75 m/s, 4.4 at 10.4 m/s; 2.5 at 8.16.
+        asked = {25.9: "none", 34.0: "none", 35.0: "harsh", 35.9: "harsh", 36.1: "forced"}
+        for v_pov, expected in asked.items():
+            assert measure(ending(-25.0, v_pov=v_pov, v_vut=26.0)).after_merge == expected
+        assert measure(ending(4.9, v_pov=40.0)).after_merge == "forced"
+        assert measure(ending(5.1, v_pov=40.0)).after_merge == "none"
+        assert measure(ending(0.0, end=End.TIMEOUT)).after_merge is None
+        assert of('after_merge == "forced"', ending(0.0)) == -1.0
+        assert of('after_merge != "none"', ending(0.0, end=End.TIMEOUT)) == 1.0
+
     def test_an_error_has_no_verdict_under_any_criterion(self):
         error = Trajectory(CASE, ending(0.0).motion, End.VUT_ERROR, "gone")
         outcome = Criterion("t_end_s > 0").outcome(0, 0, error)
         assert outcome.margin is None
         assert outcome.score is None
         assert not outcome.failed
+
+
+class TestRecords:
+    def test_end_with_what_the_merge_asks(self):
+        record = COLLISION.outcome(0, 0, ending(20.0)).to_record()
+        assert list(record)[-1] == "after_merge"
+
+    def test_of_before_say_nothing_of_it(self):
+        outcome = COLLISION.outcome(0, 0, ending(20.0))
+        record = outcome.to_record()
+        del record["after_merge"]
+        before = Outcome.from_record(record)
+        assert before.measures == replace(outcome.measures, after_merge=None)
+
+    def test_that_say_something_else_are_refused(self):
+        record = COLLISION.outcome(0, 0, ending(20.0)).to_record()
+        with pytest.raises(ValueError, match="after_merge"):
+            Outcome.from_record(record | {"after_merge": "<b>"})
 
 
 class TestNamed:
@@ -207,6 +240,62 @@ class TestNamed:
         assert Criterion("unsafe").outcome(0, 0, harsh).margin == pytest.approx(-1.0 / 3.0)
         assert not Criterion("contact").outcome(0, 0, harsh).failed
         assert not Criterion("unsafe").outcome(0, 0, ending(-25.0, v_pov=27.0)).failed
+
+
+def lines(apart_m, ends_m=-20.0):
+    """Return a mainline along y = 0 and a ramp beside it that only joins in the last metre."""
+    mainline = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
+    y = [(-400.0, 50.0), (ends_m - 1.0, 50.0), (ends_m, apart_m), (-1.0, apart_m), (0.0, 0.0)]
+    return CentreLines.of(mainline, np.array([[x, x, side] for x, side in [*y, (400.0, 0.0)]]))
+
+
+def beside(dx, x_vut=-5.0):
+    """Return an episode of one step in which the VUT is still before M."""
+    motion = np.array([[[x_vut + dx, 20.0, 0.0], [x_vut, 20.0, 0.0]]])
+    return Trajectory(CASE, motion, End.TIMEOUT)
+
+
+class TestBodiesBeforeM:
+    @pytest.mark.parametrize(
+        ("dx", "apart", "clearance"),
+        [
+            (0.0, 1.0, -0.8),  # side by side, 1.8 m wide
+            (2.0, 1.5, -0.3),
+            (0.0, 2.0, 0.2),
+            (4.9, 1.0, -0.1),  # 5 m long: one would have to move aside by less, along the lane
+            (-8.0, 1.0, 3.0),
+        ],
+    )
+    def test_clear_each_other_by_hand(self, dx, apart, clearance):
+        found = clearance_before_m(beside(dx), lines(apart))
+        assert found == pytest.approx(clearance)
+
+    def test_that_cross_by_hand(self):
+        # A ramp from the right angle: its car's nose, at y = -2, is 1.1 m from the other's side.
+        mainline = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
+        ramp = np.array([[-400.0, 0.0, -400.0], [0.0, 0.0, 0.0], [400.0, 400.0, 0.0]])
+        crossing = CentreLines.of(mainline, ramp)
+        assert crossing.together_m == 2.5
+        ahead = Trajectory(CASE, np.array([[[2.5, 20.0, 0.0], [-2.0, 0.0, 0.0]]]), End.TIMEOUT)
+        assert clearance_before_m(ahead, crossing) == pytest.approx(1.1)
+
+    def test_are_looked_at_where_the_lanes_run_together(self):
+        assert lines(1.0, ends_m=-20.0).together_m == pytest.approx(20.0, abs=SPACING_M)
+        assert lines(3.2).together_m == pytest.approx(1.0, abs=SPACING_M)
+        assert clearance_before_m(beside(0.0, x_vut=-30.0), lines(1.0)) == math.inf
+
+    def test_on_the_shipped_roads(self):
+        # The ramp of US-23 comes in at 8.8 degrees: 2.3 / sin(8.8 degrees) is 15 m.
+        us23 = centre_lines(road_for(US23))
+        assert us23.together_m == pytest.approx(15.0, abs=0.5)
+        assert clearance_before_m(beside(0.0), us23) < 0.0
+        assert clearance_before_m(beside(0.0, x_vut=-14.9), us23) > 0.0
+        assert centre_lines(road_for(US23)) is us23
+
+    def test_make_a_contact_although_the_vut_never_merges(self):
+        hit = beside(0.0)
+        assert Criterion("contact").margin(hit, measure(hit)) == MOST_MARGIN
+        assert Criterion("contact").margin(hit, measure(hit), lines(1.0)) == pytest.approx(-0.8)
 
 
 class TestOutcomes:

@@ -20,6 +20,7 @@ from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.errors import UserError
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
@@ -157,10 +158,11 @@ def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
         except BaseException:
             _close_ground()  # it stands in the middle of episodes
             raise
+    lines = None if plan.criterion.is_papers else centre_lines(plan.net)
     done: list[Ran] = []
     for place in range(len(cases)):
         measures = measure(ran[place])
-        margin = plan.criterion.margin(ran[place], measures)
+        margin = plan.criterion.margin(ran[place], measures, lines)
         done.append(Ran(measures, ran[place], *files, margin))
     return done
 

@@ -26,6 +26,7 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import Case
@@ -130,11 +131,13 @@ def _run(
         by_place.update(zip(places.tolist(), drawn, strict=True))
     cases = [by_place[place] for place in range(len(by_place))]
     outcomes: list[Outcome] = []
+    road = centre_lines(net)
     with ground_of(settings, len(cases), net) as ground:
         for first in range(0, len(cases), WRITTEN):
             ran = []
             for place, trajectory in ground.run(cases[first : first + WRITTEN]):
-                outcome = settings.criterion.outcome(first + place, first // WRITTEN, trajectory)
+                index, batch = first + place, first // WRITTEN
+                outcome = settings.criterion.outcome(index, batch, trajectory, road)
                 ran.append(outcome)
                 if on_case is not None:
                     on_case(outcome)

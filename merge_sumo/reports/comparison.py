@@ -19,6 +19,7 @@ from merge_sumo.campaigns.settings import same_pov, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports.changes import Change, ComparedCase, LevelChange, RunComparison, Untested
 from merge_sumo.reports.verdict import Verdict, counted, judge
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
@@ -157,9 +158,10 @@ def _run_again(
         return _Again({}, "had nothing to run")
     again: dict[int, Outcome] = {}
     settings = settings_of(run.folder, run.settings, given, trust=trust)
+    lines = centre_lines(net)
     with ground_of(settings, len(cases), net) as ground:
         for place, trajectory in ground.run(cases):
-            again[place] = settings.criterion.outcome(place, 0, trajectory)
+            again[place] = settings.criterion.outcome(place, 0, trajectory, lines)
     for place, outcome in enumerate(told):
         was, now = outcome.score, again[place].score
         if was is None or now is None or abs(was - now) > SAME_SCORE:

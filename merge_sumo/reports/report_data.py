@@ -82,6 +82,7 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "dx": _rounded(o.measures.dx_m, 2),
             "dv": _rounded(o.measures.dv_mps, 2),
             "t_end": o.measures.t_end_s,
+            "after": o.measures.after_merge,
             "way_out": _rounded(o.measures.last_avoidable_s, 1),
             "vut_yields": found.vut_yields_s,
             "pov_yields": found.pov_yields_s,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -23,6 +23,7 @@ from merge_sumo.reports.verdict import Verdict, counted, in_words
 from merge_sumo.system.printable import printable
 from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.merge import HARSH_MPS2, AfterMerge
 from merge_sumo.values.scenario import OWN, level_name
 from merge_sumo.values.score import Outcome
 
@@ -111,6 +112,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "plausible_chance": f"{PLAUSIBLE:.0%}",
         "fewest_failures": FEWEST_FAILURES,
         "avoidable": _avoidable(facts.worst),
+        "after": after_words(facts.run.outcomes),
         "batches": len({o.batch for o in facts.run.outcomes}),
         "driven": _duration(sum(o.measures.t_end_s for o in facts.run.outcomes)),
         "sentences": [box.sentence for box in boxes],
@@ -299,6 +301,21 @@ def _avoidable(worst: Sequence[Outcome]) -> str | None:
     """Return how many collisions need not have been, among those that count as failures."""
     told = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
     return f"{sum(told)} of {len(told)} could have been avoided by the VUT." if told else None
+
+
+def after_words(outcomes: Iterable[Outcome]) -> str | None:
+    """Return how many cases without a failure ask too much of whoever is behind after the merge."""
+    found = Counter(o.measures.after_merge for o in outcomes if not o.failed)
+    forced, harsh = (
+        counted(found[asked], "case") for asked in (AfterMerge.FORCED, AfterMerge.HARSH)
+    )
+    if not (found[AfterMerge.FORCED] or found[AfterMerge.HARSH]):
+        return None
+    return (
+        f"No failure, but no harmless merge: in {harsh} whoever is behind at M has to brake "
+        f"harder than {HARSH_MPS2:g} m/s², in {forced} harder than it can (--fail-when unsafe "
+        "looks for these)."
+    )
 
 
 def _duration(seconds: float) -> str:

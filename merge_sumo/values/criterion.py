@@ -16,8 +16,9 @@ from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
+from merge_sumo.values.bodies import CentreLines, clearance_before_m
 from merge_sumo.values.expression import Condition, Value, Vocabulary, parse_condition
-from merge_sumo.values.merge import brake_after_mps2, bumper_gap_m
+from merge_sumo.values.merge import AfterMerge, brake_after_mps2, bumper_gap_m
 from merge_sumo.values.scenario import VEHICLES, VUT
 from merge_sumo.values.score import Measures, Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
@@ -25,19 +26,30 @@ from merge_sumo.values.trajectory import End, Trajectory
 PAPER: Final = "collision"
 NAMED: Final = {
     PAPER: "score < -500",
-    "contact": "gap_m < 0",
-    "unsafe": "gap_m < 0 or brake_after_mps2 > 3",
+    "contact": "clearance_m < 0",
+    "unsafe": "clearance_m < 0 or brake_after_mps2 > 3",
 }
 """Criteria by name, and the condition that each one is."""
 
 NUMBERS: Final = (
-    *("ttc_s", "gap_m", "dx_m", "dv_mps", "drac_mps2", "brake_after_mps2", "pet_s", "t_end_s"),
+    *(
+        "ttc_s",
+        "clearance_m",
+        "gap_m",
+        "dx_m",
+        "dv_mps",
+        "drac_mps2",
+        "brake_after_mps2",
+        "pet_s",
+        "t_end_s",
+    ),
     *("impact_speed_mps", "vut_max_brake_mps2", "pov_max_brake_mps2", "last_avoidable_s"),
     *("clipped_steps", "score"),
 )
 TEXTS: Final = {
     "end": frozenset({End.MERGED.value, End.COLLISION.value, End.TIMEOUT.value}),
     "merged_first": frozenset({"VUT", "POV"}),
+    "after_merge": frozenset(asked.value for asked in AfterMerge),
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
 }
 """What may be said of measures that are texts. Errors have no verdict under any criterion."""
@@ -45,7 +57,7 @@ VOCABULARY: Final[Vocabulary] = {**dict.fromkeys(NUMBERS), **TEXTS}
 NEVER: Final[dict[str, Value]] = {
     **dict.fromkeys(("dx_m", "ttc_s", "pet_s", "last_avoidable_s"), math.inf),
     **dict.fromkeys(("dv_mps", "drac_mps2", "impact_speed_mps", "score"), 0.0),
-    "merged_first": "",
+    **{"merged_first": "", "after_merge": AfterMerge.NONE.value},
 }
 """What a measure without a value counts as: those two never meet."""
 IN_COLLISION: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
@@ -86,16 +98,23 @@ class Criterion:
         """Return when a case fails, as a condition."""
         return NAMED.get(self.fail_when, self.fail_when)
 
-    def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
-        """Return the margin of an episode; None under the paper's criterion and after an error."""
+    def margin(
+        self, trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
+    ) -> float | None:
+        """Return the margin of an episode; None under the paper's criterion and after an error.
+
+        Without the centre lines of the road, bodies are only looked at from M on.
+        """
         if self.is_papers or measures.end.is_error:
             return None
-        return _condition(self.words).margin(values_of(trajectory, measures))
+        return _condition(self.words).margin(values_of(trajectory, measures, lines))
 
-    def outcome(self, index: int, batch: int, trajectory: Trajectory) -> Outcome:
+    def outcome(
+        self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
+    ) -> Outcome:
         """Return the outcome of an episode at a place in a campaign."""
         measures = measure(trajectory)
-        margin = self.margin(trajectory, measures)
+        margin = self.margin(trajectory, measures, lines)
         return Outcome(index, batch, trajectory.case, measures, margin)
 
 
@@ -108,11 +127,16 @@ def _condition(text: str) -> Condition:
     return parse_condition(text, VOCABULARY, "--fail-when")[0]
 
 
-def values_of(trajectory: Trajectory, measures: Measures) -> dict[str, Value]:
+def values_of(
+    trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
+) -> dict[str, Value]:
     """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
+    gap_m = bumper_gap_m(trajectory)
+    before_m = math.inf if lines is None else clearance_before_m(trajectory, lines)
     missing: dict[str, Value] = NEVER | (IN_COLLISION if measures.end is End.COLLISION else {})
     found: dict[str, Value] = {
-        "gap_m": bumper_gap_m(trajectory),
+        "gap_m": gap_m,
+        "clearance_m": min(gap_m, before_m),
         "brake_after_mps2": brake_after_mps2(trajectory),
     }
     for name in VOCABULARY:

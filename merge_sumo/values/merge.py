@@ -9,6 +9,7 @@ the closing speed w that is w^2 / (2 (g - w tau)).
 from __future__ import annotations
 
 import math
+from enum import StrEnum
 from typing import Final
 
 from merge_sumo.values.scenario import VUT
@@ -17,6 +18,33 @@ from merge_sumo.values.trajectory import End, Trajectory
 REACTION_S: Final = 0.75
 """tau: from seeing the danger to braking, as the competent and careful driver of UN Regulation
 No. 157 (annex 4, appendix 3) takes."""
+
+
+HARSH_MPS2: Final = 3.0
+"""The most that a lane change may ask of a vehicle that approaches from behind: UN Regulation
+No. 79, 5.6.4.7."""
+
+
+class AfterMerge(StrEnum):
+    """What the merge asks of whoever is behind then: nothing, harsh braking, or too much."""
+
+    NONE = "none"
+    HARSH = "harsh"
+    FORCED = "forced"
+
+
+def after_merge(trajectory: Trajectory) -> AfterMerge | None:
+    """Return what the merge asks of whoever is behind; None where the VUT did not merge.
+
+    Harsh is more than 3 m/s2, forced more than the vehicles of the scenario can: the bodies touch,
+    or the one ahead has to give way.
+    """
+    if trajectory.end is not End.MERGED:
+        return None
+    needed = brake_after_mps2(trajectory)
+    if needed > -trajectory.case.scenario.a_min_mps2:
+        return AfterMerge.FORCED
+    return AfterMerge.HARSH if needed > HARSH_MPS2 else AfterMerge.NONE
 
 
 def bumper_gap_m(trajectory: Trajectory) -> float:

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
+from merge_sumo.values.merge import AfterMerge, after_merge
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
@@ -63,6 +64,8 @@ class Measures:
         clipped_steps: steps in which the VUT asked for more than its limits of acceleration.
         error: what the VUT or the simulation did wrong, else None.
         nearest: name of the car that the measures are of; recorded in traffic only.
+        after_merge: what the state at M asks of whoever is behind then, "none", "harsh" or "forced"
+            (`merge.py`); None without a merge, and where an older version did not record it.
     """
 
     end: End
@@ -82,6 +85,7 @@ class Measures:
     clipped_steps: int
     error: str | None
     nearest: str = VEHICLES[POV]
+    after_merge: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +165,8 @@ class Outcome:
             values["nearest"] = VEHICLES[POV]
         if values["nearest"] not in VEHICLES:
             raise ValueError(f"nearest is {values['nearest']!r}")
+        if values.setdefault("after_merge", None) not in (None, *AfterMerge):
+            raise ValueError(f"after_merge is {values['after_merge']!r}")
         for name, types in _TYPES.items():
             if type(value := values[name]) not in types:
                 raise TypeError(f"{name} is {value!r}")
@@ -205,6 +211,7 @@ def measure(trajectory: Trajectory) -> Measures:
             gap = abs(dx) - crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
     hardest = -pair.motion[:, :, 2].min(axis=0)
+    asked = after_merge(trajectory)
     return Measures(
         end=end,
         score=None if trajectory.error is not None else _score(trajectory, end, dx, ttc),
@@ -223,6 +230,7 @@ def measure(trajectory: Trajectory) -> Measures:
         clipped_steps=trajectory.clipped_steps,
         error=None if trajectory.error is None else as_reason(trajectory.error),
         nearest=VEHICLES[nearest],
+        after_merge=None if asked is None else asked.value,
     )
 
 

@@ -57,6 +57,8 @@ function words(i) {
     parts.push(`Collision${whom}${kind} at ${fixed(cases.t_end[i], 1)} s: gap ${fixed(cases.dx[i], 1)} m, difference in speed ${fixed(Math.abs(cases.dv[i]), 1)} m/s.`);
   } else if (end === "MERGED") {
     parts.push(`No collision: the ${cases.dx[i] < 0 ? "VUT" : met} goes first, gap ${fixed(cases.dx[i], 1)} m when the VUT arrives.`);
+    if (cases.after[i] === "harsh") parts.push("Whoever is behind then has to brake harshly.");
+    if (cases.after[i] === "forced") parts.push("Whoever is behind then cannot brake hard enough: the one ahead has to give way.");
   } else if (end === "TIMEOUT") {
     parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
   } else {
