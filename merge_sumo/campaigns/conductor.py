@@ -8,7 +8,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, RunCases, road_for, runs_on
+from merge_sumo.campaigns.ahead import Ahead, proposals
+from merge_sumo.campaigns.ground import (
+    MAX_CORRIDORS,
+    GroundPlan,
+    OnWorkers,
+    Ran,
+    RunCases,
+    road_for,
+    runs_on,
+)
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import (
@@ -22,7 +31,7 @@ from merge_sumo.drivers.vuts.files import Files, sha256_of
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
@@ -51,7 +60,7 @@ def conduct(
     batch: int,
     on_case: OnCase | None = None,
     history: Sequence[Outcome] = (),
-    stop: Callable[[Sequence[Outcome]], bool] = lambda _: False,
+    stop: Callable[[Sequence[Outcome]], bool] | None = None,
 ) -> Iterator[list[tuple[Outcome, Trajectory]]]:
     """Ask, run, tell, batch by batch; yield what each batch gave, in order of the cases.
 
@@ -62,7 +71,7 @@ def conduct(
     sampler.tell(history)
     batches_before = history[-1].batch + 1 if history else 0
     for number, first in enumerate(range(len(history), cases, batch), start=batches_before):
-        if stop(sampler.told()):
+        if stop is not None and stop(sampler.told()):
             return
         ran: list[tuple[Outcome, Trajectory]] = []
         for place, done in run(sampler.ask(min(batch, cases - first))):
@@ -194,7 +203,7 @@ def _go_on(
     record: dict[str, Any],
     net: Corridor,
     journal: Journal,
-    run: RunCases,
+    run: OnWorkers,
     history: Sequence[Outcome],
     on_case: OnCase | None,
     check: Callable[[], None],
@@ -204,19 +213,23 @@ def _go_on(
     files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
 
     def noting_files(cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
-        for place, done in run(cases):
+        for place, done in ahead(cases):
             for name, loaded in zip(FILES, (done.files, done.pov_files), strict=True):
                 files[name] = loaded | files[name]  # what was known stays
             yield place, done
 
-    batches = conduct(sampler, noting_files, settings.cases, settings.batch, on_case, history, stop)
-    for ran in batches:
-        journal.append(ran)
-        noted = {name: known or None for name, known in files.items()}
-        if noted != {name: record[name] for name in FILES}:
-            record |= noted
-            journal.rewrite_settings(record)
-        check()
+    scout = make_sampler(settings.sampler, settings.pool, settings.seed)
+    with Ahead(run, proposals(scout, history, settings.cases, settings.batch)) as ahead:
+        batches = conduct(
+            sampler, noting_files, settings.cases, settings.batch, on_case, history, stop
+        )
+        for ran in ahead.together(batches):
+            journal.append(*ran)
+            noted = {name: known or None for name, known in files.items()}
+            if noted != {name: record[name] for name in FILES}:
+                record |= noted
+                journal.rewrite_settings(record)
+            check()
     done = Run(journal.folder)
     for outcome in failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
@@ -237,9 +250,10 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
 
 def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan:
     log = folder.resolve() / LOG
+    at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
     return GroundPlan(
         vut=settings.vut_factory.with_log(log),
-        corridors=min(MAX_CORRIDORS, settings.batch),
+        corridors=min(MAX_CORRIDORS, at_once),
         net=net,
         scenario=settings.scenario,
         povs=settings.povs.with_log(log),

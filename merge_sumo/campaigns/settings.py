@@ -104,10 +104,10 @@ class CampaignSettings:
             raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
         self.stopping_rule()
 
-    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool]:
-        """Return what says of the outcomes so far whether the search is over."""
+    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
+        """Return what says of the outcomes so far whether the search is over, if anything does."""
         if self.stop_after_converged is None:
-            return lambda _: False
+            return None
         fresh = partial(make_sampler, self.sampler, self.pool, self.seed)
         return StoppingRule(self.stop_after_converged, self.batch, fresh)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,11 +59,15 @@ class Sampler(ABC):
     telling its journal to a fresh sampler.
     """
 
+    learns: ClassVar[bool] = True
+    """Whether outcomes decide on what it proposes, and not only how many cases there were."""
+
     def __init__(self, pool: Pool, seed: int) -> None:
         """Propose cases from `pool`; `seed` makes the proposals reproducible."""
         self.pool = pool
         self.seed = seed
         self._outcomes: dict[int, Outcome] = {}
+        self._proposed: Counter[int] = Counter()
 
     @abstractmethod
     def ask(self, n: int) -> list[Case]:
@@ -70,7 +76,12 @@ class Sampler(ABC):
     def tell(self, outcomes: Iterable[Outcome]) -> None:
         """Take outcomes; those without a verdict (VUT_ERROR, SIM_ERROR) only count as proposed."""
         for outcome in outcomes:
+            self._proposed[outcome.case.level] += outcome.index not in self._outcomes
             self._outcomes[outcome.index] = outcome
+
+    def skip(self, cases: Iterable[Case]) -> None:
+        """Count cases as proposed of which nothing will be told."""
+        self._proposed.update(case.level for case in cases)
 
     def told(self, level: int | None = None) -> list[Outcome]:
         """Return the outcomes with a verdict, of one level or of all, in order of their index."""
@@ -82,7 +93,7 @@ class Sampler(ABC):
 
     def proposed(self, level: int | None = None) -> int:
         """Return how many cases were told, with a verdict or without, of one level or of all."""
-        return sum(level in (None, outcome.case.level) for outcome in self._outcomes.values())
+        return self._proposed.total() if level is None else self._proposed[level]
 
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays."""
