@@ -10,6 +10,7 @@ run.report()        # path of the HTML report
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -173,6 +174,7 @@ def campaign(
     policies: Path | str | None = None,
     pov: str | None = None,
     fail_when: str = COLLISION.fail_when,
+    follow_up_s: float | None = None,
     on_case: OnCase | None = None,
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
@@ -197,11 +199,13 @@ def campaign(
         policies: folder of learned drivers in the place of the shipped ones.
         pov: a POV of your own, as after `--pov`.
         fail_when: what counts as a failure, as after `--fail-when`.
+        follow_up_s: how long both drive on behind M; the scenario's, 0, when left out.
         on_case: told of every case as it ends.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
     """
     where = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
+    where = where if follow_up_s is None else replace(where, follow_up_s=follow_up_s)
     options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     settings = CampaignSettings(
         vut=vut,

@@ -82,6 +82,7 @@ class CampaignSettings:
                     "rename it"
                 )
         object.__setattr__(self, "fail_when", self.criterion.fail_when)
+        self.criterion.check(self.scenario)
         _ = self.vut_factory
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")

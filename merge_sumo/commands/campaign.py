@@ -13,6 +13,7 @@ from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
     FailWhenOption,
+    FollowUpOption,
     InProcessOption,
     JsonOption,
     NetOption,
@@ -23,6 +24,7 @@ from merge_sumo.commands.shared import (
     VutCommandOption,
     VutMemoryOption,
     app,
+    followed_up,
     print_troubles,
     say,
     show,
@@ -63,6 +65,7 @@ def campaign(
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     fail_when: FailWhenOption = "collision",
+    follow_up: FollowUpOption = None,
     v_vut0: Annotated[
         float | None,
         typer.Option(help="Initial speed of the VUT in m/s.  [default: the scenario's, 18]"),
@@ -139,7 +142,7 @@ def campaign(
 
     gates = parse_gates(gate or ())
     if resume is None:
-        where = named_scenario(scenario)
+        where = followed_up(named_scenario(scenario), follow_up)
         options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
         levels = parse_levels(level, povs_of(policies, where, pov, options))
         settings = CampaignSettings(
@@ -300,7 +303,11 @@ def _given(context: typer.Context) -> dict[str, object]:
     if "fail_when" in given:
         given["fail_when"] = Criterion(str(given["fail_when"])).fail_when
     if "scenario" in given:
-        given["scenario"] = named_scenario(given["scenario"])
+        given["scenario"] = followed_up(
+            named_scenario(given["scenario"]), context.params["follow_up"]
+        )
+    elif _is_written(context, "follow_up"):
+        raise UserError("--follow-up is of the scenario: name that, too, with --scenario")
     if context.params["out"] is not None:
         raise UserError("--resume names the folder: leave --out away")
     return given

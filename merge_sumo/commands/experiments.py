@@ -13,6 +13,7 @@ from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
     FailWhenOption,
+    FollowUpOption,
     JsonOption,
     PoliciesOption,
     PovOption,
@@ -20,6 +21,7 @@ from merge_sumo.commands.shared import (
     VutCommandOption,
     VutMemoryOption,
     app,
+    followed_up,
     say,
     show,
 )
@@ -50,6 +52,7 @@ def truth(
     policies: PoliciesOption = None,
     pov: PovOption = None,
     fail_when: FailWhenOption = "collision",
+    follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -72,9 +75,10 @@ def truth(
     from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.fmc import fmc, regions
 
-    where = named_scenario(scenario)
+    where = followed_up(named_scenario(scenario), follow_up)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
     criterion = Criterion(fail_when)
+    criterion.check(where)
     povs = povs_of(policies, where, pov, options)
     chosen = one_level(level, povs)
     factory = _factory(vut, povs, vut_command, options)
@@ -123,6 +127,7 @@ def compare(
     policies: PoliciesOption = None,
     pov: PovOption = None,
     fail_when: FailWhenOption = "collision",
+    follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -150,7 +155,7 @@ def compare(
     from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.fmc import fmc
 
-    where = named_scenario(scenario)
+    where = followed_up(named_scenario(scenario), follow_up)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
     povs = povs_of(policies, where, pov, options)
     levels, criterion = parse_levels(level, povs), Criterion(fail_when)
@@ -167,6 +172,7 @@ def compare(
             policies=None if policies is None else str(policies),
             pov=pov,
             scenario=where,
+            fail_when=fail_when,
         )
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")

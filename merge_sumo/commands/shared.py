@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -11,6 +12,7 @@ from merge_sumo.system.printable import printable
 
 if TYPE_CHECKING:
     from merge_sumo.reports.verdict import Verdict
+    from merge_sumo.values.scenario import Scenario
 
 MOST_MESSAGES: Final = 5
 """Messages of errors and timeouts that are printed; the report has the others."""
@@ -99,6 +101,14 @@ FailWhenOption = Annotated[
         "over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
     ),
 ]
+FollowUpOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="How long both drive on behind M: what happens there is measured.  [default: the "
+        "scenario's, 0]",
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 
@@ -113,6 +123,11 @@ def print_troubles(verdict: Verdict) -> None:
     if others:
         number = sum(trouble.count for trouble in others)
         show(f"  {number} with {len(others)} other messages")
+
+
+def followed_up(scenario: Scenario, seconds: float | None) -> Scenario:
+    """Return a scenario in which both drive on behind M for so long, if that was said."""
+    return scenario if seconds is None else replace(scenario, follow_up_s=seconds)
 
 
 def show(line: object) -> None:

@@ -9,6 +9,7 @@ a margin m is the score lambda (1 - m / (1 + |m|)), which is below lambda exactl
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
@@ -19,8 +20,8 @@ from merge_sumo.system.printable import printable
 from merge_sumo.values.bodies import CentreLines, clearance_before_m
 from merge_sumo.values.expression import Condition, Value, Vocabulary, parse_condition
 from merge_sumo.values.merge import AfterMerge, brake_after_mps2, bumper_gap_m
-from merge_sumo.values.scenario import VEHICLES, VUT
-from merge_sumo.values.score import Measures, Outcome, measure
+from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
+from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
 PAPER: Final = "collision"
@@ -44,7 +45,7 @@ NUMBERS: Final = (
         "t_end_s",
     ),
     *("impact_speed_mps", "vut_max_brake_mps2", "pov_max_brake_mps2", "last_avoidable_s"),
-    *("clipped_steps", "score"),
+    *("clipped_steps", "score", *FOLLOWED_UP),
 )
 TEXTS: Final = {
     "end": frozenset({End.MERGED.value, End.COLLISION.value, End.TIMEOUT.value}),
@@ -56,7 +57,8 @@ TEXTS: Final = {
 VOCABULARY: Final[Vocabulary] = {**dict.fromkeys(NUMBERS), **TEXTS}
 NEVER: Final[dict[str, Value]] = {
     **dict.fromkeys(("dx_m", "ttc_s", "pet_s", "last_avoidable_s"), math.inf),
-    **dict.fromkeys(("dv_mps", "drac_mps2", "impact_speed_mps", "score"), 0.0),
+    **dict.fromkeys(("after_gap_m", "after_ttc_s"), math.inf),
+    **dict.fromkeys(("dv_mps", "after_drac_mps2", "drac_mps2", "impact_speed_mps", "score"), 0.0),
     **{"merged_first": "", "after_merge": AfterMerge.NONE.value},
 }
 """What a measure without a value counts as: those two never meet."""
@@ -82,6 +84,15 @@ class Criterion:
                 raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
             _, name = parse_condition(self.fail_when, VOCABULARY, "--fail-when")
         object.__setattr__(self, "fail_when", name)
+
+    def check(self, scenario: Scenario) -> None:
+        """Raise `UserError` where it speaks of what an episode of a scenario does not have."""
+        spoken = set(re.findall(r"\w+", self.words))
+        if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
+            raise UserError(
+                f"--fail-when speaks of {min(named)}, which is measured behind M: say how long "
+                "with --follow-up SECONDS"
+            )
 
     @property
     def is_papers(self) -> bool:
@@ -131,12 +142,15 @@ def values_of(
     trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
 ) -> dict[str, Value]:
     """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
-    gap_m = bumper_gap_m(trajectory)
+    gap_m, after_m = bumper_gap_m(trajectory), measures.after_gap_m
+    after_m = math.inf if after_m is None else after_m
     before_m = math.inf if lines is None else clearance_before_m(trajectory, lines)
     missing: dict[str, Value] = NEVER | (IN_COLLISION if measures.end is End.COLLISION else {})
+    if after_m <= 0.0:
+        missing = missing | {"after_drac_mps2": math.inf}
     found: dict[str, Value] = {
         "gap_m": gap_m,
-        "clearance_m": min(gap_m, before_m),
+        "clearance_m": min(gap_m, before_m, after_m),
         "brake_after_mps2": brake_after_mps2(trajectory),
     }
     for name in VOCABULARY:

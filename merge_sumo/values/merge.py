@@ -12,6 +12,8 @@ import math
 from enum import StrEnum
 from typing import Final
 
+import numpy as np
+
 from merge_sumo.values.scenario import VUT
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -62,6 +64,31 @@ def brake_after_mps2(trajectory: Trajectory) -> float:
     is in time. In traffic it is the largest that any car or the VUT needs.
     """
     return max((_needed_mps2(*pair) for pair in _neighbours(trajectory)), default=0.0)
+
+
+def followed_up(trajectory: Trajectory) -> tuple[float, float, float] | None:
+    """Return the least bumper gap, the lowest time to collision and the hardest braking behind M.
+
+    In m, s and m/s2, at any step of the follow-up and with any car; None where there was none. The
+    time to collision is between bumpers, infinite where the gap never closes and 0 where bodies
+    touch; the braking is the DRAC (Cooper and Ferguson, 1976), infinite where they touch.
+    """
+    if trajectory.after is None:
+        return None
+    scenario = trajectory.case.scenario
+    cars, vut = np.delete(trajectory.after, VUT, axis=1), trajectory.after[:, [VUT]]
+    dx, dv = ((cars - vut)[:, :, column] for column in (0, 1))
+    length_m = np.where(dx >= 0.0, scenario.pov_length_m, scenario.vut_length_m)
+    gap_m, closing_mps = np.abs(dx) - length_m, np.where(dx >= 0.0, -dv, dv)
+    least_m = float(gap_m.min())
+    if least_m <= 0.0:
+        return least_m, 0.0, math.inf
+    closes = closing_mps > 0.0
+    if not closes.any():
+        return least_m, math.inf, 0.0
+    gap_m, closing_mps = gap_m[closes], closing_mps[closes]
+    hardest_mps2 = float((np.square(closing_mps) / (2.0 * gap_m)).max())
+    return least_m, float((gap_m / closing_mps).min()), hardest_mps2
 
 
 def _neighbours(trajectory: Trajectory) -> list[tuple[float, float]]:

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
-from merge_sumo.values.merge import AfterMerge, after_merge
+from merge_sumo.values.merge import AfterMerge, after_merge, followed_up
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
@@ -66,6 +66,10 @@ class Measures:
         nearest: name of the car that the measures are of; recorded in traffic only.
         after_merge: what the state at M asks of whoever is behind then, "none", "harsh" or "forced"
             (`merge.py`); None without a merge, and where an older version did not record it.
+        after_gap_m: least gap between bumpers in the follow-up, 0 or less where bodies touch; this
+            and the next two are None without a merge, and recorded where there is a follow-up only.
+        after_ttc_s: lowest time to collision in it, between bumpers; None where no gap closes.
+        after_drac_mps2: hardest braking that it needs, dv^2 / (2 gap); None where bodies touch.
     """
 
     end: End
@@ -86,6 +90,9 @@ class Measures:
     error: str | None
     nearest: str = VEHICLES[POV]
     after_merge: str | None = None
+    after_gap_m: float | None = None
+    after_ttc_s: float | None = None
+    after_drac_mps2: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +151,9 @@ class Outcome:
             names += RECORDED_IN_TRAFFIC
         else:
             del measures["nearest"]
+        if not case.scenario.follow_up_s:
+            for name in FOLLOWED_UP:
+                del measures[name]
         place = {"index": self.index, "batch": self.batch}
         margin = {} if self.margin is None else {"margin": self.margin}
         return place | {name: getattr(case, name) for name in names} | measures | margin
@@ -168,6 +178,8 @@ class Outcome:
             raise ValueError(f"nearest is {values['nearest']!r}")
         if values.setdefault("after_merge", None) not in (None, *AfterMerge):
             raise ValueError(f"after_merge is {values['after_merge']!r}")
+        if not scenario.follow_up_s:
+            values |= dict.fromkeys(FOLLOWED_UP)
         for name, types in _TYPES.items():
             if type(value := values[name]) not in types:
                 raise TypeError(f"{name} is {value!r}")
@@ -176,6 +188,8 @@ class Outcome:
         return cls(index, batch, case, Measures(**values), margin)
 
 
+FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
+"""Measures of the follow-up."""
 _JSON_TYPES: Final = {"None": type(None), "float": float, "str": str, "bool": bool, "int": int}
 _TYPES: Final = {
     name: frozenset(_JSON_TYPES[part] for part in annotation.split(" | "))
@@ -213,6 +227,7 @@ def measure(trajectory: Trajectory) -> Measures:
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
     hardest = -pair.motion[:, :, 2].min(axis=0)
     asked = after_merge(trajectory)
+    followed: tuple[float | None, ...] = followed_up(trajectory) or (None, None, None)
     return Measures(
         end=end,
         score=None if trajectory.error is not None else _score(trajectory, end, dx, ttc),
@@ -232,7 +247,14 @@ def measure(trajectory: Trajectory) -> Measures:
         error=None if trajectory.error is None else as_reason(trajectory.error),
         nearest=VEHICLES[nearest],
         after_merge=None if asked is None else asked.value,
+        after_gap_m=followed[0],
+        after_ttc_s=_finite(followed[1]),
+        after_drac_mps2=_finite(followed[2]),
     )
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
 
 
 def time_to_collision(dx_m: float, dv_mps: float) -> float | None:
