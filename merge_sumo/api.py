@@ -174,6 +174,7 @@ def campaign(
     policies: Path | str | None = None,
     pov: str | None = None,
     fail_when: str = COLLISION.fail_when,
+    require: str | None = None,
     follow_up_s: float | None = None,
     on_case: OnCase | None = None,
 ) -> CampaignRun:
@@ -199,6 +200,7 @@ def campaign(
         policies: folder of learned drivers in the place of the shipped ones.
         pov: a POV of your own, as after `--pov`.
         fail_when: what counts as a failure, as after `--fail-when`.
+        require: what is to hold over time instead, as after `--require`.
         follow_up_s: how long both drive on behind M; the scenario's, 0, when left out.
         on_case: told of every case as it ends.
 
@@ -224,6 +226,7 @@ def campaign(
         pov=pov,
         scenario=where,
         fail_when=fail_when,
+        require=require,
     )
     folder = dated(vut) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))

@@ -162,11 +162,10 @@ def resume_campaign(
         for name in FILES:
             record[name] = _files_again(recorded, name) | (record[name] or {}) or None
         changes = differences(RECORDED_BY_DEFAULT | recorded, record)
-        if "fail_when" in changes:
-            was, now = changes["fail_when"]
+        if before.criterion != settings.criterion:
             raise UserError(
-                f"{folder} counts as a failure when {was}, and not when {now}: a campaign has one "
-                "criterion; begin another campaign for another"
+                f"in {folder} a case fails when {before.criterion.text}, and not when "
+                f"{settings.criterion.text}: a campaign has one criterion; begin another one"
             )
         if changes and not force:
             name, (was, now) = next(iter(changes.items()))

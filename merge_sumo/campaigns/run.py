@@ -173,7 +173,10 @@ def _criterion_of(settings: Mapping[str, Any], path: Path) -> Criterion:
     fail_when = settings.get("fail_when", COLLISION.fail_when)
     if not isinstance(fail_when, str):
         raise UserError(f"{path} has no fail_when, or something else there")
-    return Criterion(fail_when)
+    require = settings.get("require")
+    if not (require is None or isinstance(require, str)):
+        raise UserError(f"{path} has something else than a formula as require")
+    return Criterion(fail_when, require)
 
 
 def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[list[Outcome], bool]:

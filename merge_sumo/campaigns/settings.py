@@ -58,6 +58,7 @@ class CampaignSettings:
     pov: str | None = None
     scenario: Scenario = US23
     fail_when: str = COLLISION.fail_when
+    require: str | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels; the scenario says what is left out."""
@@ -81,8 +82,10 @@ class CampaignSettings:
                     f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
                     "rename it"
                 )
-        object.__setattr__(self, "fail_when", self.criterion.fail_when)
-        self.criterion.check(self.scenario)
+        criterion = self.criterion
+        object.__setattr__(self, "fail_when", criterion.fail_when)
+        object.__setattr__(self, "require", criterion.require)
+        criterion.check(self.scenario)
         _ = self.vut_factory
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
@@ -125,7 +128,7 @@ class CampaignSettings:
     @property
     def criterion(self) -> Criterion:
         """What counts as a failure."""
-        return Criterion(self.fail_when)
+        return Criterion(self.fail_when, self.require)
 
     def workers(self, asked: int | None) -> int:
         """Return in how many processes the cases run: see `VutFactory.workers`."""

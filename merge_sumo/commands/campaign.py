@@ -19,6 +19,7 @@ from merge_sumo.commands.shared import (
     NetOption,
     PoliciesOption,
     PovOption,
+    RequireOption,
     ScenarioOption,
     TrustOption,
     VutCommandOption,
@@ -65,6 +66,7 @@ def campaign(
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     fail_when: FailWhenOption = "collision",
+    require: RequireOption = None,
     follow_up: FollowUpOption = None,
     v_vut0: Annotated[
         float | None,
@@ -162,6 +164,7 @@ def campaign(
             pov=pov,
             scenario=where,
             fail_when=fail_when,
+            require=require,
         )
         folder = out or dated(vut)
     else:
@@ -273,7 +276,6 @@ def _given(context: typer.Context) -> dict[str, object]:
     Levels are not among them: which there are, the other settings say.
     """
     from merge_sumo.scenarios.scenario_file import named_scenario
-    from merge_sumo.values.criterion import Criterion
 
     names = {
         name: name
@@ -290,6 +292,7 @@ def _given(context: typer.Context) -> dict[str, object]:
             "pov",
             "scenario",
             "fail_when",
+            "require",
         )
     }
     names |= {"v_vut0": "v_vut0_mps", "deadline": "deadline_s", "vut_memory": "vut_memory_gib"}
@@ -300,8 +303,6 @@ def _given(context: typer.Context) -> dict[str, object]:
     }
     if "policies" in given:
         given["policies"] = str(given["policies"])
-    if "fail_when" in given:
-        given["fail_when"] = Criterion(str(given["fail_when"])).fail_when
     if "scenario" in given:
         given["scenario"] = followed_up(
             named_scenario(given["scenario"]), context.params["follow_up"]

@@ -17,6 +17,7 @@ from merge_sumo.commands.shared import (
     JsonOption,
     PoliciesOption,
     PovOption,
+    RequireOption,
     ScenarioOption,
     VutCommandOption,
     VutMemoryOption,
@@ -52,6 +53,7 @@ def truth(
     policies: PoliciesOption = None,
     pov: PovOption = None,
     fail_when: FailWhenOption = "collision",
+    require: RequireOption = None,
     follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
@@ -77,7 +79,7 @@ def truth(
 
     where = followed_up(named_scenario(scenario), follow_up)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
-    criterion = Criterion(fail_when)
+    criterion = Criterion(fail_when, require)
     criterion.check(where)
     povs = povs_of(policies, where, pov, options)
     chosen = one_level(level, povs)
@@ -127,6 +129,7 @@ def compare(
     policies: PoliciesOption = None,
     pov: PovOption = None,
     fail_when: FailWhenOption = "collision",
+    require: RequireOption = None,
     follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
@@ -158,7 +161,7 @@ def compare(
     where = followed_up(named_scenario(scenario), follow_up)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
     povs = povs_of(policies, where, pov, options)
-    levels, criterion = parse_levels(level, povs), Criterion(fail_when)
+    levels, criterion = parse_levels(level, povs), Criterion(fail_when, require)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
     factory = _factory(vut, povs, vut_command, options)
     for name in names:
@@ -173,6 +176,7 @@ def compare(
             pov=pov,
             scenario=where,
             fail_when=fail_when,
+            require=require,
         )
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")

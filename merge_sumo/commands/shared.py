@@ -101,6 +101,14 @@ FailWhenOption = Annotated[
         "over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
     ),
 ]
+RequireOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="STL",
+        help="What is to hold over time, instead of --fail-when, in signal temporal logic: "
+        "'always ((x_vut_m > -20) implies (gap_m > 2))'. Needs the extra stl.",
+    ),
+]
 FollowUpOption = Annotated[
     float | None,
     typer.Option(

@@ -22,6 +22,7 @@ from merge_sumo.values.expression import Condition, Value, Vocabulary, parse_con
 from merge_sumo.values.merge import AfterMerge, brake_after_mps2, bumper_gap_m
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
+from merge_sumo.values.temporal import check_formula, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
 
 PAPER: Final = "collision"
@@ -72,9 +73,12 @@ class Criterion:
 
     Attributes:
         fail_when: the name of a criterion, or a condition over measures, as Python writes it.
+        require: what is to hold over time instead, in signal temporal logic (`temporal.py`); the
+            margin is then its robustness.
     """
 
     fail_when: str = PAPER
+    require: str | None = None
 
     def __post_init__(self) -> None:
         """Check the condition; however it is spaced, it is the same."""
@@ -84,10 +88,19 @@ class Criterion:
                 raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
             _, name = parse_condition(self.fail_when, VOCABULARY, "--fail-when")
         object.__setattr__(self, "fail_when", name)
+        if self.require is not None:
+            if name != PAPER:
+                raise UserError("--fail-when and --require both say what a failure is: choose one")
+            object.__setattr__(self, "require", check_formula(self.require))
 
     def check(self, scenario: Scenario) -> None:
-        """Raise `UserError` where it speaks of what an episode of a scenario does not have."""
-        spoken = set(re.findall(r"\w+", self.words))
+        """Raise `UserError` where it speaks of what an episode of a scenario does not have.
+
+        Also where it is no formula, or what evaluates one is missing.
+        """
+        if self.require is not None:
+            try_formula(self.require)
+        spoken = set() if self.require else set(re.findall(r"\w+", self.words))
         if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
             raise UserError(
                 f"--fail-when speaks of {min(named)}, which is measured behind M: say how long "
@@ -97,17 +110,17 @@ class Criterion:
     @property
     def is_papers(self) -> bool:
         """Whether it is that of the paper, which needs no margin."""
-        return self.fail_when == PAPER
+        return self.fail_when == PAPER and self.require is None
 
     @property
     def text(self) -> str:
         """What a person would write."""
-        return self.fail_when
+        return self.fail_when if self.require is None else f"not ({self.require})"
 
     @property
     def words(self) -> str:
         """Return when a case fails, as a condition."""
-        return NAMED.get(self.fail_when, self.fail_when)
+        return NAMED.get(self.text, self.text)
 
     def margin(
         self, trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
@@ -118,6 +131,8 @@ class Criterion:
         """
         if self.is_papers or measures.end.is_error:
             return None
+        if self.require is not None:
+            return robustness(self.require, trajectory)
         return _condition(self.words).margin(values_of(trajectory, measures, lines))
 
     def outcome(
