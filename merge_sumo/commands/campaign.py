@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from merge_sumo.campaigns.settings import CampaignSettings
     from merge_sumo.reports.summary import Summary
     from merge_sumo.reports.verdict import Gate, Verdict
+    from merge_sumo.sumo.corridor import Corridor
 
 
 @app.command()
@@ -221,18 +222,26 @@ def campaign(
     if resume is None and level == "all" and not set(levels) >= set(LEVELS):
         named = ", ".join(map(level_name, levels))
         say(f"--level all: policies are there for level {named}; `merge-sumo train` makes others")
-    raise typer.Exit(0 if _conclude(run, settings, gates, junit, as_json=as_json) else 1)
+    raise typer.Exit(0 if _conclude(run, settings, gates, junit, road, as_json=as_json) else 1)
 
 
 def _conclude(
-    run: Run, settings: CampaignSettings, gates: list[Gate], junit: Path | None, *, as_json: bool
+    run: Run,
+    settings: CampaignSettings,
+    gates: list[Gate],
+    junit: Path | None,
+    road: Corridor,
+    *,
+    as_json: bool,
 ) -> bool:
     """Write and print what a campaign found; return whether it passed."""
+    from merge_sumo.campaigns.avoidance import note_avoidance
     from merge_sumo.reports.junit import write_junit
     from merge_sumo.reports.report import write_report
     from merge_sumo.reports.summary import summarise
     from merge_sumo.reports.verdict import NOTHING_TESTED, judge
 
+    careful = note_avoidance(run, settings, road)
     report_file = write_report(run)
     summary = summarise(run.outcomes, settings.levels)
     verdict = judge(run.outcomes)
@@ -246,6 +255,7 @@ def _conclude(
             "gates": {result.name: result.met for result in results},
             "passed": passed,
             "stopped": "converged" if converged else "cases",
+            "careful": careful,
         }
         paths = {"run": str(run.folder), "report": str(report_file)}
         typer.echo(json.dumps({**judged, **paths}))
@@ -257,7 +267,7 @@ def _conclude(
                 f"{settings.stop_after_converged:.2%} to the coverage (this says nothing of "
                 "regions that no case has come near)"
             )
-        _print_summary(run, summary, verdict, report_file)
+        _print_summary(run, summary, verdict, careful, report_file)
     if junit is not None:
         write_junit(junit, run, summary.levels, verdict, results)
     for result in results:
@@ -323,7 +333,9 @@ def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path 
     return f"stopped; go on with: {command}"
 
 
-def _print_summary(run: Run, summary: Summary, verdict: Verdict, report_file: Path) -> None:
+def _print_summary(
+    run: Run, summary: Summary, verdict: Verdict, careful: str | None, report_file: Path
+) -> None:
     from merge_sumo.campaigns.conductor import SCENARIOS, case_name
     from merge_sumo.campaigns.run import failures
 
@@ -337,6 +349,8 @@ def _print_summary(run: Run, summary: Summary, verdict: Verdict, report_file: Pa
             f"  level {level_name(level)}: {found.failures} failures in {found.cases} cases, "
             f"FMC {found.fmc:.4f}, {found.regions} regions"
         )
+    if careful is not None:
+        show(careful)
     show(f"report: {report_file}")
     worst = failures(run.outcomes)
     if worst:
