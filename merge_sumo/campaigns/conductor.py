@@ -8,7 +8,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, RunCases, road_for, runs_on
+from merge_sumo.campaigns.ahead import Ahead, proposals
+from merge_sumo.campaigns.ground import (
+    MAX_CORRIDORS,
+    GroundPlan,
+    OnWorkers,
+    Ran,
+    RunCases,
+    road_for,
+    runs_on,
+)
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.learning import lessons
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
@@ -23,7 +32,7 @@ from merge_sumo.drivers.vuts.files import Files, sha256_of
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
@@ -54,7 +63,7 @@ def conduct(
     on_case: OnCase | None = None,
     history: Sequence[Outcome] = (),
     motions: Mapping[int, FloatArray] | None = None,
-    stop: Callable[[Sequence[Outcome]], bool] = lambda _: False,
+    stop: Callable[[Sequence[Outcome]], bool] | None = None,
 ) -> Iterator[list[tuple[Outcome, Trajectory]]]:
     """Ask, run, tell, batch by batch; yield what each batch gave, in order of the cases.
 
@@ -66,7 +75,7 @@ def conduct(
     """
     sampler.tell(history, motions)
     number, first = (history[-1].batch + 1 if history else 0), len(history)
-    while first < cases and not stop(sampler.told()):
+    while first < cases and not (stop is not None and stop(sampler.told())):
         ran: list[tuple[Outcome, Trajectory]] = []
         for place, done in run(sampler.ask(min(batch or sampler.batch_size(), cases - first))):
             foretold = sampler.foretold(place)
@@ -191,7 +200,7 @@ def _go_on(
     record: dict[str, Any],
     net: Corridor,
     journal: Journal,
-    run: RunCases,
+    run: OnWorkers,
     before: Run | None,
     on_case: OnCase | None,
     check: Callable[[], None],
@@ -204,7 +213,7 @@ def _go_on(
     files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
 
     def noting_files(cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
-        for place, done in run(cases):
+        for place, done in ahead(cases):
             for name, loaded in zip(FILES, (done.files, done.pov_files), strict=True):
                 files[name] = loaded | files[name]  # what was known stays
             yield place, done
@@ -213,22 +222,25 @@ def _go_on(
     motions = None
     if before is not None and sampler.foresees:
         motions = {o.index: before.trajectory(o.index).motion for o in history}
-    for ran in conduct(
-        sampler,
-        noting_files,
-        settings.cases,
-        settings.batch,
-        on_case,
-        history,
-        motions,
-        stop,
-    ):
-        journal.append(ran)
-        noted = {name: known or None for name, known in files.items()}
-        if noted != {name: record[name] for name in FILES}:
-            record |= noted
-            journal.rewrite_settings(record)
-        check()
+    scout = make_sampler(settings.sampler, settings.pool, settings.seed)
+    with Ahead(run, proposals(scout, history, settings.cases, settings.batch)) as ahead:
+        batches = conduct(
+            sampler,
+            noting_files,
+            settings.cases,
+            settings.batch,
+            on_case,
+            history,
+            motions,
+            stop,
+        )
+        for ran in ahead.together(batches):
+            journal.append(*ran)
+            noted = {name: known or None for name, known in files.items()}
+            if noted != {name: record[name] for name in FILES}:
+                record |= noted
+                journal.rewrite_settings(record)
+            check()
     done = Run(journal.folder)
     for outcome in failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
@@ -249,9 +261,10 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
 
 def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan:
     log = folder.resolve() / LOG
+    at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
     return GroundPlan(
         vut=settings.vut_factory.with_log(log),
-        corridors=min(MAX_CORRIDORS, settings.batch or settings.cases),
+        corridors=min(MAX_CORRIDORS, at_once or settings.cases),
         net=net,
         scenario=settings.scenario,
         povs=settings.povs.with_log(log),

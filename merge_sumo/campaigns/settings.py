@@ -112,10 +112,10 @@ class CampaignSettings:
                 f"{' or '.join(able)}"
             )
 
-    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool]:
-        """Return what says of the outcomes so far whether the search is over."""
+    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
+        """Return what says of the outcomes so far whether the search is over, if anything does."""
         if self.stop_after_converged is None:
-            return lambda _: False
+            return None
         fresh = partial(make_sampler, self.sampler, self.pool, self.seed)
         return StoppingRule(self.stop_after_converged, self.batch, fresh)
 

@@ -16,10 +16,9 @@ from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
 
-CARS: Final = (POV, AHEAD, BEHIND)
-"""Rows of the cars of the mainline."""
-FOLLOWERS: Final = [POV, BEHIND]
-LEADERS: Final = [AHEAD, POV]
+FOLLOWERS: Final = slice(POV, BEHIND + 1, BEHIND - POV)
+LEADERS: Final = slice(AHEAD, None, POV - AHEAD)
+"""The POV and the car behind it, and those that they follow: the car ahead and the POV."""
 
 
 def safe_speed_mps(
@@ -99,7 +98,7 @@ def car_met(
     """
     distance_m = np.maximum(-x_m[VUT], 0.0)
     t_s = level0_time_to(distance_m, v_mps[VUT], a_mps2, v_cruise_mps)
-    cars = list(CARS)
-    gaps_m = np.abs(x_m[cars] + v_mps[cars] * t_s)
-    met: NDArray[np.int64] = np.array(cars)[gaps_m.argmin(axis=0)]
+    gaps_m = np.abs(x_m + v_mps * t_s)
+    gaps_m[VUT] = np.inf
+    met: NDArray[np.int64] = gaps_m.argmin(axis=0)
     return met

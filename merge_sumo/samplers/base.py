@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -64,6 +65,8 @@ class Sampler(ABC):
     telling its journal to a fresh sampler.
     """
 
+    learns: ClassVar[bool] = True
+    """Whether outcomes decide on what it proposes, and not only how many cases there were."""
     foresees: ClassVar[bool] = False
     """Whether it makes something of games that are played out before cases run."""
 
@@ -76,6 +79,7 @@ class Sampler(ABC):
         self.seed = seed
         self.games = games if self.foresees else None
         self._outcomes: dict[int, Outcome] = {}
+        self._proposed: Counter[int] = Counter()
 
     @abstractmethod
     def ask(self, n: int) -> list[Case]:
@@ -97,9 +101,14 @@ class Sampler(ABC):
         `motions`, (T + 1, A, 3) by the index of an outcome, are for who plays games.
         """
         for outcome in outcomes:
+            self._proposed[outcome.case.level] += outcome.index not in self._outcomes
             self._outcomes[outcome.index] = outcome
         if self.games is not None and motions is not None:
             self.games.tell(outcomes, motions)
+
+    def skip(self, cases: Iterable[Case]) -> None:
+        """Count cases as proposed of which nothing will be told."""
+        self._proposed.update(case.level for case in cases)
 
     def told(self, level: int | None = None) -> list[Outcome]:
         """Return the outcomes with a verdict, of one level or of all, in order of their index."""
@@ -111,7 +120,7 @@ class Sampler(ABC):
 
     def proposed(self, level: int | None = None) -> int:
         """Return how many cases were told, with a verdict or without, of one level or of all."""
-        return sum(level in (None, outcome.case.level) for outcome in self._outcomes.values())
+        return self._proposed.total() if level is None else self._proposed[level]
 
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays."""

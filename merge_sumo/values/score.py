@@ -8,7 +8,7 @@ of metres towards a collision, jumps little there, and goes on falling with the 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -102,7 +102,8 @@ class Outcome:
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
-        case, measures = self.case, asdict(self.measures)
+        case = self.case
+        measures = {name: getattr(self.measures, name) for name in Measures.__slots__}
         names: tuple[str, ...] = RECORDED
         if case.scenario.vehicles > 2:
             names += RECORDED_IN_TRAFFIC
