@@ -9,7 +9,7 @@ run.report()        # path of the HTML report
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from html import escape
@@ -20,7 +20,6 @@ from merge_sumo.campaigns.conductor import OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import (
-    DEFAULT_BATCH,
     DEFAULT_CASES,
     CampaignSettings,
     parse_levels,
@@ -176,6 +175,7 @@ def campaign(
     fail_when: str = COLLISION.fail_when,
     require: str | None = None,
     follow_up_s: float | None = None,
+    learn_from: Sequence[Path | str] = (),
     on_case: OnCase | None = None,
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
@@ -185,7 +185,8 @@ def campaign(
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         sampler: who chooses the cases.
         cases: number of cases.
-        batch: cases per batch; 40, or all if fewer, when left out.
+        batch: cases per batch; when left out, as many as the sampler wants: 10, later 20 and 40
+            for `coverage`, 40 for the others.
         seed: same seed, same outcomes.
         v_vut0_mps: initial speed of the VUT; the scenario's when left out.
         vut_command: command that starts the controller of `vut="traci"`.
@@ -202,6 +203,7 @@ def campaign(
         fail_when: what counts as a failure, as after `--fail-when`.
         require: what is to hold over time instead, as after `--require`.
         follow_up_s: how long both drive on behind M; the scenario's, 0, when left out.
+        learn_from: folders of earlier campaigns to learn the VUT from.
         on_case: told of every case as it ends.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
@@ -214,7 +216,7 @@ def campaign(
         levels=parse_levels(str(level), povs_of(policies, where, pov, options)),
         sampler=sampler,
         cases=cases,
-        batch=min(DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
+        batch=batch,
         seed=seed,
         v_vut0_mps=v_vut0_mps,
         stop_after_converged=stop_after_converged,
@@ -224,6 +226,7 @@ def campaign(
         in_process=in_process,
         policies=None if policies is None else str(policies),
         pov=pov,
+        learn_from=tuple(map(str, learn_from)),
         scenario=where,
         fail_when=fail_when,
         require=require,

@@ -11,6 +11,7 @@ import typer
 
 from merge_sumo.commands import (
     campaign,
+    certify,
     experiments,
     probability,
     runs,
@@ -23,7 +24,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 
 __all__ = ["app", "main"]
-COMMANDS = (campaign, experiments, probability, runs, scenarios, training, vuts)
+COMMANDS = (campaign, certify, experiments, probability, runs, scenarios, training, vuts)
 """Importing these is what adds their commands to the app."""
 
 

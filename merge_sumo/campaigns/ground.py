@@ -139,7 +139,7 @@ class Ran:
     @property
     def score(self) -> float | None:
         """The score under the plan's criterion, as `Outcome` has it."""
-        return Outcome(0, 0, self.trajectory.case, self.measures, self.margin).score
+        return Outcome(0, 0, self.trajectory.case, self.measures, margin=self.margin).score
 
 
 _kept: tuple[tuple[object, ...], ProvingGround] | None = None

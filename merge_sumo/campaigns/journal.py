@@ -49,6 +49,7 @@ class Journal:
         """Take the folder and its open outcomes; use `create` or `reopen`."""
         self.folder = folder
         self._outcomes = outcomes
+        self._threads = ThreadPoolExecutor(MOST_SYNCS)
         _lock(outcomes, folder)
 
     @classmethod
@@ -109,8 +110,7 @@ class Journal:
         lines, arrays = zip(*map(_encoded, batches), strict=True)
         try:
             end = self._outcomes.seek(0, os.SEEK_END)
-            with ThreadPoolExecutor(MOST_SYNCS) as threads:
-                list(threads.map(_write, paths, arrays))
+            list(self._threads.map(_write, paths, arrays))
             sync_folder(self.folder / TRAJECTORIES)
             try:
                 _write_all(self._outcomes, b"".join(lines))
@@ -133,6 +133,7 @@ class Journal:
 
     def __exit__(self, *_: object) -> None:
         """Close the folder; another process may write it."""
+        self._threads.shutdown()
         self._outcomes.close()
 
 

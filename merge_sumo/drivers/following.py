@@ -38,6 +38,24 @@ def safe_speed_mps(
     return speed
 
 
+def keep_safe(
+    a_mps2: FloatArray,
+    x_m: FloatArray,
+    v_mps: FloatArray,
+    taken_m: FloatArray | float,
+    decel_mps2: FloatArray | float,
+    tau_s: FloatArray | float,
+) -> None:
+    """Lower accelerations of the cars of the mainline, (A, K), to what is safe in states, (A, K).
+
+    `taken_m` is what a car and the least gap before it take of the road.
+    """
+    gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - taken_m
+    safe = safe_speed_mps(gap_m, v_mps[LEADERS], decel_mps2, tau_s)
+    most = (safe - v_mps[FOLLOWERS]) / DT_S
+    a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
+
+
 class Following:
     """Keeps the cars of the mainline in K corridors from driving into each other."""
 
@@ -60,10 +78,7 @@ class Following:
 
     def limit(self, a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray) -> None:
         """Lower accelerations, (A, K), to what is safe in states, (A, K)."""
-        gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - self._taken
-        safe = safe_speed_mps(gap_m, v_mps[LEADERS], self._decel, self._tau)
-        most = (safe - v_mps[FOLLOWERS]) / DT_S
-        a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
+        keep_safe(a_mps2, x_m, v_mps, self._taken, self._decel, self._tau)
 
     def met(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.int64]:
         """Return the row of the car that the VUT will meet, (K,), in states, (A, K)."""

@@ -141,7 +141,7 @@ class Criterion:
         """Return the outcome of an episode at a place in a campaign."""
         measures = measure(trajectory)
         margin = self.margin(trajectory, measures, lines)
-        return Outcome(index, batch, trajectory.case, measures, margin)
+        return Outcome(index, batch, trajectory.case, measures, margin=margin)
 
 
 COLLISION: Final = Criterion()

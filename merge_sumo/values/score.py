@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
+from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.merge import AfterMerge, after_merge, followed_up
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
@@ -97,13 +98,14 @@ class Measures:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A case that was run: its place in the campaign and its measures.
+    """A case that was run: its place in the campaign, its measures, and what was foretold of it.
 
     Attributes:
         index: its place in the campaign.
         batch: the batch in which it ran.
         case: the case.
         measures: what was measured.
+        foretold: what was foretold of it; None where nothing was.
         margin: how far it is from failing under the campaign's criterion, below 0 where it fails;
             None under the paper's, which has the score P, and after an error.
     """
@@ -112,6 +114,7 @@ class Outcome:
     batch: int
     case: Case
     measures: Measures
+    foretold: Foretold | None = None
     margin: float | None = None
 
     @property
@@ -155,8 +158,10 @@ class Outcome:
             for name in FOLLOWED_UP:
                 del measures[name]
         place = {"index": self.index, "batch": self.batch}
-        margin = {} if self.margin is None else {"margin": self.margin}
-        return place | {name: getattr(case, name) for name in names} | measures | margin
+        record = place | {name: getattr(case, name) for name in names} | measures
+        if self.margin is not None:
+            record["margin"] = self.margin
+        return record if self.foretold is None else record | {"foretold": self.foretold.to_record()}
 
     @classmethod
     def from_record(cls, record: dict[str, Any], scenario: Scenario = US23) -> Outcome:
@@ -171,6 +176,7 @@ class Outcome:
         in_traffic = scenario.vehicles > 2
         names = (*RECORDED, *RECORDED_IN_TRAFFIC) if in_traffic else RECORDED
         case = Case(**{name: values.pop(name) for name in names}, scenario=scenario)
+        foretold = values.pop("foretold", None)
         values["end"] = End(values["end"])
         if not in_traffic:
             values["nearest"] = VEHICLES[POV]
@@ -185,7 +191,8 @@ class Outcome:
                 raise TypeError(f"{name} is {value!r}")
             if type(value) is float and not math.isfinite(value):
                 raise ValueError(f"{name} is {value!r}")
-        return cls(index, batch, case, Measures(**values), margin)
+        said = None if foretold is None else Foretold.from_record(foretold)
+        return cls(index, batch, case, Measures(**values), said, margin)
 
 
 FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
