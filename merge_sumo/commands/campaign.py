@@ -25,6 +25,8 @@ from merge_sumo.commands.shared import (
     print_troubles,
     say,
     show,
+    written,
+    written_settings,
 )
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
@@ -161,7 +163,7 @@ def campaign(
     else:
         given = _given(context)
         settings = settings_of(resume, read_settings(resume), given, trust=trust_vut)
-        if _is_written(context, "level"):
+        if "level" in written(context):
             settings = replace(settings, levels=parse_levels(level, settings.povs))
             given["levels"] = settings.levels
         folder, levels = resume, settings.levels
@@ -256,47 +258,11 @@ def _conclude(
     return passed
 
 
-def _is_written(context: typer.Context, option: str) -> bool:
-    source = context.get_parameter_source(option)
-    return source is not None and source.name == "COMMANDLINE"
-
-
 def _given(context: typer.Context) -> dict[str, object]:
-    """Return the settings that a person wrote, by their names in `CampaignSettings`.
-
-    Levels are not among them: which there are, the other settings say.
-    """
-    from merge_sumo.scenarios.scenario_file import named_scenario
-
-    names = {
-        name: name
-        for name in (
-            "vut",
-            "sampler",
-            "cases",
-            "batch",
-            "seed",
-            "stop_after_converged",
-            "vut_command",
-            "in_process",
-            "policies",
-            "pov",
-            "scenario",
-        )
-    }
-    names |= {"v_vut0": "v_vut0_mps", "deadline": "deadline_s", "vut_memory": "vut_memory_gib"}
-    given = {
-        name: context.params[option]
-        for option, name in names.items()
-        if _is_written(context, option)
-    }
-    if "policies" in given:
-        given["policies"] = str(given["policies"])
-    if "scenario" in given:
-        given["scenario"] = named_scenario(given["scenario"])
+    """Return the settings that a person wrote beside --resume."""
     if context.params["out"] is not None:
         raise UserError("--resume names the folder: leave --out away")
-    return given
+    return written_settings(context)
 
 
 def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path | None) -> str:

@@ -80,6 +80,12 @@ def sumo_program(name: str) -> str:
     return str(program)
 
 
+def sumo_environment() -> dict[str, str]:
+    """Return the environment for a SUMO program: what is SUMO's in it is the installation's."""
+    others = {key: value for key, value in os.environ.items() if not key.startswith("SUMO_")}
+    return {**others, "SUMO_HOME": str(Path(sumo_program("sumo")).parents[1])}
+
+
 @dataclass(frozen=True, slots=True)
 class Ended:
     """How a program ended: its exit code, and why where that is not 0."""
@@ -97,11 +103,10 @@ def run_program(
     program says goes to the terminal.
     """
     program = sumo_program(name)
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("SUMO_")}
     with subprocess.Popen(
         [program, *arguments],
         cwd=folder,
-        env={**environment, "SUMO_HOME": str(Path(program).parents[1])},
+        env=sumo_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=None if limit_s is None else subprocess.PIPE,

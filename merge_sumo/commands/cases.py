@@ -1,0 +1,155 @@
+"""Commands on single cases: run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from merge_sumo.commands.shared import (
+    DeadlineOption,
+    JsonOption,
+    NetOption,
+    PoliciesOption,
+    PovOption,
+    ScenarioOption,
+    TrustOption,
+    VutCommandOption,
+    VutMemoryOption,
+    app,
+    say,
+    show,
+    written,
+    written_settings,
+)
+from merge_sumo.system.printable import quoted
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
+
+if TYPE_CHECKING:
+    from merge_sumo.campaigns.settings import CampaignSettings
+    from merge_sumo.campaigns.single import Ended
+    from merge_sumo.values.case import Case
+
+
+@app.command()
+def run(
+    context: typer.Context,
+    vut: Annotated[
+        str, typer.Option(help="Vehicle under test.  [with --case default: the campaign's]")
+    ] = "",
+    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2 or own.")] = "0",
+    x: Annotated[
+        float | None, typer.Option("--x", help="Where the POV starts, in m: M is 0.")
+    ] = None,
+    v: Annotated[float | None, typer.Option("--v", help="How fast it starts, in m/s.")] = None,
+    psi: Annotated[
+        float | None, typer.Option(help="Its social value orientation in rad, at level 2.")
+    ] = None,
+    v_vut0: Annotated[
+        float | None,
+        typer.Option(help="Initial speed of the VUT in m/s.  [default: the scenario's]"),
+    ] = None,
+    headway_ahead: Annotated[
+        float | None, typer.Option(help="Headway to the car ahead in s, in traffic.")
+    ] = None,
+    headway_behind: Annotated[
+        float | None, typer.Option(help="Headway of the car behind in s, in traffic.")
+    ] = None,
+    case: Annotated[
+        tuple[Path, int] | None,
+        typer.Option(
+            metavar="RUN INDEX", help="A case of a campaign instead; options given beside it win."
+        ),
+    ] = None,
+    scenario: ScenarioOption = "us23",
+    pov: PovOption = None,
+    policies: PoliciesOption = None,
+    net: NetOption = None,
+    vut_command: VutCommandOption = None,
+    deadline: DeadlineOption = DEADLINE_S,
+    vut_memory: VutMemoryOption = MEMORY_GIB,
+    gui: Annotated[
+        bool, typer.Option("--gui", help="Show it in sumo-gui while it runs, in real time.")
+    ] = False,
+    debug: Annotated[
+        bool,
+        typer.Option(
+            "--debug", help="Run the VUT in this process without a deadline: breakpoints work."
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder to keep it in, for `replay` and sumo-gui.")
+    ] = None,
+    trust_vut: TrustOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run one case and show what happens: verdict, measures, and the motion second by second.
+
+    Exit code 0 when the VUT merges, 1 when it collides, errs or times out, 2 for bad use.
+
+    Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
+    """
+    from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.campaigns.single import run_one
+    from merge_sumo.system.folders import check_new
+    from merge_sumo.values.trajectory import End
+
+    settings, one = _case_and_settings(context)
+    if out is not None:
+        check_new(out)
+    road = road_for(settings.scenario, net)
+
+    def ended(found: Ended) -> None:
+        from merge_sumo.reports.motion import lines_of
+        from merge_sumo.sumo.replay_folder import write_scenario
+
+        if out is not None:
+            write_scenario(out, road, found.outcome, found.trajectory)
+        if as_json:
+            kept = {} if out is None else {"out": str(out)}
+            motion = {"motion": found.trajectory.motion.tolist()}
+            typer.echo(json.dumps({**found.outcome.to_record(), **kept, **motion}))
+            return
+        for line in lines_of(found.outcome, found.trajectory):
+            show(line)
+        if out is not None:
+            show(f"kept: merge-sumo replay {quoted(out)} --gui")
+        if gui:
+            say("close the window to go on")
+
+    found = run_one(settings.vut_factory, one, road, settings.povs, live=gui, on_end=ended)
+    raise typer.Exit(0 if found.outcome.measures.end is End.MERGED else 1)
+
+
+def _case_and_settings(context: typer.Context) -> tuple[CampaignSettings, Case]:
+    """Return the case that is asked for, and how it is to be run."""
+    from merge_sumo.campaigns.run import Run
+    from merge_sumo.campaigns.settings import one_level, povs_of
+    from merge_sumo.campaigns.single import DEBUG_DEADLINE_S, FIELDS, settings_and_case
+    from merge_sumo.drivers.vuts.base import VutOptions
+    from merge_sumo.scenarios.scenario_file import named_scenario
+
+    options = context.params
+    given = written_settings(context)
+    if options["debug"]:
+        given |= {"in_process": True, "deadline_s": DEBUG_DEADLINE_S}
+    values = {
+        field: options[option[2:].replace("-", "_")]
+        for field, option in FIELDS.items()
+        if options[option[2:].replace("-", "_")] is not None
+    }
+    if options["case"] is None:
+        where = named_scenario(options["scenario"])
+        hosted = VutOptions(memory_gib=options["vut_memory"])
+        povs = povs_of(options["policies"], where, options["pov"], hosted)
+        given["scenario"] = where
+        return settings_and_case(None, one_level(options["level"], povs), values, given)
+    folder, index = options["case"]
+    recorded = Run(folder)
+    level = recorded.outcome(index).case.level
+    if "level" in written(context):
+        level = one_level(options["level"], povs_of(options["policies"], recorded.scenario))
+    of = recorded, index
+    return settings_and_case(of, level, values, given, trust=options["trust_vut"])
