@@ -56,6 +56,7 @@ EXAGGERATED: Final = 1.0 / 175.0
 """How much larger cars are drawn than they are, for a metre of the picture's width."""
 REAL_TIME_MS: Final = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
+PALE: Final = "0.93,0.93,0.90"
 SURROUNDINGS_COLOUR: Final = "0.70,0.70,0.68"
 LANE_WIDTH_M: Final = 3.2
 MAX_SURROUNDINGS: Final = 2_000
@@ -225,11 +226,10 @@ def view_settings(
         f"{text}_show": "1",
         f"{text}_size": "60",
         f"{text}_color": "0.1,0.1,0.1",
-        f"{text}_bgColor": "0.93,0.93,0.90",
-        "vehicleTextParam": label or "",
+        **({} if label is None else {"vehicleTextParam": label, "vehicleText_bgColor": PALE}),
     }
     etree.SubElement(scheme, "vehicles", vehicles)
-    etree.SubElement(scheme, "background", backgroundColor="0.93,0.93,0.90", showGrid="0")
+    etree.SubElement(scheme, "background", backgroundColor=PALE, showGrid="0")
     zoom, x, y = viewport
     etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
     etree.SubElement(root, "delay", value=REAL_TIME_MS)
