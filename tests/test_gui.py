@@ -40,6 +40,7 @@ def that_ends(*arguments):
     root = config(*arguments)
     root.find("gui_only/delay").set("value", "0")
     etree.SubElement(root.find("gui_only"), "quit-on-end", value="true")
+    root.find("gui_only").remove(root.find("gui_only/breakpoints"))
     return root
 
 replay_folder._view, replay_folder._config = with_pictures, that_ends

@@ -274,6 +274,8 @@ def _config(road: Road, timesteps: int) -> etree._Element:
             "gui-settings-file": VIEW,
             "start": "true",
             "delay": REAL_TIME_MS,
+            # It halts there, with no dialog over the last picture as where it ends.
+            "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
             "window-size": ",".join(map(str, WINDOW)),
         },
     }
