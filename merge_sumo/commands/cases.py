@@ -1,24 +1,30 @@
-"""Commands on single cases: run."""
+"""Commands on single cases: run, rerun."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from merge_sumo.commands.shared import (
     DeadlineOption,
+    InProcessOption,
     JsonOption,
     NetOption,
     PoliciesOption,
     PovOption,
+    RunArgument,
     ScenarioOption,
+    ToleranceOption,
     TrustOption,
     VutCommandOption,
     VutMemoryOption,
     app,
+    check_tolerance,
+    print_troubles,
     say,
     show,
     written,
@@ -30,6 +36,7 @@ from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 if TYPE_CHECKING:
     from merge_sumo.campaigns.settings import CampaignSettings
     from merge_sumo.campaigns.single import Ended
+    from merge_sumo.reports.rerun import Rerun
     from merge_sumo.values.case import Case
 
 
@@ -121,6 +128,97 @@ def run(
 
     found = run_one(settings.vut_factory, one, road, settings.povs, live=gui, on_end=ended)
     raise typer.Exit(0 if found.outcome.measures.end is End.MERGED else 1)
+
+
+@app.command()
+def rerun(
+    context: typer.Context,
+    run: RunArgument,
+    case: Annotated[
+        list[int] | None,
+        typer.Argument(help="Indices of cases in outcomes.jsonl; all if left out."),
+    ] = None,
+    vut: Annotated[
+        str, typer.Option(help="The changed VUT.  [default: the campaign's, as its files are now]")
+    ] = "",
+    vut_command: VutCommandOption = None,
+    deadline: DeadlineOption = DEADLINE_S,
+    vut_memory: VutMemoryOption = MEMORY_GIB,
+    in_process: InProcessOption = False,
+    policies: PoliciesOption = None,
+    net: NetOption = None,
+    tolerance: ToleranceOption = 0.0,
+    workers: Annotated[int, typer.Option(help="Processes that run cases.")] = 1,
+    trust_vut: TrustOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run recorded cases again with a changed VUT, and say which verdicts changed.
+
+    Exit code 1 when it is worse than what was recorded, as in compare-runs: at some level the share
+    of cases with an error, with an error or a timeout, or the failure mode coverage (FMC) grew by
+    more than the tolerance, or it reached the merge point in no case.
+
+    Example:  merge-sumo rerun runs/design2 3 7 --vut design2
+    """
+    from merge_sumo.campaigns.run import Run
+    from merge_sumo.reports import rerun as again
+    from merge_sumo.reports.progress import Counter
+    from merge_sumo.system.workers import open_workers
+
+    check_tolerance(tolerance)
+    recorded = Run(run)
+    total = len(case or recorded.outcomes)
+    settings = again.settings_today(recorded, written_settings(context), trust=trust_vut)
+    with (
+        open_workers(settings.workers(workers)) as there,
+        Counter(f"{settings.vut} again", total, "cases") as counter,
+    ):
+        found = again.rerun(
+            recorded,
+            settings,
+            case or (),
+            net=net,
+            workers=there,
+            on_case=counter.ended,
+        )
+    why = found.compared.worse(tolerance)
+    if as_json:
+        changed = [one.to_record() for one in found.changed]
+        judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
+        compared = {"cases": total, "changed": changed, "levels": asdict(found.compared)["levels"]}
+        typer.echo(json.dumps({"vut": found.vut, **compared, **judged}))
+    else:
+        _print_rerun(found, run)
+        show(f"it is {'worse' if why else 'not worse'}, with a tolerance of {tolerance:g}")
+        for sentence in why:
+            show(f"  {sentence} (A is what was recorded, B is now)")
+    raise typer.Exit(1 if why else 0)
+
+
+MOST_CHANGED: Final = 40
+"""Cases that are printed; JSON has all."""
+
+
+def _print_rerun(found: Rerun, folder: Path) -> None:
+    from merge_sumo.reports.verdict import judge
+
+    show(f"recorded:  {judge(found.before).counts}")
+    show(f"now:       {judge(found.after).counts} ({found.vut})")
+    print_troubles(judge(found.after))
+    changed = found.changed
+    if not changed:
+        show("no verdict changed")
+        return
+    show(f"{len(changed)} verdicts changed:" if len(changed) > 1 else "one verdict changed:")
+    for one in changed[:MOST_CHANGED]:
+        ends = f"{one.before.measures.end} -> {one.after.measures.end}"
+        show(f"  case {one.before.index}: {ends} ({one.change})")
+    if len(changed) > MOST_CHANGED:
+        show(f"  and {len(changed) - MOST_CHANGED} others; --json has them all")
+    show(
+        f"look at one: merge-sumo run --case {quoted(folder)} {changed[0].before.index} "
+        f"--vut {quoted(found.vut)} --gui"
+    )
 
 
 def _case_and_settings(context: typer.Context) -> tuple[CampaignSettings, Case]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 
 if TYPE_CHECKING:
@@ -91,6 +92,13 @@ PovOption = Annotated[
         help="A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
     ),
 ]
+ToleranceOption = Annotated[
+    float,
+    typer.Option(
+        help="Growth of FMC, or of the share of cases without a verdict, at a level that is still "
+        "no regression."
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 
@@ -130,6 +138,12 @@ def written_settings(context: typer.Context) -> dict[str, Any]:
     if "scenario" in given:
         given["scenario"] = named_scenario(given["scenario"])
     return given
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raise `UserError` for a tolerance that is none."""
+    if not tolerance >= 0.0:
+        raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
 
 
 def print_troubles(verdict: Verdict) -> None:
