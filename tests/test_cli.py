@@ -314,7 +314,8 @@ class TestACampaign:
 
     def test_goes_by_default_into_a_folder_named_after_the_vut(self, call):
         assert call(*SMALL, "--cases", 2, "--sampler", "uniform").code == 0
-        (folder,) = Path("runs").iterdir()
+        (folder,) = Path("runs").glob("*-*")
+        assert Path("runs/latest").resolve() == folder.resolve()
         assert folder.name.startswith("design1-")
         assert len(Run(folder).outcomes) == 2
 

@@ -30,7 +30,7 @@ from merge_sumo.commands.shared import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.system.folders import dated
+from merge_sumo.system.folders import dated, link_latest
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, level_name
 
@@ -83,7 +83,8 @@ def campaign(
         Path | None, typer.Option(help="New folder to write.  [default: runs/VUT-DATE]")
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option(help="Go on with the campaign in this folder; needs no --vut.")
+        Path | None,
+        typer.Option(help="Go on with the campaign in this folder; --cases may be more."),
     ] = None,
     force: Annotated[
         bool, typer.Option(help="Resume although something differs; campaign.json records it.")
@@ -199,6 +200,7 @@ def campaign(
                     folder,
                     road,
                     progress.case_ended,
+                    on_before=progress.ran_before,
                     given=given,
                     force=force,
                     workers=there,
@@ -224,6 +226,7 @@ def _conclude(
     from merge_sumo.reports.summary import summarise
     from merge_sumo.reports.verdict import NOTHING_TESTED, judge
 
+    link_latest(run.folder)
     report_file = write_report(run)
     summary = summarise(run.outcomes, settings.levels)
     verdict = judge(run.outcomes)
@@ -268,6 +271,7 @@ def _given(context: typer.Context) -> dict[str, object]:
 def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path | None) -> str:
     if not folder.exists():
         return "stopped before the first case; nothing was written"
+    link_latest(folder)
     command = f"merge-sumo campaign --resume {quoted(folder)}"
     command += f" --net {quoted(net)}" if net is not None else ""
     # Neither is a setting of the campaign, which its folder would remember.

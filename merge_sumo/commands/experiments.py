@@ -265,7 +265,7 @@ def reproduce(
     from merge_sumo.campaigns.settings import povs_of
     from merge_sumo.reports import reproduce as paper
     from merge_sumo.reports import table2
-    from merge_sumo.reports.progress import Bars
+    from merge_sumo.reports.progress import Bars, rate_text
     from merge_sumo.system.workers import open_workers
 
     if seeds is None:
@@ -276,9 +276,7 @@ def reproduce(
     with open_workers(workers, dask) as there, Bars() as bars:
 
         def ran(title: str, done: int, total: int, unit: str) -> None:
-            elapsed_s = bars.elapsed_s(title)
-            rate = f"{done / elapsed_s:.3g}" if elapsed_s > 0.0 else "-"
-            bars.show(title, done, total, f"{rate} {unit}/s")
+            bars.show(title, done, total, rate_text(done, bars.elapsed_s(title), unit))
 
         index = paper.reproduce(folder, scale, povs=povs, workers=there, on_run=ran)
     if as_json:
