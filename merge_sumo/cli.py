@@ -9,13 +9,22 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands import campaign, cases, experiments, runs, scenarios, training, vuts
+from merge_sumo.commands import (
+    campaign,
+    cases,
+    experiments,
+    probability,
+    runs,
+    scenarios,
+    training,
+    vuts,
+)
 from merge_sumo.commands.shared import app, say
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 
-__all__ = ["app", "campaign", "cases", "experiments", "main", "runs", "scenarios"]
-__all__ += ["training", "vuts"]
+__all__ = ["app", "campaign", "cases", "experiments", "main", "probability", "runs"]
+__all__ += ["scenarios", "training", "vuts"]
 
 
 @app.callback(invoke_without_command=True)
