@@ -17,6 +17,7 @@ from merge_sumo.reports.diagnosis import (
     Kind,
     failure_boxes,
 )
+from merge_sumo.reports.foretelling import foretold_in_words
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
 from merge_sumo.reports.report_maps import pairs_of
 from merge_sumo.reports.summary import LevelSummary, Summary
@@ -92,11 +93,14 @@ def page_words(facts: Facts) -> dict[str, Any]:
         ("Ten worst failures", facts.worst[:LISTED]),
         ("Ten nearest misses", facts.near[:LISTED]),
     ]
+    if facts.surprises:
+        tables.append(("Ten that were foretold worst", facts.surprises))
     return {
         "vut": facts.run.vut,
         "headline": headline(facts.verdict, summary, facts.worst, facts.kinds),
         "careful": in_a_sentence(facts.avoidance.values()),
         "avoidance": _avoidance(facts),
+        "foretold": foretold_in_words(facts.run.outcomes),
         "counts": facts.verdict.counts,
         "found": facts.verdict,
         "troubles": facts.troubles(),
