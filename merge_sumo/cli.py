@@ -9,12 +9,30 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands import campaign, experiments, runs, scenarios, training, vuts
+from merge_sumo.commands import (
+    campaign,
+    certify,
+    experiments,
+    runs,
+    scenarios,
+    training,
+    vuts,
+)
 from merge_sumo.commands.shared import app, say
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 
-__all__ = ["app", "campaign", "experiments", "main", "runs", "scenarios", "training", "vuts"]
+__all__ = [
+    "app",
+    "campaign",
+    "certify",
+    "experiments",
+    "main",
+    "runs",
+    "scenarios",
+    "training",
+    "vuts",
+]
 
 
 @app.callback(invoke_without_command=True)

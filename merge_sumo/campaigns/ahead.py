@@ -24,7 +24,7 @@ CHUNK_S: Final = 0.5
 
 
 def proposals(
-    sampler: Sampler, history: Sequence[Outcome], cases: int, batch: int
+    sampler: Sampler, history: Sequence[Outcome], cases: int, batch: int | None
 ) -> Iterator[list[Case]]:
     """Yield the batches that a sampler proposes after a history, up to so many cases in all.
 
@@ -33,10 +33,12 @@ def proposals(
     if sampler.learns:
         return
     sampler.tell(history)
-    for first in range(len(history), cases, batch):
-        proposed = sampler.ask(min(batch, cases - first))
+    first = len(history)
+    while first < cases:
+        proposed = sampler.ask(min(batch or sampler.batch_size(), cases - first))
         yield proposed
         sampler.skip(proposed)
+        first += len(proposed)
 
 
 class Ahead:

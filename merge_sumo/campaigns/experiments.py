@@ -26,6 +26,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.system.workers import Workers
+from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit
 from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.scenario import US23, Scenario
@@ -69,7 +70,7 @@ def _search(
     seed: int,
 ) -> Search:
     pool = Pool(levels=levels, scenario=scenario)
-    sampler = make_sampler(name, pool, seed)
+    sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed))
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]

@@ -74,6 +74,17 @@ DECIDES_OUTCOMES: Final = (
 )
 """Sources of this package that decide what becomes of a case."""
 
+
+def sources_sha256() -> str:
+    """Return the hash of the sources of this package that decide what becomes of a case."""
+    package = Path(__file__).resolve().parents[1]
+    sources = hashlib.sha256()
+    for part in DECIDES_OUTCOMES:
+        for source in sorted((package / part).rglob("*.py")) or [package / part]:
+            sources.update(source.read_bytes())
+    return sources.hexdigest()
+
+
 OnCases = Callable[[int], None]
 """Told how many cases have just ended."""
 
@@ -195,11 +206,6 @@ class Kept:
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
-        package = Path(__file__).resolve().parents[1]
-        sources = hashlib.sha256()
-        for part in DECIDES_OUTCOMES:
-            for source in sorted((package / part).rglob("*.py")) or [package / part]:
-                sources.update(source.read_bytes())
         # The same name may be another file in another folder.
         code = runs_code(self.vut, self.command) or (self.pov and runs_code(self.pov, None))
         here = str(Path.cwd()) if code else None
@@ -207,7 +213,7 @@ class Kept:
             **asdict(self),
             "here": here,
             "versions": versions(),
-            "sources": sources.hexdigest(),
+            "sources": sources_sha256(),
             "net": road_for(self.scenario).sha256,
         }
         key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]

@@ -16,6 +16,8 @@ from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
 
+CARS: Final = (POV, AHEAD, BEHIND)
+"""Rows of the cars of the mainline."""
 FOLLOWERS: Final = slice(POV, BEHIND + 1, BEHIND - POV)
 LEADERS: Final = slice(AHEAD, None, POV - AHEAD)
 """The POV and the car behind it, and those that they follow: the car ahead and the POV."""
@@ -36,6 +38,24 @@ def safe_speed_mps(
     room = 2.0 * decel_mps2 * np.maximum(gap_m, 0.0)
     speed: FloatArray = np.sqrt(lag * lag + v_leader_mps * v_leader_mps + room) - lag
     return speed
+
+
+def keep_safe(
+    a_mps2: FloatArray,
+    x_m: FloatArray,
+    v_mps: FloatArray,
+    taken_m: FloatArray | float,
+    decel_mps2: FloatArray | float,
+    tau_s: FloatArray | float,
+) -> None:
+    """Lower accelerations of the cars of the mainline, (A, K), to what is safe in states, (A, K).
+
+    `taken_m` is what a car and the least gap before it take of the road.
+    """
+    gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - taken_m
+    safe = safe_speed_mps(gap_m, v_mps[LEADERS], decel_mps2, tau_s)
+    most = (safe - v_mps[FOLLOWERS]) / DT_S
+    a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
 
 
 class Following:
@@ -60,10 +80,7 @@ class Following:
 
     def limit(self, a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray) -> None:
         """Lower accelerations, (A, K), to what is safe in states, (A, K)."""
-        gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - self._taken
-        safe = safe_speed_mps(gap_m, v_mps[LEADERS], self._decel, self._tau)
-        most = (safe - v_mps[FOLLOWERS]) / DT_S
-        a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
+        keep_safe(a_mps2, x_m, v_mps, self._taken, self._decel, self._tau)
 
     def met(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.int64]:
         """Return the row of the car that the VUT will meet, (K,), in states, (A, K)."""
