@@ -284,8 +284,8 @@ def main() -> None:
             history = history_of(count, run.outcomes)
             spent = {name: sampler_s(name, history) for name in SAMPLERS}
             result["samplers"][count] = spent
-            rates = ", ".join(f"{name} {seconds:.3f}" for name, seconds in spent.items())
-            tell(f"samplers: seconds for a batch of {BATCH} after {count:,} cases: {rates}")
+            shown = ", ".join(f"{name} {seconds:.3f}" for name, seconds in spent.items())
+            tell(f"samplers: seconds for a batch of {BATCH} after {count:,} cases: {shown}")
             count *= 10
         count = 10_000
         while count <= chosen.outcomes:

@@ -65,10 +65,10 @@ class Sampler(ABC):
     telling its journal to a fresh sampler.
     """
 
-    foresees: ClassVar[bool] = False
-    """Whether it makes something of games that are played out before cases run."""
     learns: ClassVar[bool] = True
     """Whether outcomes decide on what it proposes, and not only how many cases there were."""
+    foresees: ClassVar[bool] = False
+    """Whether it makes something of games that are played out before cases run."""
 
     def __init__(self, pool: Pool, seed: int, games: Foreteller | None = None) -> None:
         """Propose cases from `pool`; `seed` makes the proposals reproducible.

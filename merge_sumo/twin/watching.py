@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.following import CARS, car_met
+from merge_sumo.drivers.following import car_met
 from merge_sumo.drivers.levelk import prospects
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import POV, VUT, Scenario
+from merge_sumo.values.scenario import AHEAD, BEHIND, POV, VUT, Scenario
 
 Inputs = NDArray[np.float32]
 """As trees read them."""
@@ -72,7 +72,7 @@ class Watcher:
             place = np.arange(x_m.shape[1])
             x_pov, v_pov = x_m[met, place], v_mps[met, place]
             inputs[NOW] = met
-            for number, car in enumerate(CARS):
+            for number, car in enumerate((POV, AHEAD, BEHIND)):
                 row = NOW + 1 + OF_EACH_CAR * number
                 inputs[row], inputs[row + 1] = x_m[car] - x_vut, v_mps[car]
         times, gaps, v_level0, v_full = prospects(x_pov, v_pov, x_vut, v_vut, scenario)
