@@ -9,7 +9,7 @@ run.report()        # path of the HTML report
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -19,7 +19,6 @@ from merge_sumo.campaigns.conductor import OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import (
-    DEFAULT_BATCH,
     DEFAULT_CASES,
     CampaignSettings,
     parse_levels,
@@ -171,6 +170,7 @@ def campaign(
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
     pov: str | None = None,
+    learn_from: Sequence[Path | str] = (),
     on_case: OnCase | None = None,
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
@@ -180,7 +180,8 @@ def campaign(
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         sampler: who chooses the cases.
         cases: number of cases.
-        batch: cases per batch; 40, or all if fewer, when left out.
+        batch: cases per batch; when left out, as many as the sampler wants: 10, later 20 and 40
+            for `coverage`, 40 for the others.
         seed: same seed, same outcomes.
         v_vut0_mps: initial speed of the VUT; the scenario's when left out.
         vut_command: command that starts the controller of `vut="traci"`.
@@ -194,6 +195,7 @@ def campaign(
         scenario: a scenario, its name, or its TOML file.
         policies: folder of learned drivers in the place of the shipped ones.
         pov: a POV of your own, as after `--pov`.
+        learn_from: folders of earlier campaigns to learn the VUT from.
         on_case: told of every case as it ends.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
@@ -205,7 +207,7 @@ def campaign(
         levels=parse_levels(str(level), povs_of(policies, where, pov, options)),
         sampler=sampler,
         cases=cases,
-        batch=min(DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
+        batch=batch,
         seed=seed,
         v_vut0_mps=v_vut0_mps,
         stop_after_converged=stop_after_converged,
@@ -215,6 +217,7 @@ def campaign(
         in_process=in_process,
         policies=None if policies is None else str(policies),
         pov=pov,
+        learn_from=tuple(map(str, learn_from)),
         scenario=where,
     )
     folder = dated(vut) if out is None else Path(out)

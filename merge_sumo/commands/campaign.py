@@ -57,9 +57,20 @@ def campaign(
     ] = DEFAULT_SAMPLER,
     cases: Annotated[int, typer.Option(help="Number of test cases.")] = 800,
     batch: Annotated[
-        int | None, typer.Option(help="Cases per batch.  [default: 40, or all if fewer]")
+        int | None,
+        typer.Option(
+            help="Cases per batch.  [default: 10, later 20 and 40 for coverage; 40 for the others]"
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same outcomes.")] = 0,
+    learn_from: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RUN",
+            help="An earlier campaign, of another version or at other levels, to learn the VUT "
+            "from. May be given several times.",
+        ),
+    ] = None,
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     v_vut0: Annotated[
@@ -120,7 +131,6 @@ def campaign(
     from merge_sumo.campaigns.ground import road_for
     from merge_sumo.campaigns.run import read_settings
     from merge_sumo.campaigns.settings import (
-        DEFAULT_BATCH,
         CampaignSettings,
         parse_levels,
         povs_of,
@@ -146,7 +156,7 @@ def campaign(
             levels=levels,
             sampler=sampler,
             cases=cases,
-            batch=min(DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
+            batch=batch,
             seed=seed,
             v_vut0_mps=v_vut0,
             stop_after_converged=stop_after_converged,
@@ -156,6 +166,7 @@ def campaign(
             in_process=in_process,
             policies=None if policies is None else str(policies),
             pov=pov,
+            learn_from=tuple(map(str, learn_from or ())),
             scenario=where,
         )
         folder = out or dated(vut)
@@ -302,6 +313,8 @@ def _given(context: typer.Context) -> dict[str, object]:
     }
     if "policies" in given:
         given["policies"] = str(given["policies"])
+    if context.params["learn_from"]:
+        given["learn_from"] = tuple(map(str, context.params["learn_from"]))
     if "scenario" in given:
         given["scenario"] = named_scenario(given["scenario"])
     if context.params["out"] is not None:

@@ -34,6 +34,15 @@ app = typer.Typer(
 NetOption = Annotated[
     Path | None, typer.Option(help="SUMO net to use instead of the shipped US-23 ramp.")
 ]
+DenseOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--dense/--no-dense",
+        help="Make the dense truths, of 1,000,000 cases, or go without.  [default: those kept]",
+        show_default=False,
+    ),
+]
+
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print the result as one JSON object on standard output.")
 ]
