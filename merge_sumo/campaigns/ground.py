@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from threading import RLock
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -43,8 +43,12 @@ class ProvingGround:
         net: Corridor | None = None,
         scenario: Scenario = US23,
         povs: Povs | None = None,
+        binding: Any = None,
     ) -> None:
-        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many."""
+        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many.
+
+        `binding` takes the place of libsumo: see `World`.
+        """
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
         povs = povs or Povs(policies=policies_of(scenario))
         cars = scenario.vehicles - 1
@@ -52,7 +56,7 @@ class ProvingGround:
         corridors = povs.corridors(corridors, cars)
         with ExitStack() as opened:
             car_type = None if povs.own is None else povs.own.vut.vut_type
-            self.world = World(corridors, net, factory.vut.vut_type, scenario, car_type)
+            self.world = World(corridors, net, factory.vut.vut_type, scenario, car_type, binding)
             opened.callback(self.world.close)
             self.vut = factory(corridors, self.world)
             opened.callback(self.vut.close)

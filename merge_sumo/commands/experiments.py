@@ -1,4 +1,4 @@
-"""Commands that measure: truth, compare, reproduce, probability."""
+"""Commands that measure: truth, compare, reproduce."""
 
 from __future__ import annotations
 
@@ -15,13 +15,11 @@ from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
     DenseOption,
+    InProcessOption,
     JsonOption,
-    NetOption,
     PoliciesOption,
     PovOption,
-    RunArgument,
     ScenarioOption,
-    TrustOption,
     VutCommandOption,
     VutMemoryOption,
     app,
@@ -55,6 +53,7 @@ def truth(
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
+    in_process: InProcessOption = False,
     workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
@@ -74,7 +73,7 @@ def truth(
     from merge_sumo.values.fmc import fmc, regions
 
     where = named_scenario(scenario)
-    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
+    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
     povs = povs_of(policies, where, pov, options)
     chosen = one_level(level, povs)
     factory = _factory(vut, povs, vut_command, options)
@@ -130,6 +129,7 @@ def compare(
         Path | None,
         typer.Option(help="New file for FMC against cases: .png, .svg or .html.", metavar="FILE"),
     ] = None,
+    in_process: InProcessOption = False,
     workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
@@ -156,7 +156,7 @@ def compare(
     from merge_sumo.values.fmc import fmc
 
     where = named_scenario(scenario)
-    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
+    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
     povs = povs_of(policies, where, pov, options)
     levels = parse_levels(level, povs)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
@@ -259,7 +259,7 @@ def reproduce(
     from merge_sumo.campaigns.settings import povs_of
     from merge_sumo.reports import reproduce as paper
     from merge_sumo.reports import table2
-    from merge_sumo.reports.progress import Bars
+    from merge_sumo.reports.progress import Bars, rate_text
     from merge_sumo.system.workers import open_workers
 
     if seeds is None:
@@ -272,9 +272,7 @@ def reproduce(
     with open_workers(workers, dask) as there, Bars() as bars:
 
         def ran(title: str, done: int, total: int, unit: str) -> None:
-            elapsed_s = bars.elapsed_s(title)
-            rate = f"{done / elapsed_s:.3g}" if elapsed_s > 0.0 else "-"
-            bars.show(title, done, total, f"{rate} {unit}/s")
+            bars.show(title, done, total, rate_text(done, bars.elapsed_s(title), unit))
 
         index = paper.reproduce(folder, scale, povs=povs, workers=there, on_run=ran)
     if as_json:
@@ -283,76 +281,6 @@ def reproduce(
         return
     typer.echo((folder / paper.TABLE_MARKDOWN).read_text(encoding="utf-8"), nl=False)
     show(f"all of it: {index}")
-
-
-@app.command()
-def probability(
-    run: RunArgument,
-    cases: Annotated[int, typer.Option(help="Fresh cases to run.")] = 4000,
-    distribution: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="JSON: how often cases occur.  [default: uniform]"),
-    ] = None,
-    confidence: Annotated[
-        float, typer.Option(help="Chance that the interval holds the probability.")
-    ] = 0.95,
-    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="New file to write.  [default: RUN/probability.json]"),
-    ] = None,
-    net: NetOption = None,
-    policies: PoliciesOption = None,
-    trust_vut: TrustOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Estimate how likely a VUT is to fail, with an interval that is valid.
-
-    The cases of the campaign were chosen to fail: they only say where fresh cases are worth most.
-    These are drawn independently, run in SUMO, and weighted; the interval is by betting, and holds
-    for any number of cases.
-
-    Example:  merge-sumo probability runs/design2 --cases 4000
-    """
-    from merge_sumo.campaigns import probability as estimates
-    from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports.progress import Counter
-
-    campaign = Run(run)
-    target = out or run / estimates.RESULT
-    with Counter("fresh cases", cases, "cases") as counter:
-        found = estimates.failure_probability(
-            campaign,
-            target,
-            cases=cases,
-            distribution=distribution,
-            confidence=confidence,
-            seed=seed,
-            net=road_for(campaign.scenario, net),
-            given={} if policies is None else {"policies": str(policies)},
-            trust=trust_vut,
-            on_case=lambda _: counter.ended(1),
-        )
-    if as_json:
-        typer.echo(json.dumps({**asdict(found), "file": str(target)}, allow_nan=False))
-        return
-    how = "under the stated distribution" if distribution else "under uniform cases"
-    show(
-        f"P(fail) {how}: {found.probability:.3g}, {100.0 * confidence:g} % interval "
-        f"[{found.low:.3g}, {found.high:.3g}] ({found.failures} failures in {cases} fresh cases)"
-    )
-    if found.without_verdict:
-        show(
-            f"  {found.without_verdict} cases without a verdict: safe for the lower end, failures "
-            "for the upper end"
-        )
-    arm = found.uniform_arm
-    show(
-        f"  for comparison, the {arm.cases} plain cases among them alone: {arm.failures} failures, "
-        f"[{arm.low:.3g}, {arm.high:.3g}]"
-    )
-    show(f"written: {target}")
 
 
 def _factory(vut: str, povs: Povs, command: str | None, options: VutOptions) -> VutFactory:
