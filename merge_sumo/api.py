@@ -6,8 +6,7 @@ run = ms.campaign("design2", cases=400, seed=1)
 run.failures        # rows for pandas.DataFrame(run.failures); a table in a notebook
 run.report()        # path of the HTML report
 
-A VUT is a spec, as after `--vut`, or what Python has: a class, a function, a lambda, or an object
-with `act` or `act_batch`.
+A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.campaigns.avoidance import note_avoidance
 from merge_sumo.campaigns.conductor import SCENARIOS, OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.settings import (
@@ -83,8 +83,7 @@ def campaign(
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
 
     Args:
-        vut: vehicle under test: a spec as after `--vut`, or a class, a function, or an object with
-            `act` or `act_batch`. What can be imported from a module drives as on the command line;
+        vut: vehicle under test. What can be imported from a module drives as on the command line;
             anything else drives in this process, or in worker processes where they can have a copy.
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         sampler: who chooses the cases.
@@ -145,7 +144,8 @@ def campaign(
             if on_case is not None:
                 on_case(outcome)
 
-        run_campaign(settings, folder, road, told, workers=there)
+        done = run_campaign(settings, folder, road, told, workers=there)
+    note_avoidance(done, settings, road)
     link_latest(folder)
     run = CampaignRun(folder)
     run.report()
