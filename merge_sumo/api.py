@@ -1,159 +1,64 @@
-"""merge-sumo from Python: run a campaign or open one, and look at it in a notebook.
+"""merge-sumo from Python: run cases and campaigns, and look at them in a notebook.
 
 import merge_sumo as ms
 
 run = ms.campaign("design2", cases=400, seed=1)
 run.failures        # rows for pandas.DataFrame(run.failures); a table in a notebook
 run.report()        # path of the HTML report
+
+A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from functools import cached_property
-from html import escape
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.conductor import OnCase, run_campaign
+from merge_sumo.campaigns.avoidance import note_avoidance
+from merge_sumo.campaigns.conductor import SCENARIOS, OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import (
     DEFAULT_CASES,
     CampaignSettings,
+    one_level,
     parse_levels,
     povs_of,
 )
+from merge_sumo.campaigns.single import DEBUG_DEADLINE_S, FIELDS, run_one, settings_and_case
+from merge_sumo.campaigns.truth import Truth, ground_truth
+from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.drivers.vuts.here import is_here, object_of, spec_of, travels
 from merge_sumo.errors import UserError
-from merge_sumo.reports.coordinates import coordinates
-from merge_sumo.reports.summary import Summary, summarise
-from merge_sumo.reports.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
+from merge_sumo.reports import comparison, exports
+from merge_sumo.reports.changes import RunComparison
+from merge_sumo.reports.progress import CampaignPanel, is_watched
+from merge_sumo.reports.rerun import Rerun, settings_today
+from merge_sumo.reports.rerun import rerun as run_again
+from merge_sumo.results import CampaignRun, CaseRun
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenarios.scenario_file import named_scenario
-from merge_sumo.system.folders import dated
+from merge_sumo.sumo.replay_folder import write_scenario
+from merge_sumo.system.folders import check_new, dated, link_latest
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.criterion import COLLISION
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import End, Trajectory
 
-MOST_ROWS: Final = 20
-"""Rows that a notebook shows of a table."""
-PLACE: Final = ("index", "level")
-VERDICT: Final = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
-"""Columns that it shows before and behind the coordinates of the case; the rows hold all of
-`outcomes.jsonl`."""
+__all__ = ["CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "open_run", "rerun"]
+__all__ += ["run_case", "truth"]
 
-
-class Table(list[dict[str, Any]]):
-    """Rows of cases, as in `outcomes.jsonl`: a list that `pandas.DataFrame` takes as it is."""
-
-    def __init__(self, outcomes: Iterable[Outcome]) -> None:
-        """Take the rows of outcomes, in their order."""
-        taken = list(outcomes)
-        super().__init__(outcome.to_record() for outcome in taken)
-        scenario = taken[0].case.scenario if taken else US23
-        self._columns = (*PLACE, *(c.field for c in coordinates(scenario)), *VERDICT)
-
-    def _repr_html_(self) -> str:
-        head = "".join(f"<th>{name}</th>" for name in self._columns)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{_cell(row[name])}</td>" for name in self._columns) + "</tr>"
-            for row in self[:MOST_ROWS]
-        )
-        more = f"<p>{len(self) - MOST_ROWS} more rows</p>" if len(self) > MOST_ROWS else ""
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}"
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return ""
-    text = f"{value:.2f}" if isinstance(value, float) else str(value)
-    return escape(shortened(text, MESSAGE_CHARACTERS))
-
-
-class CampaignRun:
-    """A campaign that was run, as it lies in its folder."""
-
-    def __init__(self, folder: Path | str) -> None:
-        """Open the folder of a campaign; `UserError` when it is none."""
-        self._run = Run(Path(folder))
-        if not isinstance(self._run.settings.get("levels"), list):
-            raise UserError(f"{Path(folder) / SETTINGS} is no campaign's: it has no levels")
-
-    @property
-    def folder(self) -> Path:
-        """The folder of the campaign."""
-        return self._run.folder
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What `campaign.json` holds."""
-        return self._run.settings
-
-    @property
-    def cases(self) -> Table:
-        """All cases, in the order in which they were chosen."""
-        return Table(self._run.outcomes)
-
-    @property
-    def failures(self) -> Table:
-        """The failing cases, the worst first."""
-        return Table(failures(self._run.outcomes))
-
-    @property
-    def errors(self) -> Table:
-        """The cases that ended in an error of the VUT or of the simulation, with the message."""
-        return Table(o for o in self._run.outcomes if o.measures.end.is_error)
-
-    @property
-    def timeouts(self) -> Table:
-        """The cases in which the VUT never reached the merge point."""
-        return Table(o for o in self._run.outcomes if o.measures.end is End.TIMEOUT)
-
-    @cached_property
-    def verdict(self) -> Verdict:
-        """How many cases failed, erred or timed out; errors and timeouts by message."""
-        return judge(self._run.outcomes)
-
-    @cached_property
-    def summary(self) -> Summary:
-        """Cases, failures, regions and failure mode coverage by POV level."""
-        return summarise(self._run.outcomes, self.settings["levels"])
-
-    def trajectory(self, index: int) -> Trajectory:
-        """Return the motion of a case; `UserError` when there is none."""
-        return self._run.trajectory(index)
-
-    def report(self) -> Path:
-        """Write the HTML report and return its path."""
-        from merge_sumo.reports.report import write_report
-
-        return write_report(self._run)
-
-    def __repr__(self) -> str:
-        """Return folder and result in a line."""
-        return f"<campaign {self.folder}: {self.verdict.counts}>"
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{level_name(level)}</td><td>{found.cases}</td><td>{found.failures}</td>"
-            f"<td>{found.regions}</td><td>{found.fmc:.4f}</td></tr>"
-            for level, found in self.summary.levels.items()
-        )
-        title = escape(f"{self._run.vut}: {self.verdict.counts}")
-        wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in self.verdict.sentences)
-        return (
-            f"<p><b>{title}</b><br>{escape(str(self.folder))}</p>{wrong}"
-            "<table><thead><tr><th>POV level</th><th>cases</th><th>failures</th><th>regions</th>"
-            f"<th>FMC</th></tr></thead><tbody>{rows}</tbody></table>"
-        )
+Vut = str | type | Callable[..., Any] | object
+"""A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
+AnyRun = CampaignRun | Path | str
+"""A campaign, or its folder."""
 
 
 def campaign(
-    vut: str,
+    vut: Vut,
     *,
     level: int | str = "all",
     sampler: str = DEFAULT_SAMPLER,
@@ -171,17 +76,18 @@ def campaign(
     net: Path | str | None = None,
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
-    pov: str | None = None,
+    pov: Vut | None = None,
     fail_when: str = COLLISION.fail_when,
     require: str | None = None,
-    follow_up_s: float | None = None,
     learn_from: Sequence[Path | str] = (),
     on_case: OnCase | None = None,
+    progress: bool | None = None,
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
 
     Args:
-        vut: vehicle under test, as after `--vut`.
+        vut: vehicle under test. What can be imported from a module drives as on the command line;
+            anything else drives in this process, or in worker processes where they can have a copy.
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         sampler: who chooses the cases.
         cases: number of cases.
@@ -199,21 +105,21 @@ def campaign(
         net: SUMO net to use instead of the scenario's.
         scenario: a scenario, its name, or its TOML file.
         policies: folder of learned drivers in the place of the shipped ones.
-        pov: a POV of your own, as after `--pov`.
+        pov: a POV of your own: what a `vut` can be.
         fail_when: what counts as a failure, as after `--fail-when`.
         require: what is to hold over time instead, as after `--require`.
-        follow_up_s: how long both drive on behind M; the scenario's, 0, when left out.
         learn_from: folders of earlier campaigns to learn the VUT from.
         on_case: told of every case as it ends.
+        progress: show how far it is; by default in a notebook and on a terminal.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
     """
-    where = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
-    where = where if follow_up_s is None else replace(where, follow_up_s=follow_up_s)
+    where = _scenario(scenario)
+    spec, pov_spec, workers = _specs(vut, pov, workers)
     options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     settings = CampaignSettings(
-        vut=vut,
-        levels=parse_levels(str(level), povs_of(policies, where, pov, options)),
+        vut=spec,
+        levels=parse_levels(str(level), povs_of(policies, where, pov_spec, options)),
         sampler=sampler,
         cases=cases,
         batch=batch,
@@ -225,16 +131,29 @@ def campaign(
         vut_memory_gib=vut_memory_gib,
         in_process=in_process,
         policies=None if policies is None else str(policies),
-        pov=pov,
+        pov=pov_spec,
         learn_from=tuple(map(str, learn_from)),
         scenario=where,
         fail_when=fail_when,
         require=require,
     )
-    folder = dated(vut) if out is None else Path(out)
+    folder = dated(spec) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))
-    with open_workers(settings.workers(workers)) as there:
-        run_campaign(settings, folder, road, on_case, workers=there)
+    title = f"{spec} v level {'/'.join(map(level_name, settings.levels))}"
+    quiet = not (is_watched() if progress is None else progress)
+    with (
+        open_workers(settings.workers(workers)) as there,
+        CampaignPanel(title, settings.cases, settings.levels, quiet=quiet) as panel,
+    ):
+
+        def told(outcome: Outcome) -> None:
+            panel.case_ended(outcome)
+            if on_case is not None:
+                on_case(outcome)
+
+        done = run_campaign(settings, folder, road, told, workers=there)
+    note_avoidance(done, settings, road)
+    link_latest(folder)
     run = CampaignRun(folder)
     run.report()
     return run
@@ -243,3 +162,246 @@ def campaign(
 def open_run(folder: Path | str) -> CampaignRun:
     """Open the folder of a campaign; `UserError` when it is none."""
     return CampaignRun(folder)
+
+
+def run_case(
+    vut: Vut,
+    case: Mapping[str, Any] | None = None,
+    *,
+    level: int | str | None = None,
+    scenario: Scenario | Path | str = US23,
+    policies: Path | str | None = None,
+    pov: Vut | None = None,
+    net: Path | str | None = None,
+    vut_command: str | None = None,
+    deadline_s: float = DEADLINE_S,
+    vut_memory_gib: float = MEMORY_GIB,
+    debug: bool = False,
+    gui: bool = False,
+    out: Path | str | None = None,
+    **coordinates: float,
+) -> CaseRun:
+    """Run one case and return it; the same as `merge-sumo run`.
+
+    Args:
+        vut: as of `campaign`.
+        case: a row of `run.cases` or `run.failures`: what is not given is as there.
+        level: POV level 0, 1 or 2, or "own" for a `pov`; 0 when it stands nowhere.
+        scenario: a scenario, its name, or its TOML file.
+        policies: folder of learned drivers in the place of the shipped ones.
+        pov: a POV of your own: what a `vut` can be.
+        net: SUMO net to use instead of the scenario's.
+        vut_command: command that starts the controller of `vut="traci"`.
+        deadline_s: time that a VUT may take for a step before it is a VUT_ERROR.
+        vut_memory_gib: memory that the process of a VUT of your own may take.
+        debug: run the VUT in this process without a deadline, so that breakpoints work.
+        gui: show it in sumo-gui while it runs; returns when the window is closed.
+        out: new folder to keep it in.
+        coordinates: `x_pov0_m`, `v_pov0_mps`, at level 2 `svo_rad`, and what else the scenario has:
+            `v_vut0_mps`, `headway_ahead_s`, `headway_behind_s`.
+
+    Raises `UserError` for values that make no case, or when the folder exists.
+    """
+    unknown = coordinates.keys() - FIELDS.keys()
+    if unknown:
+        raise UserError(f"a case has no {min(unknown)}: it has {', '.join(FIELDS)}")
+    where = _scenario(scenario)
+    spec, pov_spec, _ = _specs(vut, pov, 1)
+    given = {
+        "vut": spec,
+        "scenario": where,
+        "policies": None if policies is None else str(policies),
+        "pov": pov_spec,
+        "vut_command": vut_command,
+        "deadline_s": DEBUG_DEADLINE_S if debug else deadline_s,
+        "vut_memory_gib": vut_memory_gib,
+        "in_process": debug,
+    }
+    row = dict(case or {})
+    recorded = level_name(int(row.get("level", 0)))
+    povs = povs_of(policies, where, pov_spec)
+    known = {name: row[name] for name in FIELDS if row.get(name) is not None}
+    wanted = one_level(recorded if level is None else str(level), povs)
+    settings, one = settings_and_case(None, wanted, {**known, **coordinates}, given)
+    road = road_for(settings.scenario, None if net is None else Path(net))
+    if out is not None:
+        check_new(Path(out))
+    found = run_one(settings.vut_factory, one, road, settings.povs, live=gui)
+    if out is not None:
+        write_scenario(Path(out), road, found.outcome, found.trajectory)
+    return CaseRun(found)
+
+
+def rerun(
+    run: AnyRun,
+    indices: Iterable[int] = (),
+    *,
+    vut: Vut | None = None,
+    workers: int = 1,
+    net: Path | str | None = None,
+    trust_vut: bool = False,
+    **settings: Any,
+) -> Rerun:
+    """Run recorded cases again with a changed VUT; the same as `merge-sumo rerun`.
+
+    Args:
+        run: the campaign, or its folder.
+        indices: its cases; all of them when left out.
+        vut: as of `campaign`; the campaign's, as its files are now, when left out.
+        workers: processes that run cases.
+        net: net for that; must be the one of the campaign.
+        trust_vut: run the controller that a folder names although it was not made here.
+        settings: others to change: `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`,
+            `policies`.
+
+    Raises `UserError` as the command says.
+    """
+    opened = _opened(run)
+    if vut is not None:
+        settings["vut"], _, workers = _specs(vut, None, workers)
+    today = settings_today(opened.run, settings, trust=trust_vut)
+    with open_workers(today.workers(workers)) as there:
+        where = None if net is None else Path(net)
+        return run_again(opened.run, today, tuple(indices), net=where, workers=there)
+
+
+def truth(
+    vut: Vut,
+    level: int | str,
+    *,
+    cases: int | None = None,
+    seed: int = 0,
+    scenario: Scenario | Path | str = US23,
+    policies: Path | str | None = None,
+    pov: Vut | None = None,
+    vut_command: str | None = None,
+    deadline_s: float = DEADLINE_S,
+    vut_memory_gib: float = MEMORY_GIB,
+    in_process: bool = False,
+    workers: int = 1,
+) -> Truth:
+    """Return the ground truth of a VUT at a level; the same as `merge-sumo truth`.
+
+    It comes from the cache where it is there. That of an object of this process, which a name does
+    not tell from another, is never kept. Arguments are as of `campaign`.
+    """
+    where = _scenario(scenario)
+    spec, pov_spec, workers = _specs(vut, pov, workers)
+    options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
+    povs = povs_of(policies, where, pov_spec, options)
+    own = VutOptions(
+        command=vut_command,
+        deadline_s=deadline_s,
+        memory_gib=vut_memory_gib,
+        in_process=in_process,
+        policies=povs.policies,
+    )
+    factory = vut_factory(spec, own)
+    with (
+        tempfile.TemporaryDirectory(prefix="merge-sumo-") as forgotten,
+        open_workers(povs.workers(factory, workers)) as there,
+    ):
+        number = one_level(str(level), povs)
+        cache = Path(forgotten) if is_here(spec) or is_here(pov_spec or "") else None
+        return ground_truth(
+            factory, number, cases, seed, workers=there, cache=cache, scenario=where, povs=povs
+        )
+
+
+def compare_runs(
+    a: AnyRun,
+    b: AnyRun,
+    *,
+    rerun: bool = True,
+    net: Path | str | None = None,
+    policies: Path | str | None = None,
+    trust_vut: bool = False,
+) -> RunComparison:
+    """Compare two campaigns: what got fixed, and what broke; as `merge-sumo compare-runs`.
+
+    `worse(tolerance)` of what is returned says why B is worse, if it is.
+
+    Args:
+        a: the campaign before, or its folder.
+        b: the campaign after, or its folder.
+        rerun: run the failures, errors and timeouts of each with the other's VUT.
+        net: net for that; must be the one of the campaigns.
+        policies: folder of the learned drivers, where they are elsewhere now.
+        trust_vut: run the controllers that the folders name although they were not made here.
+    """
+    first, second = _opened(a).run, _opened(b).run
+    given = {} if policies is None else {"policies": str(policies)}
+    road = road_for(first.scenario, None if net is None else Path(net)) if rerun else None
+    return comparison.compare_runs(
+        first, second, rerun=rerun, net=road, given=given, trust=trust_vut
+    )
+
+
+EXPORTS: Final = "exports"
+
+
+def export(
+    run: AnyRun,
+    indices: Iterable[int] | None = None,
+    *,
+    file_format: str = "sumo",
+    out: Path | str | None = None,
+    net: Path | str | None = None,
+) -> list[Path]:
+    """Write cases of a campaign for others, and return the paths; as `merge-sumo export`.
+
+    Args:
+        run: the campaign, or its folder.
+        indices: its cases; of a table all of them when left out.
+        file_format: "sumo" or "openscenario" for folders, "csv" or "parquet" for one table.
+        out: folder; `scenarios` or `exports` in that of the campaign when left out.
+        net: SUMO net to use instead of the scenario's.
+    """
+    loaded = _opened(run).run
+    wanted = None if indices is None else list(indices)
+    if file_format in ("csv", "parquet"):
+        wanted = wanted or [outcome.index for outcome in loaded.outcomes]
+        folder = Path(out) if out is not None else loaded.folder / EXPORTS
+        return [exports.write_table(loaded, wanted, folder, file_format)]
+    writers = {"sumo": exports.write_sumo, "openscenario": exports.write_openscenario}
+    if file_format not in writers:
+        raise UserError(f"there is no format {file_format!r}: sumo, openscenario, csv or parquet")
+    if not wanted:
+        raise UserError(f"the format {file_format} needs the indices of cases")
+    below = SCENARIOS if file_format == "sumo" else EXPORTS
+    target = Path(out) if out is not None else loaded.folder / below
+    road = road_for(loaded.scenario, None if net is None else Path(net))
+    return list(exports.write_folders(loaded, wanted, target, writers[file_format], road))
+
+
+def _opened(run: AnyRun) -> CampaignRun:
+    return run if isinstance(run, CampaignRun) else CampaignRun(run)
+
+
+def _scenario(scenario: Scenario | Path | str) -> Scenario:
+    return scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
+
+
+def _specs(vut: Vut, pov: Vut | None, workers: int) -> tuple[str, str | None, int]:
+    """Return the specs of what drives, and how many workers can have it.
+
+    Says in a sentence where something drives in this process that could do it harm.
+    """
+    specs = spec_of(vut), None if pov is None else spec_of(pov)
+    for spec in specs:
+        if spec is None or object_of(spec) is None:
+            continue
+        name = spec.partition(":")[2]
+        if travels(spec):
+            where = "the processes of the workers" if workers > 1 else "this process"
+            why = f"{name} is an object, so it drives in {where}, which what it does wrong may end"
+        else:
+            alone = ", and without workers," if workers > 1 else ""
+            workers = 1
+            why = (
+                f"{name} is known to this process alone, so it drives here{alone} where what it "
+                "does wrong may end everything; put its class or function into a module for a "
+                "process of its own"
+            )
+        warnings.warn(why, stacklevel=3)
+    return *specs, workers

@@ -11,6 +11,7 @@ import typer
 
 from merge_sumo.commands import (
     campaign,
+    cases,
     certify,
     experiments,
     probability,
@@ -23,9 +24,8 @@ from merge_sumo.commands.shared import app, say
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 
-__all__ = ["app", "main"]
-COMMANDS = (campaign, certify, experiments, probability, runs, scenarios, training, vuts)
-"""Importing these is what adds their commands to the app."""
+__all__ = ["app", "campaign", "cases", "certify", "experiments", "main", "probability", "runs"]
+__all__ += ["scenarios", "training", "vuts"]
 
 
 @app.callback(invoke_without_command=True)

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
 from foreign_nets import corridor_of
@@ -46,6 +47,28 @@ def corridor(tmp_path_factory):
         return built[name]
 
     return get
+
+
+@pytest.fixture(scope="session")
+def display() -> Iterator[str]:
+    """Start an X server without a screen on a display that is free, and return its name."""
+    program = shutil.which("Xvfb")
+    require(program is not None, "Xvfb is not on the PATH")
+    end, start = os.pipe()
+    server = subprocess.Popen(
+        [program, "-displayfd", str(start), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
+        pass_fds=[start],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        os.close(start)
+        with os.fdopen(end) as ready:
+            number = ready.readline().strip()
+        assert number, "Xvfb did not start"
+        yield f":{number}"
+    finally:
+        server.terminate()
+        server.wait()
 
 
 @pytest.fixture

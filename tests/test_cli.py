@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.run import Run, failures, read_settings
-from merge_sumo.sumo.binding import DEBIAN_PACKAGES, sumo_program
+from merge_sumo.sumo.binding import DEBIAN_PACKAGES, SUMO_VERSION, sumo_program
 from merge_sumo.sumo.replay_folder import CONFIG, RECORD
 from merge_sumo.sumo.road import default_net_path
 
@@ -168,6 +168,20 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
         assert_refused(said, "libGL.so.1", "apt-get install", DEBIAN_PACKAGES)
         assert contents(tmp_path) == before
 
+    def test_for_the_libsumo_of_another_sumo(self, call, tmp_path, monkeypatch):
+        import libsumo
+
+        monkeypatch.setattr(libsumo, "getVersion", lambda: (21, "SUMO 1.18.0"))
+        before = contents(tmp_path)
+        said = call(*SMALL, "--cases", 4, "--out", "run")
+        assert_refused(said, "libsumo is of SUMO 1.18.0", "pip install --force-reinstall")
+        assert contents(tmp_path) == before
+
+    def test_knows_the_sumo_that_the_package_pins(self):
+        pinned = (Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+        for package in ("libsumo", "eclipse-sumo", "sumolib"):
+            assert f'"{package}=={SUMO_VERSION}"' in pinned
+
     def test_for_libsumo_that_is_not_installed(self, call, monkeypatch):
         cannot_import(monkeypatch, "libsumo", ModuleNotFoundError("No", name="libsumo"))
         said = call(*SMALL, "--cases", 4, "--out", "run")
@@ -314,7 +328,8 @@ class TestACampaign:
 
     def test_goes_by_default_into_a_folder_named_after_the_vut(self, call):
         assert call(*SMALL, "--cases", 2, "--sampler", "uniform").code == 0
-        (folder,) = Path("runs").iterdir()
+        (folder,) = Path("runs").glob("*-*")
+        assert Path("runs/latest").resolve() == folder.resolve()
         assert folder.name.startswith("design1-")
         assert len(Run(folder).outcomes) == 2
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import require
 from foreign_nets import corridor_of
 from lxml import etree
 from PIL import Image
@@ -43,33 +40,12 @@ def that_ends(*arguments):
     root = config(*arguments)
     root.find("gui_only/delay").set("value", "0")
     etree.SubElement(root.find("gui_only"), "quit-on-end", value="true")
+    root.find("gui_only").remove(root.find("gui_only/breakpoints"))
     return root
 
 replay_folder._view, replay_folder._config = with_pictures, that_ends
 main()
 """
-
-
-@pytest.fixture(scope="module")
-def display() -> Iterator[str]:
-    """Start an X server without a screen on a display that is free, and return its name."""
-    program = shutil.which("Xvfb")
-    require(program is not None, "Xvfb is not on the PATH")
-    end, start = os.pipe()
-    server = subprocess.Popen(
-        [program, "-displayfd", str(start), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
-        pass_fds=[start],
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        os.close(start)
-        with os.fdopen(end) as ready:
-            number = ready.readline().strip()
-        assert number, "Xvfb did not start"
-        yield f":{number}"
-    finally:
-        server.terminate()
-        server.wait()
 
 
 @pytest.fixture(scope="module")

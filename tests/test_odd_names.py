@@ -76,7 +76,7 @@ class TestAVutFile:
         assert code == 0, err
         assert "\x1b" not in out + err
         assert Path(json.loads(out)["report"]).is_file()
-        (folder,) = (tmp_path / "runs").iterdir()
+        (folder,) = (tmp_path / "runs").glob("*-*")
         assert folder.name.isascii()
         assert Run(folder).settings["vut"] == f"{name}.py:drive"
         code, out, err = call("check-vut", f"{name}.py:drive")

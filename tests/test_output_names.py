@@ -505,3 +505,39 @@ def test_a_name_in_a_command_is_read_by_a_shell_as_it_is(name):
     )
     assert done.stdout == os.fsencode(name) + b"|end|"
     assert printable(quoted(name)) == quoted(name)
+
+
+class TestTheLinkToTheNewestRun:
+    @pytest.fixture
+    def runs(self, tmp_path, monkeypatch) -> Path:
+        monkeypatch.chdir(tmp_path)
+        for name in ("a-20260101-000000", "b-20260101-000001", "mine"):
+            (tmp_path / "runs" / name).mkdir(parents=True)
+        return Path("runs")
+
+    def test_is_made_and_moves_on_to_newer_ones_only(self, runs):
+        for newest in ("a-20260101-000000", "b-20260101-000001"):
+            folders.link_latest(runs / newest)
+            assert str((runs / "latest").readlink()) == newest
+        folders.link_latest(runs / "a-20260101-000000")
+        assert str((runs / "latest").readlink()) == "b-20260101-000001"
+        assert len(list(runs.iterdir())) == 4, "nothing of ours is left beside it"
+
+    @pytest.mark.parametrize("target", ["mine", "../elsewhere", "/", "a-20260101-000000/x"])
+    def test_of_somebody_else_stays(self, runs, target):
+        (runs / "latest").symlink_to(target)
+        folders.link_latest(runs / "b-20260101-000001")
+        assert str((runs / "latest").readlink()) == target
+
+    @pytest.mark.parametrize("make", [Path.mkdir, lambda path: path.write_text("mine")])
+    def test_does_not_take_the_place_of_a_file_or_a_folder(self, runs, make):
+        make(runs / "latest")
+        folders.link_latest(runs / "b-20260101-000001")
+        assert not (runs / "latest").is_symlink()
+
+    @pytest.mark.parametrize(
+        "folder", ["runs/mine", "elsewhere/a-20260101-000000", "runs/c-20260101-000009"]
+    )
+    def test_is_not_made_for_what_has_a_name_of_its_own_or_is_not_there(self, runs, folder):
+        folders.link_latest(Path(folder))
+        assert not os.path.lexists(runs / "latest")

@@ -18,6 +18,7 @@ from merge_sumo.campaigns.probability import failure_probability
 from merge_sumo.campaigns.proposal import CELLS, DEFENSIVE, Proposal, cells
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
+from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import V_POV0, dimensions
 
 LEVELS = (0, 1, 2)
@@ -275,6 +276,24 @@ class TestOfACampaign:
             texts.append((tmp_path / name).read_bytes())
             texts.append((tmp_path / name).with_suffix(".jsonl").read_bytes())
         assert texts[:2] == texts[2:]
+
+    @pytest.mark.long
+    def test_on_workers_is_the_same(self, run, tmp_path):
+        found = failure_probability(run, tmp_path / "a.json", cases=60, seed=3)
+        with open_workers(2) as there:
+            again = failure_probability(run, tmp_path / "b.json", cases=60, seed=3, workers=there)
+        assert again == found
+
+    def test_takes_how_the_vut_is_hosted(self, run, tmp_path, command_line):
+        out = tmp_path / "p.json"
+        options = ("--deadline", "2", "--vut-memory", "1", "--workers", "1", "--json")
+        code, said, err = command_line(
+            "probability", run.folder, "--cases", "10", "--out", out, *options
+        )
+        assert code == 0, err
+        assert json.loads(said)["cases"] == 10
+        recorded = json.loads(out.read_text())["campaign"]
+        assert (recorded["deadline_s"], recorded["vut_memory_gib"]) == (2.0, 1.0)
 
     def test_overwrites_nothing(self, run, tmp_path):
         (tmp_path / "p.jsonl").write_text("mine")

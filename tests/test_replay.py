@@ -501,3 +501,15 @@ def test_the_gui_needs_a_display(folder, monkeypatch):
     with pytest.raises(UserError, match="DISPLAY") as error:
         open_gui(folder)
     assert "\n" not in str(error.value)
+
+
+def test_in_sumo_gui_it_takes_its_own_time_and_halts_before_sumo_ends_with_a_dialog(tmp_path):
+    folder = write(
+        tmp_path / "case", drive(at_level_0(-300.0, 30.0), constant, constant, 102, End.MERGED)
+    )
+    config = etree.parse(folder / CONFIG)
+    # SUMO 1.28 delays by this many milliseconds for each simulated second.
+    assert config.find("gui_only/delay").get("value") == "1000"
+    end_s = float(config.find("time/end").get("value"))
+    assert float(config.find("gui_only/breakpoints").get("value")) == pytest.approx(end_s - 0.2)
+    assert end_s == pytest.approx((102 + 1 + HOLD_STEPS) * DT_S)

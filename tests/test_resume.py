@@ -124,6 +124,21 @@ class TestResuming:
             resume_campaign(folder)
         assert contents(folder) == before
 
+    def test_with_more_cases_is_as_one_that_had_them_from_the_start(self, tmp_path, whole):
+        folder = run_campaign(settings("coverage", cases=2 * BATCH), tmp_path / "grown").folder
+        run = resume_campaign(folder, given={"cases": 28})
+        run_campaign(settings("coverage"), tmp_path / "at once")
+        assert outcomes(folder) == outcomes(tmp_path / "at once")
+        assert run.settings["cases"] == 28
+        assert "forced" not in run.settings
+        once = read_settings(tmp_path / "at once")
+        assert differences(once, {**run.settings, "seal": once.get("seal")}) == {}
+
+    def test_tells_what_ran_before_apart(self, folder):
+        before, after = [], []
+        resume_campaign(folder, None, after.append, on_before=before.append)
+        assert [len(before), len(after)] == [2 * BATCH, 28 - 2 * BATCH]
+
     def test_of_a_finished_campaign_changes_nothing(self, whole):
         before = contents(whole)
         assert len(resume_campaign(whole).outcomes) == 28
@@ -157,7 +172,7 @@ class TestWhatDiffers:
             ({"vut": "design2"}, "vut differs"),
             ({"levels": (1,)}, "levels differs"),
             ({"sampler": "gpr"}, "sampler differs"),
-            ({"cases": 40}, "cases differs"),
+            ({"cases": 24}, "cases differs"),
             ({"batch": 4}, "batch differs"),
             ({"v_vut0_mps": 17.0}, "v_vut0_mps differs"),
         ],
@@ -195,9 +210,9 @@ class TestWhatDiffers:
         assert record["versions"]["numpy"] == now
         resume_campaign(folder)  # it is settled
 
-    def test_may_be_the_number_of_cases_when_it_is_forced(self, whole, tmp_path):
+    def test_may_be_a_larger_number_of_cases(self, whole, tmp_path):
         longer = Path(shutil.copytree(whole, tmp_path / "run"))
-        run = resume_campaign(longer, given={"cases": 36}, force=True)
+        run = resume_campaign(longer, given={"cases": 36})
         assert len(run.outcomes) == 36
         assert outcomes(longer).startswith(outcomes(whole))
         assert [outcome.batch for outcome in run.outcomes][-9:] == [3] + [4] * 8

@@ -36,6 +36,8 @@ def take(scenario: Path, time_s: float, picture: Path) -> None:
         for option, value in (("delay", "0"), ("quit-on-end", "true")):
             found = only.find(option)
             (etree.SubElement(only, option) if found is None else found).set("value", value)
+        for halt in only.findall("breakpoints"):
+            only.remove(halt)
         etree.ElementTree(config).write(folder / CONFIG)
         ended = run_program("sumo-gui", ["-c", CONFIG], folder, limit_s=None)
         assert ended.code == 0, "sumo-gui says why"  # noqa: S101

@@ -128,6 +128,7 @@ def resume_campaign(
     net: Corridor | None = None,
     on_case: OnCase | None = None,
     *,
+    on_before: OnCase | None = None,
     given: Mapping[str, object] | None = None,
     force: bool = False,
     workers: Workers | None = None,
@@ -137,14 +138,16 @@ def resume_campaign(
 ) -> Run:
     """Go on with a campaign that was stopped, however it was; return it as `run_campaign` does.
 
-    The result is the same to the last byte as if it had never been stopped. Raises `UserError`
-    with the name of the field where something differs that decides outcomes: settings that are
-    `given`, versions, net, policies. With `force` it goes on and records that they did.
+    The result is the same to the last byte as if it had never been stopped; also where more cases
+    are `given` than it had, if those ended with a whole batch. Raises `UserError` with the name of
+    the field where something differs that decides outcomes: settings that are `given`, versions,
+    net, policies. With `force` it goes on and records that they did.
 
     Args:
         folder: where the campaign is.
         net: the net with which it was started, by default the shipped one.
-        on_case: told of every case, also of those that ran before.
+        on_case: told of every case, also of those that ran before, unless there is an
+        on_before: told of those.
         given: settings that a person named again, by their names in `CampaignSettings`.
         force: go on although something differs.
         workers: where cases run, by default in this process.
@@ -165,6 +168,10 @@ def resume_campaign(
         # What was loaded while it ran must be the same, too, although it is not loaded yet.
         for name in FILES:
             record[name] = _files_again(recorded, name) | (record[name] or {}) or None
+        was = recorded.get("cases")
+        grown = isinstance(was, int) and was < settings.cases
+        if grown:  # which cases come next does not depend on how many there are to be
+            recorded["cases"] = settings.cases
         changes = differences(RECORDED_BY_DEFAULT | recorded, record)
         if before.criterion != settings.criterion:
             raise UserError(
@@ -184,11 +191,12 @@ def resume_campaign(
         if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
             record[FORCED] = [*_forced(before), *([forced] if changes else [])]
-        if changes or moved:
+        if changes or moved or grown:
             journal.rewrite_settings(record)
-        if on_case is not None:
+        told = on_before or on_case
+        if told is not None:
             for outcome in before.outcomes:
-                on_case(outcome)
+                told(outcome)
         return _go_on(settings, record, net, journal, run, before, on_case, check)
 
 

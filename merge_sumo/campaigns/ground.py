@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from threading import RLock
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -45,8 +45,12 @@ class ProvingGround:
         net: Corridor | None = None,
         scenario: Scenario = US23,
         povs: Povs | None = None,
+        binding: Any = None,
     ) -> None:
-        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many."""
+        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many.
+
+        `binding` takes the place of libsumo: see `World`.
+        """
         factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
         povs = povs or Povs(policies=policies_of(scenario))
         cars = scenario.vehicles - 1
@@ -54,7 +58,7 @@ class ProvingGround:
         corridors = povs.corridors(corridors, cars)
         with ExitStack() as opened:
             car_type = None if povs.own is None else povs.own.vut.vut_type
-            self.world = World(corridors, net, factory.vut.vut_type, scenario, car_type)
+            self.world = World(corridors, net, factory.vut.vut_type, scenario, car_type, binding)
             opened.callback(self.world.close)
             self.vut = factory(corridors, self.world)
             opened.callback(self.vut.close)
@@ -182,6 +186,14 @@ def _close_ground() -> None:
         if _kept is not None:
             ground, _kept = _kept[1], None
             ground.__exit__(None, None, None)
+
+
+@contextmanager
+def world_to_itself() -> Iterator[None]:
+    """Let who opens a world of their own do so: no other one is open in this process meanwhile."""
+    with _one_at_a_time:
+        _close_ground()
+        yield
 
 
 def lost_case(case: Case) -> Ran:

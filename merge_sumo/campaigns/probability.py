@@ -17,18 +17,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.conductor import OnCase
+from merge_sumo.campaigns.conductor import OnCase, workers_or_here
 from merge_sumo.campaigns.distribution import Distribution, read_distribution
-from merge_sumo.campaigns.ground import ground_of, road_for
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, runs_on
 from merge_sumo.campaigns.interval import Estimate, estimate
 from merge_sumo.campaigns.proposal import DEFENSIVE, Draws, Proposal, cells, expected_chance
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.folders import check_new_file, write_new
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
 from merge_sumo.values.score import Outcome
 
@@ -53,6 +53,7 @@ def failure_probability(
     net: Corridor | None = None,
     given: Mapping[str, object] | None = None,
     trust: bool = False,
+    workers: Workers | None = None,
     on_case: OnCase | None = None,
 ) -> Estimate:
     """Estimate how likely the VUT of a campaign is to fail, with fresh cases in SUMO.
@@ -61,7 +62,8 @@ def failure_probability(
     weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
 
     The controller that a folder names runs only where the folder was made here, or with `trust`.
-    What is `given` is taken in the place of what the folder names: policies that are elsewhere.
+    What is `given` is taken in the place of what the folder names: policies that are elsewhere, how
+    a VUT is hosted. Cases run on `workers`, by default in this process; the estimate is the same.
 
     Raises `UserError` for a distribution or numbers that make no sense, a run whose net or policies
     are not those of today, or files that exist or cannot be written.
@@ -89,7 +91,7 @@ def failure_probability(
         chance[level] = expected_chance(history, stated.points(level, cells(history.dims)))
     proposal = Proposal(stated.levels, chance, settings.scenario)
     draws = proposal.draw(cases, np.random.default_rng([seed, STREAM]))
-    outcomes = _run(settings, net, stated, draws, lines, on_case)
+    outcomes = _run(settings, net, stated, draws, lines, on_case, workers)
     failed = np.array([outcome.failed for outcome in outcomes])
     judged = np.array([outcome.score is not None for outcome in outcomes])
     result = estimate(draws, failed, judged, proposal.bound, confidence)
@@ -120,6 +122,7 @@ def _run(
     draws: Draws,
     lines: Path,
     on_case: OnCase | None,
+    workers: Workers | None,
 ) -> list[Outcome]:
     """Run the draws in order, some at a time; write each outcome with its weight."""
     by_place: dict[int, Case] = {}
@@ -131,13 +134,22 @@ def _run(
         by_place.update(zip(places.tolist(), drawn, strict=True))
     cases = [by_place[place] for place in range(len(by_place))]
     outcomes: list[Outcome] = []
-    road = centre_lines(net)
-    with ground_of(settings, len(cases), net) as ground:
+    plan = GroundPlan(
+        vut=settings.vut_factory,
+        corridors=min(MAX_CORRIDORS, len(cases)),
+        net=net,
+        scenario=settings.scenario,
+        povs=settings.povs,
+        criterion=settings.criterion,
+    )
+    with workers_or_here(workers) as there:
+        run = runs_on(there, plan)
         for first in range(0, len(cases), WRITTEN):
             ran = []
-            for place, trajectory in ground.run(cases[first : first + WRITTEN]):
-                index, batch = first + place, first // WRITTEN
-                outcome = settings.criterion.outcome(index, batch, trajectory, road)
+            for place, done in run(cases[first : first + WRITTEN]):
+                index, case = first + place, cases[first + place]
+                margin = done.margin
+                outcome = Outcome(index, first // WRITTEN, case, done.measures, margin=margin)
                 ran.append(outcome)
                 if on_case is not None:
                     on_case(outcome)

@@ -29,10 +29,12 @@ from merge_sumo.commands.shared import (
     print_troubles,
     say,
     show,
+    written,
+    written_settings,
 )
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.system.folders import dated
+from merge_sumo.system.folders import dated, link_latest
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, level_name
 
@@ -100,7 +102,8 @@ def campaign(
         Path | None, typer.Option(help="New folder to write.  [default: runs/VUT-DATE]")
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option(help="Go on with the campaign in this folder; needs no --vut.")
+        Path | None,
+        typer.Option(help="Go on with the campaign in this folder; --cases may be more."),
     ] = None,
     force: Annotated[
         bool, typer.Option(help="Resume although something differs; campaign.json records it.")
@@ -182,7 +185,7 @@ def campaign(
     else:
         given = _given(context)
         settings = settings_of(resume, read_settings(resume), given, trust=trust_vut)
-        if _is_written(context, "level"):
+        if "level" in written(context):
             settings = replace(settings, levels=parse_levels(level, settings.povs))
             given["levels"] = settings.levels
         folder, levels = resume, settings.levels
@@ -218,6 +221,7 @@ def campaign(
                     folder,
                     road,
                     progress.case_ended,
+                    on_before=progress.ran_before,
                     given=given,
                     force=force,
                     workers=there,
@@ -251,6 +255,7 @@ def _conclude(
     from merge_sumo.reports.verdict import NOTHING_TESTED, judge
 
     careful = note_avoidance(run, settings, road)
+    link_latest(run.folder)
     report_file = write_report(run)
     summary = summarise(run.outcomes, settings.levels)
     verdict = judge(run.outcomes)
@@ -286,60 +291,17 @@ def _conclude(
     return passed
 
 
-def _is_written(context: typer.Context, option: str) -> bool:
-    source = context.get_parameter_source(option)
-    return source is not None and source.name == "COMMANDLINE"
-
-
 def _given(context: typer.Context) -> dict[str, object]:
-    """Return the settings that a person wrote, by their names in `CampaignSettings`.
-
-    Levels are not among them: which there are, the other settings say.
-    """
-    from merge_sumo.scenarios.scenario_file import named_scenario
-
-    names = {
-        name: name
-        for name in (
-            "vut",
-            "sampler",
-            "cases",
-            "batch",
-            "seed",
-            "stop_after_converged",
-            "vut_command",
-            "in_process",
-            "policies",
-            "pov",
-            "scenario",
-            "fail_when",
-            "require",
-        )
-    }
-    names |= {"v_vut0": "v_vut0_mps", "deadline": "deadline_s", "vut_memory": "vut_memory_gib"}
-    given = {
-        name: context.params[option]
-        for option, name in names.items()
-        if _is_written(context, option)
-    }
-    if "policies" in given:
-        given["policies"] = str(given["policies"])
-    if context.params["learn_from"]:
-        given["learn_from"] = tuple(map(str, context.params["learn_from"]))
-    if "scenario" in given:
-        given["scenario"] = followed_up(
-            named_scenario(given["scenario"]), context.params["follow_up"]
-        )
-    elif _is_written(context, "follow_up"):
-        raise UserError("--follow-up is of the scenario: name that, too, with --scenario")
+    """Return the settings that a person wrote beside --resume."""
     if context.params["out"] is not None:
         raise UserError("--resume names the folder: leave --out away")
-    return given
+    return written_settings(context)
 
 
 def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path | None) -> str:
     if not folder.exists():
         return "stopped before the first case; nothing was written"
+    link_latest(folder)
     command = f"merge-sumo campaign --resume {quoted(folder)}"
     command += f" --net {quoted(net)}" if net is not None else ""
     # Neither is a setting of the campaign, which its folder would remember.

@@ -17,6 +17,7 @@ from merge_sumo.commands.shared import (
     DenseOption,
     FailWhenOption,
     FollowUpOption,
+    InProcessOption,
     JsonOption,
     PoliciesOption,
     PovOption,
@@ -60,6 +61,7 @@ def truth(
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
+    in_process: InProcessOption = False,
     workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
@@ -80,7 +82,7 @@ def truth(
     from merge_sumo.values.fmc import fmc, regions
 
     where = followed_up(named_scenario(scenario), follow_up)
-    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
+    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
     criterion = Criterion(fail_when, require)
     criterion.check(where)
     povs = povs_of(policies, where, pov, options)
@@ -123,7 +125,10 @@ def compare(
     ] = "uniform,annealing,subset,gpr,coverage",
     seeds: Annotated[int, typer.Option(help="Runs of each sampler.")] = 10,
     cases: Annotated[int, typer.Option(help="Cases of each run.")] = 400,
-    batch: Annotated[int, typer.Option(help="Cases per batch.")] = 20,
+    batch: Annotated[
+        int | None,
+        typer.Option(help="Cases per batch.  [default: what coverage wants, 20 for the others]"),
+    ] = None,
     truth_cases: Annotated[
         int | None, typer.Option(help="Cases of the truth.  [default: 10000, at level 2 20000]")
     ] = None,
@@ -141,6 +146,7 @@ def compare(
         Path | None,
         typer.Option(help="New file for FMC against cases: .png, .svg or .html.", metavar="FILE"),
     ] = None,
+    in_process: InProcessOption = False,
     workers: Annotated[int | None, typer.Option(help="Processes.  [default: one a core]")] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
@@ -168,7 +174,7 @@ def compare(
     from merge_sumo.values.fmc import fmc
 
     where = followed_up(named_scenario(scenario), follow_up)
-    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
+    options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
     povs = povs_of(policies, where, pov, options)
     levels, criterion = parse_levels(level, povs), Criterion(fail_when, require)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
@@ -276,7 +282,7 @@ def reproduce(
     from merge_sumo.campaigns.settings import povs_of
     from merge_sumo.reports import reproduce as paper
     from merge_sumo.reports import table2
-    from merge_sumo.reports.progress import Bars
+    from merge_sumo.reports.progress import Bars, rate_text
     from merge_sumo.system.workers import open_workers
 
     if seeds is None:
@@ -289,9 +295,7 @@ def reproduce(
     with open_workers(workers, dask) as there, Bars() as bars:
 
         def ran(title: str, done: int, total: int, unit: str) -> None:
-            elapsed_s = bars.elapsed_s(title)
-            rate = f"{done / elapsed_s:.3g}" if elapsed_s > 0.0 else "-"
-            bars.show(title, done, total, f"{rate} {unit}/s")
+            bars.show(title, done, total, rate_text(done, bars.elapsed_s(title), unit))
 
         index = paper.reproduce(folder, scale, povs=povs, workers=there, on_run=ran)
     if as_json:

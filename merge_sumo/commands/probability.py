@@ -5,23 +5,37 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from merge_sumo.commands.shared import (
+    DaskOption,
+    DeadlineOption,
+    InProcessOption,
     JsonOption,
     NetOption,
     PoliciesOption,
+    PovOption,
     RunArgument,
     TrustOption,
+    VutCommandOption,
+    VutMemoryOption,
     app,
     show,
+    written_settings,
 )
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
+
+HOSTING: Final = (
+    *("policies", "pov", "vut_command", "deadline_s", "vut_memory_gib", "in_process"),
+)
+"""Settings of a campaign that its estimate may have otherwise; cases and seed are of the fresh."""
 
 
 @app.command()
 def probability(
+    context: typer.Context,
     run: RunArgument,
     cases: Annotated[int, typer.Option(help="Fresh cases to run.")] = 4000,
     distribution: Annotated[
@@ -38,6 +52,13 @@ def probability(
     ] = None,
     net: NetOption = None,
     policies: PoliciesOption = None,
+    pov: PovOption = None,
+    vut_command: VutCommandOption = None,
+    deadline: DeadlineOption = DEADLINE_S,
+    vut_memory: VutMemoryOption = MEMORY_GIB,
+    in_process: InProcessOption = False,
+    workers: Annotated[int, typer.Option(help="Processes that run cases.")] = 1,
+    dask: DaskOption = None,
     trust_vut: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -52,11 +73,18 @@ def probability(
     from merge_sumo.campaigns import probability as estimates
     from merge_sumo.campaigns.ground import road_for
     from merge_sumo.campaigns.run import Run
+    from merge_sumo.campaigns.settings import settings_of
     from merge_sumo.reports.progress import Counter
+    from merge_sumo.system.workers import open_workers
 
     campaign = Run(run)
     target = out or run / estimates.RESULT
-    with Counter("fresh cases", cases, "cases") as counter:
+    given = {name: value for name, value in written_settings(context).items() if name in HOSTING}
+    settings = settings_of(run, campaign.settings, given, trust=trust_vut)
+    with (
+        open_workers(settings.workers(workers), dask) as there,
+        Counter("fresh cases", cases, "cases") as counter,
+    ):
         found = estimates.failure_probability(
             campaign,
             target,
@@ -65,8 +93,9 @@ def probability(
             confidence=confidence,
             seed=seed,
             net=road_for(campaign.scenario, net),
-            given={} if policies is None else {"policies": str(policies)},
+            given=given,
             trust=trust_vut,
+            workers=there,
             on_case=lambda _: counter.ended(1),
         )
     if as_json:

@@ -15,8 +15,10 @@ from merge_sumo.commands.shared import (
     NetOption,
     PoliciesOption,
     RunArgument,
+    ToleranceOption,
     TrustOption,
     app,
+    check_tolerance,
     print_troubles,
     show,
 )
@@ -128,13 +130,7 @@ def report(run: RunArgument) -> None:
 def compare_runs(
     a: Annotated[Path, typer.Argument(help="Folder of the campaign before.")],
     b: Annotated[Path, typer.Argument(help="Folder of the campaign after.")],
-    tolerance: Annotated[
-        float,
-        typer.Option(
-            help="Growth of FMC, or of the share of cases without a verdict, at a level that is "
-            "still no regression."
-        ),
-    ] = 0.0,
+    tolerance: ToleranceOption = 0.0,
     rerun: Annotated[
         bool,
         typer.Option(
@@ -162,8 +158,7 @@ def compare_runs(
     from merge_sumo.reports import comparison
     from merge_sumo.reports.verdict import judge
 
-    if not tolerance >= 0.0:
-        raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
+    check_tolerance(tolerance)
     runs = Run(a), Run(b)
     road = road_for(runs[0].scenario, net) if rerun else None
     given = {} if policies is None else {"policies": str(policies)}

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 
 if TYPE_CHECKING:
@@ -126,7 +127,64 @@ FollowUpOption = Annotated[
         "scenario's, 0]",
     ),
 ]
+ToleranceOption = Annotated[
+    float,
+    typer.Option(
+        help="Growth of FMC, or of the share of cases without a verdict, at a level that is still "
+        "no regression."
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
+
+
+SETTINGS: Final = {
+    **{
+        name: name
+        for name in (
+            *("vut", "sampler", "cases", "batch", "seed", "stop_after_converged", "vut_command"),
+            *("in_process", "policies", "pov", "scenario", "learn_from", "fail_when", "require"),
+        )
+    },
+    "v_vut0": "v_vut0_mps",
+    "deadline": "deadline_s",
+    "vut_memory": "vut_memory_gib",
+}
+"""Names in `CampaignSettings`, by the options for them."""
+
+
+def written(context: typer.Context) -> set[str]:
+    """Return the names of the options that a person wrote."""
+    found = {name: context.get_parameter_source(name) for name in context.params}
+    return {name for name, source in found.items() if source and source.name == "COMMANDLINE"}
+
+
+def written_settings(context: typer.Context) -> dict[str, Any]:
+    """Return the settings that a person wrote, by their names in `CampaignSettings`.
+
+    Levels are not among them: which there are, the other settings say.
+    """
+    from merge_sumo.scenarios.scenario_file import named_scenario
+
+    given = {
+        SETTINGS[option]: context.params[option] for option in written(context) & SETTINGS.keys()
+    }
+    if "policies" in given:
+        given["policies"] = str(given["policies"])
+    if "learn_from" in given:
+        given["learn_from"] = tuple(map(str, given["learn_from"]))
+    if "scenario" in given:
+        given["scenario"] = followed_up(
+            named_scenario(given["scenario"]), context.params.get("follow_up")
+        )
+    elif "follow_up" in written(context):
+        raise UserError("--follow-up is of the scenario: name that, too, with --scenario")
+    return given
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raise `UserError` for a tolerance that is none."""
+    if not tolerance >= 0.0:
+        raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
 
 
 def print_troubles(verdict: Verdict) -> None:

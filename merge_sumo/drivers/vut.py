@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.gap_acceptance import GapAcceptanceVut
@@ -17,6 +17,7 @@ from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.drivers.vuts.base import Vut, VutOptions
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.drivers.vuts.fmu import fmu_vut
+from merge_sumo.drivers.vuts.here import here_vut, is_here, keep, object_of
 from merge_sumo.drivers.vuts.hosted import SUPPORTED, hosted_vut
 from merge_sumo.drivers.vuts.onnx import onnx_vut
 from merge_sumo.drivers.vuts.python import installed_vut, installed_vuts, python_vut
@@ -143,9 +144,18 @@ class VutFactory:
             )
         return self.vut.make(corridors, world)
 
-    def __reduce__(self) -> tuple[type[VutFactory], tuple[str, VutOptions, Files | None]]:
-        """Travel as plain values; the VUT is found again on arrival."""
-        return (VutFactory, (self.spec, self.options, self.files))
+    def __reduce__(self) -> tuple[Callable[..., VutFactory], tuple[Any, ...]]:
+        """Travel as plain values; the VUT is found again on arrival.
+
+        An object that nobody else can find goes along.
+        """
+        return (_arrived, (self.spec, self.options, self.files, object_of(self.spec)))
+
+
+def _arrived(spec: str, options: VutOptions, files: Files | None, vut: Any) -> VutFactory:
+    if vut is not None:
+        keep(spec, vut)
+    return VutFactory(spec, options, files)
 
 
 def runs_code(spec: str, command: str | None) -> bool:
@@ -166,6 +176,8 @@ def find_vut(spec: str, options: VutOptions) -> Vut:
     prefix, colon, argument = spec.partition(":")
     if prefix in KINDS:
         return _prepared(KINDS[prefix], argument, spec, options)
+    if is_here(spec):
+        return here_vut(argument, options)
     if options.command is not None:
         raise UserError(f"--vut-command goes with --vut traci, not with {spec}")
     built_in = built_in_vuts(options.policies)

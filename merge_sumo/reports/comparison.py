@@ -69,12 +69,12 @@ def compare_runs(
         again_b = _run_again(b, telling_a, net, given, trust=trust)
         again_a = _run_again(a, telling_b, net, given, trust=trust)
     cases = [
-        *(_compared("A", o, o, again_b.outcomes.get(o.index)) for o in telling_a),
-        *(_compared("B", o, again_a.outcomes.get(o.index), o) for o in telling_b),
+        *(compared_case("A", o, o, again_b.outcomes.get(o.index)) for o in telling_a),
+        *(compared_case("B", o, again_a.outcomes.get(o.index), o) for o in telling_b),
     ]
-    cases.sort(key=_telling)
+    cases.sort(key=telling)
     return RunComparison(
-        {level: _level(level, cases, own_a, own_b) for level in levels},
+        {level: level_change(level, cases, own_a, own_b) for level in levels},
         cases,
         f"with {_what(own_a)} of A, B {again_b.how}; with {_what(own_b)} of B, A {again_a.how}",
     )
@@ -174,7 +174,8 @@ def _run_again(
     return _Again({o.index: again[first + n] for n, o in enumerate(failing)}, "was run again")
 
 
-def _compared(run: str, of: Outcome, a: Outcome | None, b: Outcome | None) -> ComparedCase:
+def compared_case(run: str, of: Outcome, a: Outcome | None, b: Outcome | None) -> ComparedCase:
+    """Return what became of a case of a run, "A" or "B"; None where a VUT was not run."""
     return ComparedCase(
         run=run,
         index=of.index,
@@ -205,7 +206,8 @@ def _fails(score: float | None) -> bool:
     return score is not None and score < FAILURE_SCORE
 
 
-def _telling(case: ComparedCase) -> tuple[int, float, str, int]:
+def telling(case: ComparedCase) -> tuple[int, float, str, int]:
+    """Return the key by which cases are sorted: what broke comes first, the worst of B first."""
     order = (
         Change.BROKE,
         Change.NO_VERDICT_OF_B,
@@ -220,16 +222,22 @@ def _telling(case: ComparedCase) -> tuple[int, float, str, int]:
     return order.index(case.change), score, case.run, case.index
 
 
-def _level(
-    level: int, cases: Sequence[ComparedCase], own_a: Sequence[Outcome], own_b: Sequence[Outcome]
+def level_change(
+    level: int,
+    cases: Sequence[ComparedCase],
+    own_a: Sequence[Outcome],
+    own_b: Sequence[Outcome],
+    *,
+    same_cases: bool = False,
 ) -> LevelChange:
+    """Return what changed at a level; `same_cases` where those of B are those of A, run again."""
     at_level = [case for case in cases if case.case.level == level]
     fails_a = [c.case for c in at_level if _fails(c.score_a)]
     fails_b = [c.case for c in at_level if _fails(c.score_b)]
     alone_a, alone_b = (judge(o for o in own if o.case.level == level) for own in (own_a, own_b))
     if all(case.change is not Change.NOT_RUN_AGAIN for case in at_level):
         # Both VUTs were tried on the same cases: the others of both campaigns raise no question.
-        together = alone_a.cases + alone_b.cases
+        together = alone_a.cases + (0 if same_cases else alone_b.cases)
         untested_a = _untested(alone_a, together, (_silent(c.end_a, c.score_a) for c in at_level))
         untested_b = _untested(alone_b, together, (_silent(c.end_b, c.score_b) for c in at_level))
     else:

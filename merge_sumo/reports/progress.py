@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Self
+from collections.abc import Callable, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -34,6 +36,50 @@ if TYPE_CHECKING:
     from merge_sumo.training.helix import TrainingProgress
 
 
+def rate_text(count: float, elapsed_s: float, unit: str) -> str:
+    """Return a rate as people read it: "7,140 cases/s", "12 cases/s", "3.5 cases/min"."""
+    if count <= 0.0 or elapsed_s <= 0.0:
+        return f"- {unit}/s"
+    per_s = count / elapsed_s
+    rate, per = next(
+        ((per_s * seconds, name) for seconds, name in PER if per_s * seconds >= 1.0),
+        (per_s * PER[-1][0], PER[-1][1]),
+    )
+    return f"{rate:,.0f} {unit}/{per}" if rate >= 10.0 else f"{rate:.1f} {unit}/{per}"
+
+
+PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
+"""Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
+
+
+def left_text(count: int, total: int, elapsed_s: float) -> str:
+    """Return how long it takes still, at the rate so far; empty where nobody knows."""
+    if count <= 0:
+        return ""
+    left_s = round((total - count) * elapsed_s / count)
+    hours, minutes = divmod(left_s // 60, 60)
+    return (
+        f"{hours}:{minutes:02d}:{left_s % 60:02d} left"
+        if hours
+        else (f"{minutes}:{left_s % 60:02d} left")
+    )
+
+
+def _notebook() -> Any:
+    """Return IPython's display module where this runs in a notebook, else None."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    if getattr(shell, "kernel", None) is None:
+        return None
+    from importlib import import_module
+
+    return import_module("IPython.display")
+
+
+def is_watched() -> bool:
+    """Return whether a person sees what this process shows: in a notebook or on a terminal."""
+    return _notebook() is not None or sys.stderr.isatty()
+
+
 class Bars:
     """Progress bars by title; the first appears with the first thing that is counted.
 
@@ -51,24 +97,28 @@ class Bars:
             console=Console(stderr=True),
         )
         self._tasks: dict[str, TaskID] = {}
+        self._start_s: dict[str, float] = {}
+        self._opened_s = time.monotonic()
 
     def show(self, title: str, completed: int, total: int, note: str) -> None:
         """Set a bar."""
         if title not in self._tasks:
             self._progress.start()
             shown = printable(title)
+            # What ends first began before: with the others, or when the bar before was full.
+            self._start_s[title] = self._opened_s
             self._tasks[title] = self._progress.add_task(shown, total=total, note=note)
         self._progress.update(self._tasks[title], completed=completed, note=note)
+        if completed >= total:
+            self._opened_s = time.monotonic()
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
         self._progress.console.print(text)
 
     def elapsed_s(self, title: str) -> float:
-        """Return the seconds since a bar appeared."""
-        if title not in self._tasks:
-            return 0.0
-        return self._progress.tasks[self._tasks[title]].elapsed or 0.0
+        """Return the seconds since the work of a bar began."""
+        return time.monotonic() - self._start_s.get(title, self._opened_s)
 
     def __enter__(self) -> Self:
         """Return the bars."""
@@ -92,9 +142,8 @@ class Counter(Bars):
     def ended(self, count: int, note: str = "") -> None:
         """Count things that have ended."""
         self._count += count
-        elapsed_s = self.elapsed_s(self._title)
-        rate = f"{self._count / elapsed_s:.3g}" if elapsed_s > 0.0 else "-"
-        self.show(self._title, self._count, self._total, f"{rate} {self._unit}/s  {note}")
+        rate = rate_text(self._count, self.elapsed_s(self._title), self._unit)
+        self.show(self._title, self._count, self._total, f"{rate}  {note}")
 
 
 PLAIN_LINES: Final = 10
@@ -123,7 +172,12 @@ class CampaignPanel:
         self._title, self._total, self._quiet = printable(title), cases, quiet
         self._console = console or Console(stderr=True)
         self._live: Live | None = None
-        self._start_s = self._fresh_s = 0.0
+        self._start_s = time.monotonic()
+        self._fresh_s = 0.0
+        self._update: Callable[[Any], None] | None = None
+        """Replaces what a notebook shows."""
+        self._before = 0
+        """Cases that ran before this process took over."""
         self._ran = self._errors = self._timeouts = 0
         self._cases = dict.fromkeys(levels, 0)
         self._failing: dict[int, list[Case]] = {level: [] for level in levels}
@@ -132,11 +186,33 @@ class CampaignPanel:
 
     def case_ended(self, outcome: Outcome) -> None:
         """Count a case."""
-        if self._ran == 0:
-            self._start_s = time.monotonic()
-            if self._console.is_terminal and not self._quiet:
-                self._live = Live(console=self._console, get_renderable=self._panel)
-                self._live.start()
+        if self._ran == self._before:
+            self._appear()
+        self._count(outcome)
+        if self._live is not None or self._update is not None:
+            if time.monotonic() - self._fresh_s > FRESH_S:
+                self._refresh()
+        elif not self._quiet and self._is_plain_line():
+            self._console.print(self._line(), highlight=False, markup=False, soft_wrap=True)
+
+    def ran_before(self, outcome: Outcome) -> None:
+        """Count a case that ran before: it says nothing of how fast this goes."""
+        self._count(outcome)
+        self._before += 1
+        self._start_s = time.monotonic()
+
+    def _appear(self) -> None:
+        if self._quiet:
+            return
+        notebook = _notebook()
+        if notebook is not None:
+            shown = notebook.display(notebook.HTML(""), display_id=True)
+            self._update = lambda text: shown.update(notebook.HTML(text))
+        elif self._console.is_terminal:
+            self._live = Live(console=self._console, get_renderable=self._panel)
+            self._live.start()
+
+    def _count(self, outcome: Outcome) -> None:
         level = outcome.case.level
         self._ran += 1
         # A campaign that was forced on may have cases of a level that it has no more.
@@ -146,11 +222,6 @@ class CampaignPanel:
         if outcome.failed:
             self._failing.setdefault(level, []).append(outcome.case)
             self._stale.add(level)
-        if self._live is not None:
-            if time.monotonic() - self._fresh_s > FRESH_S:
-                self._refresh()
-        elif not self._quiet and self._is_plain_line():
-            self._console.print(self._line(), highlight=False, markup=False, soft_wrap=True)
 
     def _is_plain_line(self) -> bool:
         tenth = -(-self._total // PLAIN_LINES)
@@ -162,9 +233,16 @@ class CampaignPanel:
             self._fmc[level] = fmc(to_unit(self._failing[level], level))
         self._stale.clear()
         self._fresh_s = time.monotonic()
+        if self._update is not None:
+            bar = f'<progress value="{self._ran}" max="{self._total}"></progress>'
+            self._update(f"{bar} {escape(self._line())}")
 
-    def _rate(self) -> float:
-        return self._ran / max(time.monotonic() - self._start_s, 1e-9)
+    def _rate(self) -> str:
+        return rate_text(self._ran - self._before, time.monotonic() - self._start_s, "cases")
+
+    def _left(self) -> str:
+        elapsed_s = time.monotonic() - self._start_s
+        return left_text(self._ran - self._before, self._total - self._before, elapsed_s)
 
     def _found(self) -> str:
         failures = sum(map(len, self._failing.values()))
@@ -173,18 +251,17 @@ class CampaignPanel:
     def _line(self) -> str:
         return (
             f"{self._title}: {self._ran}/{self._total} cases, {self._found()}, "
-            f"{self._rate():.3g} cases/s"
+            f"{self._rate()}, {self._left()}"
         )
 
     def _panel(self) -> Panel:
-        left_s = (self._total - self._ran) / self._rate() if self._ran else 0.0
         head = Table.grid(padding=(0, 2))
         head.add_row(
             ProgressBar(total=self._total, completed=self._ran, width=30),
             f"{self._ran}/{self._total} cases",
             self._found(),
-            f"{self._rate():.3g} cases/s",
-            f"{int(left_s) // 60}:{int(left_s) % 60:02d} left",
+            self._rate(),
+            self._left(),
         )
         table = Table(box=None, padding=(0, 2), pad_edge=False, header_style="dim")
         table.add_column("POV level")
@@ -206,8 +283,9 @@ class CampaignPanel:
 
     def __exit__(self, *_: object) -> None:
         """Leave the last state on the terminal."""
-        if self._live is not None:
+        if self._live is not None or self._update is not None:
             self._refresh()
+        if self._live is not None:
             self._live.stop()
 
 

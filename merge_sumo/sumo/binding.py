@@ -18,6 +18,8 @@ from merge_sumo.errors import UserError
 
 DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
 """Shared libraries that SUMO's wheels load, even without a window."""
+SUMO_VERSION: Final = "1.28.0"
+"""The one whose motions are known; pyproject.toml pins the same."""
 PROGRAM_LIMIT_S: Final = 15.0
 """Time that SUMO has for an episode, and netconvert for a net; both need a tenth of a second."""
 
@@ -45,9 +47,13 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def load_libsumo() -> Any:
-    """Import and return libsumo; `UserError` when the module or a system library is missing."""
+    """Import and return libsumo.
+
+    Raises `UserError` when the module or a system library is missing, or it is of another SUMO: a
+    package such as libtraci may have put another one in its place.
+    """
     try:
-        return importlib.import_module("libsumo")
+        libsumo = importlib.import_module("libsumo")
     except ModuleNotFoundError as error:
         if error.name != "libsumo":
             raise
@@ -57,6 +63,14 @@ def load_libsumo() -> Any:
             f"libsumo cannot be loaded ({error}): on Debian or Ubuntu run "
             f"`apt-get install {DEBIAN_PACKAGES}`"
         ) from error
+    found = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
+    if found != SUMO_VERSION:
+        raise UserError(
+            f"libsumo is of SUMO {found}, and merge-sumo needs {SUMO_VERSION}: run `pip install "
+            f"--force-reinstall --no-deps libsumo=={SUMO_VERSION} eclipse-sumo=={SUMO_VERSION}`, "
+            "and keep packages that bring another SUMO (older libtraci) out of this environment"
+        )
+    return libsumo
 
 
 def sumo_program(name: str) -> str:
@@ -80,6 +94,12 @@ def sumo_program(name: str) -> str:
     return str(program)
 
 
+def sumo_environment() -> dict[str, str]:
+    """Return the environment for a SUMO program: what is SUMO's in it is the installation's."""
+    others = {key: value for key, value in os.environ.items() if not key.startswith("SUMO_")}
+    return {**others, "SUMO_HOME": str(Path(sumo_program("sumo")).parents[1])}
+
+
 @dataclass(frozen=True, slots=True)
 class Ended:
     """How a program ended: its exit code, and why where that is not 0."""
@@ -97,11 +117,10 @@ def run_program(
     program says goes to the terminal.
     """
     program = sumo_program(name)
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("SUMO_")}
     with subprocess.Popen(
         [program, *arguments],
         cwd=folder,
-        env={**environment, "SUMO_HOME": str(Path(program).parents[1])},
+        env=sumo_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=None if limit_s is None else subprocess.PIPE,

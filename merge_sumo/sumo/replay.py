@@ -16,6 +16,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo import allowed, received
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint
+from merge_sumo.sumo.live import check_display
 from merge_sumo.sumo.replay_folder import (
     CONFIG,
     HOLD_STEPS,
@@ -252,10 +253,7 @@ def open_gui(folder: Path) -> int:
     As for `replay`, sumo-gui runs in a temporary folder, on nothing that was not checked. Raises
     `UserError` when there is no display or the folder is no replay folder.
     """
-    if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise UserError(
-            "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
-        )
+    check_display()
     with _staged(_received(folder)) as stage:
         return run_program("sumo-gui", ["-c", CONFIG], stage, limit_s=None).code
 

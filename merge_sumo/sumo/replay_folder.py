@@ -54,6 +54,9 @@ SMALLEST_M: Final = 100.0
 """Of such a width."""
 EXAGGERATED: Final = 1.0 / 175.0
 """How much larger cars are drawn than they are, for a metre of the picture's width."""
+REAL_TIME_MS: Final = "1000"
+"""Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
+PALE: Final = "0.93,0.93,0.90"
 SURROUNDINGS_COLOUR: Final = "0.70,0.70,0.68"
 LANE_WIDTH_M: Final = 3.2
 MAX_SURROUNDINGS: Final = 2_000
@@ -204,21 +207,32 @@ def _view(road: Road, record: etree._Element) -> etree._Element:
         exaggeration, viewport = "4", ("440", "-110", "-20")
     else:
         exaggeration, viewport = _viewport(road.corridor, record)
+    return view_settings(exaggeration, viewport)
+
+
+def view_settings(
+    exaggeration: str, viewport: tuple[str, str, str], label: str | None = None
+) -> etree._Element:
+    """Return the settings of a view with large cars, named or labelled by one of their parameters.
+
+    `viewport` is zoom, x and y.
+    """
     root = etree.Element("viewsettings")
+    text = "vehicleName" if label is None else "vehicleText"
     scheme = etree.SubElement(root, "scheme", name="merge")
-    etree.SubElement(
-        scheme,
-        "vehicles",
-        vehicleQuality="3",
-        vehicle_exaggeration=exaggeration,
-        vehicleName_show="1",
-        vehicleName_size="60",
-        vehicleName_color="0.1,0.1,0.1",
-    )
-    etree.SubElement(scheme, "background", backgroundColor="0.93,0.93,0.90", showGrid="0")
+    vehicles = {
+        "vehicleQuality": "3",
+        "vehicle_exaggeration": exaggeration,
+        f"{text}_show": "1",
+        f"{text}_size": "60",
+        f"{text}_color": "0.1,0.1,0.1",
+        **({} if label is None else {"vehicleTextParam": label, "vehicleText_bgColor": PALE}),
+    }
+    etree.SubElement(scheme, "vehicles", vehicles)
+    etree.SubElement(scheme, "background", backgroundColor=PALE, showGrid="0")
     zoom, x, y = viewport
     etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
-    etree.SubElement(root, "delay", value="100")
+    etree.SubElement(root, "delay", value=REAL_TIME_MS)
     return root
 
 
@@ -259,7 +273,9 @@ def _config(road: Road, timesteps: int) -> etree._Element:
         "gui_only": {
             "gui-settings-file": VIEW,
             "start": "true",
-            "delay": "100",
+            "delay": REAL_TIME_MS,
+            # It halts there, with no dialog over the last picture as where it ends.
+            "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
             "window-size": ",".join(map(str, WINDOW)),
         },
     }

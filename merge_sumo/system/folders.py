@@ -266,6 +266,34 @@ def dated(what: str) -> Path:
     return DEFAULT / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
 
 
+LATEST: Final = "latest"
+DATED: Final = re.compile(r"[\w.-]*-([0-9]{8}-[0-9]{6})")
+"""The names that `dated` gives, with the time."""
+
+
+def link_latest(folder: Path) -> None:
+    """Let `runs/latest` lead to a folder that has its name from `dated`, if none is newer.
+
+    An older link of this kind is ours to replace: it leads to such a folder beside it. Anything
+    else of that name stays, and so does everything where links cannot be made.
+    """
+    named = DATED.fullmatch(folder.name)
+    if folder.parent != DEFAULT or named is None or not folder.is_dir():
+        return
+    link = DEFAULT / LATEST
+    with suppress(OSError):
+        if _is_there(link):
+            before = DATED.fullmatch(str(link.readlink()))  # raises where it is no link
+            if before is None or before[1] > named[1]:
+                return
+        new = link.with_name(f"{TEMPORARY}{secrets.token_hex(8)}")
+        new.symlink_to(folder.name, target_is_directory=True)
+        try:
+            new.replace(link)
+        finally:
+            new.unlink(missing_ok=True)
+
+
 def cannot_write(path: Path, error: OSError) -> UserError:
     """Return what to say when something could not be written."""
     return UserError(f"cannot write {path}: {error.strerror or error}")

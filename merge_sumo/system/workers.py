@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Generic, Self, TypeVar
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.spawning import without_main
 
 MAX_CHUNK: Final = 500
 """Items that a worker takes at a time; what bounds its memory."""
@@ -271,7 +272,7 @@ class LocalProcesses(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit; workers that are started here, now or later, never see SIGINT."""
-        with _sigint_blocked():
+        with _sigint_blocked(), without_main():
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(self, *exception: Any) -> bool | None:

@@ -82,7 +82,7 @@ def vut_of(target: Any, spec: str, options: VutOptions) -> Vut:
             return PythonVut(corridors, lambda: _made(target, spec), options.deadline_s)
 
         return Vut(make=make)
-    if inspect.isroutine(target) and _takes_one(target):
+    if inspect.isroutine(target) and takes_one(target):
 
         def make_function(corridors: int, _world: World | None) -> Driver:
             return FunctionVut(corridors, target, options.deadline_s)
@@ -261,7 +261,8 @@ def _close(vut: Any, watch: Watch) -> None:
 _VARIABLE: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
-def _takes_one(function: Callable[..., Any]) -> bool:
+def takes_one(function: Callable[..., Any]) -> bool:
+    """Return whether something can be called with one positional argument."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):

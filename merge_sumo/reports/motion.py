@@ -1,0 +1,118 @@
+"""One episode for a terminal: what became of it in words, and its motion as a table with a strip.
+
+The strip is the road from above, straightened: both lanes up to the merge point and a little past
+it, with a letter for each vehicle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from merge_sumo.reports.coordinates import described
+from merge_sumo.reports.diagnosis import MEANING, diagnose
+from merge_sumo.reports.verdict import message_of
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End, Trajectory
+
+STRIP: Final = 48
+"""Characters of the strip."""
+PAST_M: Final = 0.08
+"""Part of the strip that is behind M."""
+LETTERS: Final = ("P", "V", "a", "b")
+"""Of the vehicles, in the order of their rows."""
+MEASURES: Final = (
+    ("score", "score P", ""),
+    ("dx_m", "gap x_POV - x_VUT", "m"),
+    ("dv_mps", "v_POV - v_VUT", "m/s"),
+    ("ttc_s", "time to collision", "s"),
+    ("pet_s", "post-encroachment time", "s"),
+    ("drac_mps2", "deceleration to avoid a crash", "m/s2"),
+    ("impact_speed_mps", "impact speed", "m/s"),
+    ("vut_max_brake_mps2", "hardest braking of the VUT", "m/s2"),
+    ("pov_max_brake_mps2", "hardest braking of the POV", "m/s2"),
+    ("last_avoidable_s", "avoidable until", "s"),
+)
+
+
+def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
+    """Return an episode as a terminal shows it: the case, the verdict, measures and motion."""
+    case = outcome.case
+    return [
+        f"case: level {level_name(case.level)}, {described(case)}",
+        verdict_of(outcome, trajectory),
+        "",
+        *_measures(outcome.measures),
+        "",
+        *motion_lines(trajectory),
+    ]
+
+
+def verdict_of(outcome: Outcome, trajectory: Trajectory) -> str:
+    """Return what became of an episode in a sentence."""
+    found = outcome.measures
+    met = "POV" if found.nearest == VEHICLES[0] else f"car {found.nearest}"
+    apart_m = abs(found.dx_m or 0.0)
+    if found.end is End.COLLISION:
+        kind = diagnose(trajectory, found).kind
+        assert kind is not None, "a collision has one"  # noqa: S101
+        return (
+            f"COLLISION with the {met} at {found.t_end_s:g} s: front bumpers {apart_m:.1f} m apart "
+            f"as the VUT reaches M ({kind}: {MEANING[kind]})"
+        )
+    if found.end is End.MERGED:
+        first = "VUT" if found.merged_first == "VUT" else met
+        return f"MERGED at {found.t_end_s:g} s: the {first} goes first, {apart_m:.1f} m ahead"
+    return f"{found.end.value} at {found.t_end_s:g} s: {message_of(found)}"
+
+
+def _measures(found: Measures) -> Iterator[str]:
+    for name, what, unit in MEASURES:
+        value = getattr(found, name)
+        if value is not None:
+            yield f"  {what:<30} {value:10.2f} {unit}".rstrip()
+    if found.clipped_steps:
+        yield f"  {'steps beyond its limits':<30} {found.clipped_steps:10d}"
+
+
+def motion_lines(trajectory: Trajectory, every_s: float = 1.0) -> list[str]:
+    """Return the motion as a table: a row for each second and for the end of the episode.
+
+    Of every vehicle x in m, v in m/s and, where there are two, a in m/s2; then the strip.
+    """
+    motion, last = trajectory.motion, len(trajectory.motion) - 1
+    vehicles = motion.shape[1]
+    shown = 3 if vehicles == 2 else 2
+    low_m = min(float(motion[0, :, 0].min()), -1.0)
+    high_m = -PAST_M / (1.0 - PAST_M) * low_m
+    heads = "".join(
+        f"  {'x ' + who.upper():>8} {'m/s':>5}" + (f" {'m/s2':>5}" if shown == 3 else "")
+        for who in VEHICLES[:vehicles]
+    )
+    at_m = _place(0.0, low_m, high_m)
+    lines = [f"{'t s':>5}{heads}   {f'{low_m:.0f} m':<{at_m}}M"]
+    step = round(every_s / DT_S)
+    rows = [*range(0, last, step), last]
+    for row in rows:
+        values = "".join(
+            f"  {x:8.1f} {v:5.1f}" + (f" {a:5.1f}" if shown == 3 else "")
+            for x, v, a in motion[row].tolist()
+        )
+        strip = _strip(motion[row, :, 0].tolist(), low_m, high_m)
+        lines.append(f"{row * DT_S:5.1f}{values}   {strip}")
+    return lines
+
+
+def _strip(x_m: list[float], low_m: float, high_m: float) -> str:
+    strip = ["."] * STRIP
+    strip[_place(0.0, low_m, high_m)] = "|"
+    for row, x in sorted(enumerate(x_m), key=lambda pair: pair[0] == VUT):
+        if low_m <= x <= high_m:
+            at = _place(x, low_m, high_m)
+            strip[at] = "X" if row == VUT and strip[at] in LETTERS else LETTERS[row]
+    return "".join(strip)
+
+
+def _place(x_m: float, low_m: float, high_m: float) -> int:
+    return round((x_m - low_m) / (high_m - low_m) * (STRIP - 1))

@@ -1,0 +1,158 @@
+"""Recorded cases again, with a changed VUT: which verdicts changed, and whether it is worse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from merge_sumo.campaigns.conductor import workers_or_here
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, runs_on
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
+from merge_sumo.errors import UserError
+from merge_sumo.reports.changes import Change, RunComparison
+from merge_sumo.reports.comparison import compared_case, level_change, telling
+from merge_sumo.reports.verdict import counted
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class ChangedVerdict:
+    """A case whose verdict is another than the recorded one."""
+
+    before: Outcome
+    after: Outcome
+
+    @property
+    def change(self) -> str:
+        """What that means: fixed, broke, or between failing and giving no verdict."""
+        return compared_case("A", self.before, self.before, self.after).change
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        was, now = self.before.measures, self.after.measures
+        return {
+            "index": self.before.index,
+            "level": self.before.case.level,
+            "change": self.change,
+            **{"end_before": was.end, "end_after": now.end},
+            **{"score_before": self.before.score, "score_after": self.after.score},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Rerun:
+    """Recorded cases and what the VUT of today makes of them.
+
+    Attributes:
+        vut: name of that VUT.
+        before: the recorded outcomes.
+        after: those of today, in the same order, with the same indices.
+        compared: what changed, as in `compare_runs`: A is what was recorded, B is today's.
+    """
+
+    vut: str
+    before: list[Outcome]
+    after: list[Outcome]
+    compared: RunComparison
+
+    @property
+    def changed(self) -> list[ChangedVerdict]:
+        """The cases whose verdict changed, in the order of the campaign."""
+        pairs = zip(self.before, self.after, strict=True)
+        return [
+            ChangedVerdict(a, b)
+            for a, b in pairs
+            if (a.measures.end, a.failed) != (b.measures.end, b.failed)
+        ]
+
+
+def settings_today(
+    run: Run, given: Mapping[str, object] | None = None, *, trust: bool = False
+) -> CampaignSettings:
+    """Return the settings of a campaign with what is given in the place of what it recorded.
+
+    A VUT that is not given is that of the campaign, as its files are today. The controller that a
+    folder names runs only where the folder was made here, or with `trust`.
+    """
+    wanted = dict(given or {})
+    if "vut" in wanted:
+        wanted.setdefault("vut_command", None)  # the command was that of the VUT that was
+    return settings_of(run.folder, run.settings, wanted, trust=trust)
+
+
+def rerun(
+    run: Run,
+    settings: CampaignSettings,
+    indices: Sequence[int] = (),
+    *,
+    net: Path | None = None,
+    workers: Workers | None = None,
+    on_case: Callable[[int], None] = lambda _: None,
+) -> Rerun:
+    """Run cases of a campaign again.
+
+    Args:
+        run: the campaign.
+        settings: how: `settings_today`.
+        indices: its cases; all of them when left out.
+        net: net for that; must be the one of the campaign.
+        workers: where the cases run, by default in this process.
+        on_case: told how many cases have just ended.
+
+    Raises `UserError` for an index without a case, and where net or POV are not those of the
+    campaign: then not only the VUT would have changed.
+    """
+    before = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
+    if not before:
+        raise UserError(f"{run.folder} has no case yet")
+    road = road_for(settings.scenario, net)
+    today = record_of(settings, road)
+    if run.settings.get("net_sha256", road.sha256) != road.sha256:
+        raise UserError(
+            f"{run.folder} was run on another net than {road.path}: give that with --net"
+        )
+    levels = sorted({outcome.case.level for outcome in before})
+    for level in levels:
+        if not same_pov(run.settings, today, level):
+            raise UserError(
+                f"{run.folder} was run against another POV of level {level_name(level)} than "
+                "today's: give its --policies"
+            )
+    plan = GroundPlan(
+        vut=settings.vut_factory,
+        corridors=min(MAX_CORRIDORS, len(before)),
+        net=road,
+        scenario=settings.scenario,
+        povs=settings.povs,
+        criterion=settings.criterion,
+    )
+    after: dict[int, Outcome] = {}
+    with workers_or_here(workers) as there:
+        for place, ran in runs_on(there, plan)([outcome.case for outcome in before]):
+            was = before[place]
+            after[place] = Outcome(was.index, was.batch, was.case, ran.measures, margin=ran.margin)
+            on_case(1)
+    again = [after[place] for place in range(len(before))]
+    return Rerun(settings.vut, before, again, _compared(levels, before, again))
+
+
+def _compared(
+    levels: Sequence[int], before: Sequence[Outcome], after: Sequence[Outcome]
+) -> RunComparison:
+    """Compare outcomes of the same cases."""
+    cases = [
+        compared_case("A", a, a, b)
+        for a, b in zip(before, after, strict=True)
+        if any(o.failed or not o.is_tested for o in (a, b))
+    ]
+    cases.sort(key=telling)
+    by_level = {
+        level: level_change(level, cases, before, after, same_cases=True) for level in levels
+    }
+    assert all(case.change is not Change.NOT_RUN_AGAIN for case in cases), "all ran"  # noqa: S101
+    return RunComparison(by_level, cases, f"{counted(len(before), 'case')} ran again")

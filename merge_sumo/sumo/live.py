@@ -1,0 +1,245 @@
+"""sumo-gui in the place of libsumo: a case is shown while it is run.
+
+libsumo has no window. sumo-gui takes the same commands over TraCI, with the same numbers: a world
+that is given a `Window` as its binding moves the same to the last bit.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any, Final, Self
+
+from lxml import etree
+
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.binding import scratch_folder, sumo_environment, sumo_program
+from merge_sumo.sumo.replay_folder import COLOURS, WINDOW, view_settings
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
+
+LEAST_M: Final = 120.0
+"""Width of the road that the window shows at least, with the VUT in the middle."""
+SEEN: Final = 1.15
+"""Where another car is, as a multiple of its distance, that the window shows, too."""
+LARGER: Final = "2"
+"""How much larger the cars are drawn than they are."""
+BEFORE_S: Final = 1.5
+"""For which the start is shown, so that a person finds the cars."""
+LOOK_S: Final = 0.5
+"""Between two looks whether the window is still open."""
+CONNECT_TRIES: Final = 120
+SPEED_MODE_COMMANDED: Final = 32
+"""All of SUMO's own checks off."""
+VIEW: Final = "View #0"
+LABEL: Final = "label"
+
+
+def check_display() -> None:
+    """Raise `UserError` where no window can open."""
+    if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UserError(
+            "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
+        )
+
+
+class Window:
+    """A sumo-gui that a `World` takes for libsumo; steps take as long as what they show.
+
+    Raises `UserError` when there is no display, or when the window is closed before its time.
+    """
+
+    def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
+        """Look for a display and for SUMO's client; the window opens with the world."""
+        check_display()
+        self._traci = _load_traci()
+        self.TraCIException: type[Exception] = self._traci.TraCIException
+        self.FatalTraCIError: type[Exception] = _NeverError
+        self._sleep = sleep
+        self._opened = ExitStack()
+        self._due_s: float | None = None
+        self._shown = 0
+
+    def start(self, command: list[str]) -> None:
+        """Open sumo-gui on what libsumo would be started with."""
+        stage = self._opened.enter_context(scratch_folder())
+        view = stage / "view.settings.xml"
+        settings = view_settings(LARGER, ("100", "0", "0"), label=LABEL)
+        view.write_bytes(etree.tostring(settings))
+        port = importlib.import_module("sumolib.miscutils").getFreeSocketPort()
+        look = ("--gui-settings-file", str(view), "--window-size", ",".join(map(str, WINDOW)))
+        # The window reads the net behind our back, when the world has removed its files.
+        files = [_kept(argument, stage) for argument in command[1:]]
+        options = [*files, *look, "--start", "--delay", "0", "--remote-port", str(port)]
+        process = subprocess.Popen(
+            [sumo_program("sumo-gui"), *options],
+            env=sumo_environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        self._opened.callback(_end, process)
+        self._process = process
+        try:
+            with _quiet():
+                self._connection = self._traci.connect(
+                    port, CONNECT_TRIES, proc=process, waitBetweenRetries=0.25
+                )
+        except (self._traci.FatalTraCIError, self._traci.TraCIException, OSError) as error:
+            self.close()
+            raise UserError(f"sumo-gui did not open: {error}") from error
+        self.vehicle = _Told(self._connection.vehicle, self._traci.FatalTraCIError)
+        self.route = _Told(self._connection.route, self._traci.FatalTraCIError)
+        self.simulation = self
+
+    def step(self) -> None:
+        """Make a step when its time has come; real time, from the second one on."""
+        with self._told():
+            if self._shown:
+                self._look()
+                now_s = time.monotonic()
+                first = self._due_s is None
+                self._due_s = now_s + BEFORE_S if first else self._due_s + DT_S  # type: ignore[operator]
+                self._sleep(max(self._due_s - now_s, 0.0))
+            self._connection.simulationStep()
+            self._shown += 1
+            if self._shown == 1:
+                self._colour()
+
+    def wait(self) -> None:
+        """Hold the cars where they are until the window is closed; only the clock runs on.
+
+        Without steps sumo-gui would not hear that it is to close.
+        """
+        with suppress(UserError), self._told():
+            self._look()
+            vehicle = self._connection.vehicle
+            for name in vehicle.getIDList():
+                vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
+                vehicle.setPreviousSpeed(name, 0.0, 0.0)
+                vehicle.setSpeed(name, 0.0)
+            while True:
+                self._connection.simulationStep()
+                self._sleep(LOOK_S)
+
+    def close(self) -> None:
+        """Close the window."""
+        self._opened.close()
+
+    def __enter__(self) -> Self:
+        """Return the window."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the window."""
+        self.close()
+
+    def _colour(self) -> None:
+        """Give the cars the colours that they have in a replay."""
+        vehicle = self._connection.vehicle
+        for name in vehicle.getIDList():
+            colour = [round(255 * float(part)) for part in COLOURS[_who(name)].split(",")]
+            vehicle.setColor(name, (*colour, 255))
+
+    def _look(self) -> None:
+        """Write the speeds beside the cars, and let the view follow the VUT.
+
+        It is in the middle, and the others are in the picture.
+        """
+        vehicle, places = self._connection.vehicle, {}
+        for name in vehicle.getIDList():
+            text = f"{_who(name).upper()} {vehicle.getSpeed(name):.1f} m/s"
+            vehicle.setParameter(name, LABEL, text)
+            places[_who(name)] = vehicle.getPosition(name)
+        x, y = places[VEHICLES[VUT]]
+        wide, high = WINDOW
+        half_m = max(
+            LEAST_M / 2.0,
+            *(SEEN * max(abs(to[0] - x), abs(to[1] - y) * wide / high) for to in places.values()),
+        )
+        box = x - half_m, y - half_m * high / wide, x + half_m, y + half_m * high / wide
+        self._connection.gui.setBoundary(VIEW, *box)
+
+    def _told(self) -> _Closed:
+        return _Closed(self._traci.FatalTraCIError)
+
+
+class _NeverError(Exception):
+    """What a window raises in the place of libsumo's fatal error: it has another for that."""
+
+
+class _Closed:
+    """Turns the end of the connection into a sentence."""
+
+    def __init__(self, fatal: type[Exception]) -> None:
+        self._fatal = fatal
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _kind: object, error: object, _trace: object) -> None:
+        if isinstance(error, (self._fatal, OSError)):
+            raise UserError("the window was closed before the case had ended") from None
+
+
+class _Told:
+    """A domain of TraCI whose end of the connection is a sentence."""
+
+    def __init__(self, domain: Any, fatal: type[Exception]) -> None:
+        self._domain, self._fatal = domain, fatal
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._domain, name)
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            with _Closed(self._fatal):
+                return function(*arguments, **options)
+
+        return call
+
+
+def _who(name: str) -> str:
+    return name.partition(".")[0]
+
+
+def _kept(argument: str, folder: Path) -> str:
+    """Return an argument, with a copy in a folder in the place of a file."""
+    file = Path(argument)
+    return str(shutil.copy(file, folder / file.name)) if file.is_file() else argument
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.kill()
+    process.wait()
+
+
+def _load_traci() -> Any:
+    """Return SUMO's own client, which comes with its programs."""
+    tools = str(Path(sumo_program("sumo-gui")).parents[1] / "tools")
+    if tools not in sys.path:
+        sys.path.append(tools)
+    try:
+        return importlib.import_module("traci")
+    except ImportError as error:
+        raise UserError(
+            f"SUMO's traci cannot be loaded ({error}): run `pip install traci==1.28.0`"
+        ) from error
+
+
+class _quiet(ExitStack):  # noqa: N801 (used as a function)
+    """Keeps what the client says of its tries to connect off the terminal."""
+
+    def __enter__(self) -> Self:
+        from contextlib import redirect_stderr, redirect_stdout
+
+        nowhere = self.enter_context(Path(os.devnull).open("w"))
+        self.enter_context(redirect_stdout(nowhere))
+        self.enter_context(redirect_stderr(nowhere))
+        return self

@@ -1,0 +1,146 @@
+"""One case on its own: on the command line, from Python, and live in sumo-gui."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.single import case_of, run_one
+from merge_sumo.drivers.povs import Povs
+from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.errors import UserError
+from merge_sumo.reports.motion import lines_of, motion_lines
+from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.sumo.live import Window
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import US23
+
+STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
+SAFE = ("--level", "0", "--x", "-300", "--v", "34")
+COLLIDES = Case(level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6)
+
+
+class TestTheCommand:
+    def test_shows_the_stalemate_of_the_shipped_folder(self, command_line):
+        code, out, _ = command_line("run", "--vut", "design2", *STALEMATE)
+        assert code == 1
+        assert "COLLISION with the POV at 9.3 s" in out
+        assert "stalemate" in out
+        assert "impact speed                        13.62 m/s" in out
+
+    def test_has_a_row_for_each_second_and_one_for_the_end(self, command_line):
+        _, out, _ = command_line("run", "--vut", "design2", *STALEMATE)
+        table = out[out.index("  t s") :].splitlines()
+        assert [row.split()[0] for row in table[1:]] == [f"{t}.0" for t in range(10)] + ["9.3"]
+        assert {row.rindex("|") for row in table[1:-2]} == {table[0].index("M", 60)}
+
+    def test_ends_with_0_when_the_vut_merges(self, command_line):
+        code, out, _ = command_line("run", "--vut", "design2", *SAFE)
+        assert (code, "MERGED" in out) == (0, True)
+
+    def test_keeps_the_case_as_a_folder_that_replays(self, command_line, tmp_path):
+        command_line("run", "--vut", "design2", *SAFE, "--out", tmp_path / "kept")
+        assert command_line("replay", tmp_path / "kept")[:2] == (
+            0,
+            f"identical: {_rows(tmp_path / 'kept')} rows of x, y, position and speed\n",
+        )
+
+    def test_says_the_same_of_a_recorded_case_as_its_campaign(self, command_line, run):
+        code, out, _ = command_line("run", "--case", run.folder, "7", "--json")
+        told = json.loads(out)
+        was = run.outcome(7)
+        assert told["score"] == was.measures.score
+        assert (np.array(told["motion"]) == run.trajectory(7).motion).all()
+        assert code == (1 if was.failed else 0)
+
+    def test_puts_another_vut_and_other_numbers_into_a_recorded_case(self, command_line, run):
+        _, out, _ = command_line("run", "--case", run.folder, "7", "--vut", "level0", "--v", "30")
+        assert f"x_POV0 {run.outcome(7).case.x_pov0_m:.1f} m, v_POV0 30.00 m/s" in out
+
+    def test_runs_a_vut_in_this_process_for_a_debugger(self, command_line, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        Path("mine.py").write_text("import os\ndef f(seen):\n    raise ValueError(os.getpid())\n")
+        _, out, _ = command_line("run", "--vut", "mine.py:f", *SAFE, "--debug")
+        assert f"ValueError: {os.getpid()}" in out
+        _, out, _ = command_line("run", "--vut", "mine.py:f", *SAFE)
+        assert "ValueError: " in out
+        assert f"ValueError: {os.getpid()}" not in out
+
+    @pytest.mark.parametrize(
+        ("arguments", "part"),
+        [
+            (("--vut", "design2", "--x", "-300"), "--v (v_pov0_mps) is missing"),
+            (("--vut", "design2", *SAFE, "--psi", "0.2"), "--psi (svo_rad) is none of"),
+            (("--vut", "design2", *SAFE, "--headway-ahead", "2"), "--headway-ahead"),
+            (("--vut", "design2", "--level", "2", "--x", "-300", "--v", "34"), "--psi"),
+            (("--vut", "design9", *SAFE), "design9"),
+            (("--vut", "design2", *SAFE, "--level", "all"), "--level all"),
+            (("--case", "nowhere", "3"), "not a campaign"),
+        ],
+    )
+    def test_is_refused_in_a_sentence(self, command_line, arguments, part):
+        code, out, err = command_line("run", *arguments)
+        assert (code, out) == (2, "")
+        assert part in err
+
+    def test_without_a_display_no_window_opens(self, command_line, monkeypatch):
+        monkeypatch.delenv("DISPLAY", raising=False)
+        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+        code, _, err = command_line("run", "--vut", "design2", *SAFE, "--gui")
+        assert (code, "needs a display" in err) == (2, True)
+
+
+def _rows(folder: Path) -> int:
+    return (folder / "episode.fcd.xml").read_text().count("<vehicle ")
+
+
+def test_in_traffic_the_table_has_all_cars():
+    where = named_scenario("us23-traffic")
+    values = {"x_pov0_m": -300, "v_pov0_mps": 30, "headway_ahead_s": 2, "headway_behind_s": 2}
+    case = case_of(where, 0, values)
+    ended = run_one(vut_factory("design2"), case, road_for(where), Povs())
+    head, first, *_ = motion_lines(ended.trajectory)
+    assert all(name in head for name in ("x POV", "x VUT", "x AHEAD", "x BEHIND"))
+    assert [letter for letter in first[-48:] if letter.isalpha()] == ["b", "P", "a", "V"]
+    assert lines_of(ended.outcome, ended.trajectory)[0].endswith("headway behind 2.00 s")
+
+
+class TestInSumoGui:
+    @pytest.fixture
+    def window(self, display, monkeypatch):
+        """Let windows open on a display of the test, without waiting for anybody."""
+        monkeypatch.setenv("DISPLAY", display)
+        monkeypatch.setattr(Window, "wait", lambda _: None)
+        monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
+        return monkeypatch
+
+    def test_a_case_is_run_live_and_moves_as_without_a_window(self, window):
+        slept: list[float] = []
+        window.setattr(Window, "__init__", _with_sleep(Window.__init__, slept.append))
+        road, factory = road_for(US23), vut_factory("design2")
+        live = run_one(factory, COLLIDES, road, Povs(), live=True)
+        without = run_one(factory, COLLIDES, road, Povs())
+        assert (live.trajectory.motion == without.trajectory.motion).all()
+        assert live.outcome == without.outcome
+        assert len(slept) == len(live.trajectory.motion) - 1, "every step waits for its time"
+
+    def test_a_window_that_is_closed_is_said_in_a_sentence(self, window):
+        def close_window(this: Window) -> None:
+            if this._shown == 20:
+                this._process.kill()
+            step(this)
+
+        step = Window.step
+        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
+        window.setattr(Window, "step", close_window)
+        with pytest.raises(UserError, match="the window was closed before the case had ended"):
+            run_one(vut_factory("design2"), COLLIDES, road_for(US23), Povs(), live=True)
+
+
+def _with_sleep(init, sleep):
+    return lambda this: init(this, sleep)
