@@ -13,15 +13,13 @@ with `act` or `act_batch`.
 from __future__ import annotations
 
 import tempfile
-import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.campaigns.conductor import SCENARIOS, OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.settings import (
-    DEFAULT_BATCH,
     DEFAULT_CASES,
     CampaignSettings,
     one_level,
@@ -32,7 +30,7 @@ from merge_sumo.campaigns.single import DEBUG_DEADLINE_S, FIELDS, run_one, setti
 from merge_sumo.campaigns.truth import Truth, ground_truth
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
-from merge_sumo.drivers.vuts.here import is_here, object_of, spec_of, travels
+from merge_sumo.drivers.vuts.here import drivers_of, is_here
 from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison, exports
 from merge_sumo.reports.changes import RunComparison
@@ -46,6 +44,7 @@ from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, dated, link_latest
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
+from merge_sumo.values.score import Outcome
 
 __all__ = ["CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "open_run", "rerun"]
 __all__ += ["run_case", "truth"]
@@ -76,6 +75,7 @@ def campaign(
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
     pov: Vut | None = None,
+    learn_from: Sequence[Path | str] = (),
     on_case: OnCase | None = None,
     progress: bool | None = None,
 ) -> CampaignRun:
@@ -88,7 +88,8 @@ def campaign(
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         sampler: who chooses the cases.
         cases: number of cases.
-        batch: cases per batch; 40, or all if fewer, when left out.
+        batch: cases per batch; when left out, as many as the sampler wants: 10, later 20 and 40
+            for `coverage`, 40 for the others.
         seed: same seed, same outcomes.
         v_vut0_mps: initial speed of the VUT; the scenario's when left out.
         vut_command: command that starts the controller of `vut="traci"`.
@@ -102,20 +103,21 @@ def campaign(
         scenario: a scenario, its name, or its TOML file.
         policies: folder of learned drivers in the place of the shipped ones.
         pov: a POV of your own: what a `vut` can be.
+        learn_from: folders of earlier campaigns to learn the VUT from.
         on_case: told of every case as it ends.
         progress: show how far it is; by default in a notebook and on a terminal.
 
     Raises `UserError` for values that make no campaign, or when the folder exists.
     """
     where = _scenario(scenario)
-    spec, pov_spec, workers = _specs(vut, pov, workers)
+    spec, pov_spec, workers = drivers_of(vut, pov, workers)
     options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     settings = CampaignSettings(
         vut=spec,
         levels=parse_levels(str(level), povs_of(policies, where, pov_spec, options)),
         sampler=sampler,
         cases=cases,
-        batch=min(DEFAULT_BATCH, max(cases, 1)) if batch is None else batch,
+        batch=batch,
         seed=seed,
         v_vut0_mps=v_vut0_mps,
         stop_after_converged=stop_after_converged,
@@ -125,6 +127,7 @@ def campaign(
         in_process=in_process,
         policies=None if policies is None else str(policies),
         pov=pov_spec,
+        learn_from=tuple(map(str, learn_from)),
         scenario=where,
     )
     folder = dated(spec) if out is None else Path(out)
@@ -190,7 +193,7 @@ def run_case(
     if unknown:
         raise UserError(f"a case has no {min(unknown)}: it has {', '.join(FIELDS)}")
     where = _scenario(scenario)
-    spec, pov_spec, _ = _specs(vut, pov, 1)
+    spec, pov_spec, _ = drivers_of(vut, pov, 1)
     given = {
         "vut": spec,
         "scenario": where,
@@ -242,7 +245,7 @@ def rerun(
     """
     opened = _opened(run)
     if vut is not None:
-        settings["vut"], _, workers = _specs(vut, None, workers)
+        settings["vut"], _, workers = drivers_of(vut, None, workers)
     today = settings_today(opened.run, settings, trust=trust_vut)
     with open_workers(today.workers(workers)) as there:
         where = None if net is None else Path(net)
@@ -270,7 +273,7 @@ def truth(
     not tell from another, is never kept. Arguments are as of `campaign`.
     """
     where = _scenario(scenario)
-    spec, pov_spec, workers = _specs(vut, pov, workers)
+    spec, pov_spec, workers = drivers_of(vut, pov, workers)
     options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     povs = povs_of(policies, where, pov_spec, options)
     own = VutOptions(
@@ -366,35 +369,10 @@ def _scenario(scenario: Scenario | Path | str) -> Scenario:
     return scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
 
 
-def _specs(vut: Vut, pov: Vut | None, workers: int) -> tuple[str, str | None, int]:
-    """Return the specs of what drives, and how many workers can have it.
-
-    Says in a sentence where something drives in this process that could do it harm.
-    """
-    specs = spec_of(vut), None if pov is None else spec_of(pov)
-    for spec in specs:
-        if spec is None or object_of(spec) is None:
-            continue
-        name = spec.partition(":")[2]
-        if travels(spec):
-            where = "the processes of the workers" if workers > 1 else "this process"
-            why = f"{name} is an object, so it drives in {where}, which what it does wrong may end"
-        else:
-            alone = ", and without workers," if workers > 1 else ""
-            workers = 1
-            why = (
-                f"{name} is known to this process alone, so it drives here{alone} where what it "
-                "does wrong may end everything; put its class or function into a module for a "
-                "process of its own"
-            )
-        warnings.warn(why, stacklevel=3)
-    return *specs, workers
-
-
 def _both(first: OnCase, second: OnCase | None) -> OnCase:
-    def told(outcome: Any) -> None:
-        first(outcome)
-        if second is not None:
-            second(outcome)
+    def told(outcome: Outcome) -> None:
+        for listener in (first, second):
+            if listener is not None:
+                listener(outcome)
 
     return told

@@ -24,7 +24,10 @@ LOOPBACK = {"127.0.0.1", "::1"}
 HEAVY_MODULES = {"numpy", "scipy", "sklearn", "libsumo", "torch"}
 
 
-LAYERS = ("system", "values", "sumo", "drivers", "samplers", "campaigns", "scenarios", "training")
+LAYERS = (
+    *("system", "values", "sumo", "drivers", "samplers", "twin", "campaigns"),
+    *("scenarios", "training"),
+)
 """From the ground up; above them stand `reports`, `commands`, and the files of the package."""
 
 MAY_IMPORT = {
@@ -33,7 +36,8 @@ MAY_IMPORT = {
     "sumo": {"system", "values", "sumo"},
     "drivers": {"system", "values", "sumo", "drivers"},
     "samplers": {"system", "values", "samplers"},
-    "campaigns": {"system", "values", "sumo", "drivers", "samplers", "campaigns"},
+    "twin": {"system", "values", "sumo", "drivers", "twin"},
+    "campaigns": {"system", "values", "sumo", "drivers", "samplers", "twin", "campaigns"},
     "scenarios": {"system", "values", "sumo", "drivers", "scenarios"},
     "training": {*LAYERS} - {"samplers", "scenarios"},
     "reports": {*LAYERS, "reports"},

@@ -36,11 +36,14 @@ class TestCompare:
         assert out.count("\n") == 1
         found = json.loads(out)
         assert found["truth_fmc"] > 0.0
+        assert found["limit_fmc"] >= found["truth_fmc"]
+        assert found["dense_levels"] == []
         assert len(found["oracle_fmc_by_batch"]) == 2
         promised = {
             "fmc_median",
             "fmc_over_truth_median",
             "fmc_over_truth_quartiles",
+            "fmc_over_limit_median",
             "regions_found_median",
             "cases_to_90_percent_median",
             "sampler_s_median",
@@ -53,9 +56,28 @@ class TestCompare:
         assert code == 0, err
         assert (tmp_path / "curves.svg").read_text().count("<svg") == 1
         assert "figure: curves.svg" in out
-        assert {"truth:", "oracle:", "uniform", "gpr"} <= {
+        assert {"truth:", "limit:", "oracle:", "uniform", "gpr"} <= {
             line.split()[0] for line in out.splitlines() if line.strip()
         }
+
+    def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
+        monkeypatch.setattr("merge_sumo.campaigns.truth.DENSE_CASES", 900)
+        tiny = (*COMPARE, "--samplers", "uniform", "--seeds", 1, "--cases", 10, "--batch", 10)
+        found = {}
+        for option in ("", "--dense", "--dense", "", "--no-dense"):
+            code, out, err = call(*tiny, *filter(None, [option]), "--json")
+            assert code == 0, err
+            result = json.loads(out)
+            found.setdefault(option, []).append((result["dense_levels"], result["limit_fmc"]))
+        (none_yet, (kept, limit)), (without,) = found[""], found["--no-dense"]
+        assert none_yet == without
+        assert without[0] == []
+        assert kept == [0]
+        assert found["--dense"] == [(kept, limit)] * 2
+        assert limit > without[1]
+        code, out, err = call(*tiny)
+        assert "limit: FMC" in out
+        assert "of 900 uniform cases" in out
 
     @pytest.mark.parametrize("figure", ["f.pdf", "gone/f.png", "mine.png"])
     def test_refuses_a_figure_that_cannot_be_before_it_runs_anything(self, call, tmp_path, figure):

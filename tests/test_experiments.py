@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from vut_contract import factory
 
-from merge_sumo.campaigns.experiments import Search, compare, oracle, search
-from merge_sumo.campaigns.truth import Kept, Truth, ground_truth
+from merge_sumo.campaigns.experiments import Search, compare, limit_fmc, oracle, search
+from merge_sumo.campaigns.truth import Kept, Truth, ground_truth, known_truth
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import from_unit, to_unit
@@ -216,6 +216,57 @@ class TestAComparisonByHand:
         found = compare([self.half], {0: nothing})
         assert found.fmc_over_truth_median is None
         assert json.dumps(asdict(found), allow_nan=False)
+
+
+class TestTheLimit:
+    truth = TestAComparisonByHand.truth
+    near = searched([[(0.2, 0.24)]])
+    far = searched([[(0.8, 0.2)]])
+
+    def test_is_the_coverage_of_all_that_truth_and_searches_found(self):
+        found = np.array([[0.2, 0.2], [0.8, 0.8], [0.2, 0.24], [0.8, 0.2]])
+        assert limit_fmc([self.near, self.far], {0: self.truth}, {}) == pytest.approx(fmc(found))
+        assert limit_fmc([], {0: self.truth}, {}) == fmc(self.truth.failures)
+
+    def test_is_that_of_a_dense_truth_where_it_is_more(self):
+        points = np.random.default_rng(0).random((50, 2))
+        dense = Truth(points, np.full(50, -600.0))
+        assert limit_fmc([self.far], {0: self.truth}, {0: dense}) == fmc(points)
+        poor = Truth(points[:1], np.full(1, -600.0))
+        without = limit_fmc([self.far], {0: self.truth}, {})
+        assert limit_fmc([self.far], {0: self.truth}, {0: poor}) == without
+
+    def test_is_summed_over_the_levels_each_with_what_is_more_there(self):
+        one = Truth(np.array([[0.5, 0.5]]), np.array([-600.0]))
+        dense = Truth(np.array([[0.1, 0.1], [0.9, 0.9]]), np.full(2, -600.0))
+        limit = limit_fmc([self.far], {0: one, 1: one}, {1: dense})
+        assert limit == pytest.approx(4.0 * fmc(one.failures))
+
+    def test_is_never_passed_although_the_truth_is(self):
+        truth = Truth(np.array([[0.2, 0.2]]), np.array([-600.0]))
+        search = searched([[(0.2, 0.2), (0.8, 0.2)]])
+        found = compare([search], {0: truth}, limit_fmc([search], {0: truth}, {}))
+        assert found.fmc_over_truth_median == pytest.approx(2.0)
+        assert found.fmc_over_limit_median == pytest.approx(1.0)
+        assert found.fmc_over_limit_quartiles == pytest.approx((1.0, 1.0))
+
+    def test_that_nobody_gave_and_one_of_nothing_have_no_share(self):
+        assert compare([self.far], {0: self.truth}).fmc_over_limit_median is None
+        assert compare([searched([[]])], {0: self.truth}, 0.0).fmc_over_limit_median is None
+
+
+def test_a_truth_is_known_when_it_was_made_and_not_before(truth, cache, tmp_path):
+    assert known_truth("design1", 0, 600, cache=tmp_path) is None
+    assert known_truth("design1", 0, 601, cache=cache) is None
+    known = known_truth("design1", 0, 600, cache=cache)
+    assert known is not None
+    assert np.array_equal(known.score, truth.score)
+
+
+def test_the_cases_of_a_truth_are_the_first_of_a_denser_one(truth, tmp_path):
+    few = ground_truth("design1", 0, 40, cache=tmp_path)
+    assert np.array_equal(few.points, truth.points[:40])
+    assert np.array_equal(few.score, truth.score[:40])
 
 
 class TestTheOracle:

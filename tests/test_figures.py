@@ -23,6 +23,8 @@ def compared(end: float) -> Comparison:
         fmc_quartiles=(end, end),
         fmc_over_truth_median=None,
         fmc_over_truth_quartiles=(None, None),
+        fmc_over_limit_median=None,
+        fmc_over_limit_quartiles=(None, None),
         failures_median=1.0,
         failures_quartiles=(1.0, 1.0),
         regions_found_median=1.0,
@@ -46,6 +48,7 @@ def curves():
         {"uniform": compared(0.01), "gpr": compared(0.05)},
         0.12,
         {0: 0.0, 10: 0.1, 40: 0.12},
+        0.15,
     )
 
 
@@ -62,12 +65,14 @@ class TestTheCurves:
         assert ([0, 20, 40], [0.0, 0.025, 0.05]) in lines
         assert ([0, 10, 40], [0.0, 0.1, 0.12]) in lines
         assert any(y == [0.12, 0.12] for _, y in lines)
-        assert {text.get_text() for text in axes.texts} == {"uniform", "gpr", "truth", "oracle"}
+        assert any(y == [0.15, 0.15] for _, y in lines)
+        names = {"uniform", "gpr", "truth", "limit", "oracle"}
+        assert {text.get_text() for text in axes.texts} == names
         assert len(axes.collections) == 2, "a band for each sampler"
 
     def test_name_lines_that_end_together_apart(self):
         figure = figures.coverage_curves(
-            "t", {"uniform": compared(0.05), "gpr": compared(0.05)}, 0.05, {0: 0.0, 40: 0.05}
+            "t", {"uniform": compared(0.05), "gpr": compared(0.05)}, 0.05, {0: 0.0, 40: 0.05}, 0.05
         )
         heights = sorted(text.xyann[1] for text in figure.axes[0].texts)
         assert min(np.diff(heights)) > 0.0

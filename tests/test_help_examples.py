@@ -16,7 +16,7 @@ from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 
 ROOT = Path(__file__).resolve().parent.parent
-SMALL = {"--cases": "40", "--seeds": "1"}
+SMALL = {"--cases": "40", "--seeds": "1", "--radius": "0.3"}
 MORE = {"compare": ["--cases", "40", "--truth-cases", "300"]}
 ELSEWHERE = {"train", "reproduce"}
 """These take minutes: tests/test_training.py and the README's commands run them small."""
@@ -66,5 +66,6 @@ def test_runs(example, place, monkeypatch, tmp_path):
     if "--batch" not in words:
         words += MORE.get(words[0], [])
     done = CliRunner().invoke(cli.app, words)
-    failed = words[0] == "compare-runs" and done.exit_code == 1  # its way to say "worse"
+    # Their ways to say "worse" and "not certain".
+    failed = words[0] in ("compare-runs", "certify") and done.exit_code == 1
     assert done.exit_code == 0 or failed, done.output

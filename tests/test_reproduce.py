@@ -59,7 +59,12 @@ class TestATinyReproduction:
             ours = column["samplers"]["coverage"]["fmc_median"]
             assert f"{ours:.4f}" in markdown
             assert f"{column['truth_fmc']:.4f} ({column['paper_fmc']['truth']:.4f})" in markdown
+            assert f"{column['limit_fmc']:.4f} (-)" in markdown
+            assert not column["dense"]
+            for sampler in column["samplers"].values():
+                assert sampler["fmc_median"] <= column["limit_fmc"]
         assert "| gpr / truth |" in markdown
+        assert "| coverage / limit |" in markdown
         assert "| coverage / truth after " in markdown
 
     def test_says_how_far_it_is(self, tiny):

@@ -30,7 +30,7 @@ MOUNT = shutil.which("mount")
 KILLER = Path(__file__).resolve().parent.parent / "tools" / "kill_campaigns.py"
 
 
-def settings(sampler: str = "uniform", **changes) -> CampaignSettings:
+def settings(sampler: str = "annealing", **changes) -> CampaignSettings:
     values = {"vut": "design1", "levels": (0,), "cases": 28, "batch": BATCH, "seed": 2}
     return CampaignSettings(sampler=sampler, **{**values, **changes})
 
@@ -47,7 +47,7 @@ class StopAfter:
             raise Stopped(signal.SIGINT)
 
 
-def stopped_after(batches: int, folder: Path, sampler: str = "uniform") -> Path:
+def stopped_after(batches: int, folder: Path, sampler: str = "annealing") -> Path:
     with pytest.raises(Stopped):
         run_campaign(settings(sampler), folder, check=StopAfter(batches))
     return folder

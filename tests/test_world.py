@@ -100,6 +100,32 @@ def test_episodes_are_the_same_in_1_and_in_32_corridors():
         assert measure(one) == measure(many)
 
 
+@pytest.mark.parametrize("model", [None, "sumo:IDM", "sumo:Krauss"])
+def test_sumo_holds_the_very_speeds_that_it_was_told(model):
+    """They are not read back: to the last bit it would give the same numbers."""
+    rng = np.random.default_rng(2)
+    vut_type = None if model is None else vut_factory(model).vut.vut_type
+    with World(16, vut_type=vut_type) as world:
+        for case in random_cases(200):
+            world.place(int(rng.integers(16)), case.starts())
+            for _ in range(3):
+                world.step(rng.uniform(A_MIN_MPS2, A_MAX_MPS2, (2, 16)) * (rng.random(16) < 0.7))
+                told_mps, x_m = world.v_mps.tolist(), world.x_m.tolist()
+                world.read()
+                assert (world.v_mps.tolist(), world.x_m.tolist()) == (told_mps, x_m)
+    assert len({speed for row in told_mps for speed in row}) > 16, "speeds of all kinds"
+
+
+@pytest.mark.parametrize("speed_mps", [29.0, 31.0])
+def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps):
+    with World(1) as world:
+        world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
+        world.step(np.zeros((2, 1)))
+        world._set_speed("pov.0", speed_mps)
+        with pytest.raises(SimulationError, match=r"0\.1.* m away from where it drives"):
+            world.step(np.zeros((2, 1)))
+
+
 def test_sumo_reports_the_acceleration_that_was_commanded():
     with World(3) as world:
         for k in range(3):

@@ -1,7 +1,7 @@
 """Measure the SUMO host beside its peers, all in one run: `python tools/bench_host.py`.
 
-    host     rollouts of the rule-based VUT against the level-0 POV: drivers, commands, state read
-             back from SUMO at every step, refills, trajectories
+    host     rollouts of the rule-based VUT against the level-0 POV: drivers, commands, positions
+             read back from SUMO and checked at every step, refills, trajectories
     bare     the same vehicles through the same motion in a plain libsumo loop: two commands, a
              step, two getters for each; the speeds are known beforehand, nothing is kept
     step     the same vehicles at constant speeds, and nothing at all but simulation steps

@@ -4,6 +4,9 @@
               `truth` uses: cases per second and the largest memory of a worker process
     workers   the same cases on one worker process and on two, in turns, beside a loop that only
               computes, on one process and on two: what the machine itself can give
+    campaign  the whole command of a uniform campaign, on one worker and on two, in turns
+    parent    cases per second that the process takes that asks, tells and keeps, where workers are
+              no limit, and how many workers like the one above that feeds
     samplers  seconds that each sampler takes for a batch, after a history of that many cases
     files     reading `outcomes.jsonl`, FMC and regions of its failures, the report
 
@@ -15,20 +18,26 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import pickle
 import resource
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan
+from merge_sumo.campaigns.ahead import Ahead, proposals
+from merge_sumo.campaigns.conductor import conduct, run_campaign
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, run_cases
+from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.truth import _scores
@@ -38,13 +47,14 @@ from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import LocalProcesses, Workers
-from merge_sumo.values.case import FloatArray, Pool, from_unit, to_unit
+from merge_sumo.values.case import Case, FloatArray, Pool, from_unit, to_unit
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
 
 VUT = "design1"
 ROUNDS = 5
+CAMPAIGN_ROUNDS = 3
 PAIR_CASES = 2000
 BATCH = 20
 
@@ -128,6 +138,61 @@ def two_workers() -> dict[str, list[float]]:
     return found
 
 
+def whole_campaigns(cases: int, rounds: int) -> dict[str, list[float]]:
+    """Return the seconds of whole commands on one worker and on two, and their ratio, by round."""
+    found: dict[str, list[float]] = {"s_on_one": [], "s_on_two": [], "gain": []}
+    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", VUT, "--level", "0"]
+    command += ["--sampler", "uniform", "--cases", str(cases), "--batch", str(BATCH), "--quiet"]
+    with tempfile.TemporaryDirectory() as scratch:
+        for number in range(rounds):
+            spent = []
+            for workers in (1, 2):
+                out = ["--workers", str(workers), "--out", f"{scratch}/{number}-{workers}"]
+                start = time.perf_counter()
+                subprocess.run([*command, *out], check=True, stdout=subprocess.DEVNULL)
+                spent.append(time.perf_counter() - start)
+            found["s_on_one"].append(spent[0])
+            found["s_on_two"].append(spent[1])
+            found["gain"].append(spent[0] / spent[1])
+    return found
+
+
+class Served:
+    """Gives what became of cases as it comes from a worker process, with no work done for it."""
+
+    def __init__(self, ran: Sequence[Ran]) -> None:
+        """Serve what became of `MAX_CHUNK` cases."""
+        # So quick that every chunk but the first is as large as can be.
+        self.workers = SimpleNamespace(count=1e-9)
+        self._sent = pickle.dumps(list(ran))
+
+    def chunks(
+        self, chunks: Iterable[Sequence[Case]]
+    ) -> Generator[tuple[int, Sequence[Ran]], None, None]:
+        """Yield (place of the first case, what became of the chunk)."""
+        first = 0
+        for chunk in chunks:
+            yield first, pickle.loads(self._sent)[: len(chunk)]  # noqa: S301 (our own)
+            first += len(chunk)
+
+
+def parent(cases: int) -> float:
+    """Return how many cases per second a campaign takes that workers have run."""
+    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of(), povs=Povs())
+    pool = Pool(levels=(0,))
+    served: Any = Served(run_cases(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
+    sampler, scout = (make_sampler("uniform", pool, 0) for _ in range(2))
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        Journal.create(Path(scratch) / "run", {}) as journal,
+        Ahead(served, proposals(scout, (), cases, BATCH)) as ahead,
+    ):
+        start = time.perf_counter()
+        for batches in ahead.together(conduct(sampler, ahead, cases, BATCH)):
+            journal.append(*batches)
+        return cases / (time.perf_counter() - start)
+
+
 def history_of(count: int, seen: Sequence[Outcome]) -> list[Outcome]:
     """Return a history of that many outcomes: new places for what was measured once."""
     rng = np.random.default_rng(2)
@@ -179,6 +244,7 @@ def main() -> None:
     parser.add_argument(
         "--most", type=int, default=100_000, help="uniform cases of the largest run"
     )
+    parser.add_argument("--campaign", type=int, default=20_000, help="cases of whole campaigns")
     parser.add_argument("--history", type=int, default=10_000, help="longest history of a sampler")
     parser.add_argument("--outcomes", type=int, default=1_000_000, help="outcomes of a report")
     parser.add_argument("--json", action="store_true")
@@ -199,6 +265,17 @@ def main() -> None:
     for name, values in result["workers"].items():
         median = statistics.median(values)
         tell(f"workers: {name}: {median:.2f} [{min(values):.2f}, {max(values):.2f}]")
+    result["campaign"] = whole_campaigns(chosen.campaign, CAMPAIGN_ROUNDS)
+    for name, values in result["campaign"].items():
+        median = statistics.median(values)
+        tell(f"campaign: {name}: {median:.2f} [{min(values):.2f}, {max(values):.2f}]")
+    rates = [parent(chosen.campaign) for _ in range(ROUNDS)]
+    feeds = statistics.median(rates) / statistics.median(result["workers"]["cases_per_s_on_one"])
+    result["parent"] = {"cases_per_s": rates, "feeds_workers": feeds}
+    tell(
+        f"parent: {statistics.median(rates):.0f} cases/s [{min(rates):.0f}, {max(rates):.0f}], "
+        f"feeds {feeds:.1f} workers"
+    )
     with tempfile.TemporaryDirectory() as scratch:
         settings = CampaignSettings(vut=VUT, levels=(0,), sampler="uniform", cases=400, batch=400)
         run = run_campaign(settings, Path(scratch) / "run")
@@ -207,8 +284,8 @@ def main() -> None:
             history = history_of(count, run.outcomes)
             spent = {name: sampler_s(name, history) for name in SAMPLERS}
             result["samplers"][count] = spent
-            rates = ", ".join(f"{name} {seconds:.3f}" for name, seconds in spent.items())
-            tell(f"samplers: seconds for a batch of {BATCH} after {count:,} cases: {rates}")
+            shown = ", ".join(f"{name} {seconds:.3f}" for name, seconds in spent.items())
+            tell(f"samplers: seconds for a batch of {BATCH} after {count:,} cases: {shown}")
             count *= 10
         count = 10_000
         while count <= chosen.outcomes:

@@ -8,8 +8,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, RunCases, road_for, runs_on
+from merge_sumo.campaigns.ahead import Ahead, proposals
+from merge_sumo.campaigns.ground import (
+    MAX_CORRIDORS,
+    GroundPlan,
+    OnWorkers,
+    Ran,
+    RunCases,
+    road_for,
+    runs_on,
+)
 from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.learning import lessons
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import (
     RECORDED_BY_DEFAULT,
@@ -22,13 +32,14 @@ from merge_sumo.drivers.vuts.files import Files, sha256_of
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
 from merge_sumo.system.trust import SEAL, seal
 from merge_sumo.system.workers import Workers, open_workers
-from merge_sumo.values.case import Case
+from merge_sumo.twin.twin import Twin
+from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -48,31 +59,34 @@ def conduct(
     sampler: Sampler,
     run: RunCases,
     cases: int,
-    batch: int,
+    batch: int | None,
     on_case: OnCase | None = None,
     history: Sequence[Outcome] = (),
-    stop: Callable[[Sequence[Outcome]], bool] = lambda _: False,
+    motions: Mapping[int, FloatArray] | None = None,
+    stop: Callable[[Sequence[Outcome]], bool] | None = None,
 ) -> Iterator[list[tuple[Outcome, Trajectory]]]:
     """Ask, run, tell, batch by batch; yield what each batch gave, in order of the cases.
 
-    It ends after `cases`, or earlier where `stop` says so of the outcomes so far. A campaign goes
-    on after `history`, whole batches of its own outcomes: the sampler is told them, and as it is
-    pure in what it was told, it proposes what it would have proposed then.
+    Without a `batch`, the sampler says how many cases it wants. It ends after `cases`, or earlier
+    where `stop` says so of the outcomes so far. A campaign goes on after `history`, whole batches
+    of its own outcomes: the sampler is told them, and as it is pure in what it was told, it
+    proposes what it would have proposed then. One that foresees is told the `motions`,
+    (T + 1, A, 3), of the history by index, too.
     """
-    sampler.tell(history)
-    batches_before = history[-1].batch + 1 if history else 0
-    for number, first in enumerate(range(len(history), cases, batch), start=batches_before):
-        if stop(sampler.told()):
-            return
+    sampler.tell(history, motions)
+    number, first = (history[-1].batch + 1 if history else 0), len(history)
+    while first < cases and not (stop is not None and stop(sampler.told())):
         ran: list[tuple[Outcome, Trajectory]] = []
-        for place, done in run(sampler.ask(min(batch, cases - first))):
-            outcome = Outcome(first + place, number, done.trajectory.case, done.measures)
+        for place, done in run(sampler.ask(min(batch or sampler.batch_size(), cases - first))):
+            foretold = sampler.foretold(place)
+            outcome = Outcome(first + place, number, done.trajectory.case, done.measures, foretold)
             ran.append((outcome, done.trajectory))
             if on_case is not None:
                 on_case(outcome)
         ran.sort(key=lambda pair: pair[0].index)
-        sampler.tell(outcome for outcome, _ in ran)
+        sampler.tell([o for o, _ in ran], {o.index: t.motion for o, t in ran})
         yield ran
+        number, first = number + 1, first + len(ran)
 
 
 def run_campaign(
@@ -105,7 +119,7 @@ def run_campaign(
         record = record_of(settings, net)
         sealed = {**record, SEAL: seal(record)}
         with Journal.create(folder, sealed) as journal:
-            return _go_on(settings, sealed, net, journal, run, (), on_case, check)
+            return _go_on(settings, sealed, net, journal, run, None, on_case, check)
 
 
 def resume_campaign(
@@ -177,7 +191,7 @@ def resume_campaign(
         if told is not None:
             for outcome in before.outcomes:
                 told(outcome)
-        return _go_on(settings, record, net, journal, run, before.outcomes, on_case, check)
+        return _go_on(settings, record, net, journal, run, before, on_case, check)
 
 
 def _files_again(recorded: Mapping[str, Any], name: str) -> Files:
@@ -194,29 +208,47 @@ def _go_on(
     record: dict[str, Any],
     net: Corridor,
     journal: Journal,
-    run: RunCases,
-    history: Sequence[Outcome],
+    run: OnWorkers,
+    before: Run | None,
     on_case: OnCase | None,
     check: Callable[[], None],
 ) -> Run:
-    sampler = make_sampler(settings.sampler, settings.pool, settings.seed)
+    taught = lessons(settings.learn_from, settings.scenario)
+    others = [motion for motions in taught.values() for motion in motions]
+    games = Twin(settings.pool, settings.povs, settings.seed, others)
+    sampler = make_sampler(settings.sampler, settings.pool, settings.seed, games)
     stop = settings.stopping_rule()
     files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
 
     def noting_files(cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
-        for place, done in run(cases):
+        for place, done in ahead(cases):
             for name, loaded in zip(FILES, (done.files, done.pov_files), strict=True):
                 files[name] = loaded | files[name]  # what was known stays
             yield place, done
 
-    batches = conduct(sampler, noting_files, settings.cases, settings.batch, on_case, history, stop)
-    for ran in batches:
-        journal.append(ran)
-        noted = {name: known or None for name, known in files.items()}
-        if noted != {name: record[name] for name in FILES}:
-            record |= noted
-            journal.rewrite_settings(record)
-        check()
+    history = [] if before is None else before.outcomes
+    motions = None
+    if before is not None and sampler.foresees:
+        motions = {o.index: before.trajectory(o.index).motion for o in history}
+    scout = make_sampler(settings.sampler, settings.pool, settings.seed)
+    with Ahead(run, proposals(scout, history, settings.cases, settings.batch)) as ahead:
+        batches = conduct(
+            sampler,
+            noting_files,
+            settings.cases,
+            settings.batch,
+            on_case,
+            history,
+            motions,
+            stop,
+        )
+        for ran in ahead.together(batches):
+            journal.append(*ran)
+            noted = {name: known or None for name, known in files.items()}
+            if noted != {name: record[name] for name in FILES}:
+                record |= noted
+                journal.rewrite_settings(record)
+            check()
     done = Run(journal.folder)
     for outcome in failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
@@ -237,9 +269,10 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
 
 def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan:
     log = folder.resolve() / LOG
+    at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
     return GroundPlan(
         vut=settings.vut_factory.with_log(log),
-        corridors=min(MAX_CORRIDORS, settings.batch),
+        corridors=min(MAX_CORRIDORS, at_once or settings.cases),
         net=net,
         scenario=settings.scenario,
         povs=settings.povs.with_log(log),

@@ -41,7 +41,7 @@ class StoppingRule:
     ended; what was expected after a batch is worked out once and kept.
     """
 
-    def __init__(self, share: float, batch: int, fresh: Callable[[], Sampler]) -> None:
+    def __init__(self, share: float, batch: int | None, fresh: Callable[[], Sampler]) -> None:
         """Stop below `share`; `fresh` makes a sampler that was told nothing.
 
         Raises `UserError` for a share that is no share, or a sampler that expects nothing.
@@ -73,9 +73,9 @@ class StoppingRule:
         """Return the gain that was expected after a batch, as a share of the coverage by then."""
         if batch not in self._expected:
             sampler = self._fresh()
-            sampler.tell(outcome for outcome in outcomes if outcome.batch <= batch)
+            sampler.tell([outcome for outcome in outcomes if outcome.batch <= batch])
             assert isinstance(sampler, Foresighted), "checked at the start"  # noqa: S101
-            self._expected[batch] = sampler.expected_gain(self._batch)
+            self._expected[batch] = sampler.expected_gain(self._batch or sampler.batch_size())
         return self._expected[batch]
 
 

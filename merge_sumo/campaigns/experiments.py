@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from heapq import heappop, heapreplace
@@ -26,6 +26,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.system.workers import Workers
+from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit
 from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.scenario import US23, Scenario
@@ -69,7 +70,7 @@ def _search(
     seed: int,
 ) -> Search:
     pool = Pool(levels=levels, scenario=scenario)
-    sampler = make_sampler(name, pool, seed)
+    sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed))
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
@@ -113,13 +114,15 @@ class Comparison:
 
     Coverage is summed over the levels. `cases_to_50_percent` and `cases_to_90_percent` are cases
     until that share of the truth's FMC, None where too few seeds reach it. `fmc_over_truth` is None
-    where the truth has no failure.
+    where the truth has no failure, and `fmc_over_limit` also where no limit was given.
     """
 
     fmc_median: float
     fmc_quartiles: Quartiles
     fmc_over_truth_median: float | None
     fmc_over_truth_quartiles: Quartiles
+    fmc_over_limit_median: float | None
+    fmc_over_limit_quartiles: Quartiles
     failures_median: float
     failures_quartiles: Quartiles
     regions_found_median: float
@@ -183,12 +186,37 @@ def _lost_search(task: Task) -> Search:
     raise UserError(f"the search of {name} with seed {seed} ended its worker process each time")
 
 
-def compare(searches: Sequence[Search], truths: Mapping[int, Truth]) -> Comparison:
-    """Compare what one sampler found, one search a seed, with the truth at each level."""
+def limit_fmc(
+    searches: Iterable[Search], truths: Mapping[int, Truth], dense: Mapping[int, Truth]
+) -> float:
+    """Return the coverage of all that is known to fail, summed over the levels: no search has more.
+
+    A truth of a few thousand cases misses places that searches find. At each level this is the
+    coverage of what truth and searches found together, or of a `dense` truth, whichever is more.
+    """
+    found = list(searches)
+    total = 0.0
+    for level, truth in truths.items():
+        failing = [truth.failures, *(search.failures(level) for search in found)]
+        together = fmc(np.concatenate([points for points in failing if len(points)] or failing[:1]))
+        total += max(together, fmc(dense[level].failures) if level in dense else 0.0)
+    return total
+
+
+def compare(
+    searches: Sequence[Search], truths: Mapping[int, Truth], limit: float | None = None
+) -> Comparison:
+    """Compare what one sampler found, one search a seed, with the truth at each level.
+
+    `limit` is the coverage of all that is known to fail (`limit_fmc`).
+    """
     truth_fmc = sum(fmc(truth.failures) for truth in truths.values())
     real = [(level, region) for level, truth in truths.items() for region in truth.real_regions()]
     curves = np.array([search.fmc for search in searches])
-    share = curves[:, -1] / truth_fmc if truth_fmc > 0.0 else np.full(len(curves), np.nan)
+    share, of_limit = (
+        curves[:, -1] / whole if whole else np.full(len(curves), np.nan)
+        for whole in (truth_fmc, limit)
+    )
     failures = np.array([sum(o.failed for o in search.outcomes) for search in searches])
     found = np.array(
         [sum(_found(s.failures(level), region) for level, region in real) for s in searches]
@@ -201,6 +229,8 @@ def compare(searches: Sequence[Search], truths: Mapping[int, Truth]) -> Comparis
         fmc_quartiles=_quartiles(curves[:, -1]),
         fmc_over_truth_median=_quantile(share, 0.5),
         fmc_over_truth_quartiles=_quartiles(share),
+        fmc_over_limit_median=_quantile(of_limit, 0.5),
+        fmc_over_limit_quartiles=_quartiles(of_limit),
         failures_median=float(np.median(failures)),
         failures_quartiles=_quartiles(failures),
         regions_found_median=float(np.median(found)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -184,7 +184,25 @@ RunCases = Callable[[Sequence[Case]], Iterable[tuple[int, Ran]]]
 """Runs cases somewhere; gives (place, what became of the case) in any order."""
 
 
-def runs_on(workers: Workers, plan: GroundPlan) -> RunCases:
+@dataclass(frozen=True, slots=True)
+class OnWorkers:
+    """Runs cases on workers."""
+
+    workers: Workers
+    plan: GroundPlan
+
+    def __call__(self, cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
+        """Run cases; yield (place, what became of the case) in any order."""
+        return self.workers.run(partial(run_cases, self.plan), cases, lost_case)
+
+    def chunks(
+        self, chunks: Iterable[Sequence[Case]]
+    ) -> Generator[tuple[int, Sequence[Ran]], None, None]:
+        """Run chunks; yield (place of the first case, what became of the chunk) in any order."""
+        return self.workers.run_chunks(partial(run_cases, self.plan), chunks, lost_case)
+
+
+def runs_on(workers: Workers, plan: GroundPlan) -> OnWorkers:
     """Return what runs cases on workers; `UserError` when the plan cannot be carried out there."""
 
     def died(_: None) -> None:
@@ -194,7 +212,7 @@ def runs_on(workers: Workers, plan: GroundPlan) -> RunCases:
 
     for _ in workers.run(partial(_open_ground, plan), [None], died):
         pass
-    return lambda cases: workers.run(partial(run_cases, plan), cases, lost_case)
+    return OnWorkers(workers, plan)
 
 
 def _open_ground(plan: GroundPlan, nothing: Sequence[None]) -> Sequence[None]:

@@ -91,11 +91,13 @@ class _Rollout:
         # One row per step of the world, shared by all corridors: x, v, a of every vehicle.
         self.record = np.zeros((RING_ROWS, vehicles, 3, corridors))
         self.row = 0
+        self.now = self.record[0]
+        """The row of this step."""
 
     def run(self) -> Iterator[tuple[int, Trajectory]]:
         world, everywhere = self.world, range(self.world.corridors)
         self.refill(everywhere)
-        while self.active.any():
+        while self.next_timeout < NEVER:  # as long as an episode runs
             self.observe()
             try:
                 world.advance()
@@ -111,18 +113,19 @@ class _Rollout:
                 self.refill(everywhere)
                 continue
             self.step += 1
-            x_vut_m = world.x_m[VUT]
-            # Scalars first: in most steps no episode ends. Idle corridors stand before M.
-            if x_vut_m.max() >= 0.0 or self.row >= self.next_timeout or self.errors:
-                ended = (x_vut_m >= 0.0) | (self.row >= self.timeout_at)
+            arrived = world.x_m[VUT] >= 0.0
+            # In most steps no episode ends. Idle corridors stand before M.
+            if np.count_nonzero(arrived) or self.row >= self.next_timeout or self.errors:
+                ended = arrived | (self.row >= self.timeout_at)
                 ended[list(self.errors)] = True
                 corridors = np.flatnonzero(ended).tolist()
                 for corridor in corridors:
                     if corridor in self.errors:
                         yield self.finish(corridor, *self.errors.pop(corridor))
                     else:
-                        arrived = x_vut_m[corridor] >= 0.0
-                        yield self.finish(corridor, End.MERGED if arrived else End.TIMEOUT)
+                        yield self.finish(
+                            corridor, End.MERGED if arrived[corridor] else End.TIMEOUT
+                        )
                 self.refill(corridors)
 
     def begin_anew(self, lost: VutLostError) -> Iterator[tuple[int, Trajectory]]:
@@ -198,27 +201,28 @@ class _Rollout:
 
     def observe(self) -> None:
         """Write the state into the next row of the record."""
-        row = self.record[self.row % RING_ROWS]
-        row[:, 0], row[:, 1] = self.world.x_m, self.world.v_mps
+        self.now = self.record[self.row % RING_ROWS]
+        self.now[:, 0], self.now[:, 1] = self.world.x_m, self.world.v_mps
         self.row += 1
 
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
         x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
         scene = Scene(self.active, self.step, x_m, v_mps)
-        answer = np.empty(x_m.shape)
-        answer[self.mainline] = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
-        if following is None:
-            answer[VUT] = self.ask_vut(scene)
-        else:
+        cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
+        if following is not None:
+            scene = Scene(self.active, self.step, x_m, v_mps, following.met(x_m, v_mps))
+        answer = np.concatenate((cars[:VUT], self.ask_vut(scene)[None], cars[VUT:]))
+        if following is not None:
             following.limit(answer, x_m, v_mps)
-            met = following.met(x_m, v_mps)
-            answer[VUT] = self.ask_vut(Scene(self.active, self.step, x_m, v_mps, met))
-        if not math.isfinite(answer.sum()):
+        if not math.isfinite(np.vdot(answer, answer)):
             answer = self.only_numbers(answer)
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
-        self.clipped += np.abs(acceleration[VUT] - answer[VUT]) > ROUNDING_MPS2
-        self.record[(self.row - 1) % RING_ROWS, :, 2] = acceleration
+        self.now[:, 2] = acceleration
+        off = answer - acceleration
+        # In most steps nobody asks for more than it may.
+        if np.vdot(off, off) > (0.5 * ROUNDING_MPS2) ** 2:
+            self.clipped += np.abs(off[VUT]) > ROUNDING_MPS2
         return acceleration
 
     def ask_vut(self, scene: Scene) -> FloatArray:
@@ -253,8 +257,12 @@ class _Rollout:
         """Return the record of a corridor's episode; after an error without the last step."""
         episode = self.episodes[corridor]
         assert episode is not None, "only running episodes end"  # noqa: S101
-        rows = np.arange(episode.first_row, self.row + (error is None)) % RING_ROWS
-        motion = self.record[rows, :, :, corridor]
+        length = self.row - episode.first_row + (error is None)
+        first = episode.first_row % RING_ROWS
+        rows = self.record[..., corridor]
+        # In two parts, of which the second is empty where the ring does not close.
+        parts = rows[first : first + length], rows[: max(first + length - RING_ROWS, 0)]
+        motion = np.concatenate(parts)
         if error is None:
             motion[-1, :, 0] = self.world.x_m[:, corridor]
             motion[-1, :, 1] = self.world.v_mps[:, corridor]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
 from merge_sumo.campaigns.convergence import StoppingRule
+from merge_sumo.campaigns.learning import hashes, lessons
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.drivers.policies import how_to_train, policies_in, policies_of
 from merge_sumo.drivers.povs import POLICIES, Povs, own_pov
@@ -18,7 +19,7 @@ from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.trust import is_own
 from merge_sumo.values.case import Pool
@@ -34,7 +35,6 @@ from merge_sumo.values.scenario import (
 from merge_sumo.values.score import Outcome
 
 DEFAULT_CASES: Final = 800
-DEFAULT_BATCH: Final = 40
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -45,7 +45,7 @@ class CampaignSettings:
     levels: tuple[int, ...]
     sampler: str = DEFAULT_SAMPLER
     cases: int = DEFAULT_CASES
-    batch: int = DEFAULT_BATCH
+    batch: int | None = None
     seed: int = 0
     v_vut0_mps: float | None = None
     stop_after_converged: float | None = None
@@ -55,6 +55,7 @@ class CampaignSettings:
     in_process: bool = False
     policies: str | None = None
     pov: str | None = None
+    learn_from: tuple[str, ...] = ()
     scenario: Scenario = US23
 
     def __post_init__(self) -> None:
@@ -73,6 +74,7 @@ class CampaignSettings:
             ("--vut-command", self.vut_command),
             ("--policies", self.policies),
             ("--pov", self.pov),
+            *(("--learn-from", folder) for folder in self.learn_from),
         ):
             if text is not None and not _is_text(text):
                 raise UserError(
@@ -85,11 +87,11 @@ class CampaignSettings:
         povs = self.povs
         for level in self.levels:
             check_level(level, povs)
-        make_sampler(self.sampler, self.pool, self.seed)
+        self._check_sampler()
         for name in ("cases", "batch"):
-            if getattr(self, name) < 1:
-                raise UserError(f"--{name} is {getattr(self, name)}: it must be 1 or more")
-        if self.batch > self.cases:
+            if (number := getattr(self, name)) is not None and number < 1:
+                raise UserError(f"--{name} is {number}: it must be 1 or more")
+        if self.batch is not None and self.batch > self.cases:
             raise UserError(
                 f"--batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
                 "cases than the campaign"
@@ -101,10 +103,19 @@ class CampaignSettings:
             raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
         self.stopping_rule()
 
-    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool]:
-        """Return what says of the outcomes so far whether the search is over."""
+    def _check_sampler(self) -> None:
+        sampler = make_sampler(self.sampler, self.pool, self.seed)
+        if self.learn_from and not sampler.foresees:
+            able = [name for name, kind in SAMPLERS.items() if kind.foresees]
+            raise UserError(
+                f"--learn-from needs a sampler that plays cases out: choose --sampler "
+                f"{' or '.join(able)}"
+            )
+
+    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
+        """Return what says of the outcomes so far whether the search is over, if anything does."""
         if self.stop_after_converged is None:
-            return lambda _: False
+            return None
         fresh = partial(make_sampler, self.sampler, self.pool, self.seed)
         return StoppingRule(self.stop_after_converged, self.batch, fresh)
 
@@ -239,6 +250,7 @@ def record_of(settings: CampaignSettings, net: Corridor) -> dict[str, Any]:
         "pov_files": povs.files or None,
         "net_sha256": net.sha256,
         "policies_sha256": povs.sha256(),
+        "learn_from_sha256": hashes(lessons(settings.learn_from, settings.scenario)) or None,
     }
 
 

@@ -33,6 +33,8 @@ from merge_sumo.values.score import FAILURE_SCORE
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
+DENSE_CASES: Final = 1_000_000
+"""Uniform cases of a dense truth: of what the paper's number of them has missed, it shows most."""
 PROGRESS_CASES: Final = 100
 """Cases after which a person is told."""
 REAL_REGION: Final = 0.03
@@ -72,6 +74,17 @@ DECIDES_OUTCOMES: Final = (
 )
 """Sources of this package that decide what becomes of a case."""
 
+
+def sources_sha256() -> str:
+    """Return the hash of the sources of this package that decide what becomes of a case."""
+    package = Path(__file__).resolve().parents[1]
+    sources = hashlib.sha256()
+    for part in DECIDES_OUTCOMES:
+        for source in sorted((package / part).rglob("*.py")) or [package / part]:
+            sources.update(source.read_bytes())
+    return sources.hexdigest()
+
+
 OnCases = Callable[[int], None]
 """Told how many cases have just ended."""
 
@@ -90,6 +103,8 @@ def ground_truth(
 ) -> Truth:
     """Return the ground truth of a VUT at a level, from the cache where it is there.
 
+    Memory grows by 40 bytes a case and no more, whatever the number of cases.
+
     The cache's key is a hash of what was asked for and of what is ours to know: VUT, cases, seed,
     net, policies, versions, and the sources that decide outcomes. What the VUT itself loaded while
     it drove is kept with the truth, and a truth is only used while those files are the same. Cases
@@ -98,16 +113,7 @@ def ground_truth(
     count = cases or TRUTH_CASES[level]
     if count < 1:
         raise UserError(f"--cases is {count}: it must be 1 or more")
-    povs = povs or Povs(policies=policies_of(scenario))
-    check_level(level, povs)
-    povs = povs if level == OWN else replace(povs, own=None)
-    factory = factory_of(vut, povs)
-    options = factory.options
-    kept = Kept(
-        *(factory.spec, level, count, seed, options.command, options.deadline_s, scenario),
-        policies=povs.sha256(),
-        pov=None if povs.own is None else povs.own.spec,
-    )
+    factory, povs, kept = _asked(vut, level, count, seed, scenario, povs)
     path = kept.path(cache)
     found = read_truth(path, level, count, scenario)
     if found is not None:
@@ -142,6 +148,38 @@ def ground_truth(
     return truth
 
 
+def known_truth(
+    vut: str | VutFactory,
+    level: int,
+    cases: int,
+    seed: int = 0,
+    *,
+    cache: Path | None = None,
+    scenario: Scenario = US23,
+    povs: Povs | None = None,
+) -> Truth | None:
+    """Return what `ground_truth` would find in the cache; None where it would have to run cases."""
+    _, _, kept = _asked(vut, level, cases, seed, scenario, povs)
+    return read_truth(kept.path(cache), level, cases, scenario)
+
+
+def _asked(
+    vut: str | VutFactory, level: int, cases: int, seed: int, scenario: Scenario, povs: Povs | None
+) -> tuple[VutFactory, Povs, Kept]:
+    """Return who drives, and what a truth of that is kept under."""
+    povs = povs or Povs(policies=policies_of(scenario))
+    check_level(level, povs)
+    povs = povs if level == OWN else replace(povs, own=None)
+    factory = factory_of(vut, povs)
+    options = factory.options
+    kept = Kept(
+        *(factory.spec, level, cases, seed, options.command, options.deadline_s, scenario),
+        policies=povs.sha256(),
+        pov=None if povs.own is None else povs.own.spec,
+    )
+    return factory, povs, kept
+
+
 def factory_of(vut: str | VutFactory, povs: Povs) -> VutFactory:
     """Return what opens a VUT that may be named only; learned ones come from where the POVs do."""
     return (
@@ -168,11 +206,6 @@ class Kept:
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
-        package = Path(__file__).resolve().parents[1]
-        sources = hashlib.sha256()
-        for part in DECIDES_OUTCOMES:
-            for source in sorted((package / part).rglob("*.py")) or [package / part]:
-                sources.update(source.read_bytes())
         # The same name may be another file in another folder.
         code = runs_code(self.vut, self.command) or (self.pov and runs_code(self.pov, None))
         here = str(Path.cwd()) if code else None
@@ -180,7 +213,7 @@ class Kept:
             **asdict(self),
             "here": here,
             "versions": versions(),
-            "sources": sources.hexdigest(),
+            "sources": sources_sha256(),
             "net": road_for(self.scenario).sha256,
         }
         key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]

@@ -152,6 +152,7 @@ def compare_runs(
 
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --tolerance 0.005
     """
+    from merge_sumo.campaigns.avoidance import in_a_sentence, read_avoidance
     from merge_sumo.campaigns.ground import road_for
     from merge_sumo.campaigns.run import Run
     from merge_sumo.reports import comparison
@@ -163,14 +164,23 @@ def compare_runs(
     given = {} if policies is None else {"policies": str(policies)}
     compared = comparison.compare_runs(*runs, rerun=rerun, net=road, given=given, trust=trust_vut)
     why = compared.worse(tolerance)
+    careful = {
+        name: in_a_sentence(read_avoidance(loaded).values())
+        for name, loaded in zip("AB", runs, strict=True)
+    }
     verdicts = {name: judge(loaded.outcomes) for name, loaded in zip("AB", runs, strict=True)}
     if as_json:
-        own = {name.lower(): verdict.to_record() for name, verdict in verdicts.items()}
+        own = {
+            name.lower(): verdict.to_record() | {"careful": careful[name]}
+            for name, verdict in verdicts.items()
+        }
         judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
         typer.echo(json.dumps({**own, **asdict(compared), **judged}))
     else:
         for (name, verdict), loaded in zip(verdicts.items(), runs, strict=True):
             show(f"{name}: {loaded.folder} ({loaded.vut}): {verdict.counts}")
+            if (said := careful[name]) is not None:
+                show(f"  {said}")
             print_troubles(verdict)
         _print_comparison(compared, {"A": a, "B": b})
         worse = "worse" if why else "not worse"

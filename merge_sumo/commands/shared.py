@@ -35,6 +35,15 @@ app = typer.Typer(
 NetOption = Annotated[
     Path | None, typer.Option(help="SUMO net to use instead of the shipped US-23 ramp.")
 ]
+DenseOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--dense/--no-dense",
+        help="Make the dense truths, of 1,000,000 cases, or go without.  [default: those kept]",
+        show_default=False,
+    ),
+]
+
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print the result as one JSON object on standard output.")
 ]
@@ -107,7 +116,7 @@ SETTINGS: Final = {
         name: name
         for name in (
             *("vut", "sampler", "cases", "batch", "seed", "stop_after_converged", "vut_command"),
-            *("in_process", "policies", "pov", "scenario"),
+            *("in_process", "policies", "pov", "learn_from", "scenario"),
         )
     },
     "v_vut0": "v_vut0_mps",
@@ -135,6 +144,8 @@ def written_settings(context: typer.Context) -> dict[str, Any]:
     }
     if "policies" in given:
         given["policies"] = str(given["policies"])
+    if "learn_from" in given:
+        given["learn_from"] = tuple(map(str, given["learn_from"]))
     if "scenario" in given:
         given["scenario"] = named_scenario(given["scenario"])
     return given

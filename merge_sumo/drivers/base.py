@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,7 @@ from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import POV, VUT
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Scene(NamedTuple):
     """The state of K corridors with A vehicles each at one step, as read from SUMO.
 
     Attributes:
@@ -78,15 +77,15 @@ class Scene:
 
         It has C K corridors: those of the POVs, then those of the cars ahead, of those behind.
         """
-        vehicles = len(self.x_m)
-        if vehicles == 2:
+        cars = len(self.x_m) - 1
+        if cars == 1:
             return self
-        cars = [row for row in range(vehicles) if row != VUT]
-        state = (
-            np.array((values[cars].ravel(), np.tile(values[VUT], len(cars))))
-            for values in (self.x_m, self.v_mps)
-        )
-        return Scene(np.tile(self.active, len(cars)), np.tile(self.step, len(cars)), *state)
+        state = np.empty((2, 2, cars, len(self.active)))
+        for pair, values in zip(state, (self.x_m, self.v_mps), strict=True):
+            pair[POV, :VUT], pair[POV, VUT:] = values[:VUT], values[VUT + 1 :]
+            pair[VUT] = values[VUT]
+        active, step = (np.concatenate([each] * cars) for each in (self.active, self.step))
+        return Scene(active, step, *state.reshape(2, 2, -1))
 
 
 class VutLostError(Exception):

@@ -16,10 +16,9 @@ from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
 
-CARS: Final = (POV, AHEAD, BEHIND)
-"""Rows of the cars of the mainline."""
-FOLLOWERS: Final = [POV, BEHIND]
-LEADERS: Final = [AHEAD, POV]
+FOLLOWERS: Final = slice(POV, BEHIND + 1, BEHIND - POV)
+LEADERS: Final = slice(AHEAD, None, POV - AHEAD)
+"""The POV and the car behind it, and those that they follow: the car ahead and the POV."""
 
 
 def safe_speed_mps(
@@ -37,6 +36,24 @@ def safe_speed_mps(
     room = 2.0 * decel_mps2 * np.maximum(gap_m, 0.0)
     speed: FloatArray = np.sqrt(lag * lag + v_leader_mps * v_leader_mps + room) - lag
     return speed
+
+
+def keep_safe(
+    a_mps2: FloatArray,
+    x_m: FloatArray,
+    v_mps: FloatArray,
+    taken_m: FloatArray | float,
+    decel_mps2: FloatArray | float,
+    tau_s: FloatArray | float,
+) -> None:
+    """Lower accelerations of the cars of the mainline, (A, K), to what is safe in states, (A, K).
+
+    `taken_m` is what a car and the least gap before it take of the road.
+    """
+    gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - taken_m
+    safe = safe_speed_mps(gap_m, v_mps[LEADERS], decel_mps2, tau_s)
+    most = (safe - v_mps[FOLLOWERS]) / DT_S
+    a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
 
 
 class Following:
@@ -61,10 +78,7 @@ class Following:
 
     def limit(self, a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray) -> None:
         """Lower accelerations, (A, K), to what is safe in states, (A, K)."""
-        gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - self._taken
-        safe = safe_speed_mps(gap_m, v_mps[LEADERS], self._decel, self._tau)
-        most = (safe - v_mps[FOLLOWERS]) / DT_S
-        a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
+        keep_safe(a_mps2, x_m, v_mps, self._taken, self._decel, self._tau)
 
     def met(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.int64]:
         """Return the row of the car that the VUT will meet, (K,), in states, (A, K)."""
@@ -84,7 +98,7 @@ def car_met(
     """
     distance_m = np.maximum(-x_m[VUT], 0.0)
     t_s = level0_time_to(distance_m, v_mps[VUT], a_mps2, v_cruise_mps)
-    cars = list(CARS)
-    gaps_m = np.abs(x_m[cars] + v_mps[cars] * t_s)
-    met: NDArray[np.int64] = np.array(cars)[gaps_m.argmin(axis=0)]
+    gaps_m = np.abs(x_m + v_mps * t_s)
+    gaps_m[VUT] = np.inf
+    met: NDArray[np.int64] = gaps_m.argmin(axis=0)
     return met

@@ -31,12 +31,12 @@ def level0_time_to(
     step's gain of speed, so this time, and what is predicted with it, does not drift while the
     vehicle follows the profile. Arrays of one shape, distances not negative.
     """
-    lag = 0.5 * a_mps2 * DT_S
+    lag, twice_a = (0.5 * DT_S) * a_mps2, 2.0 * a_mps2
     v_cruise = np.maximum(v_vut_mps, v_cruise_mps)
     v_start = v_vut_mps - lag
     v_squared = v_start * v_start
-    v_end = np.minimum(np.sqrt(v_squared + (2.0 * a_mps2) * distance_m), v_cruise - lag)
-    run_up = (v_end * v_end - v_squared) / (2.0 * a_mps2)
+    v_end = np.minimum(np.sqrt(v_squared + twice_a * distance_m), v_cruise - lag)
+    run_up = (v_end * v_end - v_squared) / twice_a
     time: FloatArray = (v_end - v_start) / a_mps2 + (distance_m - run_up) / v_cruise
     return time
 

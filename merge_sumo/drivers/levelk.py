@@ -65,8 +65,44 @@ def features(
     Times and gaps follow from what vehicles can do in the scenario, and all is measured in its
     units. The numbers below are those of the paper's scenario, whose units are 1.
     """
-    unit, a_min, a_max = Units.of(scenario), scenario.a_min_mps2, scenario.a_max_mps2
+    unit = Units.of(scenario)
+    times, gaps, v_level0, v_full = prospects(x_pov_m, v_pov_mps, x_vut_m, v_vut_mps, scenario)
+    v_hw = scenario.v_hw_min_mps
+    columns = [
+        x_pov_m / (100.0 * unit.length) + 1.0,
+        (v_pov_mps - (v_hw + 3.4 * unit.speed)) / (6.0 * unit.speed),
+        x_vut_m / (100.0 * unit.length) + 1.0,
+        (v_vut_mps - (v_hw - 2.6 * unit.speed)) / (6.0 * unit.speed),
+        *(t / (5.0 * unit.time) - 1.0 for t in times),
+        *(np.tanh(gap / (scale * unit.gap)) for gap in gaps for scale in _GAP_SCALES_M),
+        (v_level0 - v_hw) / (4.0 * unit.speed),
+        (v_full - v_hw) / (8.0 * unit.speed),
+        np.tanh((v_pov_mps - v_level0) / (3.0 * unit.speed)),
+        (v_pov_mps - v_hw) / (4.0 * unit.speed),
+    ]
+    if svo_rad is not None:
+        columns += [np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0]
+    return np.stack(columns, axis=-1)
+
+
+def prospects(
+    x_pov_m: FloatArray,
+    v_pov_mps: FloatArray,
+    x_vut_m: FloatArray,
+    v_vut_mps: FloatArray,
+    scenario: Scenario = US23,
+) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray, FloatArray]:
+    """Return what may come of n states, every array of shape (n,).
+
+    Returns:
+        The VUT's times to M in s on the level-0 profile, at constant speed and at full
+        acceleration; the gaps in m at M for a POV that keeps its speed, accelerates and brakes
+        until the first of these times, and that keeps its speed until the others; the speeds of
+        the VUT at M in m/s on the level-0 profile and at full acceleration.
+    """
+    a_min, a_max = scenario.a_min_mps2, scenario.a_max_mps2
     a_level0, v_cruise = scenario.level0_a_mps2, scenario.level0_v_mps
+    unit = Units.of(scenario)
     horizon_s = _HORIZON_S * unit.time
     distance = np.maximum(-x_vut_m, 0.0)
     t_level0 = np.minimum(level0_time_to(distance, v_vut_mps, a_level0, v_cruise), horizon_s)
@@ -81,22 +117,7 @@ def features(
         x_pov_m + v_pov_mps * t_full,
     )
     v_level0 = np.maximum(v_vut_mps, np.minimum(v_vut_mps + a_level0 * t_level0, v_cruise))
-    v_hw = scenario.v_hw_min_mps
-    columns = [
-        x_pov_m / (100.0 * unit.length) + 1.0,
-        (v_pov_mps - (v_hw + 3.4 * unit.speed)) / (6.0 * unit.speed),
-        x_vut_m / (100.0 * unit.length) + 1.0,
-        (v_vut_mps - (v_hw - 2.6 * unit.speed)) / (6.0 * unit.speed),
-        *(t / (5.0 * unit.time) - 1.0 for t in (t_level0, t_constant, t_full)),
-        *(np.tanh(gap / (scale * unit.gap)) for gap in gaps for scale in _GAP_SCALES_M),
-        (v_level0 - v_hw) / (4.0 * unit.speed),
-        (v_vut_mps + a_max * t_full - v_hw) / (8.0 * unit.speed),
-        np.tanh((v_pov_mps - v_level0) / (3.0 * unit.speed)),
-        (v_pov_mps - v_hw) / (4.0 * unit.speed),
-    ]
-    if svo_rad is not None:
-        columns += [np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0]
-    return np.stack(columns, axis=-1)
+    return (t_level0, t_constant, t_full), gaps, v_level0, v_vut_mps + a_max * t_full
 
 
 class QNetwork:

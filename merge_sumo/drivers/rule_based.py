@@ -96,7 +96,7 @@ class RuleBasedVut(Level0Vut):
         too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
         command[too_close] = 0.0
         regulate = too_close & (distance <= design.x2_m)
-        if regulate.any():
+        if np.count_nonzero(regulate):
             command[regulate] = self._pid(dx_at_m)[regulate]
         self._regulated = regulate
         if design.lag_s <= 0.0:

@@ -12,6 +12,7 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.gap_acceptance import GapAcceptanceVut
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.drivers.policies import load_driver
+from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.drivers.vuts.base import Vut, VutOptions
 from merge_sumo.drivers.vuts.files import Files, hashed
@@ -86,7 +87,8 @@ def built_in_vuts(policies: Path | None = None) -> dict[str, Callable[[int], Dri
     """Return the VUTs that the package brings, by name; the learned ones act by `policies`."""
     designs = {name: partial(RuleBasedVut, design=design) for name, design in DESIGNS.items()}
     learned = {vut: partial(load_driver, name, folder=policies) for vut, name in LEARNED.items()}
-    return {"level0": Level0Vut, **learned, **designs, "roundabout": GapAcceptanceVut}
+    rules: dict[str, Callable[[int], Driver]] = {"roundabout": GapAcceptanceVut, **REFERENCES}
+    return {"level0": Level0Vut, **learned, **designs, **rules}
 
 
 @dataclass(frozen=True)

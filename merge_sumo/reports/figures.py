@@ -138,14 +138,16 @@ def coverage_curves(
     compared: Mapping[str, Comparison],
     truth_fmc: float,
     oracle: Mapping[int, float],
+    limit_fmc: float,
 ) -> Figure:
-    """Draw FMC against cases: a median with its quartile band per sampler, truth and oracle.
+    """Draw FMC against cases: a median with its quartile band per sampler, truth, limit, oracle.
 
     Args:
         title: what is compared.
         compared: each sampler, all with the same batches.
         truth_fmc: FMC of the truth.
         oracle: FMC of the oracle after numbers of cases.
+        limit_fmc: FMC of all that is known to fail.
     """
     with _drawing(7.5, 4.6) as figure:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
@@ -161,6 +163,8 @@ def coverage_curves(
         known = list(oracle)
         axes.plot(known, list(oracle.values()), color="black", lw=1.2, ls=(0, (4, 2)), zorder=1)
         axes.axhline(truth_fmc, color="black", lw=1.2)
+        axes.axhline(limit_fmc, color="black", lw=1.2, ls=":")
+        ends.append((limit_fmc, "limit", "black"))
         ends += [(truth_fmc, "truth", "black"), (oracle[known[-1]], "oracle", "black")]
         axes.set_ylim(0.0)
         axes.set_xlabel("cases")

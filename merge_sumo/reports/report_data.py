@@ -82,6 +82,7 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "dx": _rounded(o.measures.dx_m, 2),
             "dv": _rounded(o.measures.dv_mps, 2),
             "t_end": o.measures.t_end_s,
+            **_avoidance(facts, o.index),
             "way_out": _rounded(o.measures.last_avoidable_s, 1),
             "vut_yields": found.vut_yields_s,
             "pov_yields": found.pov_yields_s,
@@ -92,6 +93,18 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
     return columns or {"index": []}
+
+
+def _avoidance(facts: Facts, index: int) -> dict[str, Any]:
+    """Return who would have avoided a case, where that is known."""
+    if not facts.avoidance:
+        return {}
+    found = facts.avoidance.get(index)
+    return {
+        "avoided_by": None if found is None else list(found.avoided_by),
+        "careful_until": None if found is None else found.careful_until_s,
+        "pov_careful": None if found is None else int(found.pov_careful),
+    }
 
 
 def _coordinate(c: Coordinate) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from merge_sumo.campaigns.avoidance import read_avoidance
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import versions
@@ -48,6 +49,7 @@ class Facts:
         self.levels = list(self.summary.levels)
         self.coordinates = coordinates(run.scenario)
         self.worst = failures(run.outcomes)
+        self.avoidance = read_avoidance(run)
         self.near = sorted(
             (o for o in run.outcomes if _is_told(o) and not o.failed),
             key=lambda o: (o.measures.score, o.index),

@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from merge_sumo.campaigns.avoidance import in_a_sentence
 from merge_sumo.campaigns.truth import TRUTH_CASES
+from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.reports.diagnosis import (
     CEDED_MPS,
@@ -93,6 +95,8 @@ def page_words(facts: Facts) -> dict[str, Any]:
     return {
         "vut": facts.run.vut,
         "headline": headline(facts.verdict, summary, facts.worst, facts.kinds),
+        "careful": in_a_sentence(facts.avoidance.values()),
+        "avoidance": _avoidance(facts),
         "counts": facts.verdict.counts,
         "found": facts.verdict,
         "troubles": facts.troubles(),
@@ -235,6 +239,16 @@ def _kinds(facts: Facts) -> list[dict[str, Any]]:
         }
         for kind, count in found.most_common()
     ]
+
+
+def _avoidance(facts: Facts) -> list[tuple[str, str]]:
+    """Return by driver how many failures it avoids; nothing where that is not known."""
+    known = list(facts.avoidance.values())
+    if not known:
+        return []
+    counts = {name: sum(name in one.avoided_by for one in known) for name in REFERENCES}
+    counts["careful, in the POV's place"] = sum(one.pov_careful for one in known)
+    return [(name, f"{count} of {len(known)}") for name, count in counts.items()]
 
 
 def _avoidable_kind(facts: Facts, outcome: Outcome) -> bool:

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.experiments import Search, compare, oracle, search
+from merge_sumo.campaigns.experiments import Search, compare, limit_fmc, oracle, search
 from merge_sumo.campaigns.settings import check_level, versions
-from merge_sumo.campaigns.truth import Truth, ground_truth
+from merge_sumo.campaigns.truth import DENSE_CASES, Truth, ground_truth, known_truth
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.reports import figures
 from merge_sumo.reports.figures import Levels, Panel, Surface
@@ -90,18 +91,23 @@ class _Work:
 
     def column(self, column: Column) -> Result:
         """Run one column of the table and draw its figures."""
-        truth = self.truth(column)
+        truth = self.truth(column, self.scale.truth_cases[column.level])
+        dense = self.dense(column)
         searches = self.search(column.vut, (column.level,), SAMPLERS, self.scale.batch)
-        compared = {name: compare(found, {column.level: truth}) for name, found in searches.items()}
+        truths, denses = {column.level: truth}, {} if dense is None else {column.level: dense}
+        limit = limit_fmc(chain.from_iterable(searches.values()), truths, denses)
+        compared = {name: compare(found, truths, limit) for name, found in searches.items()}
         result = Result(
             column,
             fmc(truth.failures),
             len(truth.failures),
             len(truth.real_regions()),
+            limit,
+            dense is not None,
             compared,
         )
         batch = self.scale.batch
-        of_oracle = oracle({column.level: truth}, self.scale.batches * batch, batch)
+        of_oracle = oracle(truths, self.scale.batches * batch, batch)
         self.draw(
             f"curves-level{column.level}",
             figures.coverage_curves(
@@ -109,9 +115,11 @@ class _Work:
                 compared,
                 result.truth_fmc,
                 of_oracle,
+                limit,
             ),
             "FMC against cases: median over the seeds, band from the first to the third quartile. "
-            "The oracle knows the failures of the truth and takes the most useful one each time.",
+            "The oracle knows the failures of the truth and takes the most useful one each time. "
+            "The limit is the coverage of all that is known to fail.",
         )
         middle = {name: _middle(found) for name, found in searches.items()}
         self.scatter(column, truth, middle)
@@ -119,10 +127,16 @@ class _Work:
             self.surfaces(column, truth, middle["gpr"], _middle_seed(searches["gpr"]))
         return result
 
-    def truth(self, column: Column) -> Truth:
+    def dense(self, column: Column) -> Truth | None:
+        """Return the dense truth of a column, if there is one or it is to be made."""
+        if self.scale.dense is None:
+            return known_truth(column.vut, column.level, DENSE_CASES, povs=self.povs)
+        return self.truth(column, DENSE_CASES) if self.scale.dense else None
+
+    def truth(self, column: Column, cases: int) -> Truth:
         """Return the truth of a column, from the cache where it is there."""
-        cases = self.scale.truth_cases[column.level]
-        title = f"truth of {column.title}"
+        dense = "dense " if cases == DENSE_CASES else ""
+        title = f"{dense}truth of {column.title}"
         done = 0
 
         def count(more: int) -> None:

@@ -7,12 +7,14 @@ whichever sampler chose its cases.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
 import numpy as np
 
 from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
+from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import Outcome
@@ -42,9 +44,9 @@ class Surface:
         from threadpoolctl import threadpool_limits
 
         parts = np.array_split(points, len(points) // PART + 1)
-        # One thread: a report is the same whatever the number of cores.
-        with threadpool_limits(1):
-            return np.concatenate([self._chance(part) for part in parts])
+        # Each part in one thread: a report is the same whatever the number of cores.
+        with threadpool_limits(1), ThreadPoolExecutor(workers_or_cores(None)) as cores:
+            return np.concatenate(list(cores.map(self._chance, parts)))
 
     def plausible_fmc(self) -> float:
         """Return the coverage if all places failed that the surrogate does not exclude.

@@ -65,12 +65,14 @@ class Scale:
         truth_cases: uniform cases of the truth at each level.
         batches: k, the batches of every run.
         batch: n, the cases per batch at one level; twice as many run where all levels do.
+        dense: whether to run a dense truth, or to go without; None for one that is kept.
     """
 
     seeds: int = 10
     truth_cases: tuple[int, int, int] = (TRUTH_CASES[0], TRUTH_CASES[1], TRUTH_CASES[2])
     batches: int = 20
     batch: int = 20
+    dense: bool | None = None
 
     def __post_init__(self) -> None:
         """Check the number of seeds."""
@@ -80,17 +82,22 @@ class Scale:
 
 def quick(seeds: int) -> Scale:
     """Return a scale for a first look and for tests: it shows that all works, and no more."""
-    return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
+    return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15, dense=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A column that has run: what the truth holds, and each sampler beside it."""
+    """A column that has run: what the truth holds, and each sampler beside it.
+
+    `limit_fmc` is the coverage of all that is known to fail, with a `dense` truth or without.
+    """
 
     column: Column
     truth_fmc: float
     truth_failures: int
     truth_regions: int
+    limit_fmc: float
+    dense: bool
     compared: dict[str, Comparison]
 
 
@@ -100,6 +107,7 @@ def table_rows(
     """Yield the rows of the table: a name, and (ours, the paper's) for each column."""
     results = table.values()
     yield "truth", [(r.truth_fmc, r.column.paper["truth"]) for r in results]
+    yield "limit", [(r.limit_fmc, None) for r in results]
     for name in SAMPLERS:
         yield name, [(r.compared[name].fmc_median, r.column.paper.get(name)) for r in results]
 
@@ -121,6 +129,10 @@ def table_markdown(table: Mapping[str, Result]) -> str:
             ours = result.compared[name].fmc_over_truth_median
             cells.append(f"{_or_dash(ours, '.2f')} ({_or_dash(share, '.2f')})")
         lines.append(f"| {name} / truth | " + " | ".join(cells) + " |")
+    for name in ADAPTIVE:
+        shares = (result.compared[name].fmc_over_limit_median for result in table.values())
+        cells = [_or_dash(share, ".2f") for share in shares]
+        lines.append(f"| {name} / limit | " + " | ".join(cells) + " |")
     for name in ADAPTIVE:
         results = [(result, result.compared[name]) for result in table.values()]
         early = max(len(results[0][1].cases_by_batch) // 4, 1) - 1
@@ -154,6 +166,8 @@ def table_record(table: Mapping[str, Result], scale: Scale) -> dict[str, Any]:
                 "truth_fmc": result.truth_fmc,
                 "truth_failures": result.truth_failures,
                 "truth_regions": result.truth_regions,
+                "limit_fmc": result.limit_fmc,
+                "dense": result.dense,
                 "paper_fmc": dict(result.column.paper),
                 "samplers": samplers,
             }

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
+from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.score import Outcome
+
+if TYPE_CHECKING:
+    from merge_sumo.samplers.foresight import Foreteller
+
+DEFAULT_BATCH: Final = 40
+"""Cases of a batch where a sampler has no wish of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,20 +65,50 @@ class Sampler(ABC):
     telling its journal to a fresh sampler.
     """
 
-    def __init__(self, pool: Pool, seed: int) -> None:
-        """Propose cases from `pool`; `seed` makes the proposals reproducible."""
+    learns: ClassVar[bool] = True
+    """Whether outcomes decide on what it proposes, and not only how many cases there were."""
+    foresees: ClassVar[bool] = False
+    """Whether it makes something of games that are played out before cases run."""
+
+    def __init__(self, pool: Pool, seed: int, games: Foreteller | None = None) -> None:
+        """Propose cases from `pool`; `seed` makes the proposals reproducible.
+
+        `games` plays cases out, for samplers that make something of that.
+        """
         self.pool = pool
         self.seed = seed
+        self.games = games if self.foresees else None
         self._outcomes: dict[int, Outcome] = {}
+        self._proposed: Counter[int] = Counter()
 
     @abstractmethod
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases."""
 
-    def tell(self, outcomes: Iterable[Outcome]) -> None:
-        """Take outcomes; those without a verdict (VUT_ERROR, SIM_ERROR) only count as proposed."""
+    def foretold(self, place: int) -> Foretold | None:
+        """Return what was foretold of a case that was asked for last, by its place there."""
+        return None
+
+    def batch_size(self) -> int:
+        """Return how many cases to ask for next, where nobody says."""
+        return DEFAULT_BATCH
+
+    def tell(
+        self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
+    ) -> None:
+        """Take outcomes; those without a verdict (VUT_ERROR, SIM_ERROR) only count as proposed.
+
+        `motions`, (T + 1, A, 3) by the index of an outcome, are for who plays games.
+        """
         for outcome in outcomes:
+            self._proposed[outcome.case.level] += outcome.index not in self._outcomes
             self._outcomes[outcome.index] = outcome
+        if self.games is not None and motions is not None:
+            self.games.tell(outcomes, motions)
+
+    def skip(self, cases: Iterable[Case]) -> None:
+        """Count cases as proposed of which nothing will be told."""
+        self._proposed.update(case.level for case in cases)
 
     def told(self, level: int | None = None) -> list[Outcome]:
         """Return the outcomes with a verdict, of one level or of all, in order of their index."""
@@ -81,7 +120,7 @@ class Sampler(ABC):
 
     def proposed(self, level: int | None = None) -> int:
         """Return how many cases were told, with a verdict or without, of one level or of all."""
-        return sum(level in (None, outcome.case.level) for outcome in self._outcomes.values())
+        return self._proposed.total() if level is None else self._proposed[level]
 
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays."""

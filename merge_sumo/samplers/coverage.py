@@ -7,52 +7,45 @@ the batch is picked from them greedily.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import LevelHistory, Sampler
 from merge_sumo.samplers.belief import Belief, gap_m, has_gaps, nearest
+from merge_sumo.samplers.candidates import LOCAL_REACH, REFINED_REACH, around, of_belief, spread_out
+from merge_sumo.samplers.foresight import Record
+from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, greedy
 from merge_sumo.samplers.ground import Ground
+from merge_sumo.samplers.informed import FEWEST, informed_batch
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.fmc import radius_for
+from merge_sumo.values.foretold import Foretold
 
-UNIFORM_QUERIES: Final = 1500
-LOCAL_QUERIES: Final = 600
-BETWEEN_QUERIES: Final = 600
-LINES: Final = 40
-LINE_STEPS: Final = 120
+FIRST_BATCH: Final = 10
+YOUNG: Final = 60
+YOUNG_BATCH: Final = 5
+"""Cases of the first batch; and of a level up to which it is young, and its share of a batch by
+then: what few cases teach changes where the next ones should be."""
+BATCHES: Final = ((100, 10), (400, 20), (math.inf, 40))
+"""Cases up to which later batches have a size."""
+REPLAYED: Final = 40
+"""Cases, the last ones of a level, by which who plays games is judged."""
 REFINED_QUERIES: Final = 600
-"""Candidates per batch: anywhere, within LOCAL_REACH of a failure, between safe cases on either
-side, on lines across the cube along the slope of the margin, and around the best of all these."""
-LOCAL_REACH: Final = 2.0
 BEST: Final = 150
-REFINED_REACH: Final = 0.6
-"""Reaches are in radii of the FMC."""
+"""Candidates around the best of the others, and from how many of these."""
 SHORTLIST: Final = 2000
 """Candidates from which the batch is picked."""
-PICKED: Final = 0.8
-"""Share of a pick's ball that counts as covered at least for the later picks of the batch."""
 NEAREST: Final = 3
 """Failures that it takes to aim at failures alone, and else how many cases stand in for them."""
 PATIENCE: Final = 40
 """Cases that are run before anything stands in for failures."""
 FORETOLD: Final = 100
 """Cases, the last ones, that a belief without them foretells, to see how far it can be trusted."""
-EVEN_IF_COVERED: Final = 1e-3
-"""Where all is covered, the likeliest failures still come before the others."""
-
-
-@dataclass(frozen=True, slots=True)
-class Proposal:
-    """A greedy batch: points, (n, d), and the expected gain of each in balls, (n,)."""
-
-    points: FloatArray
-    gain: FloatArray
 
 
 class CoverageSampler(Sampler):
@@ -62,14 +55,35 @@ class CoverageSampler(Sampler):
     three, and level 2 would never be asked.
     """
 
+    foresees = True
+
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
         proposals = self._proposals(n)
+        shares = self._shares(proposals, n)
+        self._foretold = [
+            foretold
+            for level, share in shares.items()
+            for foretold in proposals[level].foretold[:share]
+        ]
         return [
             case
-            for level, share in self._shares(proposals, n).items()
+            for level, share in shares.items()
             for case in self.pool.cases(proposals[level].points[:share], level)
         ]
+
+    def foretold(self, place: int) -> Foretold | None:
+        """Return what was foretold of a case of the last batch, by its place in it."""
+        return self._foretold[place]
+
+    def batch_size(self) -> int:
+        """Return how many cases to ask for next: few while what they teach changes much."""
+        proposed, levels = self.proposed(), len(self.pool.levels)
+        if not proposed:
+            return max(FIRST_BATCH, YOUNG_BATCH * levels)
+        if proposed < YOUNG * levels:
+            return YOUNG_BATCH * levels
+        return next(size for until, size in BATCHES if proposed < until)
 
     def allocate(self, n: int) -> dict[int, int]:
         """Return the number of cases for each level; they add up to `n`."""
@@ -99,11 +113,30 @@ class CoverageSampler(Sampler):
         from threadpoolctl import threadpool_limits
 
         history, rng = self.history(level), self.rng(level)
-        if len(history.points) < 2:
-            return Proposal(_spread_out(n, history.dims, rng), np.ones(n))
+        few = len(history.points) < FEWEST
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
-            return _Search(history, rng, n).batch(n)
+            if self.games is None or not self.games.can_play(level):
+                if few:
+                    chance = np.ones(n)
+                    spread = spread_out(n, history.dims, rng)
+                    return Proposal(spread, chance, chance, (None,) * n)
+                return _Search(history, rng, n).batch(n)
+            play = partial(self.games.play, level)
+            record = self._record(level, history)
+            if record.is_worthless and not few:
+                return record.noted(_Search(history, rng, n).batch(n), play)
+            return informed_batch(history, n, rng, play, record)
+
+    def _record(self, level: int, history: LevelHistory) -> Record:
+        """Return what the games have been worth, by what all levels have seen."""
+        last = self.told(level)[-REPLAYED:]
+        replayed: dict[int, FloatArray] = {}
+        if last and self.games is not None:
+            indices = [outcome.index for outcome in last]
+            gaps_m = self.games.replay(level, indices, history.points[-REPLAYED:])
+            replayed = dict(zip(indices, gaps_m.T, strict=True))
+        return Record(self.told(), level, self.pool.scenario.dx_crash_m, replayed)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: half of them evenly, the rest by the next gain.
@@ -133,11 +166,11 @@ class _Search:
         def trusted(of: Belief, cases: FloatArray) -> FloatArray:
             return of.of(cases) * trust[_far(cases, failing)]
 
-        candidates = _candidates(history, belief, rng, n)
+        candidates = of_belief(history, belief, rng, n)
         probability, balls = trusted(belief, candidates), self._ground.balls(candidates)
         worth = probability * self._ground.new(balls)
         best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
-        refined = _around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
+        refined = around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
         candidates = np.concatenate([candidates, refined])
         probability = np.concatenate([probability, trusted(belief, refined)])
         balls = np.concatenate([balls, self._ground.balls(refined)])
@@ -150,25 +183,9 @@ class _Search:
         )
 
     def batch(self, n: int) -> Proposal:
-        """Return the greedy batch of `n` cases.
-
-        Most of the ball of a pick counts as covered for the later ones: if the pick fails, it is
-        covered, and if it does not, picks near it would mostly have been as wrong. What is aimed
-        at may be a near miss, but only a failure is a gain.
-        """
-        balls = self._balls
-        picks: list[int] = []
-        gains: list[float] = []
-        free = np.ones(len(balls), dtype=bool)
-        for _ in range(n):
-            new = self._ground.new(balls)
-            worth = np.where(free, self._aim * (new + EVEN_IF_COVERED), -1.0)
-            best = int(np.argmax(worth))
-            free[best] = False
-            picks.append(best)
-            gains.append(float(self._probability[best] * new[best]))
-            self._ground.cover(balls[best], max(PICKED, float(self._aim[best])))
-        return Proposal(self._candidates[picks], np.array(gains))
+        """Return the greedy batch of `n` cases."""
+        picks, gain = greedy(self._ground, self._balls, self._aim, self._probability, n)
+        return Proposal(self._candidates[picks], gain, self._probability[picks], (None,) * n)
 
 
 def _far(points: FloatArray, failing: FloatArray) -> NDArray[np.int64]:
@@ -204,63 +221,3 @@ def _limit(history: LevelHistory) -> float | None:
         return None
     nearness = gap_m(history) if has_gaps(history) else history.score
     return float(np.partition(nearness, NEAREST - 1)[NEAREST - 1])
-
-
-def _spread_out(n: int, dims: int, rng: np.random.Generator) -> FloatArray:
-    """Return `n` points, (n, d), of a scrambled Halton sequence: no two of them close by chance."""
-    from scipy.stats.qmc import Halton
-
-    return np.asarray(Halton(dims, seed=rng).random(n), dtype=np.float64)
-
-
-def _candidates(
-    history: LevelHistory, belief: Belief, rng: np.random.Generator, n: int
-) -> FloatArray:
-    """Return more than `n` candidates, (m, d)."""
-    worst = history.points[np.argsort(history.score, kind="stable")[:20]]
-    failing = history.points[history.failed]
-    local_reach = LOCAL_REACH * radius_for(history.dims)
-    along = np.linspace(-1.0, 1.0, LINE_STEPS) + rng.uniform(-0.01, 0.01, (LINES, LINE_STEPS))
-    base = rng.random((LINES, history.dims))
-    lines = base[:, None] + along[..., None] * belief.rotation[:, 0]
-    lines = lines.reshape(-1, history.dims)
-    return np.concatenate(
-        [
-            rng.random((UNIFORM_QUERIES + n, history.dims)),
-            _around(failing if len(failing) else worst, LOCAL_QUERIES, local_reach, rng),
-            _between(belief, BETWEEN_QUERIES, rng),
-            lines[((lines >= 0.0) & (lines <= 1.0)).all(axis=1)],
-        ]
-    )
-
-
-def _between(belief: Belief, n: int, rng: np.random.Generator) -> FloatArray:
-    """Return `n` places, (n, d), or none, between safe cases on either side, most in narrow
-    brackets.
-    """
-    points = belief.history.points
-    _, before, behind = (points[group] for group in belief.groups)
-    if not (len(before) and len(behind)):
-        return np.empty((0, points.shape[1]))
-    near = [*range(1, 1 + min(3, len(before), len(behind)))]
-    pairs = np.concatenate([_pairs(before, behind, near), _pairs(behind, before, near)[:, ::-1]])
-    first, second = before[pairs[:, 0]], behind[pairs[:, 1]]
-    reach = REFINED_REACH * radius_for(points.shape[1])
-    weight = (np.linalg.norm(first - second, axis=1) + reach) ** -2.0
-    chosen = rng.choice(len(pairs), size=n, p=weight / weight.sum())
-    part = rng.random((n, 1))
-    return np.asarray(first[chosen] * (1.0 - part) + second[chosen] * part, dtype=np.float64)
-
-
-def _around(points: FloatArray, n: int, reach: float, rng: np.random.Generator) -> FloatArray:
-    """Return `n` places of the unit cube, (n, d), within reach of some of the points."""
-    centres = points[rng.integers(len(points), size=n)]
-    direction = rng.standard_normal(centres.shape)
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    return np.clip(centres + reach * np.sqrt(rng.random((n, 1))) * direction, 0.0, 1.0)
-
-
-def _pairs(points: FloatArray, others: FloatArray, near: list[int]) -> NDArray[np.int64]:
-    """Return pairs (place, place of one of its nearest others), (m, 2)."""
-    _, place = cKDTree(others).query(points, k=near)
-    return np.column_stack([np.repeat(np.arange(len(points)), len(near)), place.ravel()])

@@ -7,8 +7,9 @@ fills space evenly, and a ball is the nearest so many of them to its middle.
 
 from __future__ import annotations
 
+from copy import copy
 from functools import lru_cache
-from typing import Final, Protocol
+from typing import Final, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,12 @@ class Ground:
         """Prepare an uncovered ground of `dims` dimensions."""
         self._places = _places(dims)
         self._open = np.ones(self._places.count, dtype=np.float32)
+
+    def copy(self) -> Self:
+        """Return a ground that is covered as this one is."""
+        other = copy(self)
+        other._open = self._open.copy()
+        return other
 
     def balls(self, points: FloatArray) -> IntArray:
         """Return the places in the ball around each point, (n, places)."""

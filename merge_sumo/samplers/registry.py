@@ -8,6 +8,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.annealing import AnnealingSampler
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.coverage import CoverageSampler
+from merge_sumo.samplers.foresight import Foreteller
 from merge_sumo.samplers.gpr import GprSampler
 from merge_sumo.samplers.subset import SubsetSampler
 from merge_sumo.samplers.uniform import UniformSampler
@@ -22,8 +23,11 @@ SAMPLERS: Final[dict[str, type[Sampler]]] = {
 }
 
 
-def make_sampler(name: str, pool: Pool, seed: int) -> Sampler:
-    """Return the sampler of that name; `UserError` for a name nobody knows."""
+def make_sampler(name: str, pool: Pool, seed: int, games: Foreteller | None = None) -> Sampler:
+    """Return the sampler of that name; `UserError` for a name nobody knows.
+
+    `games` plays cases out, for samplers that make something of that.
+    """
     if name not in SAMPLERS:
         raise UserError(f"there is no sampler {name!r}: choose one of {', '.join(SAMPLERS)}")
-    return SAMPLERS[name](pool, seed)
+    return SAMPLERS[name](pool, seed, games)

@@ -8,6 +8,7 @@ a process that is `rough` has Matern 1/2 along the first axis, where the margin 
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Final
 
 import numpy as np
@@ -209,7 +210,7 @@ def _correlation(
         factor * np.abs(points[:, axis, None] - others[None, :, axis])
         for axis, factor in enumerate((roots / lengths).tolist())
     ]
-    correlation = np.exp(-np.sum(scaled, axis=0))
+    correlation = np.exp(-reduce(np.add, scaled))
     for distance in scaled[rough:]:
         correlation *= 1.0 + distance
     return correlation, scaled

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
+from merge_sumo.samplers.allocation import even_shares
+from merge_sumo.samplers.base import Sampler
+from merge_sumo.values.case import Case
 
-from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler
-from merge_sumo.values.case import FloatArray
 
-
-class UniformSampler(LevelwiseSampler):
+class UniformSampler(Sampler):
     """Draws every case uniformly from the pool, an equal number at each level."""
 
-    def propose(
-        self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
-    ) -> FloatArray:
-        """Return `n` uniform points."""
-        return rng.random((n, history.dims))
+    learns = False
+
+    def ask(self, n: int) -> list[Case]:
+        """Return the next `n` cases, level by level."""
+        shares = even_shares({level: self.proposed(level) for level in self.pool.levels}, n)
+        cases: list[Case] = []
+        for level, share in shares.items():
+            points = self.rng(level).random((share, len(self.pool.scenario.dimensions(level))))
+            cases += self.pool.cases(points, level)
+        return cases

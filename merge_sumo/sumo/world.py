@@ -1,11 +1,14 @@
 """K corridors in one SUMO simulation, moved exactly by the paper's equations of motion.
 
-SUMO holds the state: positions and speeds are read back from it after every step. In its default
-(Euler) mode a vehicle advances by the speed it is given for a step, so eq. (4),
+SUMO holds the state. In its default (Euler) mode a vehicle advances by the speed it is given for a
+step, so eq. (4),
 
     x(t+1) = x(t) + v(t) dt,    v(t+1) = v(t) + a(t) dt,
 
-is had by stepping at v(t) and then telling SUMO that the speed now is v(t+1).
+is had by stepping at v(t) and then telling SUMO that the speed now is v(t+1). Positions are read
+back from SUMO after every step, and must be those of eq. (4). Speeds are read back where an episode
+begins; from then on they are what SUMO was told, for to ask it again would give the same number,
+and a vehicle that did not drive at it would show in its next position.
 
 Where SUMO itself drives a vehicle, its car-following model and its junction logic decide v(t+1)
 from the state at t. SUMO then moves by v(t+1) instead of v(t), so the vehicle is put where eq. (4)
@@ -15,10 +18,13 @@ has it.
 from __future__ import annotations
 
 import bisect
+import math
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import compress
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -72,8 +78,8 @@ class World:
     """A libsumo simulation with `corridors` independent corridors.
 
     State arrays have shape (A, corridors), a row for each vehicle of an episode (`POV`, `VUT` and,
-    in traffic, `AHEAD` and `BEHIND`): `x_m`, lane coordinates with M = 0, and `v_mps`. They are
-    read from SUMO.
+    in traffic, `AHEAD` and `BEHIND`): `x_m`, lane coordinates with M = 0, read from SUMO, and
+    `v_mps`, what SUMO holds as their speeds. Every step has new arrays.
 
     libsumo holds one simulation per process, so one world may be open at a time.
     """
@@ -121,8 +127,6 @@ class World:
         }
         self._start_m: FloatArray = np.zeros((self.vehicles, corridors))
         """Lane coordinates at which the lanes begin on which the vehicles are."""
-        self._expected_m = self.x_m
-        """Where eq. (4) leads; no number where that is not known."""
         self._start()
 
     def restart(self) -> None:
@@ -170,11 +174,10 @@ class World:
         self._set_speed, self._set_previous_speed = _raw(libsumo, "setSpeed", "setPreviousSpeed")
         self._get_position, self._get_speed = _raw(libsumo, "getLanePosition", "getSpeed")
         self._get_lane = vehicle.getLaneID
-        vuts = range(VUT * self.corridors, (VUT + 1) * self.corridors)
-        self._driven = set() if self.vut_type is None else set(vuts)
-        """Indices in `_ids` of those that SUMO drives; the others hold the speed they are told."""
+        self._obeys = np.ones(self.x_m.shape, dtype=bool)
+        """Who holds the speed that it is told, (A, corridors); SUMO drives the others."""
+        self._obeys[VUT] = self.vut_type is None
         World._open = True
-        self._expected_m = np.full_like(self.x_m, np.nan)
         self.read()
 
     def _enter(self, name: str, vtype: str) -> None:
@@ -196,16 +199,15 @@ class World:
         the cars of the mainline are the tester's own.
         """
         for row, (x, v) in enumerate(starts):
-            index = row * self.corridors + corridor
-            name = self._ids[index]
+            name = self._ids[row * self.corridors + corridor]
             lane, start_m = self._lane_at(row, corridor, x)
             by_sumo = self.vut_type is not None if row == VUT else own and self.car_type is not None
-            renewed = by_sumo or index in self._driven
+            renewed = by_sumo or not self._obeys[row, corridor]
             if renewed:
                 # A new vehicle: some of SUMO's models remember how they drove.
                 self._remove(name)
                 self._enter(name, (VUT_TYPE if row == VUT else OWN_CAR) if by_sumo else CAR)
-                (self._driven.add if by_sumo else self._driven.discard)(index)
+                self._obeys[row, corridor] = not by_sumo
             self._move_to(name, lane, x - start_m)
             self._set_previous_speed(name, v, 0.0)
             if renewed:
@@ -218,7 +220,6 @@ class World:
                 self._set_max_speed(name, max(v, SLOWEST_MPS))
             self._start_m[row, corridor] = start_m
             self.x_m[row, corridor] = self._get_position(name) + start_m
-            self._expected_m[row, corridor] = self.x_m[row, corridor]
             self.v_mps[row, corridor] = self._get_speed(name)
 
     def park(self, corridor: int) -> None:
@@ -268,66 +269,65 @@ class World:
 
         Comes after `advance`; the two are one step. Raises `SimulationError`.
         """
-        v_next = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
-        # A vehicle that keeps its speed needs no command: SUMO holds the last one.
-        changed = v_next != self.v_mps
-        self._expected_m = self.x_m + self.v_mps * DT_S
+        v_mps: FloatArray = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
+        expected_m = self.x_m + self.v_mps * DT_S
         try:
-            if self._driven:
-                self._put_driven()
-                changed.flat[list(self._driven)] = True
-            speeds, accelerations = v_next.ravel().tolist(), a_mps2.ravel().tolist()
-            ids, set_previous_speed = self._ids, self._set_previous_speed
-            set_speed, driven = self._set_speed, self._driven
-            for index in np.flatnonzero(changed).tolist():
-                name, speed = ids[index], speeds[index]
-                set_previous_speed(name, speed, accelerations[index])
-                if index not in driven:
-                    set_speed(name, speed)
-            if not self.read():
-                off_m = np.abs(self.x_m - self._expected_m).max()
-                raise SimulationError(f"SUMO moved a vehicle {off_m} m away from where it drives")
+            if self.vut_type is not None or self.car_type is not None:
+                self._put_driven(expected_m, v_mps, a_mps2)
+            # A vehicle that keeps its speed needs no command: SUMO holds the last one.
+            told = (v_mps != self.v_mps) & self._obeys
+            names, speeds = [*compress(self._ids, told.ravel().tolist())], v_mps[told].tolist()
+            # The quickest loops that there are: C all the way down into SUMO.
+            deque(map(self._set_previous_speed, names, speeds, a_mps2[told].tolist()), maxlen=0)
+            deque(map(self._set_speed, names, speeds), maxlen=0)
+            self.x_m, self.v_mps = self._read_x_m(expected_m), v_mps
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
 
-    def _put_driven(self) -> None:
+    def _put_driven(self, x_m: FloatArray, v_mps: FloatArray, a_mps2: FloatArray) -> None:
         """Put the vehicles that SUMO drives where eq. (4) leads."""
-        for index in sorted(self._driven):
-            row, k = divmod(index, self.corridors)
-            x = float(self._expected_m[row, k])
+        for row, k in np.argwhere(~self._obeys).tolist():
+            name, x = self._ids[row * self.corridors + k], float(x_m[row, k])
             lane, start_m = self._lane_at(row, k, x)
-            self._move_to(self._ids[index], lane, x - start_m)
+            self._move_to(name, lane, x - start_m)
+            self._set_previous_speed(name, float(v_mps[row, k]), float(a_mps2[row, k]))
 
-    def read(self) -> bool:
-        """Read positions and speeds of all vehicles from SUMO into `x_m` and `v_mps`.
-
-        Returns whether all are where eq. (4) leads from their last state.
-        """
-        count, shape = len(self._ids), self.x_m.shape
-        position = np.fromiter(map(self._get_position, self._ids), float, count).reshape(shape)
-        self.v_mps = np.fromiter(map(self._get_speed, self._ids), float, count).reshape(shape)
-        self.x_m = position + self._start_m
-        # In most steps every vehicle is on the lane on which it was.
-        off_m = self.x_m - self._expected_m
-        if np.vdot(off_m, off_m) <= EXACT_M**2:
-            return True
-        self._find_lanes(position)
-        return bool(np.abs(self.x_m - self._expected_m).max() <= EXACT_M)
-
-    def _find_lanes(self, position_m: FloatArray) -> None:
-        """Ask for the lanes of the vehicles that are not where they would be on the last one."""
-        off_m = np.abs(self.x_m - self._expected_m).ravel()
-        for index in np.flatnonzero(~(off_m <= EXACT_M / len(off_m))).tolist():
-            at = divmod(index, self.corridors)
-            # A vehicle that is on no lane is nowhere.
-            lane = self._get_lane(self._ids[index])
-            self._start_m[at] = self._start_m_of_lane.get(lane, np.nan)
+    def read(self) -> None:
+        """Read positions and speeds of all vehicles from SUMO, wherever it has driven them."""
+        self.v_mps = self._of_all(self._get_speed)
+        position_m = self._of_all(self._get_position)
+        for index, name in enumerate(self._ids):
+            self._start_m.flat[index] = self._lane_begins_m(name)
         self.x_m = position_m + self._start_m
+
+    def _read_x_m(self, expected_m: FloatArray) -> FloatArray:
+        """Read positions from SUMO, (A, corridors), and check that they are as expected."""
+        position_m = self._of_all(self._get_position)
+        # In most steps every vehicle is on the lane on which it was.
+        x_m = position_m + self._start_m
+        off_m = x_m - expected_m
+        if np.vdot(off_m, off_m) <= EXACT_M**2:
+            return x_m
+        # The others are asked for their lanes.
+        for row, k in np.argwhere(~(np.abs(off_m) <= EXACT_M / off_m.size)).tolist():
+            self._start_m[row, k] = self._lane_begins_m(self._ids[row * self.corridors + k])
+        x_m = position_m + self._start_m
+        off = np.abs(x_m - expected_m).max()
+        if not off <= EXACT_M:
+            raise SimulationError(f"SUMO moved a vehicle {off} m away from where it drives")
+        return x_m
+
+    def _lane_begins_m(self, name: str) -> float:
+        """Return the coordinate at which a vehicle's lane begins: nowhere without a lane."""
+        return self._start_m_of_lane.get(self._get_lane(name), math.nan)
+
+    def _of_all(self, get: Callable[[str], float]) -> FloatArray:
+        """Return what SUMO says of all vehicles, (A, corridors)."""
+        return np.fromiter(map(get, self._ids), float, len(self._ids)).reshape(self.x_m.shape)
 
     def acceleration_mps2(self) -> FloatArray:
         """Return SUMO's own accelerations, (A, corridors)."""
-        get = self._libsumo.vehicle.getAcceleration
-        return np.array([get(name) for name in self._ids]).reshape(self.x_m.shape)
+        return self._of_all(self._libsumo.vehicle.getAcceleration)
 
     def close(self) -> None:
         """End the simulation; the next world may start."""

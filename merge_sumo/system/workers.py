@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -96,22 +96,38 @@ class Workers:
         Raises what `function` raises, and `UserError` when the executor goes away.
         """
         size = chunk or max(1, min(MAX_CHUNK, math.ceil(len(items) / self.count)))
-        starts = range(0, len(items), size)
-        waiting = deque(_Chunk(first, items[first : first + size]) for first in starts)
+        chunks = (items[first : first + size] for first in range(0, len(items), size))
+        for first, results in self.run_chunks(function, chunks, lost):
+            yield from enumerate(results, start=first)
+
+    def run_chunks(
+        self,
+        function: Callable[[Sequence[T]], Sequence[R]],
+        chunks: Iterable[Sequence[T]],
+        lost: Callable[[T], R],
+    ) -> Generator[tuple[int, Sequence[R]], None, None]:
+        """Yield (place of the first item, results) as chunks end; raise as `run` does.
+
+        A chunk is only taken from `chunks` when a worker may want it.
+        """
+        fresh = _in_a_row(chunks)
         suspects: deque[_Chunk[T]] = deque()
         running: dict[Future[Sequence[R]], _Chunk[T]] = {}
         try:
-            while waiting or suspects or running:
+            while True:
                 # Suspects run one at a time, so that a death is theirs.
-                source, most = (suspects, 1) if suspects else (waiting, 2 * self.count)
-                alone = source is suspects and not running
-                while source and len(running) < most and self._ready(running):
-                    next_chunk = source.popleft()
+                most, alone = (1, not running) if suspects else (2 * self.count, False)
+                while len(running) < most and self._ready(running):
+                    next_chunk = suspects.popleft() if suspects else next(fresh, None)
+                    if next_chunk is None:
+                        break
                     running[self._submit(function, next_chunk.items)] = next_chunk
+                if not running:
+                    return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     ended = running.pop(future)
                     try:
-                        yield from enumerate(future.result(), start=ended.first)
+                        yield ended.first, future.result()
                     except self._died:
                         self._broken = True
                         yield from ended.died(alone, suspects, lost)
@@ -166,7 +182,7 @@ class _Chunk(Generic[T]):
 
     def died(
         self, alone: bool, suspects: deque[_Chunk[T]], lost: Callable[[T], R]
-    ) -> Iterator[tuple[int, R]]:
+    ) -> Iterator[tuple[int, Sequence[R]]]:
         """Take note of a death: try again, item by item where it was surely ours, or give up."""
         self.deaths += alone
         if len(self.items) > 1 and self.deaths:
@@ -175,7 +191,14 @@ class _Chunk(Generic[T]):
         elif self.deaths < MAX_DEATHS:
             suspects.append(self)
         else:
-            yield self.first, lost(self.items[0])
+            yield self.first, [lost(self.items[0])]
+
+
+def _in_a_row(chunks: Iterable[Sequence[T]]) -> Iterator[_Chunk[T]]:
+    first = 0
+    for items in chunks:
+        yield _Chunk(first, items)
+        first += len(items)
 
 
 def workers_or_cores(workers: int | None) -> int:

@@ -130,13 +130,12 @@ def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> Flo
 
     Where there are no cases, d is that of the scenario.
     """
-    rows = []
+    rows, known, dims = [], scenario, scenario.dimensions(level)
     for case in cases:
-        dims = case.scenario.dimensions(level)
+        if case.scenario is not known:
+            known, dims = case.scenario, case.scenario.dimensions(level)
         rows.append([(getattr(case, d.field) - d.low) / (d.high - d.low) for d in dims])
-    return (
-        np.array(rows, dtype=np.float64) if rows else np.empty((0, len(scenario.dimensions(level))))
-    )
+    return np.array(rows, dtype=np.float64) if rows else np.empty((0, len(dims)))
 
 
 def from_unit(

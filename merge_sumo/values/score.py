@@ -8,12 +8,13 @@ of metres towards a collision, jumps little there, and goes on falling with the 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
+from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.scenario import DT_S, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
@@ -86,12 +87,13 @@ class Measures:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A case that was run: its place in the campaign and its measures."""
+    """A case that was run: its place in the campaign, its measures, and what was foretold of it."""
 
     index: int
     batch: int
     case: Case
     measures: Measures
+    foretold: Foretold | None = None
 
     @property
     def failed(self) -> bool:
@@ -100,14 +102,16 @@ class Outcome:
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
-        case, measures = self.case, asdict(self.measures)
+        case = self.case
+        measures = {name: getattr(self.measures, name) for name in Measures.__slots__}
         names: tuple[str, ...] = RECORDED
         if case.scenario.vehicles > 2:
             names += RECORDED_IN_TRAFFIC
         else:
             del measures["nearest"]
         place = {"index": self.index, "batch": self.batch}
-        return place | {name: getattr(case, name) for name in names} | measures
+        record = place | {name: getattr(case, name) for name in names} | measures
+        return record if self.foretold is None else record | {"foretold": self.foretold.to_record()}
 
     @classmethod
     def from_record(cls, record: dict[str, Any], scenario: Scenario = US23) -> Outcome:
@@ -119,6 +123,7 @@ class Outcome:
         in_traffic = scenario.vehicles > 2
         names = (*RECORDED, *RECORDED_IN_TRAFFIC) if in_traffic else RECORDED
         case = Case(**{name: values.pop(name) for name in names}, scenario=scenario)
+        foretold = values.pop("foretold", None)
         values["end"] = End(values["end"])
         if not in_traffic:
             values["nearest"] = VEHICLES[POV]
@@ -129,7 +134,8 @@ class Outcome:
                 raise TypeError(f"{name} is {value!r}")
             if type(value) is float and not math.isfinite(value):
                 raise ValueError(f"{name} is {value!r}")
-        return cls(index=index, batch=batch, case=case, measures=Measures(**values))
+        said = None if foretold is None else Foretold.from_record(foretold)
+        return cls(index, batch, case, Measures(**values), said)
 
 
 _JSON_TYPES: Final = {"None": type(None), "float": float, "str": str, "bool": bool, "int": int}

@@ -40,6 +40,13 @@ function motion(i) {
   return { rows, v, x, met: cases.nearest[i] };
 }
 const failed = (i) => cases.failed[i] === 1;
+const avoiders = document.getElementById("avoided-by"); // null where nobody was asked
+function wanted(i) { // whether the reader wants to see this failure
+  const who = avoiders?.value, by = who && failed(i) ? cases.avoided_by[i] : null;
+  if (!who || !failed(i)) return true;
+  if (by === null) return false;
+  return who === "pov" ? cases.pov_careful[i] === 1 : who === "none" ? by.length === 0 : by.includes(who);
+}
 const tested = (i) => ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
@@ -68,6 +75,12 @@ function words(i) {
   if (end === "COLLISION") {
     const until = cases.way_out[i];
     parts.push(until === null ? "There never was a way out for the VUT." : `Full braking or full acceleration of the VUT would have avoided it until ${fixed(until, 1)} s.`);
+  }
+  if (cases.avoided_by && cases.avoided_by[i] !== null) {
+    const by = cases.avoided_by[i], until = cases.careful_until[i];
+    parts.push(by.length ? `In the VUT's place ${by.join(", ")} would have avoided it.` : "No reference driver in the VUT's place would have avoided it.");
+    if (until !== null) parts.push(`A careful driver who takes over until ${fixed(until, 1)} s avoids it.`);
+    if (cases.pov_careful[i]) parts.push("So does a careful driver in the POV's place.");
   }
   return parts.join(" ");
 }
@@ -122,6 +135,7 @@ function shade(svg, values, nx, ny, box) {
 const BOX = [44, 8, 346, 286]; // x, y, width, height of the plot in a map
 const unit = (c, value) => (value - c.low) / (c.high - c.low);
 let chosen = -1;
+avoiders?.addEventListener("change", () => maps.forEach((map) => map.draw()));
 const maps = [...document.querySelectorAll(".map")].map((figure) => new FailureMap(figure));
 
 function FailureMap(figure) {
@@ -171,7 +185,7 @@ function FailureMap(figure) {
     if (truth) draw(svg, "path", { class: "outline", d: contour(slice(truth, share), truth.nx, truth.ny, 127.5, X, Y) });
     draw(svg, "rect", { class: "frame", x: left, y: top, width, height });
     for (const { i, x, y } of marks) {
-      const faint = near(i) ? "" : " faint";
+      const faint = near(i) && wanted(i) ? "" : " faint";
       if (failed(i)) draw(svg, "path", { class: `mark fail${faint}`, d: `M${x} ${y - 5}l5 5l-5 5l-5 -5Z`, "data-case": cases.index[i] });
       else if (!tested(i)) draw(svg, "rect", { class: `mark error${faint}`, x: x - 3, y: y - 3, width: 6, height: 6, "data-case": cases.index[i] });
       else draw(svg, "circle", { class: `mark safe${faint}`, cx: x, cy: y, r: 2.4, "data-case": cases.index[i] });
@@ -207,7 +221,7 @@ function FailureMap(figure) {
     const mark = marks.find((m) => m.i === chosen);
     if (mark) draw(svg, "circle", { class: "chosen", cx: mark.x, cy: mark.y, r: 8 });
   };
-  const visible = () => marks.filter((m) => near(m.i));
+  const visible = () => marks.filter((m) => near(m.i) && wanted(m.i));
   const under = (event) => {
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
     let best = null, least = 14;

@@ -1,0 +1,397 @@
+"""What is certainly absent: a covering lattice of the pool, tested to its last case.
+
+A search says where it found failures, and nothing of where it did not look. A certificate says: in
+every ball of a radius, in coordinates of the unit cube and with its centre in the pool, there is a
+case that was run and did not fail. So no such ball fails throughout; and as the simulation is
+deterministic, that is certain and no estimate. What it does not say: that there is no failure at
+all. A region that is thinner than the balls may lie between the cases.
+
+certificate.json       what was tested, by what, on which lattice; in the end what was found, hashes
+level-2/00007.npz      a block of the cases of a level, as they were run, and what became of them
+
+A third party checks such a folder with `tools/check_certificate.py`, which shares nothing with the
+lattice's code (`covering.py`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.campaigns.covering import Covering, covering
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, run_cases
+from merge_sumo.campaigns.settings import CampaignSettings, differences, record_of
+from merge_sumo.campaigns.truth import OnCases, sources_sha256
+from merge_sumo.drivers.vuts.files import Files, changed
+from merge_sumo.drivers.vuts.output import LOG
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
+from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import Case, FloatArray, Pool
+from merge_sumo.values.scenario import Dimension, level_name
+from merge_sumo.values.score import Measures, Outcome
+
+CERTIFICATE: Final = "certificate.json"
+BLOCK: Final = 2000
+"""Cases in a file: what a kill may lose."""
+WORST: Final = 20
+"""Failures of a level that are named."""
+OF_A_SEARCH: Final = (
+    *("sampler", "cases", "batch", "seed", "stop_after_converged", "in_process", "policies"),
+)
+"""Settings of a campaign that decide nothing here."""
+UNITS: Final = {"_mps": "m/s", "_m": "m", "_rad": "rad", "_s": "s"}
+
+
+class CaseResult(NamedTuple):
+    """What became of a case: its coordinates as they were run, and the verdict.
+
+    `told` is whether there was one: the VUT reached the merge point, or failed.
+    """
+
+    case: tuple[float, ...]
+    score: float
+    failed: bool
+    told: bool
+    files: Files
+
+
+RunPoints = Callable[[int, FloatArray], Iterable[tuple[int, CaseResult]]]
+"""Runs the cases at points, (n, d), of a level's unit cube; gives (place, result) in any order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a level of a certificate shows.
+
+    Attributes:
+        cases: how many were run.
+        failures: how many of them fail.
+        untold: how many gave no verdict: errors, and timeouts unless they are failures.
+        sha256: of all cases and verdicts, in their order.
+        worst: the failures with the lowest scores, coordinates by name, with their score.
+    """
+
+    cases: int
+    failures: int
+    untold: int
+    sha256: str
+    worst: list[dict[str, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """A certificate that is complete."""
+
+    radius: float
+    levels: dict[int, Found]
+    sentence: str
+
+    @property
+    def certain(self) -> bool:
+        """Whether no ball of the radius fails throughout."""
+        return not any(found.failures or found.untold for found in self.levels.values())
+
+
+def certify(
+    settings: CampaignSettings,
+    radius: float,
+    folder: Path,
+    net: Corridor,
+    run: RunPoints,
+    *,
+    resume: bool = False,
+    on_cases: OnCases | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> Certificate:
+    """Test a covering lattice of the pool, write it into a folder, and return what it shows.
+
+    Same settings, same versions: the same bytes, whatever the workers and however often it was
+    stopped.
+
+    Args:
+        settings: VUT, levels and scenario; those of a search decide nothing.
+        radius: of the balls, as a share of the axes.
+        folder: new; with `resume`, that of a certificate that was stopped.
+        net: the road.
+        run: runs cases: `runs_points_on`.
+        resume: go on with what the folder holds.
+        on_cases: told how many cases have ended.
+        check: called after every block; may raise to stop there.
+
+    Raises `UserError` where the pool has more than three coordinates, the radius takes too many
+    cases, or a folder to go on with is of another VUT, of other versions, or of other settings.
+    """
+    lattices = lattices_of(settings, radius)
+    asked = _asked(settings, radius, lattices, net)
+    if resume:
+        files = _again(folder, asked)
+    else:
+        files = dict(settings.vut_factory.files or {})
+        with new_folder(folder) as new:
+            (new / CERTIFICATE).write_bytes(_text(asked | {"files": files, "found": None}))
+    for level, lattice in lattices.items():
+        place = _place(folder, level)
+        check_own(place)
+        make_place(place)
+        missing = [n for n in range(_blocks(lattice)) if _read(place, n, lattice) is None]
+        if on_cases is not None:
+            on_cases(len(lattice) - sum(_size(lattice, n) for n in missing))
+        known = len(files)
+        for number, block in _tested(lattice, missing, partial(run, level), files, on_cases):
+            if len(files) > known:
+                known = len(files)
+                replace_own(folder / CERTIFICATE, _text(asked | {"files": files, "found": None}))
+            replace_own(_block_file(place, number), block)
+            check()
+    found = {
+        level: _found(_place(folder, level), lattice, settings.scenario.dimensions(level))
+        for level, lattice in lattices.items()
+    }
+    said = _sentence(radius, found, settings)
+    done = Certificate(radius, found, said)
+    result = {
+        "certain": done.certain,
+        "sentence": said,
+        "levels": {str(level): asdict(of_level) for level, of_level in found.items()},
+    }
+    files = dict(sorted(files.items()))
+    replace_own(folder / CERTIFICATE, _text(asked | {"files": files, "found": result}))
+    return done
+
+
+def lattices_of(settings: CampaignSettings, radius: float) -> dict[int, Covering]:
+    """Return the lattice of each level; `UserError` where there is none."""
+    return {
+        level: covering(radius, len(settings.scenario.dimensions(level)))
+        for level in settings.levels
+    }
+
+
+def runs_points_on(
+    workers: Workers, settings: CampaignSettings, net: Corridor, folder: Path
+) -> RunPoints:
+    """Return what runs points on workers; what a controller prints goes to the folder's log."""
+    log = folder.resolve() / LOG
+    plan = GroundPlan(
+        vut=settings.vut_factory.with_log(log),
+        corridors=MAX_CORRIDORS,
+        net=net,
+        scenario=settings.scenario,
+        povs=settings.povs.with_log(log),
+    )
+
+    def run(level: int, points: FloatArray) -> Iterable[tuple[int, CaseResult]]:
+        pool, rows = settings.pool, cast("Sequence[FloatArray]", points)
+
+        def lost(point: FloatArray) -> CaseResult:
+            case = pool.cases(np.asarray(point)[None], level)[0]
+            return CaseResult(_values(case), math.nan, failed=False, told=False, files={})
+
+        return workers.run(partial(_run, plan, pool, level), rows, lost)
+
+    return run
+
+
+def _run(
+    plan: GroundPlan, pool: Pool, level: int, points: Sequence[FloatArray]
+) -> Sequence[CaseResult]:
+    ran = run_cases(plan, pool.cases(np.asarray(points), level))
+    # One dictionary for a chunk: it travels once.
+    files = ran[0].files | ran[0].pov_files if ran else {}
+    return [tested(done.trajectory.case, done.measures, files) for done in ran]
+
+
+def tested(case: Case, measures: Measures, files: Files) -> CaseResult:
+    """Return what a certificate keeps of a case."""
+    failed = Outcome(0, 0, case, measures).failed
+    score = math.nan if measures.score is None else measures.score
+    return CaseResult(_values(case), score, failed, failed or measures.end.is_tested, files)
+
+
+def _values(case: Case) -> tuple[float, ...]:
+    return tuple(getattr(case, d.field) for d in case.scenario.dimensions(case.level))
+
+
+def _asked(
+    settings: CampaignSettings, radius: float, lattices: Mapping[int, Covering], net: Corridor
+) -> dict[str, Any]:
+    """Return what a certificate is of: all that decides what is in it."""
+    record = record_of(settings, net)
+    levels = {
+        str(level): {
+            "coordinates": [asdict(d) for d in settings.scenario.dimensions(level)],
+            "steps": list(lattice.steps),
+            "covering_radius": lattice.radius,
+            "cases": len(lattice),
+        }
+        for level, lattice in lattices.items()
+    }
+    return {
+        "radius": radius,
+        "levels": levels,
+        "block": BLOCK,
+        "settings": {name: v for name, v in record.items() if name not in OF_A_SEARCH},
+        "sources_sha256": sources_sha256(),
+    }
+
+
+def _again(folder: Path, asked: Mapping[str, Any]) -> Files:
+    """Return the files of the VUT in a folder to go on with; `UserError` where it is another's."""
+    path = folder / CERTIFICATE
+    check_own(path)
+    try:
+        there = json.loads(regular(path).read_text(encoding="utf-8"))
+        was, files = {name: there[name] for name in asked}, dict(there["files"])
+    except OSError as error:
+        raise UserError(
+            f"{folder} is no certificate to go on with: it has no {path.name}"
+        ) from error
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise UserError(f"{path} is not as it was written") from error
+    now = json.loads(json.dumps(asked))
+    for name, (before, today) in differences(was, now).items():
+        raise UserError(
+            f"{name} differs: {folder} was begun with {before}, now it is {today}; make it the "
+            "same, or begin anew"
+        )
+    for name in changed(files):
+        raise UserError(f"{name} is not what it was when {folder} was begun: begin anew")
+    return files
+
+
+def _tested(
+    lattice: Covering,
+    missing: Sequence[int],
+    run: Callable[[FloatArray], Iterable[tuple[int, CaseResult]]],
+    files: Files,
+    on_cases: OnCases | None,
+) -> Iterable[tuple[int, bytes]]:
+    """Yield blocks, (number, file), as their last cases end; add to the files of the VUT."""
+    if not missing:
+        return
+    points = np.concatenate([_points(lattice, number) for number in missing])
+    starts = np.cumsum([0, *(_size(lattice, number) for number in missing)])
+    open_blocks: dict[int, dict[int, CaseResult]] = {}
+    for place, done in run(points):
+        nth = int(np.searchsorted(starts, place, side="right")) - 1
+        block = open_blocks.setdefault(nth, {})
+        block[place - int(starts[nth])] = done
+        for name, sha256 in done.files.items():
+            files.setdefault(name, sha256)
+        if len(block) == starts[nth + 1] - starts[nth]:
+            del open_blocks[nth]
+            if on_cases is not None:
+                on_cases(len(block))
+            yield missing[nth], _packed([block[k] for k in range(len(block))])
+
+
+def _packed(block: Sequence[CaseResult]) -> bytes:
+    arrays = io.BytesIO()
+    np.savez(
+        arrays,
+        case=np.array([done.case for done in block], dtype="<f8"),
+        score=np.array([done.score for done in block], dtype="<f8"),
+        failed=np.array([done.failed for done in block], dtype=np.bool_),
+        told=np.array([done.told for done in block], dtype=np.bool_),
+    )
+    return arrays.getvalue()
+
+
+def _read(place: Path, number: int, lattice: Covering) -> dict[str, NDArray[Any]] | None:
+    """Return a block; None where it is not there, or is not what was written."""
+    try:
+        block = read_arrays(_block_file(place, number), "case", "score", "failed", "told")
+    except UNREADABLE_NPZ:
+        return None
+    size = _size(lattice, number)
+    shapes = {"case": (size, len(lattice.steps)), "score": (size,), "failed": (size,)}
+    types = {"case": "<f8", "score": "<f8", "failed": "|b1", "told": "|b1"}
+    fits = all(block[name].shape == shapes.get(name, (size,)) for name in types)
+    return block if fits and all(block[n].dtype == kind for n, kind in types.items()) else None
+
+
+def _found(place: Path, lattice: Covering, dims: Sequence[Dimension]) -> Found:
+    """Read the blocks of a level, one after the other."""
+    sha256, failures, untold = hashlib.sha256(), 0, 0
+    worst: list[tuple[float, list[float]]] = []
+    for number in range(_blocks(lattice)):
+        block = _read(place, number, lattice)
+        if block is None:
+            raise UserError(f"{_block_file(place, number)} is not as it was written: resume")
+        for name in ("case", "score", "failed", "told"):
+            sha256.update(block[name].tobytes())
+        failed = block["failed"]
+        failures += int(failed.sum())
+        untold += int((~block["told"]).sum())
+        # Who fails without a score comes last.
+        scores = np.nan_to_num(block["score"][failed], nan=0.0).tolist()
+        worst += zip(scores, block["case"][failed].tolist(), strict=True)
+        worst = sorted(worst)[:WORST]
+    names = [d.field for d in dims]
+    named = [dict(zip(names, case, strict=True)) | {"score": score} for score, case in worst]
+    return Found(len(lattice), failures, untold, sha256.hexdigest(), named)
+
+
+def _sentence(radius: float, found: Mapping[int, Found], settings: CampaignSettings) -> str:
+    most = max((settings.scenario.dimensions(level) for level in found), key=len)
+    parts = [f"{radius * (d.high - d.low):.2g} {_unit(d)}" for d in most]
+    ball = f"ball of radius {100.0 * radius:g} % of the axes ({', '.join(parts)})"
+    cases, failures, untold = (
+        sum(getattr(of_level, name) for of_level in found.values())
+        for name in ("cases", "failures", "untold")
+    )
+    levels = "/".join(level_name(level) for level in found)
+    tested = f"{settings.vut} v level {levels}, {cases:,} cases"
+    said = f"no {ball} fails throughout: certain, the simulation is deterministic"
+    if failures:
+        said = f"{failures:,} fail: every {ball} that fails throughout holds one of them"
+    elif untold:
+        said = "none fails"
+    if untold:
+        said += (
+            f"; {untold:,} gave no verdict, and no {ball if not failures else 'ball'} is certain "
+            "in which there are no others"
+        )
+    return f"{tested}: {said}"
+
+
+def _unit(dimension: Dimension) -> str:
+    return next(unit for end, unit in UNITS.items() if dimension.field.endswith(end))
+
+
+def _text(record: dict[str, Any]) -> bytes:
+    sha256 = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+    return (json.dumps({**record, "sha256": sha256}, indent=2, allow_nan=False) + "\n").encode()
+
+
+def _place(folder: Path, level: int) -> Path:
+    return folder / f"level-{level_name(level)}"
+
+
+def _block_file(place: Path, number: int) -> Path:
+    return place / f"{number:05d}.npz"
+
+
+def _blocks(lattice: Covering) -> int:
+    return -(-len(lattice) // BLOCK)
+
+
+def _points(lattice: Covering, number: int) -> FloatArray:
+    return lattice.points(number * BLOCK, (number + 1) * BLOCK)
+
+
+def _size(lattice: Covering, number: int) -> int:
+    return min(BLOCK, len(lattice) - number * BLOCK)

@@ -1,0 +1,93 @@
+"""Places that are worth a look: near others, between others, on the faces of the pool."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from merge_sumo.samplers.base import LevelHistory
+from merge_sumo.samplers.belief import Belief
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.fmc import radius_for
+
+UNIFORM_QUERIES: Final = 1500
+LOCAL_QUERIES: Final = 600
+BETWEEN_QUERIES: Final = 600
+LINES: Final = 40
+LINE_STEPS: Final = 120
+"""Candidates of a surrogate: anywhere, within LOCAL_REACH of a failure, between safe cases on
+either side, and on lines across the cube along the slope of the margin."""
+LOCAL_REACH: Final = 2.0
+"""How far from a failure others are looked for,"""
+REFINED_REACH: Final = 0.6
+"""and how far from the best candidates better ones are; reaches are in radii of the FMC."""
+
+
+def of_belief(
+    history: LevelHistory, belief: Belief, rng: np.random.Generator, n: int
+) -> FloatArray:
+    """Return more than `n` candidates, (m, d), for who knows a belief alone."""
+    worst = history.points[np.argsort(history.score, kind="stable")[:20]]
+    failing = history.points[history.failed]
+    local_reach = LOCAL_REACH * radius_for(history.dims)
+    along = np.linspace(-1.0, 1.0, LINE_STEPS) + rng.uniform(-0.01, 0.01, (LINES, LINE_STEPS))
+    base = rng.random((LINES, history.dims))
+    lines = base[:, None] + along[..., None] * belief.rotation[:, 0]
+    lines = lines.reshape(-1, history.dims)
+    return np.concatenate(
+        [
+            rng.random((UNIFORM_QUERIES + n, history.dims)),
+            around(failing if len(failing) else worst, LOCAL_QUERIES, local_reach, rng),
+            between(belief, BETWEEN_QUERIES, rng),
+            lines[((lines >= 0.0) & (lines <= 1.0)).all(axis=1)],
+        ]
+    )
+
+
+def around(points: FloatArray, n: int, reach: float, rng: np.random.Generator) -> FloatArray:
+    """Return `n` places of the unit cube, (n, d), within reach of some of the points."""
+    centres = points[rng.integers(len(points), size=n)]
+    direction = rng.standard_normal(centres.shape)
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    return np.clip(centres + reach * np.sqrt(rng.random((n, 1))) * direction, 0.0, 1.0)
+
+
+def between(belief: Belief, n: int, rng: np.random.Generator) -> FloatArray:
+    """Return `n` places, (n, d), or none, between safe cases on either side, most in narrow
+    brackets.
+    """
+    points = belief.history.points
+    _, before, behind = (points[group] for group in belief.groups)
+    if not (len(before) and len(behind)):
+        return np.empty((0, points.shape[1]))
+    near = [*range(1, 1 + min(3, len(before), len(behind)))]
+    pairs = np.concatenate([_pairs(before, behind, near), _pairs(behind, before, near)[:, ::-1]])
+    first, second = before[pairs[:, 0]], behind[pairs[:, 1]]
+    reach = REFINED_REACH * radius_for(points.shape[1])
+    weight = (np.linalg.norm(first - second, axis=1) + reach) ** -2.0
+    chosen = rng.choice(len(pairs), size=n, p=weight / weight.sum())
+    part = rng.random((n, 1))
+    return np.asarray(first[chosen] * (1.0 - part) + second[chosen] * part, dtype=np.float64)
+
+
+def spread_out(n: int, dims: int, rng: np.random.Generator) -> FloatArray:
+    """Return `n` points, (n, d), of a scrambled Halton sequence: no two of them close by chance."""
+    from scipy.stats.qmc import Halton
+
+    return np.asarray(Halton(dims, seed=rng).random(n), dtype=np.float64)
+
+
+def anywhere(n: int, dims: int, on_faces: float, rng: np.random.Generator) -> FloatArray:
+    """Return `n` places of the unit cube, (n, d), a share of them on its faces and edges."""
+    points = rng.random((n, dims))
+    put = rng.random(points.shape) < on_faces / dims
+    return np.where(put, rng.integers(0, 2, points.shape), points)
+
+
+def _pairs(points: FloatArray, others: FloatArray, near: list[int]) -> NDArray[np.int64]:
+    """Return pairs (place, place of one of its nearest others), (m, 2)."""
+    _, place = cKDTree(others).query(points, k=near)
+    return np.column_stack([np.repeat(np.arange(len(points)), len(near)), place.ravel()])

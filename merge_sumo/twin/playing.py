@@ -1,0 +1,126 @@
+"""Games played out by eq. (4), against the very POVs of the levels, without SUMO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.drivers.following import keep_safe
+from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, features
+from merge_sumo.drivers.policies import load_network
+from merge_sumo.drivers.povs import POLICIES, Povs
+from merge_sumo.twin.watching import Inputs, Watcher
+from merge_sumo.values.case import FloatArray, Pool
+from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
+
+Answer = Callable[[Inputs, int, NDArray[np.int64]], FloatArray]
+"""Gives accelerations of the VUT, (R,), by inputs, (R, inputs), of which some are of the present,
+and the numbers of the rows, (R,), in rising order."""
+STILL: Final = 0.8
+"""Share of rows that still play below which the others are dropped."""
+
+
+class Games:
+    """Plays cases of a pool out against a VUT that is given as a function."""
+
+    def __init__(self, pool: Pool, povs: Povs) -> None:
+        """Take the pool and the POVs."""
+        self._pool, self._scenario = pool, pool.scenario
+        self._networks = {
+            level: load_network(POLICIES[level], povs.policies)
+            for level in set(povs.levels) & set(POLICIES)
+        }
+
+    def can_play(self, level: int) -> bool:
+        """Return whether the POV of a level is known, and not a program of a person's own."""
+        return level == 0 or level in self._networks
+
+    def _starts(self, points: FloatArray, level: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""
+        scenario = self._scenario
+        values = {
+            d.field: d.low + u * (d.high - d.low)
+            for d, u in zip(scenario.dimensions(level), points.T, strict=True)
+        }
+        fixed_mps = self._pool.v_vut0_mps
+        n, v_vut0_mps = len(points), scenario.bounds("v_vut0_mps")[0]
+        x_m, v_mps = np.zeros((2, scenario.vehicles, n))
+        x_m[POV], v_mps[POV] = values["x_pov0_m"], values["v_pov0_mps"]
+        x_m[VUT] = scenario.x_vut0_m
+        v_mps[VUT] = values.get("v_vut0_mps", v_vut0_mps if fixed_mps is None else fixed_mps)
+        if scenario.vehicles > 2:
+            v_mps[[AHEAD, BEHIND]] = v_mps[POV]
+            x_m[AHEAD] = x_m[POV] + values["headway_ahead_s"] * v_mps[POV]
+            x_m[BEHIND] = x_m[POV] - values["headway_behind_s"] * v_mps[POV]
+        return x_m, v_mps, values.get("svo_rad", np.zeros(n))
+
+    def play(self, points: FloatArray, level: int, answer: Answer) -> FloatArray:
+        """Return the gaps at M to the cars that are nearest there, (R,), of cases, (R, d).
+
+        Cases are points of the unit cube; NaN where the VUT never arrives.
+        """
+        scenario = self._scenario
+        x_m, v_mps, svo_rad = self._starts(points, level)
+        rows = np.arange(len(points))
+        gap_m = np.full(len(rows), np.nan)
+        cars = [row for row in range(len(x_m)) if row != VUT]
+        a_mps2 = np.zeros_like(x_m)
+        held = np.zeros((len(cars), len(rows)))
+        watcher = Watcher(scenario, len(rows))
+        taken_m, decel = scenario.pov_length_m + scenario.min_gap_m, -scenario.a_min_mps2
+        for step in range(scenario.max_steps):
+            inputs = watcher.see(x_m, v_mps, a_mps2[VUT])
+            if level and step % DECISION_STEPS == 0:
+                held = self._decide(x_m[cars], v_mps[cars], x_m[VUT], v_mps[VUT], svo_rad, level)
+            a_mps2[cars] = held
+            if len(cars) > 1:
+                keep_safe(a_mps2, x_m, v_mps, taken_m, decel, scenario.tau_s)
+            a_mps2[VUT] = answer(inputs, watcher.now, rows)
+            a_mps2 = np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2)
+            v_next = np.maximum(v_mps + a_mps2 * DT_S, 0.0)
+            x_m = x_m + v_mps * DT_S
+            # What is recorded of a vehicle that comes to a stand.
+            a_mps2 = np.maximum(a_mps2, v_mps / -DT_S)
+            v_mps = v_next
+            arrived = x_m[VUT] >= 0.0
+            if arrived.any():
+                gaps = x_m[cars][:, arrived] - x_m[VUT, arrived]
+                nearest = np.abs(gaps).argmin(axis=0)
+                known = rows[arrived]
+                fresh = np.isnan(gap_m[known])
+                gap_m[known[fresh]] = gaps[nearest, np.arange(gaps.shape[1])][fresh]
+                going = np.isnan(gap_m[rows])
+                if not going.any():
+                    break
+                if going.mean() < STILL:
+                    rows, svo_rad = rows[going], svo_rad[going]
+                    x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
+                    held = held[:, going]
+                    watcher.keep(going)
+        return gap_m
+
+    def _decide(
+        self,
+        x_m: FloatArray,
+        v_mps: FloatArray,
+        x_vut_m: FloatArray,
+        v_vut_mps: FloatArray,
+        svo_rad: FloatArray,
+        level: int,
+    ) -> FloatArray:
+        """Return what the cars of the mainline choose, (C, R)."""
+        network, cars = self._networks[level], len(x_m)
+        seen = features(
+            x_m.ravel(),
+            v_mps.ravel(),
+            np.tile(x_vut_m, cars),
+            np.tile(v_vut_mps, cars),
+            np.tile(svo_rad, cars) if network.sees_svo else None,
+            self._scenario,
+        )
+        chosen = network.values_at_once(seen).argmax(axis=1)
+        actions: FloatArray = actions_mps2(self._scenario)[chosen].reshape(x_m.shape)
+        return actions
