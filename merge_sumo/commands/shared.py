@@ -116,7 +116,7 @@ SETTINGS: Final = {
         name: name
         for name in (
             *("vut", "sampler", "cases", "batch", "seed", "stop_after_converged", "vut_command"),
-            *("in_process", "policies", "pov", "scenario", "learn_from"),
+            *("in_process", "policies", "pov", "learn_from", "scenario"),
         )
     },
     "v_vut0": "v_vut0_mps",
