@@ -12,7 +12,6 @@ A VUT is a spec, as after `--vut`, or a class, a function, or an object with `ac
 from __future__ import annotations
 
 import tempfile
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -31,7 +30,7 @@ from merge_sumo.campaigns.single import DEBUG_DEADLINE_S, FIELDS, run_one, setti
 from merge_sumo.campaigns.truth import Truth, ground_truth
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
-from merge_sumo.drivers.vuts.here import is_here, object_of, spec_of, travels
+from merge_sumo.drivers.vuts.here import drivers_of, is_here
 from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison, exports
 from merge_sumo.reports.changes import RunComparison
@@ -115,7 +114,7 @@ def campaign(
     Raises `UserError` for values that make no campaign, or when the folder exists.
     """
     where = _scenario(scenario)
-    spec, pov_spec, workers = _specs(vut, pov, workers)
+    spec, pov_spec, workers = drivers_of(vut, pov, workers)
     options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     settings = CampaignSettings(
         vut=spec,
@@ -206,7 +205,7 @@ def run_case(
     if unknown:
         raise UserError(f"a case has no {min(unknown)}: it has {', '.join(FIELDS)}")
     where = _scenario(scenario)
-    spec, pov_spec, _ = _specs(vut, pov, 1)
+    spec, pov_spec, _ = drivers_of(vut, pov, 1)
     given = {
         "vut": spec,
         "scenario": where,
@@ -258,7 +257,7 @@ def rerun(
     """
     opened = _opened(run)
     if vut is not None:
-        settings["vut"], _, workers = _specs(vut, None, workers)
+        settings["vut"], _, workers = drivers_of(vut, None, workers)
     today = settings_today(opened.run, settings, trust=trust_vut)
     with open_workers(today.workers(workers)) as there:
         where = None if net is None else Path(net)
@@ -286,7 +285,7 @@ def truth(
     not tell from another, is never kept. Arguments are as of `campaign`.
     """
     where = _scenario(scenario)
-    spec, pov_spec, workers = _specs(vut, pov, workers)
+    spec, pov_spec, workers = drivers_of(vut, pov, workers)
     options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     povs = povs_of(policies, where, pov_spec, options)
     own = VutOptions(
@@ -380,28 +379,3 @@ def _opened(run: AnyRun) -> CampaignRun:
 
 def _scenario(scenario: Scenario | Path | str) -> Scenario:
     return scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
-
-
-def _specs(vut: Vut, pov: Vut | None, workers: int) -> tuple[str, str | None, int]:
-    """Return the specs of what drives, and how many workers can have it.
-
-    Says in a sentence where something drives in this process that could do it harm.
-    """
-    specs = spec_of(vut), None if pov is None else spec_of(pov)
-    for spec in specs:
-        if spec is None or object_of(spec) is None:
-            continue
-        name = spec.partition(":")[2]
-        if travels(spec):
-            where = "the processes of the workers" if workers > 1 else "this process"
-            why = f"{name} is an object, so it drives in {where}, which what it does wrong may end"
-        else:
-            alone = ", and without workers," if workers > 1 else ""
-            workers = 1
-            why = (
-                f"{name} is known to this process alone, so it drives here{alone} where what it "
-                "does wrong may end everything; put its class or function into a module for a "
-                "process of its own"
-            )
-        warnings.warn(why, stacklevel=3)
-    return *specs, workers

@@ -24,8 +24,8 @@ from merge_sumo.commands.shared import app, say
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 
-__all__ = ["app", "campaign", "cases", "certify", "experiments", "main", "probability", "runs"]
-__all__ += ["scenarios", "training", "vuts"]
+__all__ = ["app", "campaign", "cases", "certify", "experiments", "main", "probability"]
+__all__ += ["runs", "scenarios", "training", "vuts"]
 
 
 @app.callback(invoke_without_command=True)

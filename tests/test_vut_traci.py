@@ -174,9 +174,11 @@ class TestAStockClient:
         assert seen["acceleration"] == 0.0
         assert seen["colour"] == (26, 89, 230, 255)
         assert seen["leader"] is None
-        assert seen["junction"] == (0.0, 0.0)
+        assert seen["junction"] == (0.0, 1.6)
         assert seen["on lane"] == ("vut",)
-        assert seen["lanes of the net"] == ("main_in_0", "ramp_0", "main_out_0")
+        assert seen["lanes of the net"] == (
+            *("main_in_0", "main_in_1", "main_out_0", "main_out_1", "ramp_0"),
+        )
         assert seen["shape"] == pytest.approx((0.0, 0.0), abs=1e-6)
         assert seen["times"] == (0.2, 0.1)
         assert seen["version"][0] == traci.constants.TRACI_VERSION
@@ -279,11 +281,11 @@ class TestAStockClient:
                 refused(c.vehicle.setSpeed, "nobody", 10.0),
                 refused(c.vehicle.moveTo, "vut", "main_out_0", 5.0),
                 refused(c.vehicle.setPreviousSpeed, "vut", 50.0),
-                refused(c.vehicle.getCO2Emission, "vut"),
+                refused(c.vehicle.getCO2Emission, "nobody"),
                 refused(c.lane.getLength, "lane_0"),
                 refused(c.vehicle.subscribe, "nobody", [0x40]),
                 refused(c.load, ["-c", "x.sumocfg"]),
-                refused(c.trafficlight.getIDList),
+                refused(c.trafficlight.getPhase, "none"),
             ]
             c.vehicle.setSpeed("vut", 18.1)
             c.simulationStep()
@@ -298,10 +300,11 @@ class TestAStockClient:
         assert "'nobody' is not known" in said[3]
         assert "does not carry out" in said[4]
         assert "does not carry out" in said[5]
-        assert "does not know variable" in said[6]
+        assert "'nobody' is not known" in said[6]
         assert "'lane_0' is not known" in said[7]
         assert "'nobody' is not known" in said[8]
-        assert all("has no command" in text for text in said[9:])
+        assert said[9] == "merge-sumo does not carry out CMD_LOAD"
+        assert "'none' is not known" in said[10]
 
     def test_may_close_when_the_vehicle_has_arrived_and_another_come(self):
         def once(c):

@@ -254,8 +254,8 @@ def _conclude(
     from merge_sumo.reports.summary import summarise
     from merge_sumo.reports.verdict import NOTHING_TESTED, judge
 
-    careful = note_avoidance(run, settings, road)
     link_latest(run.folder)
+    careful = note_avoidance(run, settings, road)
     report_file = write_report(run)
     summary = summarise(run.outcomes, settings.levels)
     verdict = judge(run.outcomes)

@@ -142,7 +142,7 @@ SETTINGS: Final = {
         name: name
         for name in (
             *("vut", "sampler", "cases", "batch", "seed", "stop_after_converged", "vut_command"),
-            *("in_process", "policies", "pov", "scenario", "learn_from", "fail_when", "require"),
+            *("in_process", "policies", "pov", "learn_from", "scenario", "fail_when", "require"),
         )
     },
     "v_vut0": "v_vut0_mps",

@@ -6,11 +6,8 @@ that is given a `Window` as its binding moves the same to the last bit.
 
 from __future__ import annotations
 
-import importlib
 import os
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -20,7 +17,8 @@ from typing import Any, Final, Self
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.binding import scratch_folder, sumo_environment, sumo_program
+from merge_sumo.sumo.binding import scratch_folder
+from merge_sumo.sumo.client import end_program, load_traci, open_program
 from merge_sumo.sumo.replay_folder import COLOURS, WINDOW, view_settings
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
 
@@ -34,7 +32,6 @@ BEFORE_S: Final = 1.5
 """For which the start is shown, so that a person finds the cars."""
 LOOK_S: Final = 0.5
 """Between two looks whether the window is still open."""
-CONNECT_TRIES: Final = 120
 SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off."""
 VIEW: Final = "View #0"
@@ -58,7 +55,7 @@ class Window:
     def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
         """Look for a display and for SUMO's client; the window opens with the world."""
         check_display()
-        self._traci = _load_traci()
+        self._traci = load_traci()
         self.TraCIException: type[Exception] = self._traci.TraCIException
         self.FatalTraCIError: type[Exception] = _NeverError
         self._sleep = sleep
@@ -72,28 +69,12 @@ class Window:
         view = stage / "view.settings.xml"
         settings = view_settings(LARGER, ("100", "0", "0"), label=LABEL)
         view.write_bytes(etree.tostring(settings))
-        port = importlib.import_module("sumolib.miscutils").getFreeSocketPort()
         look = ("--gui-settings-file", str(view), "--window-size", ",".join(map(str, WINDOW)))
         # The window reads the net behind our back, when the world has removed its files.
         files = [_kept(argument, stage) for argument in command[1:]]
-        options = [*files, *look, "--start", "--delay", "0", "--remote-port", str(port)]
-        process = subprocess.Popen(
-            [sumo_program("sumo-gui"), *options],
-            env=sumo_environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        self._opened.callback(_end, process)
-        self._process = process
-        try:
-            with _quiet():
-                self._connection = self._traci.connect(
-                    port, CONNECT_TRIES, proc=process, waitBetweenRetries=0.25
-                )
-        except (self._traci.FatalTraCIError, self._traci.TraCIException, OSError) as error:
-            self.close()
-            raise UserError(f"sumo-gui did not open: {error}") from error
+        options = [*files, *look, "--start", "--delay", "0"]
+        self._process, self._connection = open_program("sumo-gui", options)
+        self._opened.callback(end_program, self._process)
         self.vehicle = _Told(self._connection.vehicle, self._traci.FatalTraCIError)
         self.route = _Told(self._connection.route, self._traci.FatalTraCIError)
         self.simulation = self
@@ -212,34 +193,3 @@ def _kept(argument: str, folder: Path) -> str:
     """Return an argument, with a copy in a folder in the place of a file."""
     file = Path(argument)
     return str(shutil.copy(file, folder / file.name)) if file.is_file() else argument
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.kill()
-    process.wait()
-
-
-def _load_traci() -> Any:
-    """Return SUMO's own client, which comes with its programs."""
-    tools = str(Path(sumo_program("sumo-gui")).parents[1] / "tools")
-    if tools not in sys.path:
-        sys.path.append(tools)
-    try:
-        return importlib.import_module("traci")
-    except ImportError as error:
-        raise UserError(
-            f"SUMO's traci cannot be loaded ({error}): run `pip install traci==1.28.0`"
-        ) from error
-
-
-class _quiet(ExitStack):  # noqa: N801 (used as a function)
-    """Keeps what the client says of its tries to connect off the terminal."""
-
-    def __enter__(self) -> Self:
-        from contextlib import redirect_stderr, redirect_stdout
-
-        nowhere = self.enter_context(Path(os.devnull).open("w"))
-        self.enter_context(redirect_stdout(nowhere))
-        self.enter_context(redirect_stderr(nowhere))
-        return self

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import inspect
 import sys
+import warnings
 from dataclasses import replace
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -77,6 +78,31 @@ def travels(spec: str) -> bool:
     except Exception:  # whatever an object does when it is asked for a copy of itself
         return False
     return not any(name.encode() in content for name in MAINS)
+
+
+def drivers_of(vut: Any, pov: Any, workers: int) -> tuple[str, str | None, int]:
+    """Return the specs of what drives, and how many workers can have it.
+
+    Says in a sentence where something drives in this process that could do it harm.
+    """
+    specs = spec_of(vut), None if pov is None else spec_of(pov)
+    for spec in specs:
+        if spec is None or object_of(spec) is None:
+            continue
+        name = spec.partition(":")[2]
+        if travels(spec):
+            where = "the processes of the workers" if workers > 1 else "this process"
+            why = f"{name} is an object, so it drives in {where}, which what it does wrong may end"
+        else:
+            alone = ", and without workers," if workers > 1 else ""
+            workers = 1
+            why = (
+                f"{name} is known to this process alone, so it drives here{alone} where what it "
+                "does wrong may end everything; put its class or function into a module for a "
+                "process of its own"
+            )
+        warnings.warn(why, stacklevel=3)
+    return *specs, workers
 
 
 def here_vut(argument: str, options: VutOptions) -> Vut:

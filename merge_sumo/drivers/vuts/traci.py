@@ -195,8 +195,17 @@ class TraciVut(Driver):
                     before = f"{ended} (before it connected)" if ended else late
                     raise FaultError(before) from None
         self._patience_s = self._options.connect_s
-        session = Session(self._road, self._scenario)
+        session = Session(self._road, self._scenario, note=self._note)
         self._client = _Client(connection, session, self._options.deadline_s, self._program)
+
+    def _note(self, sentence: str) -> None:
+        """Add a sentence to what the controller printed."""
+        log = self._options.log
+        if log is None:
+            sys.stderr.write(f"note: {sentence}\n")
+            return
+        with suppress(OSError), log.open("a", encoding="utf-8") as file:
+            file.write(f"note: {sentence}\n")
 
     def _disconnect(self, *, grace: bool = False) -> None:
         """Drop the client and end its program; nobody of it is left, nor of who waits."""
@@ -278,6 +287,7 @@ class _Client:
 
     def close(self) -> None:
         self._socket.close()
+        self._session.close()
 
     def _answer_step(self) -> None:
         """Answer the step that the client waits for, unless it asked to step on further."""
@@ -312,7 +322,9 @@ class _Client:
                         raise FaultError(self._gone("closed the connection during the episode"))
                     raise ClosedError
                 else:
+                    before_s = monotonic()
                     self._reply += self._checked(session.handle, command)
+                    until += monotonic() - before_s  # it waits for us, and not we for it
                 self._flush()
             self._commands.extend(self._receive(until))
 

@@ -49,6 +49,10 @@ class ProtocolError(Exception):
     """Bytes that are not TraCI; the text says what is wrong with them."""
 
 
+class AnsweredError(Exception):
+    """A server's answer that it does not carry a command out; the text is its own."""
+
+
 @dataclass(frozen=True, slots=True)
 class Command:
     """A command of a message: its identifier and its payload."""
@@ -154,6 +158,29 @@ def commands_of(body: bytes) -> list[Command]:
     if not commands:
         raise ProtocolError("a message has no command")
     return commands
+
+
+def value_of(body: bytes) -> bytes:
+    """Return the typed value in the answer to a question, without the message's length.
+
+    Raises `AnsweredError` where the server has none, and `ProtocolError` for no such answer.
+    """
+    reader = Reader(body)
+    _length(reader)
+    reader.ubyte()
+    result, said = reader.ubyte(), reader.string()
+    if result != OK:
+        raise AnsweredError(said)
+    _length(reader)
+    reader.raw(2)
+    reader.string()
+    return reader.raw(reader.left)
+
+
+def _length(reader: Reader) -> None:
+    """Read past the length of a command."""
+    if reader.ubyte() == 0:
+        reader.integer()
 
 
 def message(content: bytes) -> bytes:

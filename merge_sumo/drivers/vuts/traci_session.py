@@ -6,14 +6,19 @@ The session has no socket and does not decide when a step is made. What there is
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Final
 
 from merge_sumo.drivers.vuts import traci_protocol as tp
+from merge_sumo.drivers.vuts.base import Seen
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
 from merge_sumo.drivers.vuts.traci_simulation import VUT, RefusedError, Simulation
 from merge_sumo.drivers.vuts.traci_variables import GET_VEHICLE, GETTERS
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.beside import Beside, GoneError, State
+from merge_sumo.sumo.traci_names import name_of, named
 from merge_sumo.values.scenario import DT_S, VEHICLES
 
 API_VERSION: Final = 22
@@ -25,15 +30,31 @@ SET_ORDER: Final = 0x03
 CLOSE: Final = 0x7F
 
 SET_VEHICLE: Final = 0xC4
+ASKS: Final = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
+"""Identifiers of the commands that ask, one for each domain."""
+SETTERS_TO_GETTERS: Final = 0x20
 GETTERS_TO_SUBSCRIPTIONS: Final = 0x30
 GETTERS_TO_CONTEXTS: Final = -0x20
 TO_RESPONSE: Final = 0x10
 """Identifiers of the kinds of command lie these distances apart, for every domain."""
 
 SLOW_DOWN, SET_SPEED, SET_ACCELERATION = 0x14, 0x40, 0x72
-SPEED_MODE, LANE_CHANGE_MODE, COLOUR, PARAMETER = 0xB3, 0xB6, 0x45, 0x7E
-ACCEPTED: Final = frozenset({SPEED_MODE, LANE_CHANGE_MODE, COLOUR, PARAMETER})
-"""Commands on the VUT that change nothing: eq. (4) and the limits of acceleration hold anyway."""
+PARAMETER: Final = 0x7E
+DRIVES: Final = frozenset({SLOW_DOWN, SET_SPEED, SET_ACCELERATION})
+"""What drives the VUT."""
+CHANGES_NOTHING: Final = frozenset(
+    f"vehicle.{function}"
+    for function in (
+        *("setColor", "setSignals", "highlight", "setShapeClass", "setWidth", "setHeight"),
+        *("setSpeedMode", "setLaneChangeMode", "changeLane", "changeLaneRelative"),
+        *("changeSublane", "setLateralAlignment", "setMaxSpeedLat", "setMinGapLat"),
+        *("setLine", "setVia", "setRoutingMode", "rerouteTraveltime", "rerouteEffort"),
+        *("setAdaptedTraveltime", "setEffort", "updateBestLanes", "setEmissionClass"),
+    )
+)
+"""Commands that are accepted: eq. (4), the limits of acceleration and the path hold anyway."""
+ONLY_SEEN: Final = ("gui", "poi", "polygon")
+"""Domains of what is only looked at."""
 FOR_EVER: Final = -1073741824.0
 
 
@@ -87,11 +108,36 @@ class Session(Simulation):
 
     wish: SpeedWish = field(default_factory=SpeedWish)
     subscriptions: dict[tuple[int, str, int | None], Subscription] = field(default_factory=dict)
+    note: Callable[[str], None] = lambda _: None
+    """Told in a sentence, once each, what a command changes nothing by."""
+    noted: set[str] = field(default_factory=set)
+    history: list[dict[str, State]] = field(default_factory=list)
+    """The states of the episode so far, for a SUMO that is asked for the first time."""
+    beside: Beside | None = None
+    no_beside: str = ""
+    """Why there is no such SUMO."""
+
+    def show(self, seen: Seen) -> None:
+        """Advance by a step, to a state with all vehicles."""
+        super().show(seen)
+        state = {name: (v.x_m, v.v_mps, v.a_mps2) for name, v in self.vehicles.items()}
+        self.history.append(state)
+        if self.beside is not None:
+            self.beside.show(state)
+
+    def close(self) -> None:
+        """End the SUMO beside."""
+        if self.beside is not None:
+            self.beside.close()
+            self.beside = None
 
     def clear(self, *, more: bool) -> None:
         """Advance by a step, to an empty road; `more` vehicles may come."""
         super().clear(more=more)
         self.wish = SpeedWish()
+        self.history.clear()
+        if self.beside is not None:
+            self.beside.show({})
         self.subscriptions = {
             key: subscription
             for key, subscription in self.subscriptions.items()
@@ -112,14 +158,17 @@ class Session(Simulation):
             return tp.status(identifier, refused.result, str(refused))
 
     def _handle(self, identifier: int, reader: Reader) -> bytes:
-        if identifier in GETTERS:
+        if identifier in ASKS:
             return tp.status(identifier) + self._get(identifier, reader)
-        if identifier == SET_VEHICLE:
-            self._set(reader)
+        if identifier - SETTERS_TO_GETTERS in ASKS:
+            if identifier == SET_VEHICLE:
+                self._set(reader)
+            else:
+                self._change(identifier, reader.ubyte())
             return tp.status(identifier)
-        if identifier - GETTERS_TO_SUBSCRIPTIONS in GETTERS:
+        if identifier - GETTERS_TO_SUBSCRIPTIONS in ASKS:
             return self._subscribe(identifier, reader)
-        if identifier - GETTERS_TO_CONTEXTS in GETTERS:
+        if identifier - GETTERS_TO_CONTEXTS in ASKS:
             return self._subscribe_context(identifier, reader)
         if identifier == GET_VERSION:
             text = tp.raw_string(f"SUMO {version('libsumo')}, hosted by merge-sumo")
@@ -128,7 +177,9 @@ class Session(Simulation):
         if identifier == SET_ORDER:
             reader.integer()
             return tp.status(identifier)
-        raise RefusedError(f"merge-sumo has no command 0x{identifier:02x}", tp.NOT_IMPLEMENTED)
+        raise RefusedError(
+            f"merge-sumo does not carry out {name_of(identifier)}", tp.NOT_IMPLEMENTED
+        )
 
     def _get(self, identifier: int, reader: Reader) -> bytes:
         variable, object_id = reader.ubyte(), reader.string()
@@ -138,15 +189,39 @@ class Session(Simulation):
 
     def _value(self, getter: int, variable: int, object_id: str, reader: Reader) -> bytes:
         """Return the typed value of a variable; raises `RefusedError` where there is none."""
-        answer = GETTERS[getter].get(variable)
-        if answer is None:
-            raise RefusedError(
-                f"merge-sumo does not know variable 0x{variable:02x} of command 0x{getter:02x}"
-            )
-        return answer(self, object_id, reader)
+        answer = GETTERS.get(getter, {}).get(variable)
+        if answer is not None:
+            return answer(self, object_id, reader)
+        return self._from_sumo(getter, variable, object_id, reader.raw(reader.left))
+
+    def _from_sumo(self, getter: int, variable: int, object_id: str, parameter: bytes) -> bytes:
+        """Return what the SUMO beside answers; it is started for the first such question."""
+        name = name_of(getter, variable)
+        if self.no_beside:
+            raise RefusedError(f"{name} is not answered here: {self.no_beside}")
+        try:
+            if self.beside is None:
+                self.beside = Beside(self.road, self.scenario, self.scenario.vehicles)
+                for state in self.history:
+                    self.beside.show(state)
+            asked = bytes((getter, variable)) + tp.raw_string(object_id) + parameter
+            return tp.value_of(self.beside.ask(tp.command(asked)))
+        except UserError as error:
+            self.no_beside = str(error)
+        except (GoneError, ProtocolError):
+            self.no_beside = f"SUMO ended when it was asked for {name}"
+        except tp.AnsweredError as error:
+            raise RefusedError(str(error)) from error
+        self.close()
+        raise RefusedError(f"{name} is not answered here: {self.no_beside}")
 
     def _set(self, reader: Reader) -> None:
         variable, name = reader.ubyte(), reader.string()
+        if variable not in DRIVES:
+            if name not in self.vehicles:
+                self.vehicle(name)
+            self._change(SET_VEHICLE, variable)
+            return
         if name in VEHICLES and name != VUT:
             raise RefusedError(f"the vehicle '{name}' is not the controller's to command")
         self.vehicle(name)
@@ -160,13 +235,21 @@ class Session(Simulation):
             if duration_s < 0.0:
                 raise RefusedError(f"a duration of {duration_s} s is negative")
             self.wish = SpeedWish(target, max(duration_s, DT_S))
-        elif variable in (SET_SPEED, SLOW_DOWN, SET_ACCELERATION):
+        else:
             raise ProtocolError(f"a speed was commanded by {value!r:.60}")
-        elif variable not in ACCEPTED:
+
+    def _change(self, command: int, variable: int) -> None:
+        """Accept a command that can change nothing here, and say so once; refuse others by name."""
+        name = name_of(command, variable)
+        found = named().get((command, variable))
+        if found is None or not changes_nothing(found.functions):
             raise RefusedError(
-                f"merge-sumo does not carry out command 0x{variable:02x} on a vehicle: the VUT is "
-                "driven by setSpeed, slowDown and setAcceleration"
+                f"merge-sumo does not carry out {name}: the VUT is driven by vehicle.setSpeed, "
+                "slowDown and setAcceleration"
             )
+        if name not in self.noted:
+            self.noted.add(name)
+            self.note(f"{name} is accepted and changes nothing here")
 
     def _subscribe(self, identifier: int, reader: Reader) -> bytes:
         getter = identifier - GETTERS_TO_SUBSCRIPTIONS
@@ -235,6 +318,16 @@ class Session(Simulation):
             except RefusedError as refused:
                 parts.append(bytes((variable, tp.ERROR)) + tp.string(str(refused)))
         return b"".join(parts)
+
+
+def changes_nothing(functions: Sequence[str]) -> bool:
+    """Return whether commands can change nothing of how vehicles move here."""
+    return any(
+        function in CHANGES_NOTHING
+        or function.endswith(".setParameter")
+        or function.partition(".")[0] in ONLY_SEEN
+        for function in functions
+    )
 
 
 def _two_doubles(value: object) -> bool:

@@ -70,7 +70,7 @@ class Simulation:
             before = self.vehicles.get(name)
             if before is None:
                 self.departed.append(name)
-                self.vehicles[name] = Vehicle(x_m, v_mps, 0.0, self.time_s)
+                self.vehicles[name] = Vehicle(x_m, v_mps, 0.0, self.time_s - DT_S)
             else:
                 a_mps2 = (v_mps - before.v_mps) / DT_S
                 self.vehicles[name] = Vehicle(x_m, v_mps, a_mps2, before.departure_s)

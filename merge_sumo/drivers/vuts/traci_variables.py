@@ -67,7 +67,6 @@ _VEHICLE: Final[dict[int, Getter]] = {
     ID_LIST: lambda s, _n, _r: tp.strings(list(s.vehicles)),
     ID_COUNT: lambda s, _n, _r: tp.integer(len(s.vehicles)),
     0x40: _of_vehicle(lambda _s, _n, v: tp.double(v.v_mps)),  # getSpeed
-    0xB1: _of_vehicle(lambda _s, _n, v: tp.double(v.v_mps)),  # getSpeedWithoutTraCI
     0x72: _of_vehicle(lambda _s, _n, v: tp.double(v.a_mps2)),  # getAcceleration
     0x56: _of_vehicle(lambda s, n, _v: tp.double(s.point(n)[1])),  # getLanePosition
     0x42: _of_vehicle(lambda s, n, _v: tp.position(*s.point(n)[2:4])),  # getPosition
@@ -137,8 +136,6 @@ def _of_lane(value: Callable[[Piece], bytes]) -> Getter:
 
 
 _LANE: Final[dict[int, Getter]] = {
-    ID_LIST: lambda s, _n, _r: tp.strings(list(s.lanes())),
-    ID_COUNT: lambda s, _n, _r: tp.integer(len(s.lanes())),
     0x44: _of_lane(lambda lane: tp.double(lane.length_m)),  # getLength
     0x41: _of_lane(lambda lane: tp.double(lane.speed_limit_mps)),  # getMaxSpeed
     0x31: _of_lane(lambda lane: tp.string(edge_of(lane.lane))),  # getEdgeID
@@ -155,30 +152,14 @@ def _on_edge(simulation: Simulation, edge: str) -> list[str]:
 
 
 _EDGE: Final[dict[int, Getter]] = {
-    ID_LIST: lambda s, _n, _r: tp.strings(s.edges()),
-    ID_COUNT: lambda s, _n, _r: tp.integer(len(s.edges())),
     0x10: lambda s, n, _r: tp.integer(len(_on_edge(s, n))),
     0x12: lambda s, n, _r: tp.strings(_on_edge(s, n)),
 }
 
 
-def _junction(simulation: Simulation, name: str, _reader: Reader) -> bytes:
-    """Return the position of the junction at M: M itself."""
-    if name != simulation.road.junction_id:
-        raise RefusedError(f"Junction '{name}' is not known.")
-    at = simulation.road.lane_point(0.0, on_ramp=False)
-    return tp.position(at.x_m, at.y_m)
-
-
-_JUNCTION: Final[dict[int, Getter]] = {
-    ID_LIST: lambda s, _n, _r: tp.strings((s.road.junction_id,)),
-    ID_COUNT: lambda _s, _n, _r: tp.integer(1),
-    0x42: _junction,  # getPosition
-}
 GETTERS: Final = {
     GET_VEHICLE: _VEHICLE,
     GET_SIMULATION: _SIMULATION,
     GET_LANE: _LANE,
     GET_EDGE: _EDGE,
-    GET_JUNCTION: _JUNCTION,
 }

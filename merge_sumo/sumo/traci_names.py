@@ -1,0 +1,98 @@
+"""What TraCI's commands are called, from SUMO's own client: (command, variable) to functions.
+
+Every function of the client's domains is called once with a connection that only notes what it
+would send.
+"""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+from merge_sumo.sumo.client import load_traci
+
+DUMMIES: Final[tuple[Any, ...]] = ("x", 1.0, 1, [("1", 1.0, 1, 1)], (1, 2, 3, 4), [1.0], ["a"])
+"""Arguments that one function or another takes before it sends something."""
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """A command on a variable: its number, that of the variable, and what asks or sets it."""
+
+    command: int
+    variable: int
+    functions: tuple[str, ...]
+    """As `vehicle.getSpeed`; some variables have several functions."""
+
+    @property
+    def name(self) -> str:
+        """The names in one."""
+        return " or ".join(self.functions)
+
+
+class _SentError(Exception):
+    """Ends a call when it is known what it sends."""
+
+
+class _Notes:
+    """A connection that notes the first command and ends the call."""
+
+    def __init__(self) -> None:
+        self.sent: tuple[int, int] | None = None
+
+    def _sendCmd(self, command: int, variable: Any, *_: Any) -> None:  # noqa: N802 (TraCI's name)
+        if isinstance(variable, int):
+            self.sent = command, variable
+        raise _SentError
+
+
+@cache
+def named() -> dict[tuple[int, int], Named]:
+    """Return all commands on variables, by the numbers of both."""
+    traci = load_traci()
+    domain_of = traci.domain.Domain
+    found: dict[tuple[int, int], list[str]] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # some functions are deprecated
+        for name, domain in sorted(vars(traci).items()):
+            if not isinstance(domain, domain_of):
+                continue
+            mine: Any = domain
+            before, mine._connection = mine._connection, None
+            try:
+                for function, call in inspect.getmembers(mine, inspect.ismethod):
+                    sent = None if function.startswith("_") else _sent(mine, call)
+                    if sent is not None:
+                        found.setdefault(sent, []).append(f"{name}.{function}")
+            finally:
+                mine._connection = before
+    return {key: Named(*key, tuple(functions)) for key, functions in found.items()}
+
+
+def _sent(domain: Any, call: Any) -> tuple[int, int] | None:
+    parameters = inspect.signature(call).parameters.values()
+    needed = sum(p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters)
+    # With these on, a function may ask something first.
+    off = {p.name: False for p in parameters if p.default is True}
+    notes = domain._connection = _Notes()
+    for dummy in DUMMIES:
+        try:
+            call(*[dummy] * needed, **off)
+        except _SentError:
+            break
+        except Exception:  # noqa: S112 (it wants other arguments, or asks nothing of SUMO)
+            continue
+    return notes.sent
+
+
+def name_of(command: int, variable: int | None = None) -> str:
+    """Return what a command is called, on a variable if it is on one."""
+    if variable is not None and (command, variable) in named():
+        return named()[command, variable].name
+    constants = vars(load_traci().constants)
+    names = [n for n, v in constants.items() if n.startswith("CMD_") and v == command]
+    of = f" of variable 0x{variable:02x}" if variable is not None else ""
+    return (names[0] if names else f"the command 0x{command:02x}") + of

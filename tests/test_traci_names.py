@@ -1,0 +1,134 @@
+"""Everything that a TraCI client can ask and command, against a real SUMO."""
+
+from __future__ import annotations
+
+import pytest
+import traci
+import traci_page
+from traci_pair import Pair, answer, questions
+
+from merge_sumo.drivers.vuts.traci_session import ASKS
+from merge_sumo.sumo.traci_names import name_of, named
+
+SAME = 0.95
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    made = Pair(tmp_path_factory.mktemp("pair"))
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def answers(pair):
+    """Return both answers by question, where the client itself does not refuse to ask."""
+    found = {(q[0], q[1]): (answer(pair.real, *q), answer(pair.ours, *q)) for q in questions()}
+    return {q: both for q, both in found.items() if not both[0].startswith("not asked")}
+
+
+class TestQuestions:
+    def test_there_are_as_many_as_the_client_has(self, answers):
+        assert len(answers) > 500
+        assert sum(not real.startswith("refused") for real, _ in answers.values()) > 290
+
+    @pytest.mark.parametrize("kind", ["answers", "refusals"])
+    def test_get_what_a_real_sumo_says(self, answers, kind):
+        refused = kind == "refusals"
+        of_kind = {q: b for q, b in answers.items() if b[0].startswith("refused") == refused}
+        differ = {q: both for q, both in of_kind.items() if both[0] != both[1]}
+        assert len(differ) <= (1.0 - SAME) * len(of_kind), differ
+
+    @pytest.mark.parametrize("domain", ["edge", "lane", "junction", "route", "vehicletype"])
+    def test_of_the_road_and_its_types_are_all_answered_the_same(self, answers, domain):
+        assert {q: b for q, b in answers.items() if q[0] == domain and b[0] != b[1]} == {}
+
+    def test_of_the_vehicle_differ_in_what_depends_on_how_it_was_commanded_alone(self, answers):
+        differ = {q[1] for q, b in answers.items() if q[0] == "vehicle" and b[0] != b[1]}
+        assert differ <= {"getSpeedWithoutTraCI", "getTimeLoss"}
+
+    def test_that_end_sumo_leave_the_connection_and_are_refused_by_name(self, tmp_path):
+        mine = Pair(tmp_path)
+        try:
+            assert mine.ours.vehicle.getTau("vut") == 1.0
+            mine.session.beside._connection._socket.close()
+            for _ in range(2):
+                with pytest.raises(traci.TraCIException, match="SUMO ended when it was asked for"):
+                    mine.ours.vehicle.getTau("vut")
+            assert mine.ours.vehicle.getSpeed("vut") == pytest.approx(19.5, abs=0.1)
+        finally:
+            mine.close()
+
+
+class TestCommands:
+    @pytest.mark.parametrize(
+        ("function", "arguments"),
+        [
+            ("setColor", (255, 0, 0)),
+            ("setSpeedMode", 0),
+            ("changeLane", None),
+            ("updateBestLanes", None),
+            ("setParameter", None),
+            ("rerouteTraveltime", False),
+        ],
+    )
+    def test_that_change_nothing_are_accepted_and_noted_once(self, pair, function, arguments):
+        pair.notes.clear()
+        pair.session.noted.clear()
+        values = {"changeLane": (0, 5.0), "setParameter": ("a", "b")}.get(function, ())
+        values = values or (() if arguments is None else (arguments,))
+        for _ in range(2):
+            getattr(pair.ours.vehicle, function)("vut", *values)
+        (note,) = pair.notes
+        assert f"vehicle.{function}" in note
+        assert note.endswith("is accepted and changes nothing here")
+
+    @pytest.mark.parametrize(
+        ("function", "values"),
+        [
+            ("setMaxSpeed", (10.0,)),
+            ("setAccel", (1.0,)),
+            ("setDecel", (1.0,)),
+            ("setTau", (1.0,)),
+            ("openGap", (1.0, 1.0, 1.0, 1.0)),
+            ("moveTo", ("ramp_0", 1.0)),
+            ("remove", ()),
+        ],
+    )
+    def test_that_would_change_something_are_refused_by_name(self, pair, function, values):
+        with pytest.raises(
+            traci.TraCIException, match=rf"does not carry out .*vehicle\.{function}"
+        ):
+            getattr(pair.ours.vehicle, function)("vut", *values)
+        assert pair.ours.vehicle.getIDList() == ("pov", "vut")
+
+    def test_on_the_road_are_refused_and_on_the_window_accepted(self, pair):
+        with pytest.raises(traci.TraCIException, match=r"carry out edge\.setMaxSpeed"):
+            pair.ours.edge.setMaxSpeed("ramp", 5.0)
+        pair.ours.gui.setZoom("View #0", 500.0)
+
+    def test_without_a_name_are_refused_by_number(self):
+        assert name_of(0x7E) == "CMD_ADD_SUBSCRIPTION_FILTER"
+        assert name_of(0x0E) == "the command 0x0e"
+
+
+def test_the_numbers_of_the_domains_are_those_of_the_client():
+    assert {d._cmdGetID for d in traci.domain.DOMAINS} == ASKS
+    for d in traci.domain.DOMAINS:
+        distances = (d._subscribeID - 0x30, d._contextID + 0x20)
+        assert {*distances, d._cmdGetID if d._cmdSetID is None else d._cmdSetID - 0x20} == {
+            d._cmdGetID
+        }
+
+
+def test_names_are_those_of_the_client():
+    constants = traci.constants
+    assert named()[constants.CMD_GET_VEHICLE_VARIABLE, constants.VAR_SPEED].functions == (
+        "vehicle.getSpeed",
+    )
+    assert len(named()) > 700
+
+
+def test_the_page_is_made_from_these_tables():
+    """Where this fails: python tools/traci_page.py."""
+    assert traci_page.PAGE.read_text(encoding="utf-8") == traci_page.page()
