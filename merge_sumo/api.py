@@ -43,6 +43,7 @@ from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, dated, link_latest
 from merge_sumo.system.workers import open_workers
+from merge_sumo.values.criterion import COLLISION
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 
@@ -75,6 +76,8 @@ def campaign(
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
     pov: Vut | None = None,
+    fail_when: str = COLLISION.fail_when,
+    require: str | None = None,
     learn_from: Sequence[Path | str] = (),
     on_case: OnCase | None = None,
     progress: bool | None = None,
@@ -102,6 +105,8 @@ def campaign(
         scenario: a scenario, its name, or its TOML file.
         policies: folder of learned drivers in the place of the shipped ones.
         pov: a POV of your own: what a `vut` can be.
+        fail_when: what counts as a failure, as after `--fail-when`.
+        require: what is to hold over time instead, as after `--require`.
         learn_from: folders of earlier campaigns to learn the VUT from.
         on_case: told of every case as it ends.
         progress: show how far it is; by default in a notebook and on a terminal.
@@ -128,6 +133,8 @@ def campaign(
         pov=pov_spec,
         learn_from=tuple(map(str, learn_from)),
         scenario=where,
+        fail_when=fail_when,
+        require=require,
     )
     folder = dated(spec) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))

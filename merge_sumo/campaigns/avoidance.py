@@ -36,13 +36,15 @@ from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.errors import UserError
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.world import World
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
+from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
-from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
 AVOIDANCE: Final = "avoidance.jsonl"
@@ -133,14 +135,14 @@ def _avoidance(
     world: World,
     povs: Driver,
 ) -> list[Avoidance]:
-    substitutes = _Substitutes(world.corridors)
+    substitutes, lines = _Substitutes(world.corridors), centre_lines(world.road)
 
     def pass_again(asked: Sequence[tuple[int, dict[str, Any]]]) -> list[bool]:
         """Return which episodes are passed: (index of the failure, what is different)."""
         cases = [_again(motion[index], **other) for index, other in asked]
         passed = [False] * len(cases)
         for place, trajectory in rollout(world, povs, substitutes, cases):
-            passed[place] = _passes(run, trajectory)
+            passed[place] = _passes(run, trajectory, lines)
         return passed
 
     steps = {index: len(kept.motion) - 1 for index, kept in motion.items()}
@@ -187,9 +189,9 @@ def _again(failure: Trajectory, **other: Any) -> _Again:
     return _Again(**same, recorded=failure.a_vut_mps2, **other)
 
 
-def _passes(run: Run, trajectory: Trajectory) -> bool:
-    """Return whether an episode ends at M without a failure."""
-    outcome = Outcome(0, 0, trajectory.case, measure(trajectory))
+def _passes(run: Run, trajectory: Trajectory, lines: CentreLines) -> bool:
+    """Return whether an episode ends at M without a failure, by the criterion of the campaign."""
+    outcome = run.criterion.outcome(0, 0, trajectory, lines)
     return outcome.measures.end.is_tested and not outcome.failed
 
 

@@ -53,7 +53,7 @@ class Facts:
         self.avoidance = read_avoidance(run)
         self.near = sorted(
             (o for o in run.outcomes if _is_told(o) and not o.failed),
-            key=lambda o: (o.measures.score, o.index),
+            key=lambda o: (o.score, o.index),
         )
         self.surprises = surprises(run.outcomes, run.scenario.dx_crash_m)[:LISTED]
         self.expected = _expected(run, levels)
@@ -98,7 +98,7 @@ def _expected(run: Run, levels: Sequence[int]) -> Expected | None:
 
 
 def _is_told(outcome: Outcome) -> bool:
-    return outcome.measures.end.is_tested and outcome.measures.score is not None
+    return outcome.is_tested and outcome.score is not None
 
 
 def _motion(run: Run, index: int) -> Trajectory | None:
@@ -137,5 +137,6 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         run.scenario,
         policies=settings.get("policies_sha256", {}),
         pov=settings.get("pov") if level == OWN else None,
+        criterion=run.criterion,
     )
     return read_truth(kept.path(), level, kept.cases, kept.scenario)
