@@ -6,8 +6,7 @@ run = ms.campaign("design2", cases=400, seed=1)
 run.failures        # rows for pandas.DataFrame(run.failures); a table in a notebook
 run.report()        # path of the HTML report
 
-A VUT is a spec, as after `--vut`, or what Python has: a class, a function, a lambda, or an object
-with `act` or `act_batch`.
+A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.campaigns.avoidance import note_avoidance
 from merge_sumo.campaigns.conductor import SCENARIOS, OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.settings import (
@@ -82,8 +82,7 @@ def campaign(
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
 
     Args:
-        vut: vehicle under test: a spec as after `--vut`, or a class, a function, or an object with
-            `act` or `act_batch`. What can be imported from a module drives as on the command line;
+        vut: vehicle under test. What can be imported from a module drives as on the command line;
             anything else drives in this process, or in worker processes where they can have a copy.
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         sampler: who chooses the cases.
@@ -138,8 +137,14 @@ def campaign(
         open_workers(settings.workers(workers)) as there,
         CampaignPanel(title, settings.cases, settings.levels, quiet=quiet) as panel,
     ):
-        told = _both(panel.case_ended, on_case)
-        run_campaign(settings, folder, road, told, workers=there)
+
+        def told(outcome: Outcome) -> None:
+            panel.case_ended(outcome)
+            if on_case is not None:
+                on_case(outcome)
+
+        done = run_campaign(settings, folder, road, told, workers=there)
+    note_avoidance(done, settings, road)
     link_latest(folder)
     run = CampaignRun(folder)
     run.report()
@@ -367,12 +372,3 @@ def _opened(run: AnyRun) -> CampaignRun:
 
 def _scenario(scenario: Scenario | Path | str) -> Scenario:
     return scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
-
-
-def _both(first: OnCase, second: OnCase | None) -> OnCase:
-    def told(outcome: Outcome) -> None:
-        for listener in (first, second):
-            if listener is not None:
-                listener(outcome)
-
-    return told

@@ -59,6 +59,17 @@ def test_a_campaign_that_was_stopped_goes_on_ahead_to_the_same_bytes(
     assert recorded(tmp_path / "run") == in_turn
 
 
+@pytest.mark.parametrize("left", [0.0, 0.3, 0.5, 0.9])
+def test_batches_that_were_not_written_to_their_end_run_again(in_turn, tmp_path, left):
+    """All trajectories are on the disk before the first line."""
+    run_campaign(SETTINGS, tmp_path / "run")
+    lines = (tmp_path / "run" / "outcomes.jsonl").read_bytes()
+    with (tmp_path / "run" / "outcomes.jsonl").open("r+b") as file:
+        file.truncate(int(left * len(lines)))
+    resume_campaign(tmp_path / "run")
+    assert recorded(tmp_path / "run") == in_turn
+
+
 def test_who_does_not_learn_is_foreseen_in_every_batch():
     pool = Pool(levels=(0, 1, 2))
     sampler, history = make_sampler("uniform", pool, 7), [episode(0)[0], episode(1)[0]]

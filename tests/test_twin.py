@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
+from merge_sumo.reports.foretelling import Expected, foretold_in_words, off_m, surprises
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.foresight import Record
 from merge_sumo.scenarios.scenario_file import named_scenario
@@ -25,7 +27,7 @@ from merge_sumo.system.interrupt import Stopped
 from merge_sumo.twin.playing import Games
 from merge_sumo.twin.twin import Twin
 from merge_sumo.twin.watching import NOW, Watcher
-from merge_sumo.values.case import Case, Pool
+from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
@@ -305,3 +307,26 @@ def test_a_sampler_without_games_is_the_surrogate_alone():
 def test_a_folder_of_before_has_nothing_foretold(tmp_path: Path):
     record = outcome(0, 1.0).to_record()
     assert "foretold" not in record
+
+
+class TestTheReport:
+    def test_says_how_well_it_was_foretold(self, whole):
+        words = foretold_in_words(whole.outcomes)
+        assert words is not None
+        assert re.match(r"In half of the last \d+ cases the error was below \d", words)
+        assert foretold_in_words([outcome(0, 1.0)]) is None
+
+    def test_lists_what_came_otherwise_than_foretold(self):
+        told = [outcome(i, 10.0 + i, said(10.0, 0.5, 0.5)) for i in range(3)]
+        missed = outcome(3, -2.0, said(math.nan, 0.5, 0.5))
+        assert [o.index for o in surprises([*told, missed, outcome(4, 0.0)], 6.0)] == [3, 2, 1, 0]
+        assert off_m(told[2]) == 2.0
+        assert off_m(missed) is None
+
+    def test_expects_failures_where_they_are(self, whole):
+        expected = Expected(whole, [0, 1])
+        fails = [o.case for o in whole.outcomes if o.failed and o.case.level == 1]
+        near = expected.nearness(to_unit(fails, 1), 1)
+        assert near is not None
+        assert np.median(near) > 0.5
+        assert expected.nearness(to_unit(fails, 1), 3) is None

@@ -454,7 +454,7 @@ class TestTwoVersions:
         assert found["worse"] is True
         assert found["why"][0].startswith("at POV level 0 B reached the merge point in no case")
         assert found["b"]["errors"] == 20
-        assert found["a"] == {"errors": 0, "timeouts": 0, "troubles": []}
+        assert found["a"] == {"errors": 0, "timeouts": 0, "troubles": [], "careful": None}
         level = found["levels"]["0"]
         assert level["untested_b"] == {
             "cases": 40,

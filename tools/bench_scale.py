@@ -269,11 +269,11 @@ def main() -> None:
     for name, values in result["campaign"].items():
         median = statistics.median(values)
         tell(f"campaign: {name}: {median:.2f} [{min(values):.2f}, {max(values):.2f}]")
-    rates = [parent(chosen.campaign) for _ in range(ROUNDS)]
-    feeds = statistics.median(rates) / statistics.median(result["workers"]["cases_per_s_on_one"])
-    result["parent"] = {"cases_per_s": rates, "feeds_workers": feeds}
+    taken = [parent(chosen.campaign) for _ in range(ROUNDS)]
+    feeds = statistics.median(taken) / statistics.median(result["workers"]["cases_per_s_on_one"])
+    result["parent"] = {"cases_per_s": taken, "feeds_workers": feeds}
     tell(
-        f"parent: {statistics.median(rates):.0f} cases/s [{min(rates):.0f}, {max(rates):.0f}], "
+        f"parent: {statistics.median(taken):.0f} cases/s [{min(taken):.0f}, {max(taken):.0f}], "
         f"feeds {feeds:.1f} workers"
     )
     with tempfile.TemporaryDirectory() as scratch:

@@ -33,17 +33,19 @@ from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.system.workers import open_workers
 
 PLACES = ("moment", "sync", "torn", "worker")
-SAMPLERS = ("gpr", "coverage")
+SAMPLERS = ("gpr", "coverage", "uniform")
+"""The last one runs ahead, and keeps several batches at a time."""
 CASES, BATCH = 60, 12
 WRITES = 1 + 2 * CASES // BATCH
 """Files that the journal writes: settings, then trajectories and outcomes of every batch."""
 SYNCS = 3 + 3 * CASES // BATCH
-"""Of settings and two folders, then of trajectories, their folder and outcomes of every batch."""
+"""Of settings and two folders, then of trajectories, their folder and outcomes of every batch; less
+where batches are kept together, so that some kills come too late."""
 PATIENCE_S = 600.0
 
 
 def settings_of(sampler: str) -> CampaignSettings:
-    """Return a campaign in which every batch depends on those before it."""
+    """Return a campaign in which every batch depends on those before it, or runs ahead of them."""
     return CampaignSettings(
         vut="design1", levels=(0, 1), sampler=sampler, cases=CASES, batch=BATCH, seed=1
     )
@@ -164,7 +166,7 @@ def main() -> None:
             expected[sampler] = (folder / OUTCOMES).read_bytes()
         for kill in range(chosen.kills):
             rng = np.random.default_rng([chosen.seed, kill])
-            place, sampler = PLACES[kill % len(PLACES)], SAMPLERS[kill // len(PLACES) % 2]
+            place, sampler = PLACES[kill % len(PLACES)], SAMPLERS[kill // len(PLACES) % 3]
             folder = Path(scratch) / f"run-{kill}"
             code = disturb(folder, sampler, place, rng, whole_s)
             there = (folder / SETTINGS).is_file()

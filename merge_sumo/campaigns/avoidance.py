@@ -19,13 +19,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, world_to_itself
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -106,15 +107,13 @@ def avoidance(run: Run, settings: CampaignSettings, net: Corridor) -> list[Avoid
     corridors = settings.povs.corridors(MAX_CORRIDORS, settings.scenario.vehicles - 1)
     own = settings.povs.own
     car_type = None if own is None else own.vut.vut_type
-    world = World(corridors, net, None, settings.scenario, car_type)
-    try:
+    with ExitStack() as opened:
+        opened.enter_context(world_to_itself())
+        world = World(corridors, net, None, settings.scenario, car_type)
+        opened.callback(world.close)
         povs = _Mainline(corridors * (world.vehicles - 1), settings.povs, world)
-        try:
-            return _avoidance(run, failing, motion, world, povs)
-        finally:
-            povs.close()
-    finally:
-        world.close()
+        opened.callback(povs.close)
+        return _avoidance(run, failing, motion, world, povs)
 
 
 def _trajectory(run: Run, outcome: Outcome) -> Trajectory | None:

@@ -49,7 +49,8 @@ BLOCK: Final = 2000
 WORST: Final = 20
 """Failures of a level that are named."""
 OF_A_SEARCH: Final = (
-    *("sampler", "cases", "batch", "seed", "stop_after_converged", "in_process", "policies"),
+    *("sampler", "cases", "batch", "seed", "stop_after_converged", "learn_from"),
+    *("in_process", "policies"),
 )
 """Settings of a campaign that decide nothing here."""
 UNITS: Final = {"_mps": "m/s", "_m": "m", "_rad": "rad", "_s": "s"}

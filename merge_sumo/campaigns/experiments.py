@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from heapq import heappop, heapreplace
 from itertools import accumulate
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -52,7 +52,12 @@ class Search:
         return to_unit((o.case for o in self.outcomes if o.failed and o.case.level == level), level)
 
 
-Task = tuple[str, tuple[int, ...], int, int, int]
+ORACLE_STEP: Final = 5
+"""Divides all sizes of batches that samplers choose."""
+COMPARED_BATCH: Final = 20
+"""Cases of a batch where nobody says, of samplers that have no wish of their own."""
+
+Task = tuple[str, tuple[int, ...], int, int | None, int]
 """A search: sampler, levels, cases, batch, seed."""
 
 
@@ -66,7 +71,7 @@ def _search(
     name: str,
     levels: tuple[int, ...],
     cases: int,
-    batch: int,
+    batch: int | None,
     seed: int,
 ) -> Search:
     pool = Pool(levels=levels, scenario=scenario)
@@ -75,6 +80,7 @@ def _search(
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
     search = Search([], [], 0.0)
+    batch = batch or (None if sampler.foresees else COMPARED_BATCH)
     for ran in conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), cases, batch):
         search.outcomes.extend(outcome for outcome, _ in ran)
         search.fmc.append(sum(fmc(search.failures(level)) for level in levels))
@@ -146,7 +152,7 @@ def search(
     *,
     seeds: int = 10,
     cases: int = 400,
-    batch: int = 20,
+    batch: int | None = None,
     workers: Workers | None = None,
     on_search: Callable[[str, int], None] | None = None,
     scenario: Scenario = US23,
@@ -162,7 +168,7 @@ def search(
         check_level(level, povs)
     plan = GroundPlan(
         vut=factory_of(vut, povs),
-        corridors=min(MAX_CORRIDORS, batch),
+        corridors=min(MAX_CORRIDORS, batch or COMPARED_BATCH),
         net=road_for(scenario),
         povs=povs,
     )
@@ -292,7 +298,7 @@ def _found(points: FloatArray, region: FloatArray) -> bool:
     return bool((distance <= radius_for(points.shape[1])).any())
 
 
-def oracle(truths: Mapping[int, Truth], cases: int, batch: int) -> dict[int, float]:
+def oracle(truths: Mapping[int, Truth], cases: int, batch: int | None) -> dict[int, float]:
     """Return the coverage of an oracle by number of cases, summed over the levels.
 
     It knows the failures of the truth and takes, one after the other, the one whose ball adds the
@@ -302,7 +308,9 @@ def oracle(truths: Mapping[int, Truth], cases: int, batch: int) -> dict[int, flo
 
     Returns:
         FMC after every case of the first batch, and then after every batch, up to `cases`.
+        Without a `batch`, samplers choose, and every ORACLE_STEP cases are shown.
     """
+    batch = batch or ORACLE_STEP
     greedy = {level: _greedy(truth.failures, cases) for level, truth in truths.items()}
     ball = {level: fmc(np.zeros((1, truth.points.shape[1]))) for level, truth in truths.items()}
     gains = [(-g * ball[level], level) for level, (_, gain) in greedy.items() for g in gain]

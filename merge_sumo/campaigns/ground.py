@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -170,6 +170,14 @@ def _close_ground() -> None:
         if _kept is not None:
             ground, _kept = _kept[1], None
             ground.__exit__(None, None, None)
+
+
+@contextmanager
+def world_to_itself() -> Iterator[None]:
+    """Let who opens a world of their own do so: no other one is open in this process meanwhile."""
+    with _one_at_a_time:
+        _close_ground()
+        yield
 
 
 def lost_case(case: Case) -> Ran:

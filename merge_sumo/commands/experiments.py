@@ -114,7 +114,10 @@ def compare(
     ] = "uniform,annealing,subset,gpr,coverage",
     seeds: Annotated[int, typer.Option(help="Runs of each sampler.")] = 10,
     cases: Annotated[int, typer.Option(help="Cases of each run.")] = 400,
-    batch: Annotated[int, typer.Option(help="Cases per batch.")] = 20,
+    batch: Annotated[
+        int | None,
+        typer.Option(help="Cases per batch.  [default: what coverage wants, 20 for the others]"),
+    ] = None,
     truth_cases: Annotated[
         int | None, typer.Option(help="Cases of the truth.  [default: 10000, at level 2 20000]")
     ] = None,

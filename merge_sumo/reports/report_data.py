@@ -17,11 +17,12 @@ from merge_sumo.reports.diagnosis import (
     Diagnosis,
     Kind,
 )
+from merge_sumo.reports.foretelling import off_m
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, Facts
 from merge_sumo.reports.report_maps import maps_of
 from merge_sumo.reports.verdict import shortened
 from merge_sumo.sumo.corridor import Corridor, LanePath
-from merge_sumo.values.case import to_unit
+from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
 from merge_sumo.values.trajectory import End, Trajectory
@@ -131,6 +132,7 @@ def _maps(facts: Facts) -> dict[int, dict[str, Any]]:
             [o for o in others if o.case.level == level],
             facts.surfaces[level],
             facts.truths[level],
+            facts.expected,
         )
         for level in facts.levels
     }
@@ -160,8 +162,23 @@ def _search(facts: Facts) -> dict[str, Any]:
             so_far = points[failed & (group <= number)]
             wanted = (last - number) % stride == 0
             covered.append(round(fmc(so_far), 5) if wanted else None)
-        levels.append({"level": level, "cases": counted, "score": means, "fmc": covered})
+        off = np.array([off_m(o) for o in at], dtype=np.float64)
+        levels.append(
+            {
+                "level": level,
+                "cases": counted,
+                "score": means,
+                "fmc": covered,
+                "off": [_median(off[group == number]) for number in range(len(groups))],
+            }
+        )
     return {"batch": groups, "width": width, "levels": levels}
+
+
+def _median(values: FloatArray) -> float | None:
+    """Return the median of those that are numbers, if there are any."""
+    known = values[~np.isnan(values)]
+    return round(float(np.median(known)), 3) if len(known) else None
 
 
 def _commands(facts: Facts) -> dict[int, str]:

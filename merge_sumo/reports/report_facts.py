@@ -17,6 +17,7 @@ from merge_sumo.reports.diagnosis import (
     Kind,
     diagnose,
 )
+from merge_sumo.reports.foretelling import Expected, is_foretold, surprises
 from merge_sumo.reports.summary import summarise
 from merge_sumo.reports.surface import learn_surface
 from merge_sumo.reports.verdict import Trouble, judge
@@ -54,9 +55,11 @@ class Facts:
             (o for o in run.outcomes if _is_told(o) and not o.failed),
             key=lambda o: (o.measures.score, o.index),
         )
+        self.surprises = surprises(run.outcomes, run.scenario.dx_crash_m)[:LISTED]
+        self.expected = _expected(run, levels)
         self.untested = [o for o in run.outcomes if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
-        listed = examples + self.worst[:LISTED] + self.near[:LISTED]
+        listed = [*(*examples, *self.worst[:LISTED], *self.near[:LISTED], *self.surprises)]
         telling = {o.index: o for o in (*listed, *self.worst, *self.untested, *self.near)}
         self.shown = sorted(list(telling.values())[:SHOWN], key=lambda outcome: outcome.index)
         self.motion = {o.index: motion for o in self.shown if (motion := _motion(run, o.index))}
@@ -82,6 +85,16 @@ class Facts:
     def examples_of(self, trouble: Trouble) -> list[Outcome]:
         """Return the cases that are listed for a message."""
         return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
+
+
+def _expected(run: Run, levels: Sequence[int]) -> Expected | None:
+    """Return where the twin of a run expects failures, if the run had one."""
+    if not is_foretold(run.outcomes):
+        return None
+    try:
+        return Expected(run, levels)
+    except UserError:
+        return None
 
 
 def _is_told(outcome: Outcome) -> bool:

@@ -8,7 +8,7 @@ pair comes first is what the surrogate says: the two that explain the most of wh
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, Final
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.campaigns.truth import Truth
+from merge_sumo.reports.foretelling import Expected
 from merge_sumo.reports.surface import Surface
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
@@ -26,6 +27,8 @@ from merge_sumo.values.score import FAILURE_SCORE, Outcome
 COUNT_GRID: Final = (32, 20)
 GRID: Final = {2: (97, 97, 1), 3: (49, 49, 17)}
 """Nodes of a map in its two coordinates and in the one that it moves through."""
+COARSE_GRID: Final = {2: (41, 41, 1), 3: (25, 25, 9)}
+"""And of one at whose nodes games are played out."""
 NEIGHBOURS: Final = 3
 """Cases of the truth that decide whether a node of the map fails."""
 PAIR_NODES: Final = 41
@@ -87,6 +90,7 @@ def maps_of(
     others: Sequence[Outcome],
     surface: Surface | None,
     truth: Truth | None,
+    expected: Expected | None = None,
 ) -> dict[str, Any]:
     """Return what the script draws the map of a level from.
 
@@ -96,6 +100,7 @@ def maps_of(
         others: outcomes of the level that the page does not show one by one: they are counted.
         surface: what the surrogate says.
         truth: the truth of the level.
+        expected: where the twin of the VUT expects failures.
     """
     dims = len(scenario.dimensions(level))
     pairs = pairs_of(dims, surface)
@@ -108,6 +113,7 @@ def maps_of(
             {
                 "chance": None if surface is None else _chance(surface, dims, pair.axes),
                 "truth": None if truth is None else _truth(truth, dims, pair.axes),
+                "expected": None if expected is None else _expected(expected, level, dims),
                 "counts": _counts(others, scenario, level, pair.axes) if others else None,
             }
             for pair in pairs
@@ -147,9 +153,26 @@ def _truth(truth: Truth, dims: int, axes: Axes) -> dict[str, Any]:
     return _means(truth.points[:, list(axes)], failed.astype(np.float64))
 
 
-def _nodes(dims: int) -> FloatArray:
+def _expected(expected: Expected, level: int, dims: int) -> dict[str, Any] | None:
+    from scipy.ndimage import maximum_filter
+
+    nodes = COARSE_GRID.get(dims)
+    if nodes is None:
+        return None
+    near = expected.nearness(_nodes(dims, COARSE_GRID), level)
+    if near is None:
+        return None
+    # Failures may lie on a thin curve: what is drawn is what they would cover.
+    shape = [n for n in nodes[::-1] if n > 1]
+    reach = [int(radius_for(dims) * (n - 1) + 0.5) for n in shape]
+    steps = np.meshgrid(*[np.arange(-r, r + 1) / max(r, 1) for r in reach], indexing="ij")
+    ball = np.square(steps).sum(axis=0) <= 1.0
+    return _packed(nodes, maximum_filter(near.reshape(shape), footprint=ball).ravel())
+
+
+def _nodes(dims: int, grid: Mapping[int, tuple[int, int, int]] = GRID) -> FloatArray:
     """Return the nodes of a map, (n, d), the first coordinate running fastest."""
-    axes = [np.linspace(0.0, 1.0, n) for n in GRID[dims] if n > 1]
+    axes = [np.linspace(0.0, 1.0, n) for n in grid[dims] if n > 1]
     mesh = np.meshgrid(*axes[::-1], indexing="ij")
     return np.stack([axis.ravel() for axis in mesh[::-1]], axis=1)
 

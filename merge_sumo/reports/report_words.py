@@ -17,12 +17,14 @@ from merge_sumo.reports.diagnosis import (
     Kind,
     failure_boxes,
 )
+from merge_sumo.reports.foretelling import foretold_in_words
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
 from merge_sumo.reports.report_maps import pairs_of
 from merge_sumo.reports.summary import LevelSummary, Summary
 from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.reports.verdict import Verdict, counted, in_words
 from merge_sumo.system.printable import printable
+from merge_sumo.values.empty_ball import EmptyBall
 from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.scenario import OWN, level_name
 from merge_sumo.values.score import Outcome
@@ -92,11 +94,14 @@ def page_words(facts: Facts) -> dict[str, Any]:
         ("Ten worst failures", facts.worst[:LISTED]),
         ("Ten nearest misses", facts.near[:LISTED]),
     ]
+    if facts.surprises:
+        tables.append(("Ten that were foretold worst", facts.surprises))
     return {
         "vut": facts.run.vut,
         "headline": headline(facts.verdict, summary, facts.worst, facts.kinds),
         "careful": in_a_sentence(facts.avoidance.values()),
         "avoidance": _avoidance(facts),
+        "foretold": foretold_in_words(facts.run.outcomes),
         "counts": facts.verdict.counts,
         "found": facts.verdict,
         "troubles": facts.troubles(),
@@ -222,9 +227,27 @@ def _note(facts: Facts, level: int, found: LevelSummary) -> str:
         text += f", {counted(found.regions, 'region')}"
     if found.tested < found.cases:
         text += f"; {found.cases - found.tested} not tested"
+    if found.unseen is not None:
+        text += f". {_unseen(facts, level, found.unseen)}"
     if facts.surfaces[level] is None:
         text += f". No surrogate: it takes {FEWEST_FAILURES} failures to learn one"
     return text + "."
+
+
+def _unseen(facts: Facts, level: int, ball: EmptyBall) -> str:
+    """Return the largest ball that no case has entered, in a clause."""
+    axes = facts.coordinates_of(level)
+    spans = [(c, c.dimension.high - c.dimension.low) for c in axes]
+    radii = ", ".join(f"{ball.radius * span:.2g} {c.unit}" for c, span in spans)
+    centre = ", ".join(
+        f"{c.name} {c.dimension.low + share * span:.{c.digits}f}"
+        for (c, span), share in zip(spans, ball.centre, strict=True)
+    )
+    more = ball.at_most > 1.01 * ball.radius
+    return (
+        f"The largest ball that no case has entered has {'at least ' if more else ''}a radius of "
+        f"{ball.radius:.0%} of the axes ({radii}), around {centre}"
+    )
 
 
 def _kinds(facts: Facts) -> list[dict[str, Any]]:

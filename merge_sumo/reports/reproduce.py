@@ -93,7 +93,7 @@ class _Work:
         """Run one column of the table and draw its figures."""
         truth = self.truth(column, self.scale.truth_cases[column.level])
         dense = self.dense(column)
-        searches = self.search(column.vut, (column.level,), SAMPLERS, self.scale.batch)
+        searches = self.search(column.vut, (column.level,), SAMPLERS)
         truths, denses = {column.level: truth}, {} if dense is None else {column.level: dense}
         limit = limit_fmc(chain.from_iterable(searches.values()), truths, denses)
         compared = {name: compare(found, truths, limit) for name, found in searches.items()}
@@ -155,9 +155,16 @@ class _Work:
         return truth
 
     def search(
-        self, vut: str, levels: tuple[int, ...], samplers: tuple[str, ...], batch: int
+        self,
+        vut: str,
+        levels: tuple[int, ...],
+        samplers: tuple[str, ...],
+        batch: int | None = None,
     ) -> dict[str, list[Search]]:
-        """Let samplers search with all seeds."""
+        """Let samplers search with all seeds, in batches of the paper's size if nobody says.
+
+        `coverage` has batches of its own then: they are a part of it.
+        """
         title = f"{vut} v level {'/'.join(map(str, levels))}"
         runs = len(samplers) * self.scale.seeds
         counter = iter(range(1, runs + 1))
@@ -167,7 +174,7 @@ class _Work:
             levels,
             samplers,
             seeds=self.scale.seeds,
-            cases=self.scale.batches * batch,
+            cases=self.scale.batches * (batch or self.scale.batch),
             batch=batch,
             workers=self.workers,
             on_search=lambda *_: self.on_run(title, next(counter), runs, "runs"),

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from merge_sumo.values.case import to_unit
+from merge_sumo.values.empty_ball import EmptyBall, largest_empty_ball
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
@@ -22,6 +23,8 @@ class LevelSummary:
         failures: cases with P < -500.
         fmc: failure mode coverage, M(s, 0.05, -500), in the level's unit cube.
         regions: groups of failures that are linked at a distance of 0.05.
+        unseen: the largest ball of the level's unit cube that no case has entered, but for those
+            that ended in an error; None without cases.
     """
 
     cases: int
@@ -29,6 +32,7 @@ class LevelSummary:
     failures: int
     fmc: float
     regions: int
+    unseen: EmptyBall | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +59,7 @@ def summarise(outcomes: Sequence[Outcome], levels: Sequence[int]) -> Summary:
 
 def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
+    seen = to_unit((o.case for o in at_level if not o.measures.end.is_error), level)
     points = to_unit((outcome.case for outcome in at_level if outcome.failed), level)
     return LevelSummary(
         cases=len(at_level),
@@ -62,4 +67,5 @@ def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
         failures=len(points),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
+        unseen=largest_empty_ball(seen),
     )

@@ -158,7 +158,7 @@ function FailureMap(figure) {
   };
   this.level = level;
   this.draw = () => {
-    const { chance, truth } = of.grids[pair], share = all ? null : unit(third, at);
+    const { chance, truth, expected } = of.grids[pair], share = all ? null : unit(third, at);
     svg.replaceChildren();
     const clip = draw(draw(svg, "defs"), "clipPath", { id: "clip" });
     draw(clip, "rect", { x: left, y: top, width, height });
@@ -182,6 +182,7 @@ function FailureMap(figure) {
       const r = Math.sqrt(of.radius ** 2 - off ** 2); // the slice of the ball here
       draw(balls, "ellipse", { cx: x, cy: y, rx: r * width, ry: r * height });
     }
+    if (expected) draw(svg, "path", { class: "expected", d: contour(slice(expected, share), expected.nx, expected.ny, 127.5, X, Y) });
     if (truth) draw(svg, "path", { class: "outline", d: contour(slice(truth, share), truth.nx, truth.ny, 127.5, X, Y) });
     draw(svg, "rect", { class: "frame", x: left, y: top, width, height });
     for (const { i, x, y } of marks) {
@@ -485,6 +486,8 @@ function search() {
   plot(byId("chart-share"), { ...common, yRange: [0, most * 1.05], lines: [], bars });
   const scores = lines("score"), coverage = lines("fmc");
   plot(byId("chart-score"), { ...common, yRange: range(scores.flatMap(({ points }) => points.map(([, y]) => y)).concat(scores.length ? [] : [0])), lines: scores });
+  const off = lines("off");
+  if (byId("chart-off")) plot(byId("chart-off"), { ...common, yRange: [0, Math.max(...off.flatMap(({ points }) => points.map(([, y]) => y)), 1) * 1.1], lines: off });
   plot(byId("chart-fmc"), { ...common, yRange: [0, Math.max(...coverage.flatMap(({ points }) => points.map(([, y]) => y)), 0.001) * 1.1], lines: coverage });
 }
 

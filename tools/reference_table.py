@@ -1,0 +1,79 @@
+"""Print the table of built-in VUTs, SUMO's models and reference drivers that README has.
+
+python tools/reference_table.py                         all of them, 1,000 uniform cases a level
+python tools/reference_table.py --cases 100 design2     fewer, of some
+
+Failures and timeouts at POV levels 0, 1 and 2, failure mode coverage of the failures that were
+found, the share of the failures that a careful and competent driver in the VUT's place avoids, and
+the median of the times until which one may take over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+from pathlib import Path
+
+from merge_sumo.campaigns.avoidance import avoidance
+from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.reports.summary import summarise
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.scenario import LEVELS, US23
+from merge_sumo.values.trajectory import End
+
+MODELS = ("Krauss", "IDM", "EIDM", "ACC", "CACC")
+VUTS = (
+    *("design1", "design2", "level1", "level2"),
+    *(f"sumo:{model}" for model in MODELS),
+    *("level0", *REFERENCES),
+)
+HEAD = (
+    "| VUT | failures at levels 0, 1, 2 | timeouts | FMC at levels 0, 1, 2 | avoided by a careful "
+    "driver | who takes over until |\n|---|---|---|---|---|---|"
+)
+
+
+def row(vut: str, cases: int, workers: int | None) -> str:
+    """Run uniform cases at each level and return the line of the table."""
+    failures, timeouts, coverage, avoided, known, times = [], 0, [], 0, 0, []
+    net = road_for(US23)
+    with tempfile.TemporaryDirectory() as folder:
+        for level in LEVELS:
+            settings = CampaignSettings(
+                vut=vut, levels=(level,), sampler="uniform", cases=cases, batch=min(cases, 500)
+            )
+            with open_workers(settings.workers(workers)) as there:
+                run = run_campaign(settings, Path(folder) / str(level), net, workers=there)
+            found = summarise(run.outcomes, (level,)).levels[level]
+            failures.append(found.failures)
+            coverage.append(f"{found.fmc:.4f}")
+            timeouts += sum(o.measures.end is End.TIMEOUT for o in run.outcomes)
+            for one in avoidance(run, settings, net):
+                known += 1
+                avoided += one.by_careful
+                if one.careful_until_s is not None:
+                    times.append(one.careful_until_s)
+    share = f"{avoided} of {known}" if known else "–"
+    until = f"{statistics.median(times):.1f} s" if times else "–"
+    counts = ", ".join(map(str, failures))
+    return f"| `{vut}` | {counts} | {timeouts} | {', '.join(coverage)} | {share} | {until} |"
+
+
+def main() -> None:
+    """Print the table line by line."""
+    parser = argparse.ArgumentParser(description="Print the table of VUTs that README has.")
+    parser.add_argument("vuts", nargs="*", default=VUTS)
+    parser.add_argument("--cases", type=int, default=1000, help="uniform cases at each level")
+    parser.add_argument("--workers", type=int, help="processes; by default one a core")
+    arguments = parser.parse_args()
+    print(HEAD, flush=True)
+    for vut in arguments.vuts:
+        print(row(vut, arguments.cases, arguments.workers), flush=True)
+
+
+if __name__ == "__main__":
+    main()
