@@ -9,7 +9,8 @@ of it:
   That is tried every half second, and after the last success every step;
 - with a careful driver on the mainline in the POV's place, against what the VUT did.
 
-avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases
+avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases;
+                        of very many, the worst
 
 That of a folder which somebody sent is data as everything in it.
 """
@@ -49,6 +50,8 @@ from merge_sumo.values.trajectory import Trajectory
 AVOIDANCE: Final = "avoidance.jsonl"
 CAREFUL: Final = "careful"
 """The reference driver that takes over, and that the headline counts."""
+MOST: Final = 500
+"""Failures that are driven again, the worst: each takes some thirty episodes."""
 EVERY_STEPS: Final = 5
 """A take-over is tried every half second first."""
 ROWS: Final = round(MAX_EPISODE_S / DT_S) + 1
@@ -98,10 +101,10 @@ class _Again(Case):
 def avoidance(run: Run, settings: CampaignSettings, net: Corridor) -> list[Avoidance]:
     """Return who would have avoided each failure of a campaign, in the order of its cases.
 
-    Failures whose trajectory is lost are left out. The POVs are those of `settings`; a POV of the
-    tester's own runs again.
+    Of more than `MOST` failures, of the worst ones. Failures whose trajectory is lost are left out.
+    The POVs are those of `settings`; a POV of the tester's own runs again.
     """
-    found = sorted(failures(run.outcomes), key=lambda outcome: outcome.index)
+    found = sorted(failures(run.outcomes)[:MOST], key=lambda outcome: outcome.index)
     motion = {o.index: kept for o in found if (kept := _trajectory(run, o)) is not None}
     failing = [outcome for outcome in found if outcome.index in motion]
     if not failing:
