@@ -15,10 +15,11 @@ from test_score import CASE, ending
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import Run
-from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.truth import Kept, ground_truth
 from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison import compare_runs
+from merge_sumo.reports.rerun import rerun
 from merge_sumo.reports.verdict import judge
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.centre_lines import centre_lines
@@ -385,6 +386,18 @@ class TestCampaigns:
         (tmp_path / "outcomes.jsonl").write_bytes(lines)
         with pytest.raises(UserError, match="not judged by the criterion"):
             Run(tmp_path)
+
+    def test_are_kept_where_recorded_cases_run_again(self, harsh):
+        again = rerun(harsh, settings_of(harsh.folder, harsh.settings), (0, 1, 2))
+        assert [o.margin for o in again.after] == [o.margin for o in harsh.outcomes[:3]]
+        assert not again.changed
+
+    def test_decide_on_one_case_of_theirs(self, harsh, command_line):
+        ends = {o.failed: o for o in harsh.outcomes if o.measures.end is End.MERGED}
+        for failed, outcome in ends.items():
+            code, _, _ = command_line("run", "--case", harsh.folder, outcome.index)
+            assert code == int(failed)
+        assert set(ends) == {True, False}
 
     def test_of_different_criteria_are_not_compared(self, harsh, tmp_path):
         other = run_campaign(settings(vut="design1", cases=20), tmp_path / "other")

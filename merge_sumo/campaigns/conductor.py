@@ -33,6 +33,7 @@ from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
@@ -221,9 +222,14 @@ def _go_on(
 ) -> Run:
     taught = lessons(settings.learn_from, settings.scenario)
     others = [motion for motions in taught.values() for motion in motions]
-    # It foretells gaps at M, and they decide on no other criterion.
-    plays = settings.criterion.is_papers
-    games = Twin(settings.pool, settings.povs, settings.seed, others) if plays else None
+    games = Twin(
+        settings.pool,
+        settings.povs,
+        settings.seed,
+        others,
+        settings.criterion,
+        centre_lines(net),
+    )
     sampler = make_sampler(settings.sampler, settings.pool, settings.seed, games)
     stop = settings.stopping_rule()
     files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}

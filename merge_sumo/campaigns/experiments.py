@@ -25,6 +25,7 @@ from merge_sumo.drivers.vut import VutFactory
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit
@@ -76,7 +77,8 @@ def _search(
     seed: int,
 ) -> Search:
     pool = Pool(levels=levels, scenario=scenario)
-    games = Twin(pool, plan.povs, seed) if plan.criterion.is_papers else None
+    lines = centre_lines(plan.net)
+    games = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
     sampler = make_sampler(name, pool, seed, games)
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]

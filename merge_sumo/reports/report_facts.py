@@ -56,7 +56,7 @@ class Facts:
             key=lambda o: (o.score, o.index),
         )
         self.surprises = surprises(run.outcomes, run.scenario.dx_crash_m)[:LISTED]
-        self.expected = _expected(run, levels)
+        self.expected = _expected(run, levels, self.road)
         self.untested = [o for o in run.outcomes if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
         listed = [*(*examples, *self.worst[:LISTED], *self.near[:LISTED], *self.surprises)]
@@ -87,12 +87,12 @@ class Facts:
         return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
 
 
-def _expected(run: Run, levels: Sequence[int]) -> Expected | None:
+def _expected(run: Run, levels: Sequence[int], road: Corridor) -> Expected | None:
     """Return where the twin of a run expects failures, if the run had one."""
     if not is_foretold(run.outcomes):
         return None
     try:
-        return Expected(run, levels)
+        return Expected(run, levels, road)
     except UserError:
         return None
 
