@@ -43,6 +43,7 @@ from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, dated, link_latest
 from merge_sumo.system.workers import open_workers
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 
@@ -75,6 +76,8 @@ def campaign(
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
     pov: Vut | None = None,
+    fail_when: str = COLLISION.fail_when,
+    require: str | None = None,
     learn_from: Sequence[Path | str] = (),
     on_case: OnCase | None = None,
     progress: bool | None = None,
@@ -102,6 +105,8 @@ def campaign(
         scenario: a scenario, its name, or its TOML file.
         policies: folder of learned drivers in the place of the shipped ones.
         pov: a POV of your own: what a `vut` can be.
+        fail_when: what counts as a failure, as after `--fail-when`.
+        require: what is to hold over time instead, as after `--require`.
         learn_from: folders of earlier campaigns to learn the VUT from.
         on_case: told of every case as it ends.
         progress: show how far it is; by default in a notebook and on a terminal.
@@ -128,6 +133,8 @@ def campaign(
         pov=pov_spec,
         learn_from=tuple(map(str, learn_from)),
         scenario=where,
+        fail_when=fail_when,
+        require=require,
     )
     folder = dated(spec) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))
@@ -218,7 +225,8 @@ def run_case(
     road = road_for(settings.scenario, None if net is None else Path(net))
     if out is not None:
         check_new(Path(out))
-    found = run_one(settings.vut_factory, one, road, settings.povs, live=gui)
+    driven = settings.vut_factory, one, road, settings.povs
+    found = run_one(*driven, criterion=settings.criterion, live=gui)
     if out is not None:
         write_scenario(Path(out), road, found.outcome, found.trajectory)
     return CaseRun(found)
@@ -266,6 +274,8 @@ def truth(
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
     pov: Vut | None = None,
+    fail_when: str = COLLISION.fail_when,
+    require: str | None = None,
     vut_command: str | None = None,
     deadline_s: float = DEADLINE_S,
     vut_memory_gib: float = MEMORY_GIB,
@@ -281,6 +291,8 @@ def truth(
     spec, pov_spec, workers = drivers_of(vut, pov, workers)
     options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     povs = povs_of(policies, where, pov_spec, options)
+    criterion = Criterion(fail_when, require)
+    criterion.check(where)
     own = VutOptions(
         command=vut_command,
         deadline_s=deadline_s,
@@ -296,7 +308,12 @@ def truth(
         number = one_level(str(level), povs)
         cache = Path(forgotten) if is_here(spec) or is_here(pov_spec or "") else None
         return ground_truth(
-            factory, number, cases, seed, workers=there, cache=cache, scenario=where, povs=povs
+            *(factory, number, cases, seed),
+            workers=there,
+            cache=cache,
+            scenario=where,
+            povs=povs,
+            criterion=criterion,
         )
 
 

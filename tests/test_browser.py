@@ -12,6 +12,7 @@ from conftest import require
 from foreign_nets import corridor_of
 from handmade import write_run
 
+from merge_sumo.campaigns.avoidance import Avoidance, write_avoidance
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.reports import report, report_facts
 from merge_sumo.reports.coordinates import WRITTEN
@@ -331,3 +332,22 @@ def test_all_cars_are_drawn_and_say_which_one_the_vut_meets(browser, in_traffic)
         assert page.locator("#chart-gap .line.behind").count() == 1
         assert "headway behind" in page.inner_text("#case-title")
         assert "car behind" in page.inner_text("#case-words")
+
+
+def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):
+    run = write_run(tmp_path / "run", error=None)
+    found = failures(run.outcomes)
+    first, others = found[0].index, [o.index for o in found[1:]]
+    lines = [Avoidance(first, ("careful", "rss"), 3.0, pov_careful=True)]
+    lines += [Avoidance(index, (), None, pov_careful=False) for index in others]
+    write_avoidance(run.folder, lines)
+    with shown(browser, report.write_report(run)) as page:
+        assert "In the VUT's place careful, rss would have avoided it." in page.inner_text("#case")
+        assert "1 of" in page.inner_text(".verdict")
+        page.locator(".map input[type=checkbox]").first.check()
+        bright = page.locator(".map .mark.fail:not(.faint)")
+        for value, wanted in (("careful", 1), ("pov", 1), ("fsm", 0), ("", len(found))):
+            page.select_option("#avoided-by", value)
+            assert bright.count() == wanted
+        page.select_option("#avoided-by", "none")
+        assert bright.count() == len(others)

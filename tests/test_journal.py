@@ -122,7 +122,7 @@ class TestARecord:
     def test_has_the_fields_of_the_specification_in_their_order(self):
         names = list(episode(0)[0].to_record())
         assert names[: len(SPEC_FIELDS)] == SPEC_FIELDS
-        assert names[-1] == "error"
+        assert names[-2:] == ["error", "after_merge"]
 
     def test_has_no_orientation_below_level_2(self):
         outcome, _ = episode(0)

@@ -23,11 +23,13 @@ from merge_sumo.reports.foretelling import Expected, foretold_in_words, off_m, s
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.foresight import Record
 from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.twin.playing import Games
 from merge_sumo.twin.twin import Twin
 from merge_sumo.twin.watching import NOW, Watcher
 from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
@@ -95,6 +97,23 @@ class TestGames:
             np.full((3, 2), 0.5), 0, lambda inputs, now, rows: np.full(len(rows), -4.0)
         )
         assert np.isnan(found).all()
+
+    @pytest.mark.parametrize("text", ["unsafe", 'pet_s < 2.5 or end == "TIMEOUT"'])
+    def test_are_judged_as_cases_are(self, text, tmp_path):
+        (tmp_path / "slows.py").write_text(SLOWS)
+        criterion, pool, road = Criterion(text), Pool(levels=(0,)), road_for(US23)
+        points = np.random.default_rng(5).random((24, 2))
+        plan = GroundPlan(
+            vut=vut_factory(f"{tmp_path / 'slows.py'}:vut"), corridors=16, net=road, povs=Povs()
+        )
+        done = run_cases(plan, pool.cases(points, 0))
+        lines = centre_lines(road)
+        expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap_m for one in done]
+        found = Games(pool, Povs(), criterion, lines).play(
+            points, 0, lambda inputs, now, rows: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
+        )
+        assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)
+        assert (np.abs(found) < 6.0).any()
 
     def test_cannot_be_played_against_a_program(self):
         assert not Games(Pool(levels=(0,)), Povs()).can_play(3)
@@ -324,7 +343,7 @@ class TestTheReport:
         assert off_m(missed) is None
 
     def test_expects_failures_where_they_are(self, whole):
-        expected = Expected(whole, [0, 1])
+        expected = Expected(whole, [0, 1], road_for(whole.scenario))
         fails = [o.case for o in whole.outcomes if o.failed and o.case.level == 1]
         near = expected.nearness(to_unit(fails, 1), 1)
         assert near is not None

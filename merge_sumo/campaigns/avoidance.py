@@ -9,7 +9,8 @@ of it:
   That is tried every half second, and after the last success every step;
 - with a careful driver on the mainline in the POV's place, against what the VUT did.
 
-avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases
+avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases;
+                        of very many, the worst
 
 That of a folder which somebody sent is data as everything in it.
 """
@@ -35,18 +36,22 @@ from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.errors import UserError
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.world import World
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
+from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
-from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
 AVOIDANCE: Final = "avoidance.jsonl"
 CAREFUL: Final = "careful"
 """The reference driver that takes over, and that the headline counts."""
+MOST: Final = 500
+"""Failures that are driven again, the worst: each takes some thirty episodes."""
 EVERY_STEPS: Final = 5
 """A take-over is tried every half second first."""
 ROWS: Final = round(MAX_EPISODE_S / DT_S) + 1
@@ -96,10 +101,10 @@ class _Again(Case):
 def avoidance(run: Run, settings: CampaignSettings, net: Corridor) -> list[Avoidance]:
     """Return who would have avoided each failure of a campaign, in the order of its cases.
 
-    Failures whose trajectory is lost are left out. The POVs are those of `settings`; a POV of the
-    tester's own runs again.
+    Of more than `MOST` failures, of the worst ones. Failures whose trajectory is lost are left out.
+    The POVs are those of `settings`; a POV of the tester's own runs again.
     """
-    found = sorted(failures(run.outcomes), key=lambda outcome: outcome.index)
+    found = sorted(failures(run.outcomes)[:MOST], key=lambda outcome: outcome.index)
     motion = {o.index: kept for o in found if (kept := _trajectory(run, o)) is not None}
     failing = [outcome for outcome in found if outcome.index in motion]
     if not failing:
@@ -130,14 +135,14 @@ def _avoidance(
     world: World,
     povs: Driver,
 ) -> list[Avoidance]:
-    substitutes = _Substitutes(world.corridors)
+    substitutes, lines = _Substitutes(world.corridors), centre_lines(world.road)
 
     def pass_again(asked: Sequence[tuple[int, dict[str, Any]]]) -> list[bool]:
         """Return which episodes are passed: (index of the failure, what is different)."""
         cases = [_again(motion[index], **other) for index, other in asked]
         passed = [False] * len(cases)
         for place, trajectory in rollout(world, povs, substitutes, cases):
-            passed[place] = _passes(run, trajectory)
+            passed[place] = _passes(run, trajectory, lines)
         return passed
 
     steps = {index: len(kept.motion) - 1 for index, kept in motion.items()}
@@ -184,9 +189,9 @@ def _again(failure: Trajectory, **other: Any) -> _Again:
     return _Again(**same, recorded=failure.a_vut_mps2, **other)
 
 
-def _passes(run: Run, trajectory: Trajectory) -> bool:
-    """Return whether an episode ends at M without a failure."""
-    outcome = Outcome(0, 0, trajectory.case, measure(trajectory))
+def _passes(run: Run, trajectory: Trajectory, lines: CentreLines) -> bool:
+    """Return whether an episode ends at M without a failure, by the criterion of the campaign."""
+    outcome = run.criterion.outcome(0, 0, trajectory, lines)
     return outcome.measures.end.is_tested and not outcome.failed
 
 

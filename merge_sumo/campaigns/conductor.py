@@ -33,6 +33,7 @@ from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
@@ -78,8 +79,9 @@ def conduct(
     while first < cases and not (stop is not None and stop(sampler.told())):
         ran: list[tuple[Outcome, Trajectory]] = []
         for place, done in run(sampler.ask(min(batch or sampler.batch_size(), cases - first))):
-            foretold = sampler.foretold(place)
-            outcome = Outcome(first + place, number, done.trajectory.case, done.measures, foretold)
+            case, foretold = done.trajectory.case, sampler.foretold(place)
+            index, margin = first + place, done.margin
+            outcome = Outcome(index, number, case, done.measures, foretold, margin)
             ran.append((outcome, done.trajectory))
             if on_case is not None:
                 on_case(outcome)
@@ -172,6 +174,11 @@ def resume_campaign(
         if grown:  # which cases come next does not depend on how many there are to be
             recorded["cases"] = settings.cases
         changes = differences(RECORDED_BY_DEFAULT | recorded, record)
+        if before.criterion != settings.criterion:
+            raise UserError(
+                f"in {folder} a case fails when {before.criterion.text}, and not when "
+                f"{settings.criterion.text}: a campaign has one criterion; begin another one"
+            )
         if changes and not force:
             name, (was, now) = next(iter(changes.items()))
             raise UserError(
@@ -215,7 +222,14 @@ def _go_on(
 ) -> Run:
     taught = lessons(settings.learn_from, settings.scenario)
     others = [motion for motions in taught.values() for motion in motions]
-    games = Twin(settings.pool, settings.povs, settings.seed, others)
+    games = Twin(
+        settings.pool,
+        settings.povs,
+        settings.seed,
+        others,
+        settings.criterion,
+        centre_lines(net),
+    )
     sampler = make_sampler(settings.sampler, settings.pool, settings.seed, games)
     stop = settings.stopping_rule()
     files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
@@ -276,6 +290,7 @@ def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan
         net=net,
         scenario=settings.scenario,
         povs=settings.povs.with_log(log),
+        criterion=settings.criterion,
     )
 
 

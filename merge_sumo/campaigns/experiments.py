@@ -25,9 +25,11 @@ from merge_sumo.drivers.vut import VutFactory
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
@@ -75,7 +77,9 @@ def _search(
     seed: int,
 ) -> Search:
     pool = Pool(levels=levels, scenario=scenario)
-    sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed))
+    lines = centre_lines(plan.net)
+    games = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
+    sampler = make_sampler(name, pool, seed, games)
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
@@ -157,6 +161,7 @@ def search(
     on_search: Callable[[str, int], None] | None = None,
     scenario: Scenario = US23,
     povs: Povs | None = None,
+    criterion: Criterion = COLLISION,
 ) -> dict[str, list[Search]]:
     """Let samplers search a pool, with the seeds 0 to `seeds` - 1 each.
 
@@ -171,6 +176,7 @@ def search(
         corridors=min(MAX_CORRIDORS, batch or COMPARED_BATCH),
         net=road_for(scenario),
         povs=povs,
+        criterion=criterion,
     )
     found: dict[int, Search] = {}
     with workers_or_here(workers) as there:

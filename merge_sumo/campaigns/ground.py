@@ -20,14 +20,16 @@ from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.errors import UserError
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.system.resources import resource
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import US23, Scenario
-from merge_sumo.values.score import Measures, measure
+from merge_sumo.values.score import Measures, Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
 MAX_CORRIDORS: Final = 32
@@ -92,6 +94,7 @@ class GroundPlan:
     net: Corridor
     povs: Povs
     scenario: Scenario = US23
+    criterion: Criterion = COLLISION
     software: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -128,12 +131,19 @@ class Ran:
         trajectory: what happened.
         files: those of the user's that the VUT has loaded, with their hashes.
         pov_files: those that a POV of the user's own has loaded.
+        margin: that of the plan's criterion; None where it needs none.
     """
 
     measures: Measures
     trajectory: Trajectory
     files: Files = field(default_factory=dict)
     pov_files: Files = field(default_factory=dict)
+    margin: float | None = None
+
+    @property
+    def score(self) -> float | None:
+        """The score under the plan's criterion, as `Outcome` has it."""
+        return Outcome(0, 0, self.trajectory.case, self.measures, margin=self.margin).score
 
 
 _kept: tuple[tuple[object, ...], ProvingGround] | None = None
@@ -152,7 +162,13 @@ def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
         except BaseException:
             _close_ground()  # it stands in the middle of episodes
             raise
-    return [Ran(measure(ran[place]), ran[place], *files) for place in range(len(cases))]
+    lines = None if plan.criterion.is_papers else centre_lines(plan.net)
+    done: list[Ran] = []
+    for place in range(len(cases)):
+        measures = measure(ran[place])
+        margin = plan.criterion.margin(ran[place], measures, lines)
+        done.append(Ran(measures, ran[place], *files, margin))
+    return done
 
 
 def _opened_ground(plan: GroundPlan) -> ProvingGround:

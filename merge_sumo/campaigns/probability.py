@@ -93,7 +93,7 @@ def failure_probability(
     draws = proposal.draw(cases, np.random.default_rng([seed, STREAM]))
     outcomes = _run(settings, net, stated, draws, lines, on_case, workers)
     failed = np.array([outcome.failed for outcome in outcomes])
-    judged = np.array([outcome.measures.score is not None for outcome in outcomes])
+    judged = np.array([outcome.score is not None for outcome in outcomes])
     result = estimate(draws, failed, judged, proposal.bound, confidence)
     record = {
         **asdict(result),
@@ -140,14 +140,16 @@ def _run(
         net=net,
         scenario=settings.scenario,
         povs=settings.povs,
+        criterion=settings.criterion,
     )
     with workers_or_here(workers) as there:
         run = runs_on(there, plan)
         for first in range(0, len(cases), WRITTEN):
             ran = []
             for place, done in run(cases[first : first + WRITTEN]):
-                case = cases[first + place]
-                outcome = Outcome(first + place, first // WRITTEN, case, done.measures)
+                index, case = first + place, cases[first + place]
+                margin = done.margin
+                outcome = Outcome(index, first // WRITTEN, case, done.measures, margin=margin)
                 ran.append(outcome)
                 if on_case is not None:
                     on_case(outcome)

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
-from merge_sumo.drivers.following import Following
+from merge_sumo.drivers.following import Following, keep_behind_vut
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
@@ -33,6 +33,9 @@ OF_THE_POV: Final = "the POV: "
 MAX_LOSSES: Final = 2
 """A case that made the driver lose its memory so often, on its own, is not tried again."""
 
+END_OF_ROAD_M: Final = 20.0
+"""No vehicle is followed up to where the road ends."""
+
 NEVER: Final = 2**62
 """The step at which a corridor without an episode times out."""
 
@@ -44,6 +47,10 @@ class _Episode:
     index: int
     case: Case
     first_row: int
+    merge_row: int | None = None
+    """The row in which the VUT is at M, where it goes on behind M."""
+    clipped: int = 0
+    """Answers that were clipped before M."""
 
 
 def rollout(
@@ -89,7 +96,9 @@ class _Rollout:
         """Rows of the record at which episodes time out."""
         self.next_timeout = NEVER
         # One row per step of the world, shared by all corridors: x, v, a of every vehicle.
-        self.record = np.zeros((RING_ROWS, vehicles, 3, corridors))
+        self.follow_steps = round(world.scenario.follow_up_s / DT_S)
+        self.ring = RING_ROWS + self.follow_steps
+        self.record = np.zeros((self.ring, vehicles, 3, corridors))
         self.row = 0
         self.now = self.record[0]
         """The row of this step."""
@@ -119,6 +128,8 @@ class _Rollout:
                 ended = arrived | (self.row >= self.timeout_at)
                 ended[list(self.errors)] = True
                 corridors = np.flatnonzero(ended).tolist()
+                if self.follow_steps:
+                    corridors = [corridor for corridor in corridors if not self.goes_on(corridor)]
                 for corridor in corridors:
                     if corridor in self.errors:
                         yield self.finish(corridor, *self.errors.pop(corridor))
@@ -127,6 +138,19 @@ class _Rollout:
                             corridor, End.MERGED if arrived[corridor] else End.TIMEOUT
                         )
                 self.refill(corridors)
+
+    def goes_on(self, corridor: int) -> bool:
+        """Return whether an episode goes on behind M; note where that begins."""
+        episode, x_m = self.episodes[corridor], self.world.x_m[:, corridor]
+        assert episode is not None, "only running episodes go on"  # noqa: S101
+        if corridor in self.errors or x_m[VUT] < 0.0:
+            return False
+        if episode.merge_row is None:
+            episode.merge_row, episode.clipped = self.row, int(self.clipped[corridor])
+            self.timeout_at[corridor] = self.row + self.follow_steps
+            self.next_timeout = int(self.timeout_at.min())
+        on_the_road = bool(x_m.max() < self.world.road.mainline.after_m - END_OF_ROAD_M)
+        return self.row < self.timeout_at[corridor] and on_the_road
 
     def begin_anew(self, lost: VutLostError) -> Iterator[tuple[int, Trajectory]]:
         """Start over what was running; yield the episode that is known to be at fault, if any."""
@@ -201,7 +225,7 @@ class _Rollout:
 
     def observe(self) -> None:
         """Write the state into the next row of the record."""
-        self.now = self.record[self.row % RING_ROWS]
+        self.now = self.record[self.row % self.ring]
         self.now[:, 0], self.now[:, 1] = self.world.x_m, self.world.v_mps
         self.row += 1
 
@@ -215,6 +239,8 @@ class _Rollout:
         answer = np.concatenate((cars[:VUT], self.ask_vut(scene)[None], cars[VUT:]))
         if following is not None:
             following.limit(answer, x_m, v_mps)
+        if self.follow_steps:
+            keep_behind_vut(answer, x_m, v_mps, self.world.scenario)
         if not math.isfinite(np.vdot(answer, answer)):
             answer = self.only_numbers(answer)
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
@@ -254,14 +280,17 @@ class _Rollout:
         return np.where(finite, answer, 0.0)
 
     def finish(self, corridor: int, end: End, error: str | None = None) -> tuple[int, Trajectory]:
-        """Return the record of a corridor's episode; after an error without the last step."""
+        """Return the record of a corridor's episode; after an error without the last step.
+
+        An error behind M ends the follow-up alone: the VUT has merged.
+        """
         episode = self.episodes[corridor]
         assert episode is not None, "only running episodes end"  # noqa: S101
         length = self.row - episode.first_row + (error is None)
-        first = episode.first_row % RING_ROWS
+        first = episode.first_row % self.ring
         rows = self.record[..., corridor]
         # In two parts, of which the second is empty where the ring does not close.
-        parts = rows[first : first + length], rows[: max(first + length - RING_ROWS, 0)]
+        parts = rows[first : first + length], rows[: max(first + length - self.ring, 0)]
         motion = np.concatenate(parts)
         if error is None:
             motion[-1, :, 0] = self.world.x_m[:, corridor]
@@ -270,4 +299,10 @@ class _Rollout:
         # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
         motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
         clipped = int(self.clipped[corridor])
-        return episode.index, Trajectory(episode.case, motion, end, error, clipped)
+        if episode.merge_row is None:
+            return episode.index, Trajectory(episode.case, motion, end, error, clipped)
+        steps = episode.merge_row - episode.first_row
+        before, after = motion[: steps + 1].copy(), motion[steps:]
+        before[-1, :, 2] = 0.0
+        merged = Trajectory(episode.case, before, End.MERGED, None, episode.clipped, after)
+        return episode.index, merged

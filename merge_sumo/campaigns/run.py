@@ -25,6 +25,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import FloatArray
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
@@ -59,6 +60,14 @@ class Run:
             raise _no_campaign(folder, error) from error
         self.scenario = scenario_of(self.settings, folder / SETTINGS)
         self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES), self.scenario)
+        self.criterion = _criterion_of(self.settings, folder / SETTINGS)
+        for outcome in self.outcomes:
+            needs = not (self.criterion.is_papers or outcome.measures.end.is_error)
+            if needs != (outcome.margin is not None):
+                raise UserError(
+                    f"case {outcome.index} in {folder / OUTCOMES} is not judged by the criterion "
+                    f"that {SETTINGS} names, {self.criterion.text}"
+                )
         _check_lines(folder, text, self.outcomes)
         self._batches: dict[int, dict[int, FloatArray]] = {}
 
@@ -159,6 +168,17 @@ def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
         raise UserError(f"{path} has no scenario: {error}") from error
 
 
+def _criterion_of(settings: Mapping[str, Any], path: Path) -> Criterion:
+    """Return what counts as a failure in a campaign; one that does not say was the paper's."""
+    fail_when = settings.get("fail_when", COLLISION.fail_when)
+    if not isinstance(fail_when, str):
+        raise UserError(f"{path} has no fail_when, or something else there")
+    require = settings.get("require")
+    if not (require is None or isinstance(require, str)):
+        raise UserError(f"{path} has something else than a formula as require")
+    return Criterion(fail_when, require)
+
+
 def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[list[Outcome], bool]:
     """Return the outcomes in the bytes of an `outcomes.jsonl`, and whether the last was torn.
 
@@ -187,7 +207,7 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[li
 
 def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Return the failing outcomes, the worst first."""
-    return sorted((o for o in outcomes if o.failed), key=lambda o: (o.measures.score, o.index))
+    return sorted((o for o in outcomes if o.failed), key=lambda o: (o.score, o.index))
 
 
 def batch_file(folder: Path, batch: int) -> Path:

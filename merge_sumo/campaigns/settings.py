@@ -23,6 +23,7 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.trust import is_own
 from merge_sumo.values.case import Pool
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import (
     ALL_LEVELS,
     DEADLINE_S,
@@ -57,6 +58,8 @@ class CampaignSettings:
     pov: str | None = None
     learn_from: tuple[str, ...] = ()
     scenario: Scenario = US23
+    fail_when: str = COLLISION.fail_when
+    require: str | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels; the scenario says what is left out."""
@@ -81,6 +84,10 @@ class CampaignSettings:
                     f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
                     "rename it"
                 )
+        criterion = self.criterion
+        object.__setattr__(self, "fail_when", criterion.fail_when)
+        object.__setattr__(self, "require", criterion.require)
+        criterion.check(self.scenario)
         _ = self.vut_factory
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
@@ -105,6 +112,8 @@ class CampaignSettings:
 
     def _check_sampler(self) -> None:
         sampler = make_sampler(self.sampler, self.pool, self.seed)
+        if self.learn_from and not self.criterion.is_papers:
+            raise UserError("--learn-from is for the paper's criterion: leave one of them away")
         if self.learn_from and not sampler.foresees:
             able = [name for name, kind in SAMPLERS.items() if kind.foresees]
             raise UserError(
@@ -128,6 +137,11 @@ class CampaignSettings:
     def povs(self) -> Povs:
         """Who drives the POV."""
         return povs_of(self.policies, self.scenario, self.pov, self._options)
+
+    @property
+    def criterion(self) -> Criterion:
+        """What counts as a failure."""
+        return Criterion(self.fail_when, self.require)
 
     def workers(self, asked: int | None) -> int:
         """Return in how many processes the cases run: see `VutFactory.workers`."""

@@ -12,11 +12,13 @@ from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory
 from merge_sumo.errors import UserError
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.live import Window
 from merge_sumo.values.case import Case
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import Scenario, level_name
-from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
 DEBUG_DEADLINE_S: Final = 86_400.0
@@ -105,6 +107,7 @@ def run_one(
     net: Corridor,
     povs: Povs,
     *,
+    criterion: Criterion = COLLISION,
     live: bool = False,
     on_end: Callable[[Ended], None] = lambda _: None,
 ) -> Ended:
@@ -118,7 +121,7 @@ def run_one(
     with ProvingGround(vut, 1, net, case.scenario, povs, window) as ground:
         episodes = ground.run([case])
         _, trajectory = next(episodes)
-        ended = Ended(Outcome(0, 0, case, measure(trajectory)), trajectory)
+        ended = Ended(criterion.outcome(0, 0, trajectory, centre_lines(net)), trajectory)
         on_end(ended)
         if window is not None:
             window.wait()  # before the corridor is made ready for the next case

@@ -27,6 +27,7 @@ from merge_sumo.system.folders import check_own, check_place, make_place, replac
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import OWN, US23, Scenario
 from merge_sumo.values.score import FAILURE_SCORE
@@ -47,7 +48,7 @@ class Truth:
 
     Attributes:
         points: cases in the unit cube, (n, d).
-        score: P, (n,), NaN without a verdict.
+        score: that of the criterion, P for the paper's, (n,), NaN without a verdict.
     """
 
     points: FloatArray
@@ -100,20 +101,21 @@ def ground_truth(
     on_cases: OnCases | None = None,
     scenario: Scenario = US23,
     povs: Povs | None = None,
+    criterion: Criterion = COLLISION,
 ) -> Truth:
     """Return the ground truth of a VUT at a level, from the cache where it is there.
 
     Memory grows by 40 bytes a case and no more, whatever the number of cases.
 
     The cache's key is a hash of what was asked for and of what is ours to know: VUT, cases, seed,
-    net, policies, versions, and the sources that decide outcomes. What the VUT itself loaded while
-    it drove is kept with the truth, and a truth is only used while those files are the same. Cases
-    run on `workers`, by default in this process.
+    criterion, net, policies, versions, and the sources that decide outcomes. What the VUT itself
+    loaded while it drove is kept with the truth, and a truth is only used while those files are the
+    same. Cases run on `workers`, by default in this process.
     """
     count = cases or TRUTH_CASES[level]
     if count < 1:
         raise UserError(f"--cases is {count}: it must be 1 or more")
-    factory, povs, kept = _asked(vut, level, count, seed, scenario, povs)
+    factory, povs, kept = _asked(vut, level, count, seed, scenario, povs, criterion)
     path = kept.path(cache)
     found = read_truth(path, level, count, scenario)
     if found is not None:
@@ -124,7 +126,14 @@ def ground_truth(
     scores = np.full(count, np.nan)
     files = (factory.files or {}) | povs.files
     road = road_for(scenario)
-    plan = GroundPlan(vut=factory, corridors=MAX_CORRIDORS, net=road, scenario=scenario, povs=povs)
+    plan = GroundPlan(
+        vut=factory,
+        corridors=MAX_CORRIDORS,
+        net=road,
+        scenario=scenario,
+        povs=povs,
+        criterion=criterion,
+    )
     with workers_or_here(workers) as there:
         rows = cast("Sequence[FloatArray]", points)
         scored = there.run(partial(_scores, plan, level, scenario), rows, lambda _: (np.nan, {}))
@@ -157,14 +166,21 @@ def known_truth(
     cache: Path | None = None,
     scenario: Scenario = US23,
     povs: Povs | None = None,
+    criterion: Criterion = COLLISION,
 ) -> Truth | None:
     """Return what `ground_truth` would find in the cache; None where it would have to run cases."""
-    _, _, kept = _asked(vut, level, cases, seed, scenario, povs)
+    _, _, kept = _asked(vut, level, cases, seed, scenario, povs, criterion)
     return read_truth(kept.path(cache), level, cases, scenario)
 
 
 def _asked(
-    vut: str | VutFactory, level: int, cases: int, seed: int, scenario: Scenario, povs: Povs | None
+    vut: str | VutFactory,
+    level: int,
+    cases: int,
+    seed: int,
+    scenario: Scenario,
+    povs: Povs | None,
+    criterion: Criterion,
 ) -> tuple[VutFactory, Povs, Kept]:
     """Return who drives, and what a truth of that is kept under."""
     povs = povs or Povs(policies=policies_of(scenario))
@@ -176,6 +192,7 @@ def _asked(
         *(factory.spec, level, cases, seed, options.command, options.deadline_s, scenario),
         policies=povs.sha256(),
         pov=None if povs.own is None else povs.own.spec,
+        criterion=criterion,
     )
     return factory, povs, kept
 
@@ -203,6 +220,7 @@ class Kept:
     scenario: Scenario = US23
     policies: Mapping[str, str] = field(default_factory=lambda: policies_sha256(policies_of()))
     pov: str | None = None
+    criterion: Criterion = COLLISION
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
@@ -248,5 +266,5 @@ def _scores(
 ) -> Sequence[tuple[float, Files]]:
     pool = Pool(levels=(level,), scenario=scenario)
     ran = run_cases(plan, pool.cases(np.asarray(points), level))
-    scores = [np.nan if done.measures.score is None else done.measures.score for done in ran]
+    scores = [np.nan if done.score is None else done.score for done in ran]
     return [(score, done.files | done.pov_files) for score, done in zip(scores, ran, strict=True)]

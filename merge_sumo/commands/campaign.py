@@ -12,16 +12,20 @@ import typer
 from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
+    FailWhenOption,
+    FollowUpOption,
     InProcessOption,
     JsonOption,
     NetOption,
     PoliciesOption,
     PovOption,
+    RequireOption,
     ScenarioOption,
     TrustOption,
     VutCommandOption,
     VutMemoryOption,
     app,
+    followed_up,
     print_troubles,
     say,
     show,
@@ -75,6 +79,9 @@ def campaign(
     ] = None,
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
+    fail_when: FailWhenOption = "collision",
+    require: RequireOption = None,
+    follow_up: FollowUpOption = None,
     v_vut0: Annotated[
         float | None,
         typer.Option(help="Initial speed of the VUT in m/s.  [default: the scenario's, 18]"),
@@ -151,7 +158,7 @@ def campaign(
 
     gates = parse_gates(gate or ())
     if resume is None:
-        where = named_scenario(scenario)
+        where = followed_up(named_scenario(scenario), follow_up)
         options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
         levels = parse_levels(level, povs_of(policies, where, pov, options))
         settings = CampaignSettings(
@@ -171,6 +178,8 @@ def campaign(
             pov=pov,
             learn_from=tuple(map(str, learn_from or ())),
             scenario=where,
+            fail_when=fail_when,
+            require=require,
         )
         folder = out or dated(vut)
     else:

@@ -126,8 +126,9 @@ def run(
         if gui:
             say("close the window to go on")
 
-    found = run_one(settings.vut_factory, one, road, settings.povs, live=gui, on_end=ended)
-    raise typer.Exit(0 if found.outcome.measures.end is End.MERGED else 1)
+    driven = settings.vut_factory, one, road, settings.povs
+    found = run_one(*driven, criterion=settings.criterion, live=gui, on_end=ended).outcome
+    raise typer.Exit(0 if found.measures.end is End.MERGED and not found.failed else 1)
 
 
 @app.command()

@@ -15,14 +15,18 @@ from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
     DenseOption,
+    FailWhenOption,
+    FollowUpOption,
     InProcessOption,
     JsonOption,
     PoliciesOption,
     PovOption,
+    RequireOption,
     ScenarioOption,
     VutCommandOption,
     VutMemoryOption,
     app,
+    followed_up,
     say,
     show,
 )
@@ -36,6 +40,7 @@ if TYPE_CHECKING:
     from merge_sumo.drivers.vut import VutFactory
     from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.system.workers import Workers
+    from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.scenario import Scenario
 
 
@@ -50,6 +55,9 @@ def truth(
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     pov: PovOption = None,
+    fail_when: FailWhenOption = "collision",
+    require: RequireOption = None,
+    follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -70,15 +78,18 @@ def truth(
     from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.system.workers import open_workers
+    from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.fmc import fmc, regions
 
-    where = named_scenario(scenario)
+    where = followed_up(named_scenario(scenario), follow_up)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
+    criterion = Criterion(fail_when, require)
+    criterion.check(where)
     povs = povs_of(policies, where, pov, options)
     chosen = one_level(level, povs)
     factory = _factory(vut, povs, vut_command, options)
     with open_workers(povs.workers(factory, workers), dask) as there:
-        found = _truth(factory, povs, chosen, cases, seed, there, where)
+        found = _truth(factory, povs, chosen, cases, seed, there, where, criterion)
     if factory.vut.named_only:
         say(
             "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
@@ -125,6 +136,9 @@ def compare(
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     pov: PovOption = None,
+    fail_when: FailWhenOption = "collision",
+    require: RequireOption = None,
+    follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -156,12 +170,13 @@ def compare(
     from merge_sumo.reports.progress import Counter
     from merge_sumo.scenarios.scenario_file import named_scenario
     from merge_sumo.system.workers import open_workers
+    from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.fmc import fmc
 
-    where = named_scenario(scenario)
+    where = followed_up(named_scenario(scenario), follow_up)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
     povs = povs_of(policies, where, pov, options)
-    levels = parse_levels(level, povs)
+    levels, criterion = parse_levels(level, povs), Criterion(fail_when, require)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
     factory = _factory(vut, povs, vut_command, options)
     for name in names:
@@ -175,6 +190,8 @@ def compare(
             policies=None if policies is None else str(policies),
             pov=pov,
             scenario=where,
+            fail_when=fail_when,
+            require=require,
         )
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")
@@ -186,12 +203,14 @@ def compare(
         Counter(title, len(names) * seeds, "runs") as counter,
     ):
         truths = {
-            level: _truth(factory, povs, level, truth_cases, 0, there, where) for level in levels
+            level: _truth(factory, povs, level, truth_cases, 0, there, where, criterion)
+            for level in levels
         }
-        made = partial(
-            _truth, factory, povs, cases=DENSE_CASES, seed=0, workers=there, scenario=where
+        asked = partial(partial, cases=DENSE_CASES, scenario=where, criterion=criterion)
+        made, known = (
+            asked(_truth, factory, povs, seed=0, workers=there),
+            asked(known_truth, factory, povs=povs),
         )
-        known = partial(known_truth, factory, cases=DENSE_CASES, povs=povs, scenario=where)
         dense_truths = truths_of(levels, made if dense else known if dense is None else None)
         searches = experiments.search(
             factory,
@@ -204,6 +223,7 @@ def compare(
             on_search=lambda name, _: counter.ended(1, name),
             scenario=where,
             povs=povs,
+            criterion=criterion,
         )
     limit = experiments.limit_fmc(chain.from_iterable(searches.values()), truths, dense_truths)
     compared = {name: experiments.compare(found, truths, limit) for name, found in searches.items()}
@@ -300,6 +320,7 @@ def _truth(
     seed: int,
     workers: Workers,
     scenario: Scenario,
+    criterion: Criterion,
 ) -> Truth:
     from merge_sumo.campaigns.truth import TRUTH_CASES, ground_truth
     from merge_sumo.reports.progress import Counter
@@ -319,4 +340,5 @@ def _truth(
             on_cases=counter.ended,
             scenario=scenario,
             povs=povs,
+            criterion=criterion,
         )

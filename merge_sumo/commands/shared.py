@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -12,6 +13,7 @@ from merge_sumo.system.printable import printable
 
 if TYPE_CHECKING:
     from merge_sumo.reports.verdict import Verdict
+    from merge_sumo.values.scenario import Scenario
 
 MOST_MESSAGES: Final = 5
 """Messages of errors and timeouts that are printed; the report has the others."""
@@ -101,6 +103,30 @@ PovOption = Annotated[
         help="A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
     ),
 ]
+FailWhenOption = Annotated[
+    str,
+    typer.Option(
+        metavar="EXPR",
+        help="What counts as a failure: collision (the paper's), contact, unsafe, or a condition "
+        "over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
+    ),
+]
+RequireOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="STL",
+        help="What is to hold over time, instead of --fail-when, in signal temporal logic: "
+        "'always ((x_vut_m > -20) implies (gap_m > 2))'. Needs the extra stl.",
+    ),
+]
+FollowUpOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="How long both drive on behind M: what happens there is measured.  [default: the "
+        "scenario's, 0]",
+    ),
+]
 ToleranceOption = Annotated[
     float,
     typer.Option(
@@ -116,7 +142,7 @@ SETTINGS: Final = {
         name: name
         for name in (
             *("vut", "sampler", "cases", "batch", "seed", "stop_after_converged", "vut_command"),
-            *("in_process", "policies", "pov", "learn_from", "scenario"),
+            *("in_process", "policies", "pov", "learn_from", "scenario", "fail_when", "require"),
         )
     },
     "v_vut0": "v_vut0_mps",
@@ -147,7 +173,11 @@ def written_settings(context: typer.Context) -> dict[str, Any]:
     if "learn_from" in given:
         given["learn_from"] = tuple(map(str, given["learn_from"]))
     if "scenario" in given:
-        given["scenario"] = named_scenario(given["scenario"])
+        given["scenario"] = followed_up(
+            named_scenario(given["scenario"]), context.params.get("follow_up")
+        )
+    elif "follow_up" in written(context):
+        raise UserError("--follow-up is of the scenario: name that, too, with --scenario")
     return given
 
 
@@ -168,6 +198,11 @@ def print_troubles(verdict: Verdict) -> None:
     if others:
         number = sum(trouble.count for trouble in others)
         show(f"  {number} with {len(others)} other messages")
+
+
+def followed_up(scenario: Scenario, seconds: float | None) -> Scenario:
+    """Return a scenario in which both drive on behind M for so long, if that was said."""
+    return scenario if seconds is None else replace(scenario, follow_up_s=seconds)
 
 
 def show(line: object) -> None:

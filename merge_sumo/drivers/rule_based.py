@@ -89,9 +89,10 @@ class RuleBasedVut(Level0Vut):
     def act(self, scene: Scene) -> FloatArray:
         """Return the commanded acceleration, behind the actuator's lag if there is one."""
         design = self.design
-        distance = -scene.x_vut_m
+        distance = np.maximum(-scene.x_vut_m, 0.0)
         t_m = level0_time_to(distance, scene.v_vut_mps, self.a_mps2, self.v_cruise_mps)
-        dx_at_m = scene.x_pov_m + scene.v_pov_mps * t_m
+        # Behind M it is the gap that there is.
+        dx_at_m = scene.x_pov_m + scene.v_pov_mps * t_m - np.maximum(scene.x_vut_m, 0.0)
         command = super().act(scene)
         too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
         command[too_close] = 0.0

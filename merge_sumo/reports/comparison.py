@@ -19,11 +19,12 @@ from merge_sumo.campaigns.settings import same_pov, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports.changes import Change, ComparedCase, LevelChange, RunComparison, Untested
 from merge_sumo.reports.verdict import Verdict, counted, judge
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import FAILURE_SCORE, Measures, Outcome, measure
+from merge_sumo.values.score import FAILURE_SCORE, Outcome
 from merge_sumo.values.trajectory import End
 
 CHECKED: Final = 32
@@ -60,8 +61,7 @@ def compare_runs(
         if not own:
             raise UserError(f"{run.folder} has no case at a POV level of both: it shows nothing")
     telling_a, telling_b = (
-        [*failures(own), *(o for o in own if not o.measures.end.is_tested)]
-        for own in (own_a, own_b)
+        [*failures(own), *(o for o in own if not o.is_tested)] for own in (own_a, own_b)
     )
     again_a = again_b = _Again({}, "was not run again")
     if rerun:
@@ -69,8 +69,8 @@ def compare_runs(
         again_b = _run_again(b, telling_a, net, given, trust=trust)
         again_a = _run_again(a, telling_b, net, given, trust=trust)
     cases = [
-        *(compared_case("A", o, o.measures, again_b.measures.get(o.index)) for o in telling_a),
-        *(compared_case("B", o, again_a.measures.get(o.index), o.measures) for o in telling_b),
+        *(compared_case("A", o, o, again_b.outcomes.get(o.index)) for o in telling_a),
+        *(compared_case("B", o, again_a.outcomes.get(o.index), o) for o in telling_b),
     ]
     cases.sort(key=telling)
     return RunComparison(
@@ -110,6 +110,11 @@ def _common_levels(a: Run, b: Run) -> list[int]:
             f"the VUT starts at {speeds[0]} m/s in {a.folder} and at {speeds[1]} m/s in "
             f"{b.folder}: compare campaigns with the same --v-vut0"
         )
+    if a.criterion != b.criterion:
+        raise UserError(
+            f"a case of {a.folder} fails when {a.criterion.text}, and one of {b.folder} when "
+            f"{b.criterion.text}: compare campaigns with the same --fail-when"
+        )
     for level in common:
         if not same_pov(a.settings, b.settings, level):
             raise UserError(
@@ -133,7 +138,7 @@ def _common_net(a: Run, b: Run, net: Corridor) -> Corridor:
 class _Again:
     """What a VUT made of the other one's telling cases, by index, and how that came about."""
 
-    measures: dict[int, Measures]
+    outcomes: dict[int, Outcome]
     how: str
 
 
@@ -146,18 +151,19 @@ def _run_again(
     trust: bool,
 ) -> _Again:
     """Run a campaign's VUT on the other's telling cases, if it is still the same VUT."""
-    told = [o for o in run.outcomes if o.measures.score is not None]
-    told = sorted(told, key=lambda o: (o.measures.score, o.index))[:CHECKED]
+    told = [o for o in run.outcomes if o.score is not None]
+    told = sorted(told, key=lambda o: (o.score, o.index))[:CHECKED]
     cases = [o.case for o in (*told, *failing)]
     if not failing:
         return _Again({}, "had nothing to run")
-    measures: dict[int, Measures] = {}
+    again: dict[int, Outcome] = {}
     settings = settings_of(run.folder, run.settings, given, trust=trust)
+    lines = centre_lines(net)
     with ground_of(settings, len(cases), net) as ground:
         for place, trajectory in ground.run(cases):
-            measures[place] = measure(trajectory)
+            again[place] = settings.criterion.outcome(place, 0, trajectory, lines)
     for place, outcome in enumerate(told):
-        was, now = outcome.measures.score, measures[place].score
+        was, now = outcome.score, again[place].score
         if was is None or now is None or abs(was - now) > SAME_SCORE:
             return _Again(
                 {},
@@ -165,10 +171,10 @@ def _run_again(
                 f"{outcome.index} records",
             )
     first = len(told)
-    return _Again({o.index: measures[first + n] for n, o in enumerate(failing)}, "was run again")
+    return _Again({o.index: again[first + n] for n, o in enumerate(failing)}, "was run again")
 
 
-def compared_case(run: str, of: Outcome, a: Measures | None, b: Measures | None) -> ComparedCase:
+def compared_case(run: str, of: Outcome, a: Outcome | None, b: Outcome | None) -> ComparedCase:
     """Return what became of a case of a run, "A" or "B"; None where a VUT was not run."""
     return ComparedCase(
         run=run,
@@ -176,20 +182,20 @@ def compared_case(run: str, of: Outcome, a: Measures | None, b: Measures | None)
         case=of.case,
         score_a=None if a is None else a.score,
         score_b=None if b is None else b.score,
-        end_a=None if a is None else a.end,
-        end_b=None if b is None else b.end,
+        end_a=None if a is None else a.measures.end,
+        end_b=None if b is None else b.measures.end,
         change=_change(a, b),
     )
 
 
-def _change(a: Measures | None, b: Measures | None) -> Change:
+def _change(a: Outcome | None, b: Outcome | None) -> Change:
     if a is None or b is None:
         return Change.NOT_RUN_AGAIN
-    if not (a.end.is_tested or b.end.is_tested):
+    if not (a.is_tested or b.is_tested):
         return Change.NO_VERDICT
-    if not a.end.is_tested:
+    if not a.is_tested:
         return Change.NO_VERDICT_OF_A
-    if not b.end.is_tested:
+    if not b.is_tested:
         return Change.NO_VERDICT_OF_B
     if _fails(a.score) and _fails(b.score):
         return Change.BOTH_FAIL
@@ -232,11 +238,13 @@ def level_change(
     if all(case.change is not Change.NOT_RUN_AGAIN for case in at_level):
         # Both VUTs were tried on the same cases: the others of both campaigns raise no question.
         together = alone_a.cases + (0 if same_cases else alone_b.cases)
-        untested_a = _untested(alone_a, together, (case.end_a for case in at_level))
-        untested_b = _untested(alone_b, together, (case.end_b for case in at_level))
+        untested_a = _untested(alone_a, together, (_silent(c.end_a, c.score_a) for c in at_level))
+        untested_b = _untested(alone_b, together, (_silent(c.end_b, c.score_b) for c in at_level))
     else:
-        untested_a = _untested(alone_a, alone_a.cases, (c.end_a for c in at_level if c.run == "A"))
-        untested_b = _untested(alone_b, alone_b.cases, (c.end_b for c in at_level if c.run == "B"))
+        own_ends_a = (_silent(c.end_a, c.score_a) for c in at_level if c.run == "A")
+        own_ends_b = (_silent(c.end_b, c.score_b) for c in at_level if c.run == "B")
+        untested_a = _untested(alone_a, alone_a.cases, own_ends_a)
+        untested_b = _untested(alone_b, alone_b.cases, own_ends_b)
 
     # Where one fails and the other gives no verdict, nothing was fixed and nothing broke.
     silent = (Change.NO_VERDICT_OF_A, Change.NO_VERDICT_OF_B)
@@ -259,6 +267,11 @@ def level_change(
             change.value: sum(case.change is change for case in at_level) for change in Change
         },
     )
+
+
+def _silent(end: End | None, score: float | None) -> End | None:
+    """Return how a case ended that says nothing; None of a failure, however it ended."""
+    return None if _fails(score) else end
 
 
 def _untested(alone: Verdict, cases: int, ends: Iterable[End | None]) -> Untested:

@@ -227,7 +227,7 @@ def failure_boxes(
     """
     from sklearn.tree import DecisionTreeClassifier
 
-    told = [o for o in outcomes if o.case.level == level and o.measures.score is not None]
+    told = [o for o in outcomes if o.case.level == level and o.score is not None]
     failed = np.array([o.failed for o in told], dtype=bool)
     if failed.sum() < FEWEST_FAILURES:
         return []

@@ -24,6 +24,7 @@ from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder
+from merge_sumo.values.bodies import WIDTH_M
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
 TABLE: Final = "trajectories"
@@ -31,7 +32,6 @@ ROAD: Final = "road.xodr"
 _EPOCH: Final = datetime(2000, 1, 1)
 MINOR_VERSION: Final = 2
 """OpenSCENARIO 1.2."""
-WIDTH_M: Final = 1.8
 HEIGHT_M: Final = 1.5
 WHEEL_M: Final = 0.7
 

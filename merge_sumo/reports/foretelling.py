@@ -13,8 +13,11 @@ from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.foresight import compressed
+from merge_sumo.sumo.centre_lines import centre_lines
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool
+from merge_sumo.values.scenario import DX_CRASH_M
 from merge_sumo.values.score import Outcome
 
 LAST: Final = 200
@@ -34,7 +37,7 @@ def off_m(outcome: Outcome) -> float | None:
     """Return how many metres the foretold gap was off; None where there was none to compare."""
     if outcome.foretold is None or outcome.measures.score is None:
         return None
-    said, came = outcome.foretold.median_dx_m, outcome.measures.dx_m
+    said, came = outcome.foretold.median_dx_m, outcome.signed_gap_m
     return None if said is None or came is None else abs(said - came)
 
 
@@ -47,7 +50,7 @@ def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:
 
     def surprise(outcome: Outcome) -> float:
         assert outcome.foretold is not None, "only these are asked"  # noqa: S101
-        gaps = np.array([outcome.foretold.median_dx_m, outcome.measures.dx_m], dtype=np.float64)
+        gaps = np.array([outcome.foretold.median_dx_m, outcome.signed_gap_m], dtype=np.float64)
         return abs(float(np.diff(compressed(gaps, limit_m))[0]))
 
     told = [o for o in outcomes if o.foretold is not None and o.measures.score is not None]
@@ -79,7 +82,7 @@ def _metres(length_m: float) -> str:
 class Expected:
     """The twin of a run that has ended: where it expects failures."""
 
-    def __init__(self, run: Run, levels: Sequence[int]) -> None:
+    def __init__(self, run: Run, levels: Sequence[int], road: Corridor) -> None:
         """Learn from the motions of a run; raises `UserError` where they or policies are gone."""
         povs = Povs(policies=policies_of(run.scenario))
         if povs.sha256() != run.settings.get("policies_sha256"):
@@ -90,8 +93,9 @@ class Expected:
             v_vut0_mps=float(speed) if isinstance(speed, int | float) else None,
             scenario=run.scenario,
         )
-        self._limit_m = run.scenario.dx_crash_m
-        self._twin = Twin(pool, povs, 0)
+        criterion = run.criterion
+        self._limit_m = run.scenario.dx_crash_m if criterion.is_papers else DX_CRASH_M
+        self._twin = Twin(pool, povs, 0, criterion=criterion, lines=centre_lines(road))
         last = run.outcomes[-MOST_CASES:]
         self._twin.tell(last, {o.index: run.trajectory(o.index).motion for o in last})
 

@@ -28,6 +28,8 @@ from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
 CLASS: Final = "merge-sumo"
+FAILED: Final = "FAILED"
+"""What a failure is called that need not be a collision."""
 
 
 def check_junit(path: Path, folder: Path) -> None:
@@ -95,8 +97,10 @@ def _case(suite: etree._Element, outcome: Outcome) -> None:
     test = _test(suite, name, f"{CLASS}.level{level_name(case.level)}", measures.t_end_s)
     if measures.end.is_error:
         _wrong(test, "error", measures.end.value, message_of(measures))
-    elif not measures.end.is_tested:
+    elif not outcome.is_tested:
         _wrong(test, "failure", End.TIMEOUT.value, message_of(measures))
+    elif outcome.margin is not None and outcome.failed:
+        _wrong(test, "failure", FAILED, f"margin {outcome.margin:.3g}")
     elif outcome.failed:
         gap = "" if measures.dx_m is None else f", gap {measures.dx_m:.1f} m"
         _wrong(test, "failure", End.COLLISION.value, f"collision at the merge point{gap}")

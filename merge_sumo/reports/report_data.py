@@ -79,10 +79,11 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "nearest": VEHICLES.index(o.measures.nearest),
             "end": ends.index(o.measures.end),
             "failed": int(o.failed),
-            "score": _rounded(o.measures.score, 1),
+            "score": _rounded(o.score, 1),
             "dx": _rounded(o.measures.dx_m, 2),
             "dv": _rounded(o.measures.dv_mps, 2),
             "t_end": o.measures.t_end_s,
+            "after": o.measures.after_merge,
             **_avoidance(facts, o.index),
             "way_out": _rounded(o.measures.last_avoidable_s, 1),
             "vut_yields": found.vut_yields_s,
@@ -91,6 +92,8 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "offset": offsets.get(o.index, 0),
             "rows": len(facts.motion[o.index].motion) if o.index in facts.motion else 0,
         }
+        if not facts.run.criterion.is_papers:
+            row["margin"] = _rounded(o.margin, 3)
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
     return columns or {"index": []}
@@ -147,7 +150,7 @@ def _search(facts: Facts) -> dict[str, Any]:
     for level in facts.levels:
         at = [o for o in facts.run.outcomes if o.case.level == level]
         group = np.array([o.batch // width for o in at], dtype=np.int64)
-        score = np.array([o.measures.score for o in at], dtype=np.float64)
+        score = np.array([o.score for o in at], dtype=np.float64)
         failed = np.array([o.failed for o in at], dtype=bool)
         points = to_unit((o.case for o in at), level, facts.run.scenario)
         counted: list[int] = []

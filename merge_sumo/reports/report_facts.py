@@ -53,10 +53,10 @@ class Facts:
         self.avoidance = read_avoidance(run)
         self.near = sorted(
             (o for o in run.outcomes if _is_told(o) and not o.failed),
-            key=lambda o: (o.measures.score, o.index),
+            key=lambda o: (o.score, o.index),
         )
         self.surprises = surprises(run.outcomes, run.scenario.dx_crash_m)[:LISTED]
-        self.expected = _expected(run, levels)
+        self.expected = _expected(run, levels, self.road)
         self.untested = [o for o in run.outcomes if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
         listed = [*(*examples, *self.worst[:LISTED], *self.near[:LISTED], *self.surprises)]
@@ -87,18 +87,18 @@ class Facts:
         return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
 
 
-def _expected(run: Run, levels: Sequence[int]) -> Expected | None:
+def _expected(run: Run, levels: Sequence[int], road: Corridor) -> Expected | None:
     """Return where the twin of a run expects failures, if the run had one."""
     if not is_foretold(run.outcomes):
         return None
     try:
-        return Expected(run, levels)
+        return Expected(run, levels, road)
     except UserError:
         return None
 
 
 def _is_told(outcome: Outcome) -> bool:
-    return outcome.measures.end.is_tested and outcome.measures.score is not None
+    return outcome.is_tested and outcome.score is not None
 
 
 def _motion(run: Run, index: int) -> Trajectory | None:
@@ -137,5 +137,6 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         run.scenario,
         policies=settings.get("policies_sha256", {}),
         pov=settings.get("pov") if level == OWN else None,
+        criterion=run.criterion,
     )
     return read_truth(kept.path(), level, kept.cases, kept.scenario)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -24,8 +24,10 @@ from merge_sumo.reports.summary import LevelSummary, Summary
 from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.reports.verdict import Verdict, counted, in_words
 from merge_sumo.system.printable import printable
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.empty_ball import EmptyBall
 from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.merge import HARSH_MPS2, AfterMerge
 from merge_sumo.values.scenario import OWN, level_name
 from merge_sumo.values.score import Outcome
 
@@ -74,6 +76,7 @@ ABOUT: Final = {
 def page_words(facts: Facts) -> dict[str, Any]:
     """Return what the template needs for text and tables."""
     settings, summary = facts.run.settings, facts.summary
+    criterion = facts.run.criterion
     wanted = settings.get("cases")
     boxes = [
         box
@@ -98,7 +101,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         tables.append(("Ten that were foretold worst", facts.surprises))
     return {
         "vut": facts.run.vut,
-        "headline": headline(facts.verdict, summary, facts.worst, facts.kinds),
+        "headline": headline(facts.verdict, summary, facts.worst, facts.kinds, criterion),
         "careful": in_a_sentence(facts.avoidance.values()),
         "avoidance": _avoidance(facts),
         "foretold": foretold_in_words(facts.run.outcomes),
@@ -118,6 +121,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "plausible_chance": f"{PLAUSIBLE:.0%}",
         "fewest_failures": FEWEST_FAILURES,
         "avoidable": _avoidable(facts.worst),
+        "after": after_words(facts.run.outcomes),
         "batches": len({o.batch for o in facts.run.outcomes}),
         "driven": _duration(sum(o.measures.t_end_s for o in facts.run.outcomes)),
         "sentences": [box.sentence for box in boxes],
@@ -129,6 +133,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "kinds": _kinds(facts),
         "ceded": f"{CEDED_MPS:g}",
         "scenario": facts.run.scenario,
+        "criterion": None if criterion.is_papers else criterion.words,
         "traffic": facts.run.scenario.vehicles > 2,
         "coordinates": facts.coordinates,
         "covered": any(level.dims <= 3 for level in levels),
@@ -279,7 +284,11 @@ def _avoidable_kind(facts: Facts, outcome: Outcome) -> bool:
 
 
 def headline(
-    verdict: Verdict, summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]
+    verdict: Verdict,
+    summary: Summary,
+    worst: Sequence[Outcome],
+    kinds: Mapping[int, Kind],
+    criterion: Criterion = COLLISION,
 ) -> str:
     """Return the result of a campaign in a few sentences: what was not tested comes first."""
     if not verdict.cases:
@@ -289,18 +298,23 @@ def headline(
         for level, found in summary.levels.items():
             if found.cases and not found.tested:
                 said.append(f"At POV level {level_name(level)} nothing was tested.")
-        said.append(_collisions(verdict, summary, worst, kinds))
+        said.append(_failures(verdict, summary, worst, kinds, criterion))
     return " ".join(said)
 
 
-def _collisions(
-    verdict: Verdict, summary: Summary, worst: Sequence[Outcome], kinds: Mapping[int, Kind]
+def _failures(
+    verdict: Verdict,
+    summary: Summary,
+    worst: Sequence[Outcome],
+    kinds: Mapping[int, Kind],
+    criterion: Criterion,
 ) -> str:
     if not summary.failures:
+        what = "collision" if criterion.is_papers else "failure"
         others = "the other " if verdict.tested < verdict.cases else ""
         return (
-            f"No collision in {others}{counted(verdict.tested, 'case')}. That is no proof: the "
-            "search saw these cases and no others."
+            f"No {what} in {others}{counted(verdict.tested, 'case')}. That is no proof: the search "
+            "saw these cases and no others."
         )
     failing = {level: found for level, found in summary.levels.items() if found.failures}
     tested = {level: found for level, found in summary.levels.items() if found.tested}
@@ -310,7 +324,7 @@ def _collisions(
         f"({counted(found.regions, 'region')})"
         for level, found in failing.items()
     ]
-    text = f"Collides in {in_words(parts)}"
+    text = f"{'Collides' if criterion.is_papers else 'Fails'} in {in_words(parts)}"
     text += f", never at level {in_words(never)}." if never else "."
     common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
     if common:
@@ -321,10 +335,24 @@ def _collisions(
 
 
 def _avoidable(worst: Sequence[Outcome]) -> str | None:
-    if not worst:
+    """Return how many collisions need not have been, among those that count as failures."""
+    told = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
+    return f"{sum(told)} of {len(told)} could have been avoided by the VUT." if told else None
+
+
+def after_words(outcomes: Iterable[Outcome]) -> str | None:
+    """Return how many cases without a failure ask too much of whoever is behind after the merge."""
+    found = Counter(o.measures.after_merge for o in outcomes if not o.failed)
+    forced, harsh = (
+        counted(found[asked], "case") for asked in (AfterMerge.FORCED, AfterMerge.HARSH)
+    )
+    if not (found[AfterMerge.FORCED] or found[AfterMerge.HARSH]):
         return None
-    count = sum(bool(o.measures.avoidable) for o in worst)
-    return f"{count} of {len(worst)} could have been avoided by the VUT."
+    return (
+        f"No failure, but no harmless merge: in {harsh} whoever is behind at M has to brake "
+        f"harder than {HARSH_MPS2:g} m/s², in {forced} harder than it can (--fail-when unsafe "
+        "looks for these)."
+    )
 
 
 def _duration(seconds: float) -> str:

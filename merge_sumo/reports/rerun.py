@@ -30,7 +30,7 @@ class ChangedVerdict:
     @property
     def change(self) -> str:
         """What that means: fixed, broke, or between failing and giving no verdict."""
-        return compared_case("A", self.before, self.before.measures, self.after.measures).change
+        return compared_case("A", self.before, self.before, self.after).change
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
@@ -40,7 +40,7 @@ class ChangedVerdict:
             "level": self.before.case.level,
             "change": self.change,
             **{"end_before": was.end, "end_after": now.end},
-            **{"score_before": was.score, "score_after": now.score},
+            **{"score_before": self.before.score, "score_after": self.after.score},
         }
 
 
@@ -64,7 +64,11 @@ class Rerun:
     def changed(self) -> list[ChangedVerdict]:
         """The cases whose verdict changed, in the order of the campaign."""
         pairs = zip(self.before, self.after, strict=True)
-        return [ChangedVerdict(a, b) for a, b in pairs if a.measures.end is not b.measures.end]
+        return [
+            ChangedVerdict(a, b)
+            for a, b in pairs
+            if (a.measures.end, a.failed) != (b.measures.end, b.failed)
+        ]
 
 
 def settings_today(
@@ -125,12 +129,13 @@ def rerun(
         net=road,
         scenario=settings.scenario,
         povs=settings.povs,
+        criterion=settings.criterion,
     )
     after: dict[int, Outcome] = {}
     with workers_or_here(workers) as there:
         for place, ran in runs_on(there, plan)([outcome.case for outcome in before]):
             was = before[place]
-            after[place] = Outcome(was.index, was.batch, was.case, ran.measures)
+            after[place] = Outcome(was.index, was.batch, was.case, ran.measures, margin=ran.margin)
             on_case(1)
     again = [after[place] for place in range(len(before))]
     return Rerun(settings.vut, before, again, _compared(levels, before, again))
@@ -141,9 +146,9 @@ def _compared(
 ) -> RunComparison:
     """Compare outcomes of the same cases."""
     cases = [
-        compared_case("A", a, a.measures, b.measures)
+        compared_case("A", a, a, b)
         for a, b in zip(before, after, strict=True)
-        if any(o.failed or not o.measures.end.is_tested for o in (a, b))
+        if any(o.failed or not o.is_tested for o in (a, b))
     ]
     cases.sort(key=telling)
     by_level = {

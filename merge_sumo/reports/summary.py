@@ -63,7 +63,7 @@ def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
     points = to_unit((outcome.case for outcome in at_level if outcome.failed), level)
     return LevelSummary(
         cases=len(at_level),
-        tested=sum(outcome.measures.end.is_tested for outcome in at_level),
+        tested=sum(outcome.is_tested for outcome in at_level),
         failures=len(points),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,

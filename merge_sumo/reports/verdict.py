@@ -135,7 +135,7 @@ def judge(outcomes: Iterable[Outcome]) -> Verdict:
         cases += 1
         failures += outcome.failed
         measures = outcome.measures
-        if measures.end.is_tested:
+        if outcome.is_tested:
             continue
         errors += measures.end.is_error
         timeouts += not measures.end.is_error

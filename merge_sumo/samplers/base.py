@@ -29,9 +29,10 @@ class LevelHistory:
 
     Attributes:
         points: cases in the unit cube, (N, d).
-        score: P, (N,).
-        failed: P < lambda, (N,).
-        dx_m: signed gap at M, (N,); NaN where the VUT never arrived or gives no trajectory.
+        score: P, or what stands for it under another criterion than the paper's, (N,).
+        failed: score < lambda, (N,).
+        dx_m: signed gap at M, (N,), or what stands for it under another criterion: a case fails
+            where it is within 6 m; NaN where the VUT never arrived or gives no trajectory.
         batch: batch of the campaign in which the case ran, (N,).
     """
 
@@ -115,7 +116,7 @@ class Sampler(ABC):
         return [
             outcome
             for _, outcome in sorted(self._outcomes.items())
-            if outcome.measures.score is not None and level in (None, outcome.case.level)
+            if outcome.score is not None and level in (None, outcome.case.level)
         ]
 
     def proposed(self, level: int | None = None) -> int:
@@ -127,10 +128,10 @@ class Sampler(ABC):
         outcomes = self.told(level)
         return LevelHistory(
             points=to_unit((o.case for o in outcomes), level, self.pool.scenario),
-            score=np.array([o.measures.score for o in outcomes], dtype=np.float64),
+            score=np.array([o.score for o in outcomes], dtype=np.float64),
             failed=np.array([o.failed for o in outcomes], dtype=bool),
             # None becomes NaN.
-            dx_m=np.array([o.measures.dx_m for o in outcomes], dtype=np.float64),
+            dx_m=np.array([o.signed_gap_m for o in outcomes], dtype=np.float64),
             batch=np.array([o.batch for o in outcomes], dtype=np.int64),
         )
 

@@ -25,6 +25,7 @@ from merge_sumo.samplers.informed import FEWEST, informed_batch
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.foretold import Foretold
+from merge_sumo.values.scenario import DX_CRASH_M
 
 FIRST_BATCH: Final = 10
 YOUNG: Final = 60
@@ -136,7 +137,11 @@ class CoverageSampler(Sampler):
             indices = [outcome.index for outcome in last]
             gaps_m = self.games.replay(level, indices, history.points[-REPLAYED:])
             replayed = dict(zip(indices, gaps_m.T, strict=True))
-        return Record(self.told(), level, self.pool.scenario.dx_crash_m, replayed)
+        told = self.told()
+        # What stands for a gap under another criterion has the limit of the paper's scenario.
+        stands_in = any(outcome.margin is not None for outcome in told)
+        limit_m = DX_CRASH_M if stands_in else self.pool.scenario.dx_crash_m
+        return Record(told, level, limit_m, replayed)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: half of them evenly, the rest by the next gain.

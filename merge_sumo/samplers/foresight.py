@@ -207,7 +207,7 @@ class Record:
 
         By gaps, (E, G): a member of an expert is as good as any other.
         """
-        true = compressed(np.array(outcome.measures.dx_m, dtype=np.float64), self._limit_m)
+        true = compressed(np.array(outcome.signed_gap_m, dtype=np.float64), self._limit_m)
         off = (true - compressed(gaps_m, self._limit_m))[..., None]
         density = np.exp(-0.5 * np.square(off / WIDTHS)) / (WIDTHS * np.sqrt(2.0 * np.pi))
         by_width = density.mean(axis=1)

@@ -30,6 +30,8 @@ NEAR: Final = 300
 BETWEEN: Final = 200
 """Candidates that one member screens: anywhere, a share of them on faces of the pool, near
 failures, and between safe cases on either side."""
+ASKED: Final = 1500
+"""And candidates of the surrogate's that it is asked about."""
 SCREENED: Final = 80
 OF_THE_BELIEF: Final = 40
 AT_RANDOM: Final = 20
@@ -75,7 +77,7 @@ def informed_batch(
     screened, chosen = [uniform], [uniform[:AT_RANDOM]]
     if belief is not None:
         screened.append(between(belief, BETWEEN, rng))
-        proposed = of_belief(history, belief, rng, n)
+        proposed = rng.permutation(of_belief(history, belief, rng, n))[:ASKED]
         chosen.append(best(proposed, belief.of(proposed), OF_THE_BELIEF))
     if len(failing):
         screened.append(around(failing, NEAR, LOCAL_REACH * reach, rng))

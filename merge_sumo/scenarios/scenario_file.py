@@ -97,6 +97,7 @@ COMMENTS: Final = {
     "a_min_mps2": "hardest braking of both",
     "a_max_mps2": "hardest acceleration of both",
     "timeout_s": "an episode that has not ended by then is a TIMEOUT",
+    "follow_up_s": "both drive on behind M for so long",
     "v_hw_min_mps": "speeds between which the mainline drives",
     "v_min_mps": "below this the VUT is slow",
     "ttc_min_s": "a time to collision below this is short",

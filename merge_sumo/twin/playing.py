@@ -13,8 +13,11 @@ from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, features
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.drivers.povs import POLICIES, Povs
 from merge_sumo.twin.watching import Inputs, Watcher
+from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray, Pool
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
+from merge_sumo.values.trajectory import End, Trajectory
 
 Answer = Callable[[Inputs, int, NDArray[np.int64]], FloatArray]
 """Gives accelerations of the VUT, (R,), by inputs, (R, inputs), of which some are of the present,
@@ -26,17 +29,28 @@ STILL: Final = 0.8
 class Games:
     """Plays cases of a pool out against a VUT that is given as a function."""
 
-    def __init__(self, pool: Pool, povs: Povs) -> None:
-        """Take the pool and the POVs."""
+    def __init__(
+        self,
+        pool: Pool,
+        povs: Povs,
+        criterion: Criterion = COLLISION,
+        lines: CentreLines | None = None,
+    ) -> None:
+        """Take the pool, the POVs, what counts as a failure, and the road's centre lines."""
         self._pool, self._scenario = pool, pool.scenario
+        self._criterion, self._lines = criterion, lines
         self._networks = {
             level: load_network(POLICIES[level], povs.policies)
             for level in set(povs.levels) & set(POLICIES)
         }
 
     def can_play(self, level: int) -> bool:
-        """Return whether the POV of a level is known, and not a program of a person's own."""
-        return level == 0 or level in self._networks
+        """Return whether the POV of a level is known, and not a program of a person's own.
+
+        A game ends at M, so none can be played where what happens behind it counts.
+        """
+        known = level == 0 or level in self._networks
+        return known and (self._criterion.is_papers or not self._scenario.follow_up_s)
 
     def _starts(self, points: FloatArray, level: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""
@@ -60,8 +74,37 @@ class Games:
     def play(self, points: FloatArray, level: int, answer: Answer) -> FloatArray:
         """Return the gaps at M to the cars that are nearest there, (R,), of cases, (R, d).
 
-        Cases are points of the unit cube; NaN where the VUT never arrives.
+        Cases are points of the unit cube; NaN where the VUT never arrives. Under another criterion
+        than the paper's it is what stands for the gap: see `Outcome.signed_gap_m`.
         """
+        if not self._criterion.is_papers:
+            return self._judged(points, level, answer)
+        return self._play(points, level, answer)
+
+    def _judged(self, points: FloatArray, level: int, answer: Answer) -> FloatArray:
+        """Return what stands for the gaps at M, (R,)."""
+        played: list[FloatArray] = []
+        gap_m = self._play(points, level, answer, played)
+        motion = np.array(played)
+        found = np.empty(len(points))
+        for row, case in enumerate(self._pool.cases(points, level)):
+            arrived = motion[:, VUT, 0, row] >= 0.0
+            last = int(arrived.argmax()) if arrived.any() else len(motion) - 1
+            of_row = motion[: last + 1, :, :, row].copy()
+            of_row[-1, :, 2] = 0.0
+            end = End.TIMEOUT if np.isnan(gap_m[row]) else End.MERGED
+            outcome = self._criterion.outcome(0, 0, Trajectory(case, of_row, end), self._lines)
+            found[row] = outcome.signed_gap_m
+        return found
+
+    def _play(
+        self,
+        points: FloatArray,
+        level: int,
+        answer: Answer,
+        played: list[FloatArray] | None = None,
+    ) -> FloatArray:
+        """Return the gaps at M, (R,); add every step, (A, 3, R), to what is `played`."""
         scenario = self._scenario
         x_m, v_mps, svo_rad = self._starts(points, level)
         rows = np.arange(len(points))
@@ -81,9 +124,11 @@ class Games:
             a_mps2[VUT] = answer(inputs, watcher.now, rows)
             a_mps2 = np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2)
             v_next = np.maximum(v_mps + a_mps2 * DT_S, 0.0)
-            x_m = x_m + v_mps * DT_S
+            x_before_m, x_m = x_m, x_m + v_mps * DT_S
             # What is recorded of a vehicle that comes to a stand.
             a_mps2 = np.maximum(a_mps2, v_mps / -DT_S)
+            if played is not None:
+                played.append(np.stack((x_before_m, v_mps, a_mps2), axis=1))
             v_mps = v_next
             arrived = x_m[VUT] >= 0.0
             if arrived.any():
@@ -95,11 +140,13 @@ class Games:
                 going = np.isnan(gap_m[rows])
                 if not going.any():
                     break
-                if going.mean() < STILL:
+                if played is None and going.mean() < STILL:
                     rows, svo_rad = rows[going], svo_rad[going]
                     x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
                     held = held[:, going]
                     watcher.keep(going)
+        if played is not None:
+            played.append(np.stack((x_m, v_mps, np.zeros_like(x_m)), axis=1))
         return gap_m
 
     def _decide(

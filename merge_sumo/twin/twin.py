@@ -12,7 +12,9 @@ from merge_sumo.drivers.povs import Povs
 from merge_sumo.twin.experts import GROUPS, Expert, Steps
 from merge_sumo.twin.playing import Games
 from merge_sumo.twin.watching import Inputs, Watcher
+from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray, Pool
+from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import VUT
 from merge_sumo.values.score import Outcome
 
@@ -35,14 +37,20 @@ class Twin:
     """
 
     def __init__(
-        self, pool: Pool, povs: Povs, seed: int, others: Sequence[FloatArray] = ()
+        self,
+        pool: Pool,
+        povs: Povs,
+        seed: int,
+        others: Sequence[FloatArray] = (),
+        criterion: Criterion = COLLISION,
+        lines: CentreLines | None = None,
     ) -> None:
-        """Know the pool and its POVs.
+        """Know the pool and its POVs, what counts as a failure, and the road's centre lines.
 
         `others` are motions, (T + 1, A, 3), of campaigns that are learned from.
         """
         self._pool, self._seed = pool, seed
-        self._games = Games(pool, povs)
+        self._games = Games(pool, povs, criterion, lines)
         self._batch: dict[int, int] = {}
         self._steps: dict[int, Steps] = {}
         self._others = self._watched(others, own=False)

@@ -29,6 +29,9 @@ MEMORY_GIB: Final = 4.0
 MAX_EPISODE_S: Final = 120.0
 """No scenario lets an episode last longer."""
 
+MAX_FOLLOW_UP_S: Final = 30.0
+"""None follows vehicles for longer behind M."""
+
 ROOM_AFTER_M: Final = 2000.0
 """Length behind M that the road has at least."""
 
@@ -95,6 +98,7 @@ class Scenario:
         a_min_mps2: hardest braking of both, negative.
         a_max_mps2: hardest acceleration of both.
         timeout_s: an episode that has not ended by then is a TIMEOUT.
+        follow_up_s: how long both drive on behind M; the verdict of the paper is at M.
         v_hw_min_mps: lowest speed that the mainline drives at.
         v_hw_max_mps: highest speed that it drives at.
         v_min_mps: below this the VUT is slow.
@@ -124,6 +128,7 @@ class Scenario:
     a_min_mps2: float = -4.0
     a_max_mps2: float = 2.0
     timeout_s: float = 30.0
+    follow_up_s: float = 0.0
     v_hw_min_mps: float = 24.6
     v_hw_max_mps: float = 35.0
     v_min_mps: float = 12.0
@@ -163,6 +168,7 @@ class Scenario:
             ("a_min_mps2", self.a_min_mps2 < 0.0, "below 0"),
             ("a_max_mps2", self.a_max_mps2 > 0.0, "above 0"),
             ("timeout_s", DT_S <= self.timeout_s <= MAX_EPISODE_S, f"up to {MAX_EPISODE_S:g}"),
+            ("follow_up_s", 0.0 <= self.follow_up_s <= MAX_FOLLOW_UP_S, self._followed),
             ("v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"),
             ("v_min_mps", self.v_min_mps > 0.0, "above 0"),
             ("ttc_min_s", self.ttc_min_s > 0.0, "above 0"),
@@ -190,6 +196,10 @@ class Scenario:
                 raise UserError(f"a scenario has no {name!r}{meant}")
             values[name] = _read(name, value, known[name].type)
         return cls(**values)
+
+    @property
+    def _followed(self) -> str:
+        return f"0 to {MAX_FOLLOW_UP_S:g} seconds"
 
     @property
     def _ahead(self) -> str:

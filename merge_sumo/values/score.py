@@ -15,7 +15,8 @@ import numpy as np
 
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
 from merge_sumo.values.foretold import Foretold
-from merge_sumo.values.scenario import DT_S, POV, US23, VEHICLES, VUT, Scenario
+from merge_sumo.values.merge import AfterMerge, after_merge, followed_up
+from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
@@ -64,6 +65,12 @@ class Measures:
         clipped_steps: steps in which the VUT asked for more than its limits of acceleration.
         error: what the VUT or the simulation did wrong, else None.
         nearest: name of the car that the measures are of; recorded in traffic only.
+        after_merge: what the state at M asks of whoever is behind then, "none", "harsh" or "forced"
+            (`merge.py`); None without a merge, and where an older version did not record it.
+        after_gap_m: least gap between bumpers in the follow-up, 0 or less where bodies touch; this
+            and the next two are None without a merge, and recorded where there is a follow-up only.
+        after_ttc_s: lowest time to collision in it, between bumpers; None where no gap closes.
+        after_drac_mps2: hardest braking that it needs, dv^2 / (2 gap); None where bodies touch.
     """
 
     end: End
@@ -83,22 +90,60 @@ class Measures:
     clipped_steps: int
     error: str | None
     nearest: str = VEHICLES[POV]
+    after_merge: str | None = None
+    after_gap_m: float | None = None
+    after_ttc_s: float | None = None
+    after_drac_mps2: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A case that was run: its place in the campaign, its measures, and what was foretold of it."""
+    """A case that was run: its place in the campaign, its measures, and what was foretold of it.
+
+    Attributes:
+        index: its place in the campaign.
+        batch: the batch in which it ran.
+        case: the case.
+        measures: what was measured.
+        foretold: what was foretold of it; None where nothing was.
+        margin: how far it is from failing under the campaign's criterion, below 0 where it fails;
+            None under the paper's, which has the score P, and after an error.
+    """
 
     index: int
     batch: int
     case: Case
     measures: Measures
     foretold: Foretold | None = None
+    margin: float | None = None
+
+    @property
+    def score(self) -> float | None:
+        """The score under the campaign's criterion: it fails below lambda; None after an error."""
+        return self.measures.score if self.margin is None else score_of(self.margin)
 
     @property
     def failed(self) -> bool:
-        """Whether this case is a failure of the VUT: P < lambda."""
-        return self.measures.score is not None and self.measures.score < FAILURE_SCORE
+        """Whether this case is a failure of the VUT: its score is below lambda."""
+        return self.score is not None and self.score < FAILURE_SCORE
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether this case says something of the VUT: it reached the merge point, or failed."""
+        return self.measures.end.is_tested or self.failed
+
+    @property
+    def signed_gap_m(self) -> float | None:
+        """The gap dx at M that a sampler learns; a case fails where it is within 6 m.
+
+        Under another criterion than the paper's it is what stands for it: 6 m times 1 + m at a
+        margin m of 0 or more, and 6 m / (1 - m) below; negative where the VUT goes first.
+        """
+        dx, margin = self.measures.dx_m, self.margin
+        if margin is None:
+            return dx
+        gap = DX_CRASH_M * (1.0 + margin if margin >= 0.0 else 1.0 / (1.0 - margin))
+        return -gap if dx is not None and dx < 0.0 else gap
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
@@ -109,8 +154,13 @@ class Outcome:
             names += RECORDED_IN_TRAFFIC
         else:
             del measures["nearest"]
+        if not case.scenario.follow_up_s:
+            for name in FOLLOWED_UP:
+                del measures[name]
         place = {"index": self.index, "batch": self.batch}
         record = place | {name: getattr(case, name) for name in names} | measures
+        if self.margin is not None:
+            record["margin"] = self.margin
         return record if self.foretold is None else record | {"foretold": self.foretold.to_record()}
 
     @classmethod
@@ -120,6 +170,9 @@ class Outcome:
         index, batch = values.pop("index"), values.pop("batch")
         if type(index) is not int or type(batch) is not int:
             raise TypeError("index and batch must be whole numbers")
+        margin = values.pop("margin", None)
+        if margin is not None and not (type(margin) is float and math.isfinite(margin)):
+            raise ValueError(f"margin is {margin!r}")
         in_traffic = scenario.vehicles > 2
         names = (*RECORDED, *RECORDED_IN_TRAFFIC) if in_traffic else RECORDED
         case = Case(**{name: values.pop(name) for name in names}, scenario=scenario)
@@ -129,15 +182,21 @@ class Outcome:
             values["nearest"] = VEHICLES[POV]
         if values["nearest"] not in VEHICLES:
             raise ValueError(f"nearest is {values['nearest']!r}")
+        if values.setdefault("after_merge", None) not in (None, *AfterMerge):
+            raise ValueError(f"after_merge is {values['after_merge']!r}")
+        if not scenario.follow_up_s:
+            values |= dict.fromkeys(FOLLOWED_UP)
         for name, types in _TYPES.items():
             if type(value := values[name]) not in types:
                 raise TypeError(f"{name} is {value!r}")
             if type(value) is float and not math.isfinite(value):
                 raise ValueError(f"{name} is {value!r}")
         said = None if foretold is None else Foretold.from_record(foretold)
-        return cls(index, batch, case, Measures(**values), said)
+        return cls(index, batch, case, Measures(**values), said, margin)
 
 
+FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
+"""Measures of the follow-up."""
 _JSON_TYPES: Final = {"None": type(None), "float": float, "str": str, "bool": bool, "int": int}
 _TYPES: Final = {
     name: frozenset(_JSON_TYPES[part] for part in annotation.split(" | "))
@@ -145,6 +204,11 @@ _TYPES: Final = {
     if name != "end"
 }
 """What the fields of `Measures` may hold when they are read from JSON."""
+
+
+def score_of(margin: float) -> float:
+    """Return the score that a margin stands for, in the same order; lambda at a margin of 0."""
+    return FAILURE_SCORE * (1.0 - margin / (1.0 + abs(margin)))
 
 
 def measure(trajectory: Trajectory) -> Measures:
@@ -169,6 +233,8 @@ def measure(trajectory: Trajectory) -> Measures:
             gap = abs(dx) - crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
     hardest = -pair.motion[:, :, 2].min(axis=0)
+    asked = after_merge(trajectory)
+    followed: tuple[float | None, ...] = followed_up(trajectory) or (None, None, None)
     return Measures(
         end=end,
         score=None if trajectory.error is not None else _score(trajectory, end, dx, ttc),
@@ -187,7 +253,15 @@ def measure(trajectory: Trajectory) -> Measures:
         clipped_steps=trajectory.clipped_steps,
         error=None if trajectory.error is None else as_reason(trajectory.error),
         nearest=VEHICLES[nearest],
+        after_merge=None if asked is None else asked.value,
+        after_gap_m=followed[0],
+        after_ttc_s=_finite(followed[1]),
+        after_drac_mps2=_finite(followed[2]),
     )
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
 
 
 def time_to_collision(dx_m: float, dv_mps: float) -> float | None:

@@ -55,7 +55,9 @@ class Trajectory:
 
     `end` is MERGED whenever the VUT arrived at M: whether it collided there is the verdict of the
     score. `error` says what the VUT or the simulation did wrong. `clipped_steps` counts the
-    answers of the VUT that were outside the limits of acceleration and were clipped.
+    answers of the VUT that were outside the limits of acceleration and were clipped. `after` is the
+    motion behind M where the scenario has it followed up, its first row that of the merge; it is
+    measured and not kept.
     """
 
     case: Case
@@ -63,6 +65,7 @@ class Trajectory:
     end: End
     error: str | None = None
     clipped_steps: int = 0
+    after: FloatArray | None = None
 
     @property
     def x_pov_m(self) -> FloatArray:

@@ -47,7 +47,7 @@ function wanted(i) { // whether the reader wants to see this failure
   if (by === null) return false;
   return who === "pov" ? cases.pov_careful[i] === 1 : who === "none" ? by.length === 0 : by.includes(who);
 }
-const tested = (i) => ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
+const tested = (i) => failed(i) || ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
 function title(i) {
@@ -64,10 +64,15 @@ function words(i) {
     parts.push(`Collision${whom}${kind} at ${fixed(cases.t_end[i], 1)} s: gap ${fixed(cases.dx[i], 1)} m, difference in speed ${fixed(Math.abs(cases.dv[i]), 1)} m/s.`);
   } else if (end === "MERGED") {
     parts.push(`No collision: the ${cases.dx[i] < 0 ? "VUT" : met} goes first, gap ${fixed(cases.dx[i], 1)} m when the VUT arrives.`);
+    if (cases.after[i] === "harsh") parts.push("Whoever is behind then has to brake harshly.");
+    if (cases.after[i] === "forced") parts.push("Whoever is behind then cannot brake hard enough: the one ahead has to give way.");
   } else if (end === "TIMEOUT") {
     parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
   } else {
     parts.push(`${end}: ${data.errors[cases.index[i]] || "no reason given"}`);
+  }
+  if (cases.margin && cases.margin[i] !== null) {
+    parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
   if (yields.length) {
     parts.push(yields.map(([t, who], n) => `${n ? "the" : "The"} ${who} begins to yield at ${fixed(t, 1)} s`).join(", ") + ".");

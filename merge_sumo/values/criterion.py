@@ -1,0 +1,176 @@
+"""What counts as a failure: a criterion that is named, or a condition on the measures of a case.
+
+A criterion gives every case a margin: below 0 it fails, above 0 it does not, and how far from 0
+is said in units of the thresholds (`expression.py`). Samplers, truths and reports know scores:
+a margin m is the score lambda (1 - m / (1 + |m|)), which is below lambda exactly where m is below
+0. The criterion of the paper has its own score, P, and needs no margin.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import lru_cache
+from typing import Final
+
+from merge_sumo.errors import UserError
+from merge_sumo.system.printable import printable
+from merge_sumo.values.bodies import CentreLines, clearance_before_m
+from merge_sumo.values.expression import Condition, Value, Vocabulary, parse_condition
+from merge_sumo.values.merge import AfterMerge, brake_after_mps2, bumper_gap_m
+from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
+from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
+from merge_sumo.values.temporal import check_formula, robustness, try_formula
+from merge_sumo.values.trajectory import End, Trajectory
+
+PAPER: Final = "collision"
+NAMED: Final = {
+    PAPER: "score < -500",
+    "contact": "clearance_m < 0",
+    "unsafe": "clearance_m < 0 or brake_after_mps2 > 3",
+}
+"""Criteria by name, and the condition that each one is."""
+
+NUMBERS: Final = (
+    *(
+        "ttc_s",
+        "clearance_m",
+        "gap_m",
+        "dx_m",
+        "dv_mps",
+        "drac_mps2",
+        "brake_after_mps2",
+        "pet_s",
+        "t_end_s",
+    ),
+    *("impact_speed_mps", "vut_max_brake_mps2", "pov_max_brake_mps2", "last_avoidable_s"),
+    *("clipped_steps", "score", *FOLLOWED_UP),
+)
+TEXTS: Final = {
+    "end": frozenset({End.MERGED.value, End.COLLISION.value, End.TIMEOUT.value}),
+    "merged_first": frozenset({"VUT", "POV"}),
+    "after_merge": frozenset(asked.value for asked in AfterMerge),
+    "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
+}
+"""What may be said of measures that are texts. Errors have no verdict under any criterion."""
+VOCABULARY: Final[Vocabulary] = {**dict.fromkeys(NUMBERS), **TEXTS}
+NEVER: Final[dict[str, Value]] = {
+    **dict.fromkeys(("dx_m", "ttc_s", "pet_s", "last_avoidable_s"), math.inf),
+    **dict.fromkeys(("after_gap_m", "after_ttc_s"), math.inf),
+    **dict.fromkeys(("dv_mps", "after_drac_mps2", "drac_mps2", "impact_speed_mps", "score"), 0.0),
+    **{"merged_first": "", "after_merge": AfterMerge.NONE.value},
+}
+"""What a measure without a value counts as: those two never meet."""
+IN_COLLISION: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
+"""What it counts as in a collision: no braking would do, and there was no way out at any time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Criterion:
+    """What counts as a failure; `UserError` for what is no criterion.
+
+    Attributes:
+        fail_when: the name of a criterion, or a condition over measures, as Python writes it.
+        require: what is to hold over time instead, in signal temporal logic (`temporal.py`); the
+            margin is then its robustness.
+    """
+
+    fail_when: str = PAPER
+    require: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the condition; however it is spaced, it is the same."""
+        name = self.fail_when.strip()
+        if name not in NAMED:
+            if name.isidentifier() and (near := get_close_matches(name, NAMED, n=1)):
+                raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
+            _, name = parse_condition(self.fail_when, VOCABULARY, "--fail-when")
+        object.__setattr__(self, "fail_when", name)
+        if self.require is not None:
+            if name != PAPER:
+                raise UserError("--fail-when and --require both say what a failure is: choose one")
+            object.__setattr__(self, "require", check_formula(self.require))
+
+    def check(self, scenario: Scenario) -> None:
+        """Raise `UserError` where it speaks of what an episode of a scenario does not have.
+
+        Also where it is no formula, or what evaluates one is missing.
+        """
+        if self.require is not None:
+            try_formula(self.require)
+        spoken = set() if self.require else set(re.findall(r"\w+", self.words))
+        if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
+            raise UserError(
+                f"--fail-when speaks of {min(named)}, which is measured behind M: say how long "
+                "with --follow-up SECONDS"
+            )
+
+    @property
+    def is_papers(self) -> bool:
+        """Whether it is that of the paper, which needs no margin."""
+        return self.fail_when == PAPER and self.require is None
+
+    @property
+    def text(self) -> str:
+        """What a person would write."""
+        return self.fail_when if self.require is None else f"not ({self.require})"
+
+    @property
+    def words(self) -> str:
+        """Return when a case fails, as a condition."""
+        return NAMED.get(self.text, self.text)
+
+    def margin(
+        self, trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
+    ) -> float | None:
+        """Return the margin of an episode; None under the paper's criterion and after an error.
+
+        Without the centre lines of the road, bodies are only looked at from M on.
+        """
+        if self.is_papers or measures.end.is_error:
+            return None
+        if self.require is not None:
+            return robustness(self.require, trajectory)
+        return _condition(self.words).margin(values_of(trajectory, measures, lines))
+
+    def outcome(
+        self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
+    ) -> Outcome:
+        """Return the outcome of an episode at a place in a campaign."""
+        measures = measure(trajectory)
+        margin = self.margin(trajectory, measures, lines)
+        return Outcome(index, batch, trajectory.case, measures, margin=margin)
+
+
+COLLISION: Final = Criterion()
+"""The paper's."""
+
+
+@lru_cache
+def _condition(text: str) -> Condition:
+    return parse_condition(text, VOCABULARY, "--fail-when")[0]
+
+
+def values_of(
+    trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
+) -> dict[str, Value]:
+    """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
+    gap_m, after_m = bumper_gap_m(trajectory), measures.after_gap_m
+    after_m = math.inf if after_m is None else after_m
+    before_m = math.inf if lines is None else clearance_before_m(trajectory, lines)
+    missing: dict[str, Value] = NEVER | (IN_COLLISION if measures.end is End.COLLISION else {})
+    if after_m <= 0.0:
+        missing = missing | {"after_drac_mps2": math.inf}
+    found: dict[str, Value] = {
+        "gap_m": gap_m,
+        "clearance_m": min(gap_m, before_m, after_m),
+        "brake_after_mps2": brake_after_mps2(trajectory),
+    }
+    for name in VOCABULARY:
+        if name not in found:
+            value = getattr(measures, name)
+            value = missing[name] if value is None else value
+            found[name] = value if isinstance(value, str) else float(value)
+    return found

@@ -1,0 +1,132 @@
+"""Requirements over time: signal temporal logic over the signals of an episode, by rtamt.
+
+A formula says what is to hold, such as `always (v_vut_mps > 2)`. Its robustness at the begin of the
+episode (Donze and Maler, 2010) is above 0 where it holds and below where it does not, in the units
+of the signals. rtamt (Nickovic and Yamaguchi, 2020) imports modules that a formula names, so that
+only words and signs of our own get to it.
+"""
+
+from __future__ import annotations
+
+import re
+from difflib import get_close_matches
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.errors import UserError
+from merge_sumo.system.printable import printable
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.expression import LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S
+from merge_sumo.values.trajectory import Trajectory
+
+SIGNALS: Final = (
+    *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),
+    *("dx_m", "dv_mps", "gap_m", "ttc_s"),
+)
+"""What a formula may speak of, at every step; of the car that is nearest to the VUT at M."""
+NEVER_S: Final = 100.0
+"""The time to collision where no gap closes, and the longest."""
+WORDS: Final = (
+    *("always", "eventually", "until", "historically", "once", "since", "not", "and", "or"),
+    *("implies", "iff", "xor", "rise", "fall", "prev", "next", "abs"),
+)
+_TOKEN: Final = re.compile(r"\s+|[A-Za-z_]\w*|(?:\d+\.?\d*|\.\d+)(?!\w)|<=|>=|->|[-+*<>()\[\]:,]")
+_BOUNDS: Final = re.compile(r"\[([^\]]*)\]")
+_NUMBER: Final = re.compile(r"\d+\.?\d*|\.\d+")
+
+
+def check_formula(text: str) -> str:
+    """Return a formula on one line, with single spaces; `UserError` where a word or sign is none.
+
+    Whether it is one as a whole, `try_formula` says.
+    """
+    what = f"--require {printable(text[:80])!r}"
+    if len(text) > MOST_CHARACTERS:
+        raise UserError(f"--require has {len(text)} characters: {MOST_CHARACTERS} are the most")
+    place = depth = 0
+    while place < len(text):
+        found = _TOKEN.match(text, place)
+        if found is None:
+            sign = printable(text[place])
+            raise UserError(f"{what}: {sign!r} is no part of a formula over signals")
+        word = found[0]
+        if word[0].isalpha() or word[0] == "_":
+            _check_word(word, what)
+        depth += (word == "(") - (word == ")")
+        if depth < 0:
+            raise UserError(f"{what}: a bracket is closed that was not opened")
+        place = found.end()
+    for bounds in _BOUNDS.findall(text):
+        ends_s = [float(number) for number in _NUMBER.findall(bounds)]
+        if ends_s != sorted(ends_s) or max(ends_s, default=0.0) > MAX_EPISODE_S + MAX_FOLLOW_UP_S:
+            raise UserError(f"{what}: no episode has a time [{bounds}], in seconds")
+    return " ".join(text.split())
+
+
+def _check_word(word: str, what: str) -> None:
+    if word not in (*SIGNALS, *WORDS):
+        near = get_close_matches(word, (*SIGNALS, *WORDS), n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"choose {', '.join(SIGNALS)}"
+        raise UserError(f"{what}: there is no signal {word!r}: {hint}")
+
+
+def try_formula(text: str) -> None:
+    """Raise `UserError` where a checked formula is none, or rtamt is missing."""
+    try:
+        _robustness(text, {name: np.ones(2) for name in SIGNALS})
+    except ImportError as error:
+        raise UserError("--require needs rtamt: pip install 'merge-sumo[stl]'") from error
+    # A parser that is not ours.
+    except Exception as error:
+        raise UserError(
+            f"--require {text[:80]!r} is no formula of signal temporal logic such as 'always "
+            f"((x_vut_m > -20) implies (gap_m > 2))': {printable(str(error))[:200]}"
+        ) from error
+
+
+def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
+    """Return the signals of an episode by name, (T + 1,), with those of the follow-up behind M."""
+    motion = trajectory.motion
+    if trajectory.after is not None:
+        motion = np.concatenate([motion[:-1], trajectory.after])
+    scenario = trajectory.case.scenario
+    (x_pov, v_pov, a_pov), (x_vut, v_vut, a_vut) = (
+        motion[:, row].T for row in (trajectory.nearest, 1)
+    )
+    dx, dv = x_pov - x_vut, v_pov - v_vut
+    gap = np.abs(dx) - np.where(dx >= 0.0, scenario.pov_length_m, scenario.vut_length_m)
+    closing = np.where(dx >= 0.0, -dv, dv)
+    ttc = np.full(len(gap), NEVER_S)
+    np.divide(np.maximum(gap, 0.0), closing, out=ttc, where=closing > 0.0)
+    values = (x_pov, v_pov, a_pov, x_vut, v_vut, a_vut, dx, dv, gap, np.minimum(ttc, NEVER_S))
+    return dict(zip(SIGNALS, values, strict=True))
+
+
+def robustness(text: str, trajectory: Trajectory) -> float:
+    """Return the robustness of a formula at the begin of an episode: finite, and never 0."""
+    found = _robustness(text, signals(trajectory))
+    size = min(max(abs(found), LEAST_MARGIN), MOST_MARGIN)
+    return size if found > 0.0 else -size
+
+
+def _robustness(text: str, values: dict[str, FloatArray]) -> float:
+    steps = len(values[SIGNALS[0]])
+    time_s = [round(step * DT_S, 1) for step in range(steps)]
+    data = {"time": time_s, **{name: of.tolist() for name, of in values.items()}}
+    return float(_specification(text).evaluate(data)[0][1])
+
+
+@lru_cache(maxsize=8)
+def _specification(text: str) -> Any:
+    import rtamt
+
+    specification = rtamt.StlDiscreteTimeOfflineSpecification()
+    for name in SIGNALS:
+        specification.declare_var(name, "float")
+    specification.set_sampling_period(100, "ms", 0.1)
+    specification.spec = f"({text})"  # what stands behind a formula would not be read
+    specification.parse()
+    return specification

@@ -1,0 +1,133 @@
+"""Requirements over time: signals by hand, words that get to the parser, robustness by rtamt."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from conftest import require
+from test_score import CASE, ending
+
+from merge_sumo.errors import UserError
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.expression import MOST_MARGIN
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.temporal import NEVER_S, SIGNALS, check_formula, signals
+from merge_sumo.values.trajectory import End, Trajectory
+
+NEAR = "always ((x_vut_m > -20) implies (gap_m > 2))"
+
+
+@pytest.fixture
+def rtamt():
+    """Skip where rtamt is not installed."""
+    if sys.version_info >= (3, 13):
+        pytest.skip("rtamt runs up to Python 3.12")
+    require(find_spec("rtamt") is not None, "rtamt is not installed")
+
+
+class TestSignals:
+    def test_by_hand(self):
+        motion = np.array([[[-40.0, 30.0, 1.0], [-20.0, 20.0, -1.0]], [[8.0, 20.0, 0.0]] * 2])
+        found = signals(Trajectory(CASE, motion, End.MERGED))
+        assert tuple(found) == SIGNALS
+        # The POV is 20 m behind and 10 m/s faster: 15 m between bumpers, 1.5 s.
+        assert {name: float(values[0]) for name, values in found.items()} == {
+            **{"x_pov_m": -40.0, "v_pov_mps": 30.0, "a_pov_mps2": 1.0},
+            **{"x_vut_m": -20.0, "v_vut_mps": 20.0, "a_vut_mps2": -1.0},
+            **{"dx_m": -20.0, "dv_mps": 10.0, "gap_m": 15.0, "ttc_s": 1.5},
+        }
+        assert (found["gap_m"][1], found["ttc_s"][1]) == (-5.0, NEVER_S)
+
+    def test_go_on_behind_m(self):
+        episode = ending(20.0, steps=10)
+        after = np.concatenate([episode.motion[-1:], episode.motion[-1:] + 1.0])
+        on = signals(replace(episode, after=after))
+        assert len(on["x_vut_m"]) == 12
+        assert on["x_vut_m"][-1] == episode.x_vut_m[-1] + 1.0
+
+
+class TestFormulas:
+    def test_are_kept_on_one_line(self):
+        assert check_formula(" always\n (gap_m  > 2) ") == "always (gap_m > 2)"
+        assert Criterion(require="always  (gap_m > 2)") == Criterion(require="always (gap_m > 2)")
+
+    @pytest.mark.parametrize(
+        ("text", "said"),
+        [
+            ("always (gab_m > 2)", "no signal 'gab_m': did you mean gap_m"),
+            ("from os import path always (gap_m > 2)", "no signal 'from'"),
+            ("import os", "no signal 'import'"),
+            ("x_vut_m = 2", "'=' is no part"),
+            ("always (gap_m > 2);", "';' is no part"),
+            ("gap_m/dx_m > 2", "'/' is no part"),
+            ("always (gap_m > 2e9)", "'2' is no part"),
+            ("always[0:2s] (gap_m > 2)", "'2' is no part"),
+            ("always[0:151] (gap_m > 2)", "no episode has a time [0:151]"),
+            ("always[2:1] (gap_m > 2)", "no episode has a time [2:1]"),
+            ("x" * 2000, "1000 are the most"),
+            ("\ud800", "is no part"),
+            ("gap_m > 2) or (gap_m < 1", "closed that was not opened"),
+        ],
+    )
+    def test_with_other_words_do_not_get_to_the_parser(self, text, said):
+        with pytest.raises(UserError, match="--require") as error:
+            Criterion(require=text)
+        assert said in str(error.value)
+
+    @pytest.mark.parametrize("text", ["always (gap_m >", "", "(" * 400, "gap_m > 2 dx_m < 1"])
+    @pytest.mark.usefixtures("rtamt")
+    def test_that_are_none_are_refused(self, text):
+        with pytest.raises(UserError, match="no formula of signal temporal logic"):
+            Criterion(require=text).check(US23)
+
+    def test_go_without_a_condition(self):
+        with pytest.raises(UserError, match="choose one"):
+            Criterion("contact", NEAR)
+
+    def test_need_the_extra(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "rtamt", None)
+        with pytest.raises(UserError, match="merge-sumo\\[stl\\]"):
+            Criterion(require="eventually (gap_m > 3)").check(US23)
+
+
+@pytest.mark.usefixtures("rtamt")
+class TestRobustness:
+    @pytest.mark.parametrize(
+        ("formula", "margin"),
+        [
+            ("always (gap_m > 2)", 9.0),  # from 11 m between bumpers to 15 m
+            ("eventually (gap_m > 17.5)", -2.5),
+            ("v_vut_mps > 26", -1e-9),
+            ("eventually (x_vut_m > 0)", 1.0),  # 1 m past M at the end, 2.6 m a step
+            ("always (x_vut_m > 0)", -25.0),
+            ("always[0:0.5] (x_vut_m < -10)", 2.0),
+            ("(v_pov_mps > 25) and (v_vut_mps > 25)", 1.0),
+            ("always (v_vut_mps > 1000)", -MOST_MARGIN),
+        ],
+    )
+    def test_is_the_margin(self, formula, margin):
+        outcome = Criterion(require=formula).outcome(0, 0, ending(20.0))
+        assert outcome.margin == pytest.approx(margin)
+        assert outcome.failed is (margin < 0.0)
+
+    def test_decides_a_campaign(self, tmp_path, command_line):
+        code, out, err = command_line(
+            *("campaign", "--vut", "design1", "--level", 0, "--cases", 20, "--json", "-q"),
+            *("--require", NEAR, "--out", tmp_path / "run"),
+        )
+        assert (code, err) == (0, "")
+        record = json.loads((tmp_path / "run" / "campaign.json").read_text(encoding="utf-8"))
+        assert (record["fail_when"], record["require"]) == ("collision", NEAR)
+        lines = (tmp_path / "run" / "outcomes.jsonl").read_text(encoding="utf-8").splitlines()
+        failing = [line for line in map(json.loads, lines) if line["margin"] < 0.0]
+        assert json.loads(out)["failures"] == len(failing)
+        code, _, err = command_line(
+            "campaign", "--resume", tmp_path / "run", "--require", "always (gap_m > 3)"
+        )
+        assert code == 2
+        assert "a campaign has one criterion" in err
