@@ -274,6 +274,28 @@ def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser
         assert inside
 
 
+def test_a_map_zooms_about_the_case_and_is_dragged(page, made):
+    index = failures(made.outcomes)[0].index
+    figure = f".map[data-level='{made.outcome(index).case.level}']"
+    mark, whole = f"{figure} [data-case='{index}'].mark", page.locator(f"{figure} .mark").count()
+    click(page, mark)
+    page.keyboard.press("Escape")
+    for _ in range(2):
+        page.locator(f"{figure} [aria-label='Zoom in']").click()
+    assert page.locator(f"{figure} .mark").count() < whole
+    frame, box = (page.locator(part).bounding_box() for part in (f"{figure} .frame", mark))
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    assert frame["x"] <= x <= frame["x"] + frame["width"]
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 5, y + 5)
+    page.mouse.move(x + 20, y + 10)
+    page.mouse.up()
+    assert chosen(page) == index, "a drag is no click"
+    page.locator(f"{figure} button", has_text="All").click()
+    assert page.locator(f"{figure} .mark").count() == whole
+
+
 def test_a_command_breaks_between_words_only(browser, made):
     viewport = {"width": 390, "height": 800}
     with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
