@@ -296,6 +296,25 @@ def test_a_map_zooms_about_the_case_and_is_dragged(page, made):
     assert page.locator(f"{figure} .mark").count() == whole
 
 
+@WINDOWS
+def test_two_cases_are_compared(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    first, second = (o.index for o in spread_failures(made.outcomes)[:2])
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        page.locator("#keep").click()
+        page.locator(f".list [data-case='{second}']").click()
+        assert chosen(page) == second
+        assert page.inner_text("#beside-title").startswith(f"Case {first} ")
+        assert "Collision" in page.inner_text("#beside-words")
+        for chart, lines in (("speed", 2), ("position", 2), ("gap", 1)):
+            assert page.locator(f"#chart-{chart} .line.beside").count() == lines
+            assert page.locator(f"#chart-{chart} .line").count() == 2 * lines
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        page.locator("#keep").click()
+        assert page.locator(".line.beside").count() == 0
+        assert not page.locator("#beside").is_visible()
+
+
 def test_a_command_breaks_between_words_only(browser, made):
     viewport = {"width": 390, "height": 800}
     with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:

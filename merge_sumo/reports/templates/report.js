@@ -345,7 +345,7 @@ function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags
     if (points.length === 1) draw(svg, "circle", { class: name, cx: X(points[0][0]), cy: Y(points[0][1]), r: 2 });
   }
   for (const { name, x, y } of flags) draw(svg, "path", { class: name, d: `M${X(x)} ${Y(y) - 2}l-4.5 -7h9Z` });
-  return { X, now: draw(svg, "line", { class: "now", x1: -9, x2: -9, y1: top, y2: bottom }), from: left, to: right };
+  return { X, now: draw(svg, "line", { class: "now", x1: -9, x2: -9, y1: top, y2: bottom }), from: left, to: right, end: xRange[1] };
 }
 function nice(step) {
   if (!(step > 0)) return 1;
@@ -364,7 +364,7 @@ function range(values, pad = 0.06) {
 
 /* ---------- a case: road, motion, charts ---------- */
 const road = byId("road"), slider = byId("time");
-let moving = null, step = 0, playing = false, last = 0, charts = [];
+let moving = null, beside = -1, step = 0, playing = false, last = 0, charts = [];
 
 const panel = byId("case");
 function dock(on) { // at the foot of the window, or in its place beside the lists
@@ -391,6 +391,10 @@ function openLinked() { // #case-111
   openCase(place.get(index));
   return true;
 }
+byId("keep").addEventListener("click", () => {
+  beside = beside < 0 ? chosen : -1;
+  show(chosen);
+});
 addEventListener("hashchange", openLinked);
 addEventListener("keydown", (event) => { if (event.key === "Escape") dock(false); });
 byId("close").addEventListener("click", () => dock(false));
@@ -415,27 +419,37 @@ function show(i) {
   for (const button of document.querySelectorAll("[data-case]")) {
     button.closest("tr")?.classList.toggle("on", Number(button.dataset.case) === cases.index[i]);
   }
+  const compared = beside >= 0 && beside !== i;
+  byId("beside").hidden = !compared;
+  byId("beside-title").textContent = compared ? title(beside) : "";
+  byId("beside-words").textContent = compared ? words(beside) : "";
+  byId("keep").hidden = false;
+  byId("keep").textContent = beside < 0 ? "Compare with the next" : "End the comparison";
   moving = motion(i);
   byId("case-motion").hidden = moving === null;
   play(false);
   if (moving) showMotion(i);
 }
 function showMotion(i) {
-  const { rows, v, x, met } = moving, end = (rows - 1) * DT;
+  const { rows, v, x, met } = moving;
+  const other = beside >= 0 && beside !== i ? motion(beside) : null, end = (Math.max(rows, other?.rows ?? 0) - 1) * DT;
   const over = (values) => values.map((value, t) => [t * DT, value]);
-  const lines = (values) => vehicles.map((name, who) => ({ name, points: over(values[who]) }));
+  const lines = (values, more = "") => vehicles.map((name, who) => ({ name: name + more, points: over(values[who]) }));
+  const both = (key) => (other ? [...lines(other[key], " beside"), ...lines(moving[key])] : lines(moving[key]));
+  const all = (key) => [...moving[key].flat(), ...(other?.[key].flat() ?? [])];
+  const otherGap = other ? other.x[other.met].map((place, t) => place - other.x[VUT][t]) : [];
   const others = vehicles.map((_, who) => who).filter((who) => who !== VUT);
   const gap = x.map((places) => places.map((place, t) => place - x[VUT][t]));
-  const inView = range([...gap[met], -12, 12]); // of the car that the VUT meets
+  const inView = range([...gap[met], ...otherGap, -12, 12]); // of the car that the VUT meets
   const flags = [[met, cases.pov_yields[i]], [VUT, cases.vut_yields[i]]]
     .filter(([, t]) => t !== null).map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] }));
   const common = { xRange: [0, end], xLabel: "time, s" };
   charts = [
-    plot(byId("chart-speed"), { ...common, yRange: range(v.flat(), 0.14), lines: lines(v), flags }),
-    plot(byId("chart-position"), { ...common, yRange: range(x.flat()), lines: lines(x) }),
+    plot(byId("chart-speed"), { ...common, yRange: range(all("v"), 0.14), lines: both("v"), flags }),
+    plot(byId("chart-position"), { ...common, yRange: range(all("x")), lines: both("x") }),
     plot(byId("chart-gap"), {
       ...common, yRange: inView, bands: [[-CRASH, CRASH]],
-      lines: others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) })),
+      lines: [...(other ? [{ name: "gap beside", points: over(otherGap) }] : []), ...others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }))],
     }),
   ];
   slider.max = rows - 1;
@@ -525,7 +539,7 @@ for (const id of ["chart-speed", "chart-position", "chart-gap"]) {
     if (event.type === "pointermove" && !event.buttons) return;
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
     play(false);
-    at((point.x - charts[0].from) / (charts[0].to - charts[0].from) * (moving.rows - 1));
+    at((point.x - charts[0].from) / (charts[0].to - charts[0].from) * charts[0].end / DT);
   };
   svg.addEventListener("pointerdown", scrub);
   svg.addEventListener("pointermove", scrub);
