@@ -306,6 +306,11 @@ def test_two_cases_are_compared(browser, made, size):
         assert chosen(page) == second
         assert page.inner_text("#beside-title").startswith(f"Case {first} ")
         assert "Collision" in page.inner_text("#beside-words")
+        if size[0] < 1000:
+            assert page.locator("#case").evaluate("(panel) => panel.matches('.docked')")
+        page.evaluate("dock(true)")
+        upper, lower = (page.locator(part).bounding_box() for part in ("#keep", ".case-command"))
+        assert upper["y"] + upper["height"] <= lower["y"]
         for chart, lines in (("speed", 2), ("position", 2), ("gap", 1)):
             assert page.locator(f"#chart-{chart} .line.beside").count() == lines
             assert page.locator(f"#chart-{chart} .line").count() == 2 * lines
