@@ -13,7 +13,7 @@ from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.campaigns.avoidance import Avoidance, write_avoidance
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.reports import report, report_facts
 from merge_sumo.reports.coordinates import WRITTEN
 from merge_sumo.scenarios.scenario_file import named_scenario
@@ -145,8 +145,81 @@ def test_a_click_on_a_case_shows_it(page, made):
     )
 
 
+def in_sight(page, part: str) -> bool:
+    """Return whether a part of the page is in the window and nothing lies over its middle."""
+    return page.locator(part).evaluate(
+        """(part) => {
+            const { top, bottom, left, right } = part.getBoundingClientRect();
+            const over = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+            return top >= 0 && bottom <= innerHeight && left >= 0 && right <= innerWidth
+                && (part === over || part.contains(over));
+        }"""
+    )
+
+
+def click(page, part: str) -> None:
+    """Click where something is drawn, once it has come into the window."""
+    found = page.locator(part)
+    found.scroll_into_view_if_needed()
+    box = found.bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+
+
+WINDOWS = pytest.mark.parametrize("size", [(1280, 900), (390, 800)], ids=["wide", "phone"])
+
+
+@WINDOWS
+def test_a_click_on_a_mark_shows_its_case_and_the_mark_without_scrolling(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    level = failures(made.outcomes)[0].case.level
+    lowest = min(
+        (o for o in made.outcomes if o.failed and o.case.level == level),
+        key=lambda o: o.case.v_pov0_mps,
+    )
+    mark = f".map [data-case='{lowest.index}'].mark"
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        click(page, mark)
+        assert chosen(page) == lowest.index
+        for part in ("#case-title", "#road", "#play"):
+            assert in_sight(page, part), part
+        box, panel = (page.locator(part).bounding_box() for part in (mark, "#case"))
+        assert box["y"] >= 0.0
+        assert box["y"] + box["height"] <= panel["y"]
+        assert page.evaluate(INSIDE) == [True, True]
+        assert page.evaluate("location.hash") == f"#case-{lowest.index}"
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        page.keyboard.press("Escape")
+        assert not in_sight(page, "#case-title")
+
+
+@WINDOWS
+def test_a_link_opens_its_case(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        for index in (111, 7):
+            page.evaluate(f"location.hash = '#case-{index}'")
+            page.wait_for_function(f"byId('case-link').hash === '#case-{index}'")
+            assert chosen(page) == index
+            assert in_sight(page, "#case-title")
+        page.reload()
+        assert chosen(page) == 7
+        assert in_sight(page, "#case-title")
+        page.evaluate("location.hash = '#case-99999'")
+        assert chosen(page) == 7
+
+
+def test_a_command_breaks_between_words_only(browser, made):
+    viewport = {"width": 390, "height": 800}
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        words = page.locator("#command span")
+        assert words.count() == 9
+        assert (
+            words.evaluate_all("all => all.map((word) => word.getClientRects().length)") == [1] * 9
+        )
+
+
 def test_arrow_keys_move_through_the_lists(page, made):
-    worst = [o.index for o in failures(made.outcomes)]
+    worst = [o.index for o in spread_failures(made.outcomes)]
     page.locator(".list button").first.focus()
     for expected in (worst[1], worst[2]):
         page.keyboard.press("ArrowDown")

@@ -357,6 +357,18 @@ class TestTheCommand:
         assert "fail: every ball of radius 4 %" in out
         assert "x_pov0_m" in out
 
+    def test_goes_by_any_criterion(self, command_line, tmp_path):
+        plan = ("certify", "--vut", "design2", "--level", 0, "--radius", 0.3, "--workers", 1)
+        criterion = ("--fail-when", 'end == "MERGED"')
+        code, out, err = command_line(*plan, *criterion, "--out", tmp_path / "c", "--json")
+        assert code == 1, err
+        found = json.loads(out)["levels"]["0"]
+        assert found["failures"] == found["cases"] == len(covering(0.3, 2))
+        assert check_certificate.check(tmp_path / "c")[1] == []
+        code, _, err = command_line(*plan, "--resume", tmp_path / "c")
+        assert code == 2
+        assert "settings.fail_when differs" in err
+
     @pytest.mark.parametrize(
         ("options", "said"),
         [

@@ -429,7 +429,7 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
     assert trajectory.x_vut_m[-1] >= 0.0
     (junctions, edges, vehicles), *rows = seen
     pieces = {p.lane: p for path in (road.mainline, road.ramp) for p in path.pieces}
-    assert junctions == (road.junction_id,)
+    assert road.junction_id in junctions
     assert (set(edges), vehicles) == ({lane.rpartition("_")[0] for lane in pieces}, ())
     paths = {"pov": (road.mainline, 0), "vut": (road.ramp, 1)}
     assert len(rows) >= 2 * (len(trajectory.motion) - 1)

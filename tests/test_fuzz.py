@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from merge_sumo import cli
+from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.run import (
     OUTCOMES,
     SETTINGS,
@@ -97,6 +98,13 @@ def answer(read: Callable[[], object]) -> object:
     assert sentence
     assert "\n" not in sentence
     return None
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Run:
+    """Return a small campaign of which nothing was foretold: its report takes little time."""
+    settings = CampaignSettings(vut="design1", levels=(0,), sampler="uniform", cases=60, seed=4)
+    return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
 
 
 @pytest.fixture(scope="module")

@@ -135,7 +135,7 @@ ELEMENTS = {
         "default.speeddev",
     ),
     *("fcd_replay_device", "device.fcd-replay.files", "report", "no-warnings", "xml-validation"),
-    *("gui_only", "gui-settings-file", "start", "delay", "window-size"),
+    *("gui_only", "gui-settings-file", "start", "delay", "window-size", "breakpoints"),
     *("viewsettings", "scheme", "vehicles", "background", "viewport"),
     *("net", "location", "edge", "lane", "junction", "request", "connection"),
     *("additional", "vType", "fcd-export", "timestep", "vehicle"),

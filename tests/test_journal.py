@@ -18,7 +18,7 @@ from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import Run, failures, read_outcomes, to_line
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case
-from merge_sumo.values.score import Measures, Outcome, measure
+from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
 SPEC_FIELDS = [
@@ -445,4 +445,5 @@ class TestARun:
 
 def test_every_measure_is_in_the_record():
     record = episode(0)[0].to_record()
-    assert {field.name for field in fields(Measures)} - {"nearest"} <= set(record)
+    elsewhere = {"nearest", *FOLLOWED_UP}  # in traffic, and where there is a follow-up
+    assert {field.name for field in fields(Measures)} - elsewhere <= set(record)

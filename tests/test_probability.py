@@ -259,7 +259,7 @@ class TestOfACampaign:
         found = failure_probability(run, out, cases=600)
         # 2.5 % of the pool fail (250 of 10,000 uniform cases).
         assert found.low < 0.025 < found.high
-        assert found.failures > 2 * 0.025 * 600, "the campaign says where to look"
+        assert found.failures > 1.3 * 0.025 * 600, "the campaign says where to look"
         record = json.loads(out.read_text())
         assert record["probability"] == found.probability
         assert record["campaign"]["vut"] == "design1"

@@ -13,7 +13,7 @@ import pytest
 from handmade import write_run
 from lxml import html
 
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.campaigns.truth import Truth
 from merge_sumo.drivers.vuts.output import LINES, LOG
 from merge_sumo.reports import report_data, report_facts
@@ -21,7 +21,7 @@ from merge_sumo.reports.report import report_page, write_report
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
 from merge_sumo.reports.report_words import headline
 from merge_sumo.reports.summary import summarise
-from merge_sumo.reports.surface import learn_surface
+from merge_sumo.reports.surface import Surface, learn_surface
 from merge_sumo.reports.verdict import judge
 from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import to_unit
@@ -108,7 +108,7 @@ class TestThePage:
         root = html.fromstring(page)
         listed = [int(n) for n in root.xpath("//button/@data-case")]
         assert listed[0] == 179, "the case that ended with an error"
-        assert listed[1:11] == [o.index for o in failures(made.outcomes)[:10]]
+        assert listed[1:11] == [o.index for o in spread_failures(made.outcomes)[:10]]
         near = [made.outcome(index) for index in listed[11:]]
         assert len(near) == 10
         assert not any(o.failed for o in near)
@@ -119,6 +119,32 @@ class TestThePage:
             for o in made.outcomes
             if o.measures.score is not None and not o.failed and o not in near
         )
+
+    def test_worst_failures_are_of_one_region_each_before_a_second_of_any(self, made):
+        found, region = failures(made.outcomes), regions_of(made.outcomes)
+        spread = spread_failures(made.outcomes)
+        assert sorted(o.index for o in spread) == sorted(o.index for o in found)
+        assert spread[0] == found[0]
+        own = [(o.case.level, region[o.index]) for o in spread]
+        different = len(set(own))
+        assert 1 < different < len(own)
+        assert len(set(own[:different])) == different
+        firsts = spread[:different]
+        assert [o.score for o in firsts] == sorted(o.score for o in firsts)
+        for o in firsts:
+            same = [
+                f.score for f in found if (f.case.level, region[f.index]) == own[firsts.index(o)]
+            ]
+            assert o.score == min(same)
+
+    def test_bars_of_all_levels_share_a_scale(self, page):
+        root = html.fromstring(page)
+        rows = root.xpath("(//table[@class='bars'])[2]//tr[td]")
+        found = [float(row.xpath("./td[1]")[0].text_content()) for row in rows]
+        bars = [float(row.xpath(".//rect[@class='fail']/@width")[0]) for row in rows]
+        assert len(bars) == 3
+        scales = [bar / value for bar, value in zip(bars, found, strict=True)]
+        assert scales == pytest.approx([scales[0]] * 3, rel=0.01)
 
     def test_says_when_a_campaign_was_interrupted(self, made, tmp_path):
         assert "interrupted" not in text_of(report_page(made))
@@ -158,7 +184,8 @@ class TestWhatWasNotTested:
         }
         by_message = list(lists.values())[:3]
         assert by_message == [[3, 6], [9], [0, 1, 2, 4]]
-        others = set(lists["Ten worst failures"]) | set(lists["Ten nearest misses"])
+        names = ("Ten worst failures, one of each region first", "Ten nearest misses")
+        others = {index for name in names for index in lists[name]}
         assert len(others) > 10
         assert others & {0, 1, 2, 3, 4, 6, 9} == set()
 
@@ -300,6 +327,10 @@ class TestTheSurrogate:
         for level, found in summarise(made.outcomes, (0, 1, 2)).levels.items():
             surface = learn_surface(made.outcomes, level)
             assert surface.plausible_fmc() >= found.fmc - 1e-3
+
+    def test_finds_no_more_than_the_pool_plausible(self):
+        everywhere = Surface(np.array([[0.5, 0.5]]), lambda points: np.ones(len(points)))
+        assert everywhere.plausible_fmc() == 1.0
 
     def test_is_not_made_of_too_few_failures(self, made):
         few = [o for o in made.outcomes if not o.failed] + failures(made.outcomes)[:4]

@@ -7,8 +7,12 @@ import traci
 import traci_page
 from traci_pair import Pair, answer, questions
 
+from merge_sumo.campaigns.ground import road_for
 from merge_sumo.drivers.vuts.traci_session import ASKS
+from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.sumo.beside import Beside
 from merge_sumo.sumo.traci_names import name_of, named
+from merge_sumo.values.scenario import VEHICLES
 
 SAME = 0.95
 
@@ -58,6 +62,30 @@ class TestQuestions:
             assert mine.ours.vehicle.getSpeed("vut") == pytest.approx(19.5, abs=0.1)
         finally:
             mine.close()
+
+
+@pytest.mark.parametrize("name", ["roundabout", "us23-traffic"])
+def test_the_sumo_that_answers_has_every_vehicle_where_it_is(name):
+    scenario = named_scenario(name)
+    road = road_for(scenario)
+    beside = Beside(road, scenario, scenario.vehicles)
+    names = VEHICLES[: scenario.vehicles]
+    try:
+        for step in range(60):
+            states = {who: (-40.0 - 30.0 * n + step, 10.0, 0.5) for n, who in enumerate(names)}
+            beside.show(states)
+            for who, (x_m, v_mps, a_mps2) in states.items():
+                point = road.lane_point(x_m, on_ramp=who == "vut")
+                vehicle = beside._connection.vehicle
+                assert vehicle.getLaneID(who) == point.lane
+                assert vehicle.getLanePosition(who) == pytest.approx(point.position_m, abs=1e-9)
+                assert vehicle.getSpeed(who) == v_mps
+                assert vehicle.getAcceleration(who) == a_mps2 or step == 0
+        beside.show({})
+        beside.show(states)  # they may come again
+        assert set(beside._connection.vehicle.getIDList()) == set(names)
+    finally:
+        beside.close()
 
 
 class TestCommands:

@@ -379,7 +379,7 @@ class TestACampaignOfFewCasesThatIsResumed:
             raise Stopped(signal.SIGINT)
 
         settings = CampaignSettings(
-            vut="design2", levels=(0,), sampler="uniform", cases=20, batch=10, seed=1
+            vut="design2", levels=(0,), sampler="annealing", cases=20, batch=10, seed=1
         )
         with pytest.raises(Stopped):
             run_campaign(settings, tmp_path / "run", check=check)

@@ -3,10 +3,13 @@
     python tools/bench_samplers.py --vut design1 --level 0 --seeds 10
     python tools/bench_samplers.py --vut design1 --level 0 --seeds 10 --ablate
     python tools/bench_samplers.py --time
+    python tools/bench_samplers.py --trials --seeds 10 --first 1000
 
-The first prints medians of FMC / truth after 100, 200 and 400 cases in batches of 20; the second
-does so for `gpr` with one of its choices changed at a time; the third prints the seconds that a
-sampler takes for a batch after N cases.
+The first prints medians of FMC / truth after 100, 200 and 400 cases, `coverage` in batches of its
+own and the others in batches of 20; the second does so for `gpr` with one of its choices changed
+at a time; the third prints the seconds that a sampler takes for a batch after N cases; the last
+lets `coverage`, the same without its twin, and `gpr` search the VUTs of `trial_vuts.py`, on which
+nothing was tuned, at every level at which they fail.
 """
 
 from __future__ import annotations
@@ -14,8 +17,9 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,12 +32,18 @@ from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.road import road_of
+from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
+from merge_sumo.values.scenario import LEVELS
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
 CASES, BATCH = 400, 20
+WITHOUT = "coverage without its twin"
+TRIALS = ("Idm", "Hysteresis", "Delayed", "Rss", "Courteous", "Table", "Noisy", "Hidden")
+FEWEST_FAILURES = 5
+"""Failures of a truth from which a share of it means something."""
 SHOWN = (100, 200, 400)
 ABLATIONS: dict[str, dict[str, Any]] = {
     "as it is": {},
@@ -71,26 +81,35 @@ def search(
     name: str, level: int, seed: int, plan: GroundPlan, truth: Truth
 ) -> tuple[list[float], int, float]:
     """Return FMC / truth at SHOWN, the real regions found, and the seconds of the sampler."""
-    sampler = make_sampler(name, Pool(levels=(level,)), seed)
+    pool = Pool(levels=(level,))
+    games = None if name == WITHOUT else Twin(pool, plan.povs, seed)
+    sampler = make_sampler("coverage" if name == WITHOUT else name, pool, seed, games)
+    batch = None if sampler.games else BATCH
     seconds = 0.0
-    ask = sampler.ask
 
-    def timed(n: int) -> Any:
-        nonlocal seconds
-        start = time.process_time()
-        cases = ask(n)
-        seconds += time.process_time() - start
-        return cases
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(*arguments: Any) -> Any:
+            nonlocal seconds
+            start = time.process_time()
+            try:
+                return function(*arguments)
+            finally:
+                seconds += time.process_time() - start
+
+        return wrapper
 
     def run(cases: Sequence[Case]) -> Iterable[tuple[int, Ran]]:
         return enumerate(run_cases(plan, cases))
 
-    sampler.ask = timed  # type: ignore[method-assign]
+    sampler.ask = timed(sampler.ask)  # type: ignore[method-assign]
+    sampler.tell = timed(sampler.tell)  # type: ignore[method-assign]
     found: list[Any] = []
-    curve = {}
-    for number, ran in enumerate(conduct(sampler, run, CASES, BATCH), start=1):
+    curve, ended = {}, 0
+    for ran in conduct(sampler, run, CASES, batch):
         found += [outcome.case for outcome, _ in ran if outcome.failed]
-        curve[number * BATCH] = fmc(to_unit(found, level))
+        ended += len(ran)
+        if ended in SHOWN:
+            curve[ended] = fmc(to_unit(found, level))
     points, whole = to_unit(found, level), fmc(truth.failures)
     regions = sum(
         bool((np.linalg.norm(points[:, None] - region, axis=2) <= RADIUS).any())
@@ -99,9 +118,9 @@ def search(
     return [curve[n] / whole if whole else math.nan for n in SHOWN], regions, seconds
 
 
-def bench(name: str, level: int, seeds: int, plan: GroundPlan, truth: Truth) -> str:
-    """Return a line of medians over the seeds."""
-    runs = [search(name, level, seed, plan, truth) for seed in range(seeds)]
+def bench(name: str, level: int, seeds: int, plan: GroundPlan, truth: Truth, first: int = 0) -> str:
+    """Return a line of medians over the seeds, from the first one on."""
+    runs = [search(name, level, seed, plan, truth) for seed in range(first, first + seeds)]
     shares = np.median([run[0] for run in runs], axis=0)
     lowest = min(run[0][-1] for run in runs)
     whole = sum(run[1] == len(truth.real_regions()) for run in runs)
@@ -139,6 +158,21 @@ def print_times(names: list[str]) -> None:
         print(f"{name:30s}" + " ".join(f"{s:7.2f}" for s in seconds), flush=True)
 
 
+def print_trials(seeds: int, first: int) -> None:
+    """Print how samplers search VUTs on which nothing was tuned."""
+    print("FMC / truth" + " ".join(f"{f'N={n}':>7s}" for n in SHOWN) + " lowest   all regions")
+    for trial in TRIALS:
+        vut = f"{Path(__file__).with_name('trial_vuts.py')}:{trial}"
+        plan = GroundPlan(vut=vut_factory(vut), corridors=32, net=road_of(), povs=Povs())
+        for level in LEVELS:
+            truth = ground_truth(vut, level)
+            if len(truth.failures) < FEWEST_FAILURES:
+                continue
+            for name in ("coverage", WITHOUT, "gpr"):
+                line = bench(name, level, seeds, plan, truth, first)
+                print(f"{f'{trial}, level {level}: {name}':45s}{line}", flush=True)
+
+
 def main() -> None:
     """Parse the command line and print the table that it asks for."""
     parser = argparse.ArgumentParser(description="What samplers find, and what they cost.")
@@ -147,11 +181,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--samplers", default=",".join(SAMPLERS))
     parser.add_argument("--ablate", action="store_true", help="change the choices of gpr")
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--trials", action="store_true", help="search VUTs unlike ours")
     parser.add_argument("--time", action="store_true", help="time batches up to N = 5,000")
     options = parser.parse_args()
     names = options.samplers.split(",")
     if options.time:
         print_times(names)
+        return
+    if options.trials:
+        print_trials(options.seeds, options.first)
         return
     truth = ground_truth(options.vut, options.level)
     print(f"{options.vut}, level {options.level}, FMC of the truth {fmc(truth.failures):.4f}")
@@ -163,11 +202,11 @@ def main() -> None:
     if options.ablate:
         for label, constants in ABLATIONS.items():
             with changed(constants):
-                line = bench("gpr", options.level, options.seeds, plan, truth)
+                line = bench("gpr", options.level, options.seeds, plan, truth, options.first)
             print(f"{label:30s}{line}", flush=True)
     else:
         for name in names:
-            line = bench(name, options.level, options.seeds, plan, truth)
+            line = bench(name, options.level, options.seeds, plan, truth, options.first)
             print(f"{name:30s}{line}", flush=True)
 
 

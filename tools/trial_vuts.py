@@ -174,9 +174,3 @@ class Hidden:
         self.plan = np.where(deciding, np.where(np.abs(gap) < 10.0, -1.8, 1.0), self.plan)
         answer = np.where(self.plan == 0.0, profile(seen.v_vut_mps), self.plan)
         return np.asarray(np.where((answer < 0.0) & (seen.v_vut_mps < 10.0), 0.0, answer))
-
-
-TRIALS = {
-    name.__name__.lower(): name
-    for name in (Idm, Hysteresis, Delayed, Rss, Courteous, Table, Noisy, Hidden)
-}

@@ -54,7 +54,6 @@ MOST: Final = 500
 """Failures that are driven again, the worst: each takes some thirty episodes."""
 EVERY_STEPS: Final = 5
 """A take-over is tried every half second first."""
-ROWS: Final = round(MAX_EPISODE_S / DT_S) + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +134,8 @@ def _avoidance(
     world: World,
     povs: Driver,
 ) -> list[Avoidance]:
-    substitutes, lines = _Substitutes(world.corridors), centre_lines(world.road)
+    rows = max(len(kept.motion) for kept in motion.values())
+    substitutes, lines = _Substitutes(world.corridors, rows), centre_lines(world.road)
 
     def pass_again(asked: Sequence[tuple[int, dict[str, Any]]]) -> list[bool]:
         """Return which episodes are passed: (index of the failure, what is different)."""
@@ -198,12 +198,12 @@ def _passes(run: Run, trajectory: Trajectory, lines: CentreLines) -> bool:
 class _Substitutes(Driver):
     """Drives in the VUT's place: first what the VUT did, then a reference driver."""
 
-    def __init__(self, corridors: int) -> None:
+    def __init__(self, corridors: int, rows: int) -> None:
         super().__init__(corridors)
         self._drivers = {name: make(corridors) for name, make in REFERENCES.items()}
         self._by = np.zeros(corridors, dtype=np.int64)
         self._until = np.zeros(corridors, dtype=np.int64)
-        self._recorded = np.zeros((ROWS, corridors))
+        self._recorded = np.zeros((rows, corridors))
 
     def begin(self, corridor: int, case: Case) -> None:
         assert isinstance(case, _Again), "only failures are driven again"  # noqa: S101
@@ -215,7 +215,7 @@ class _Substitutes(Driver):
 
     def act(self, scene: Scene) -> FloatArray:
         recorded = scene.step < self._until
-        row = np.minimum(scene.step, ROWS - 1)
+        row = np.minimum(scene.step, len(self._recorded) - 1)
         answer: FloatArray = self._recorded[row, np.arange(self.corridors)]
         for number, driver in enumerate(self._drivers.values()):
             mine = scene.active & (self._by == number)

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.campaigns.covering import Covering, covering
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, run_cases
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, run_cases
 from merge_sumo.campaigns.settings import CampaignSettings, differences, record_of
 from merge_sumo.campaigns.truth import OnCases, sources_sha256
 from merge_sumo.drivers.vuts.files import Files, changed
@@ -41,7 +41,7 @@ from merge_sumo.system.folders import check_own, make_place, new_folder, replace
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, FloatArray, Pool
 from merge_sumo.values.scenario import Dimension, level_name
-from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.score import Outcome
 
 CERTIFICATE: Final = "certificate.json"
 BLOCK: Final = 2000
@@ -192,6 +192,7 @@ def runs_points_on(
         net=net,
         scenario=settings.scenario,
         povs=settings.povs.with_log(log),
+        criterion=settings.criterion,
     )
 
     def run(level: int, points: FloatArray) -> Iterable[tuple[int, CaseResult]]:
@@ -212,14 +213,15 @@ def _run(
     ran = run_cases(plan, pool.cases(np.asarray(points), level))
     # One dictionary for a chunk: it travels once.
     files = ran[0].files | ran[0].pov_files if ran else {}
-    return [tested(done.trajectory.case, done.measures, files) for done in ran]
+    return [_result(done, files) for done in ran]
 
 
-def tested(case: Case, measures: Measures, files: Files) -> CaseResult:
-    """Return what a certificate keeps of a case."""
-    failed = Outcome(0, 0, case, measures).failed
-    score = math.nan if measures.score is None else measures.score
-    return CaseResult(_values(case), score, failed, failed or measures.end.is_tested, files)
+def _result(done: Ran, files: Files) -> CaseResult:
+    """Return what a certificate keeps of a case, by the criterion of the plan."""
+    case = done.trajectory.case
+    outcome = Outcome(0, 0, case, done.measures, margin=done.margin)
+    score = math.nan if outcome.score is None else outcome.score
+    return CaseResult(_values(case), score, outcome.failed, outcome.is_tested, files)
 
 
 def _values(case: Case) -> tuple[float, ...]:

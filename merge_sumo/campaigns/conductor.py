@@ -20,7 +20,7 @@ from merge_sumo.campaigns.ground import (
 )
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.learning import lessons
-from merge_sumo.campaigns.run import SETTINGS, Run, failures
+from merge_sumo.campaigns.run import SETTINGS, Run, spread_failures
 from merge_sumo.campaigns.settings import (
     RECORDED_BY_DEFAULT,
     CampaignSettings,
@@ -264,7 +264,7 @@ def _go_on(
                 journal.rewrite_settings(record)
             check()
     done = Run(journal.folder)
-    for outcome in failures(done.outcomes)[:EXPORTED_FAILURES]:
+    for outcome in spread_failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
         if not os.path.lexists(folder):  # written whole, before the campaign was stopped
             export_case(done, outcome.index, folder, net)

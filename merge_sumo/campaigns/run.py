@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from itertools import groupby
 from pathlib import Path
@@ -24,8 +25,9 @@ from numpy.typing import NDArray
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.printable import printable
-from merge_sumo.values.case import FloatArray
+from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.criterion import COLLISION, Criterion
+from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
@@ -208,6 +210,36 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[li
 def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Return the failing outcomes, the worst first."""
     return sorted((o for o in outcomes if o.failed), key=lambda o: (o.score, o.index))
+
+
+def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:
+    """Return the region of each failure within its level, the largest is 0, by index of the case.
+
+    A region is a group of failures that are linked at the radius of the coverage (`fmc.regions`).
+    """
+    found = failures(outcomes)
+    region: dict[int, int] = {}
+    for level in sorted({outcome.case.level for outcome in found}):
+        own = [outcome for outcome in found if outcome.case.level == level]
+        points = to_unit((outcome.case for outcome in own), level, own[0].case.scenario)
+        region |= zip((o.index for o in own), regions(points).tolist(), strict=True)
+    return region
+
+
+def spread_failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
+    """Return the failing outcomes: the worst of every region, then the second of each, and so on.
+
+    Neighbours fail alike: who looks at the first ten sees ten regions, where there are as many.
+    """
+    found = failures(outcomes)
+    region = regions_of(found)
+    before: Counter[tuple[int, int]] = Counter()
+    turns = []
+    for outcome in found:
+        own = outcome.case.level, region[outcome.index]
+        turns.append(before[own])
+        before[own] += 1
+    return [o for _, o in sorted(zip(turns, found, strict=True), key=lambda pair: pair[0])]
 
 
 def batch_file(folder: Path, batch: int) -> Path:

@@ -112,8 +112,6 @@ class CampaignSettings:
 
     def _check_sampler(self) -> None:
         sampler = make_sampler(self.sampler, self.pool, self.seed)
-        if self.learn_from and not self.criterion.is_papers:
-            raise UserError("--learn-from is for the paper's criterion: leave one of them away")
         if self.learn_from and not sampler.foresees:
             able = [name for name, kind in SAMPLERS.items() if kind.foresees]
             raise UserError(

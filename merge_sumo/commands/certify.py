@@ -12,14 +12,18 @@ import typer
 from merge_sumo.commands.shared import (
     DaskOption,
     DeadlineOption,
+    FailWhenOption,
+    FollowUpOption,
     JsonOption,
     NetOption,
     PoliciesOption,
     PovOption,
+    RequireOption,
     ScenarioOption,
     VutCommandOption,
     VutMemoryOption,
     app,
+    followed_up,
     say,
     show,
 )
@@ -42,6 +46,9 @@ def certify(
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     pov: PovOption = None,
+    fail_when: FailWhenOption = "collision",
+    require: RequireOption = None,
+    follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -79,7 +86,7 @@ def certify(
 
     if out is not None and resume is not None:
         raise UserError("--resume names the folder: leave --out away")
-    where = named_scenario(scenario)
+    where = followed_up(named_scenario(scenario), follow_up)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory)
     settings = CampaignSettings(
         vut=vut,
@@ -90,6 +97,8 @@ def certify(
         policies=None if policies is None else str(policies),
         pov=pov,
         scenario=where,
+        fail_when=fail_when,
+        require=require,
     )
     lattices = certificate.lattices_of(settings, radius)
     folder = resume or out or dated(f"certify-{vut}")

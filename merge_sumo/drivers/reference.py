@@ -92,7 +92,9 @@ class ReferenceDriver(Level0Vut):
         t_s = level0_time_to(distance_m, v_mps, self.a_mps2, self.v_cruise_mps)
         v_at_m = np.sqrt(v_mps * v_mps + 2.0 * self.a_mps2 * distance_m)
         v_at_m = np.minimum(v_at_m, np.maximum(v_mps, self.v_cruise_mps))
-        dx_m = scene.x_pov_m + scene.v_pov_mps * t_s
+        # Behind M, where an episode may go on, the two are as they are.
+        x_pov_m = scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
+        dx_m = x_pov_m + scene.v_pov_mps * t_s
         follows = dx_m >= 0.0
         demand = self.braking_mps2(
             np.abs(dx_m) - self.crash_m,
@@ -102,7 +104,7 @@ class ReferenceDriver(Level0Vut):
         # Braking at the limit from here on it is at M later, or never.
         left = v_mps * v_mps - 2.0 * self.limit_mps2 * distance_m
         t_late_s = (v_mps - np.sqrt(np.maximum(left, 0.0))) / self.limit_mps2
-        helps = (left <= 0.0) | (scene.x_pov_m + scene.v_pov_mps * t_late_s >= self.crash_m)
+        helps = (left <= 0.0) | (x_pov_m + scene.v_pov_mps * t_late_s >= self.crash_m)
         return np.where(helps, demand, 0.0)
 
     def forget_risk(self, where: NDArray[np.bool_]) -> None:
@@ -301,7 +303,8 @@ class CarefulPov(CarefulVut):
         v_at_m = np.sqrt(v_vut * v_vut + 2.0 * self.a_mps2 * distance_m)
         v_at_m = np.minimum(v_at_m, np.maximum(v_vut, self.v_cruise_mps))
         v_pov = scene.v_pov_mps
-        dx_m = scene.x_pov_m + v_pov * t_s
+        x_pov_m = scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
+        dx_m = x_pov_m + v_pov * t_s
         follows = dx_m < 0.0
         demand = self.braking_mps2(
             np.abs(dx_m) - self.crash_m,
@@ -309,7 +312,7 @@ class CarefulPov(CarefulVut):
             np.where(follows, v_at_m, v_pov),
         )
         t_brake = np.minimum(t_s, v_pov / self.limit_mps2)
-        dx_late = scene.x_pov_m + (v_pov - 0.5 * self.limit_mps2 * t_brake) * t_brake
+        dx_late = x_pov_m + (v_pov - 0.5 * self.limit_mps2 * t_brake) * t_brake
         demand = np.where(dx_late <= -self.crash_m, demand, 0.0)
         return self._answer(demand, np.zeros(self.corridors))
 

@@ -88,9 +88,14 @@ class Expected:
         if povs.sha256() != run.settings.get("policies_sha256"):
             raise UserError("the run had other drivers than those that are here")
         speed = run.settings.get("v_vut0_mps")
+        if type(speed) not in (int, float, type(None)):
+            raise UserError("the speed with which the VUT began is no number")
+        most_mps = run.scenario.v_start_max_mps
+        if speed is not None and not 0.0 <= speed <= most_mps:
+            raise UserError(f"the VUT began with {speed} m/s, which no campaign of ours has")
         pool = Pool(
             levels=tuple(levels),
-            v_vut0_mps=float(speed) if isinstance(speed, int | float) else None,
+            v_vut0_mps=None if speed is None else float(speed),
             scenario=run.scenario,
         )
         criterion = run.criterion

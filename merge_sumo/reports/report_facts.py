@@ -7,7 +7,7 @@ from typing import Final
 
 from merge_sumo.campaigns.avoidance import read_avoidance
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.run import SETTINGS, Run, failures
+from merge_sumo.campaigns.run import SETTINGS, Run, failures, regions_of, spread_failures
 from merge_sumo.campaigns.settings import versions
 from merge_sumo.campaigns.truth import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.errors import UserError
@@ -50,6 +50,8 @@ class Facts:
         self.levels = list(self.summary.levels)
         self.coordinates = coordinates(run.scenario)
         self.worst = failures(run.outcomes)
+        self.regions = regions_of(self.worst)
+        self.spread = spread_failures(self.worst)[:LISTED]
         self.avoidance = read_avoidance(run)
         self.near = sorted(
             (o for o in run.outcomes if _is_told(o) and not o.failed),
@@ -59,7 +61,7 @@ class Facts:
         self.expected = _expected(run, levels, self.road)
         self.untested = [o for o in run.outcomes if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
-        listed = [*(*examples, *self.worst[:LISTED], *self.near[:LISTED], *self.surprises)]
+        listed = [*(*examples, *self.spread, *self.near[:LISTED], *self.surprises)]
         telling = {o.index: o for o in (*listed, *self.worst, *self.untested, *self.near)}
         self.shown = sorted(list(telling.values())[:SHOWN], key=lambda outcome: outcome.index)
         self.motion = {o.index: motion for o in self.shown if (motion := _motion(run, o.index))}

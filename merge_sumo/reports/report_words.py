@@ -94,7 +94,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         for trouble in facts.troubles()
     ]
     tables += [
-        ("Ten worst failures", facts.worst[:LISTED]),
+        ("Ten worst failures, one of each region first", facts.spread),
         ("Ten nearest misses", facts.near[:LISTED]),
     ]
     if facts.surprises:
@@ -164,9 +164,17 @@ def _levels(facts: Facts) -> list[Level]:
         default=0.0,
     )
 
+    # One scale for all levels: their bars are compared.
+    most = max(
+        (
+            max(found.fmc, plausible[level] or 0.0, truth[level] or 0.0)
+            for level, found in facts.summary.levels.items()
+        ),
+        default=0.0,
+    )
+
     def row(level: int, found: LevelSummary) -> Level:
         # Found against what there may be: a bar shows nothing where only one of them is known.
-        most = max(found.fmc, plausible[level] or 0.0, truth[level] or 0.0)
         known = plausible[level] is not None or truth[level] is not None
         scale = 90.0 / most if known and most > 0.0 else 0.0
         share = 100.0 / (most_share * found.cases) if most_share > 0.0 and found.cases else 0.0

@@ -52,11 +52,13 @@ class Surface:
         """Return the coverage if all places failed that the surrogate does not exclude.
 
         As many uniform points as a ground truth has cases, those with a chance of at least
-        `PLAUSIBLE`, together with the failures found. No confidence bound: a region of which the
-        surrogate knows nothing is not in it.
+        `PLAUSIBLE`, together with the failures found. No more than the pool, though balls at its
+        faces reach out of it, unless the failures found alone cover more. No confidence bound: a
+        region of which the surrogate knows nothing is not in it.
         """
         points, chance = self.pool()
-        return fmc(np.concatenate([self._failing, points[chance >= PLAUSIBLE]]))
+        whole = fmc(np.concatenate([self._failing, points[chance >= PLAUSIBLE]]))
+        return whole if whole <= 1.0 else max(1.0, fmc(self._failing))
 
     def pool(self) -> tuple[FloatArray, FloatArray]:
         """Return uniform points of the unit cube, (n, d), and the chance of each to fail, (n,)."""

@@ -130,6 +130,30 @@ HOSTED_NET: Final = {
 }
 """A net that `hosting` made, with lanes inside of junctions."""
 
+_PHASE = Allowed(
+    {
+        **dict.fromkeys(("duration", "minDur", "maxDur"), number(0, 1e6)),
+        "state": matching("[a-zA-Z]{1,256}", "a row of letters"),
+    }
+)
+ROAD_NET: Final = {
+    "net": Allowed(
+        NET["net"].attributes,
+        {
+            **NET["net"].children,
+            "connection": Allowed(
+                {**_CONNECTION.attributes, "via": _ID, "tl": _ID, "linkIndex": _COUNT}
+            ),
+            "roundabout": Allowed({"nodes": _IDS, "edges": _IDS}),
+            "tlLogic": Allowed(
+                {"id": _ID, "type": _WORD, "programID": _ID, "offset": number(-1e6, 1e6)},
+                {"phase": _PHASE},
+            ),
+        },
+    )
+}
+"""A net as netconvert writes it, with lanes inside of junctions, roundabouts and lights."""
+
 _WHO: Final = matching("|".join(VEHICLES), "one of " + ", ".join(VEHICLES))
 _COLOUR: Final = matching(r"[0-9.]{1,20}(?:,[0-9.]{1,20}){2,3}|[a-z]{1,20}", "a colour")
 

@@ -65,7 +65,7 @@ class Beside:
             content = received.read_bytes(
                 road.path, "the net", follow_links=True, limit=received.MAX_NET_BYTES
             )
-            (stage / NET).write_bytes(received.cleaned(content, allowed.NET, name))
+            (stage / NET).write_bytes(received.cleaned(content, allowed.ROAD_NET, name))
             (stage / TYPES).write_bytes(_types(road, scenario, vehicles))
             files = ("--net-file", str(stage / NET), "--additional-files", str(stage / TYPES))
             process, self._connection = open_program("sumo", [*files, *OPTIONS])
@@ -105,12 +105,15 @@ class Beside:
 
     def _start(self, name: str, state: State) -> dict[str, str]:
         """Return where a vehicle departs; it can do so on the first edge of its route only."""
-        point = self._road.lane_point(state[0], on_ramp=name == VEHICLES[VUT])
+        path = self._path(name)
+        point = path.point(state[0])
         edge, _, lane = point.lane.rpartition("_")
-        if edge != _edges(self._path(name))[0]:
-            return {"departLane": "best", "departSpeed": str(state[1])}
-        place = {"departLane": lane, "departPos": str(point.position_m)}
-        return {**place, "departSpeed": str(state[1])}
+        # It is told its own speed behind the step; SUMO lets none depart faster than the limit.
+        fastest_mps = min(path.piece(state[0]).speed_limit_mps, self._road.speed_limit_mps)
+        speed = {"departSpeed": str(min(state[1], fastest_mps))}
+        if edge != _edges(path)[0]:
+            return {"departLane": "best", **speed}
+        return {"departLane": lane, "departPos": str(point.position_m), **speed}
 
     def ask(self, command: bytes) -> bytes:
         """Return what SUMO answers to one command; raises `GoneError`.

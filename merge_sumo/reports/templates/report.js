@@ -237,23 +237,27 @@ function FailureMap(figure) {
     }
     return best;
   };
-  svg.addEventListener("click", (event) => { const mark = under(event); if (mark) show(mark.i); });
-  svg.addEventListener("pointermove", (event) => { const mark = under(event); mark ? tip(event, title(mark.i)) : tip(null); });
+  const drawn = (i) => svg.querySelector(`[data-case="${cases.index[i]}"]`);
+  svg.addEventListener("click", (event) => { const mark = under(event); if (mark) openCase(mark.i, drawn(mark.i)); });
+  svg.addEventListener("pointermove", (event) => {
+    const mark = event.pointerType === "touch" ? null : under(event);
+    mark ? tip(event, title(mark.i)) : tip(null);
+  });
   svg.addEventListener("pointerleave", () => tip(null));
   svg.addEventListener("keydown", (event) => {
     const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     if (!way) return;
     event.preventDefault();
     const here = marks.find((m) => m.i === chosen);
-    const open = visible();
-    if (!here) { if (open.length) show(open[open.length - 1].i); return; }
+    const seen = visible();
+    if (!here) { if (seen.length) openCase(seen[seen.length - 1].i, svg); return; }
     let best = null, least = Infinity;
-    for (const mark of open) {
+    for (const mark of seen) {
       const dx = mark.x - here.x, dy = mark.y - here.y;
       const along = dx * way[0] + dy * way[1], aside = Math.abs(dx * way[1]) + Math.abs(dy * way[0]);
       if (along > 0.01 && along + 3 * aside < least) [best, least] = [mark, along + 3 * aside];
     }
-    if (best) show(best.i);
+    if (best) openCase(best.i, drawn(best.i));
   });
   slider?.addEventListener("input", () => this.move(Number(slider.value), false));
   check?.addEventListener("change", () => this.move(at, check.checked));
@@ -269,8 +273,10 @@ function tip(event, text) {
   tipBox.hidden = event === null;
   if (!event) return;
   tipBox.textContent = text;
-  tipBox.style.left = `${Math.max(4, Math.min(event.pageX + 12, document.documentElement.clientWidth - tipBox.offsetWidth - 8))}px`;
-  tipBox.style.top = `${event.pageY + 14}px`;
+  const { clientWidth, clientHeight } = document.documentElement;
+  const below = event.clientY + 14 + tipBox.offsetHeight < clientHeight;
+  tipBox.style.left = `${Math.max(4, Math.min(event.clientX + 12, clientWidth - tipBox.offsetWidth - 8))}px`;
+  tipBox.style.top = `${below ? event.clientY + 14 : event.clientY - 10 - tipBox.offsetHeight}px`;
 }
 /* ---------- plots over time ---------- */
 function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags = [], xTicks = 4, decimals = null }) {
@@ -320,12 +326,48 @@ function range(values, pad = 0.06) {
 const road = byId("road"), slider = byId("time");
 let moving = null, step = 0, playing = false, last = 0, charts = [];
 
-function show(i, scroll = false) {
+const panel = byId("case");
+function dock(on) { // at the foot of the window, or in its place beside the lists
+  panel.classList.toggle("docked", on);
+  byId("explorer").classList.toggle("docked", on);
+  byId("close").hidden = !on;
+  if (moving) at(step);
+}
+function openCase(i, element = null) { // asked for by the reader: it is in sight, and so is what was clicked
+  tip(null);
+  show(i);
+  history.replaceState(null, "", `#case-${cases.index[i]}`);
+  const { top, height } = panel.getBoundingClientRect();
+  if (top < 0 || top + Math.min(height, 380) > innerHeight) dock(true);
+  if (!element || !panel.classList.contains("docked")) return;
+  const hidden = element.getBoundingClientRect().bottom + 12 - panel.getBoundingClientRect().top;
+  if (hidden > 0) scrollBy({ top: hidden, behavior: "instant" });
+}
+function openLinked() { // #case-111
+  const index = Number(/^#case-(\d+)$/.exec(location.hash)?.[1] ?? NaN);
+  if (!place.has(index)) return false;
+  openCase(place.get(index));
+  return true;
+}
+addEventListener("hashchange", openLinked);
+addEventListener("keydown", (event) => { if (event.key === "Escape") dock(false); });
+byId("close").addEventListener("click", () => dock(false));
+
+function show(i) {
   chosen = i;
   for (const map of maps) map.lookAt(i);
   byId("case-title").textContent = title(i);
   byId("case-words").textContent = words(i);
-  byId("command").textContent = data.commands[cases.index[i]] || `${data.export} ${cases.index[i]} && ${data.replay.replace("NNNNN", String(cases.index[i]).padStart(5, "0"))}`;
+  const link = byId("case-link");
+  link.hidden = false;
+  link.href = link.textContent = `#case-${cases.index[i]}`;
+  const command = data.commands[cases.index[i]] || `${data.export} ${cases.index[i]} && ${data.replay.replace("NNNNN", String(cases.index[i]).padStart(5, "0"))}`;
+  // Lines break between words only: a hyphen in a name is no place for it.
+  byId("command").replaceChildren(...command.split(" ").flatMap((word, n) => {
+    const whole = document.createElement("span");
+    whole.textContent = word;
+    return n ? [" ", whole] : [whole];
+  }));
   for (const part of document.querySelectorAll(".command, .command-title")) part.hidden = false;
   for (const map of maps) map.choose();
   for (const button of document.querySelectorAll("[data-case]")) {
@@ -335,7 +377,6 @@ function show(i, scroll = false) {
   byId("case-motion").hidden = moving === null;
   play(false);
   if (moving) showMotion(i);
-  if (scroll) byId("case").scrollIntoView({ block: "nearest" });
 }
 function showMotion(i) {
   const { rows, v, x, met } = moving, end = (rows - 1) * DT;
@@ -394,7 +435,8 @@ function at(t) {
   // The view follows all of them, never closer than 90 m; cars keep a size that can be seen.
   const ratio = road.clientHeight / (road.clientWidth || 1) || 0.25;
   const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 22) / ratio, 90), middle = (low + high) / 2;
-  const size = Math.max(1, width / 90), height = width * ratio;
+  const height = width * ratio, size = Math.max(1, Math.min(width / 90, height / 22.5)); // labels fit
+ 
   road.setAttribute("viewBox", `${middle - width / 2} ${-(bottom + top) / 2 - height / 2} ${width} ${height}`);
   for (const [who, name] of vehicles.entries()) {
     const { x, y, angle } = places[who], v = moving.v[who], a = (v[next] - v[k]) / DT;
@@ -460,14 +502,14 @@ byId("copy").addEventListener("click", async () => {
 for (const table of document.querySelectorAll(".list")) {
   const buttons = [...table.querySelectorAll("button")];
   for (const [n, button] of buttons.entries()) {
-    const open = () => show(place.get(Number(button.dataset.case)), true);
-    button.closest("tr").addEventListener("click", open);
+    const row = button.closest("tr");
+    row.addEventListener("click", () => openCase(place.get(Number(button.dataset.case)), row));
     button.addEventListener("keydown", (event) => {
       const to = { ArrowDown: n + 1, ArrowUp: n - 1, Home: 0, End: buttons.length - 1 }[event.key];
       if (to === undefined || !buttons[to]) return;
       event.preventDefault();
       buttons[to].focus();
-      show(place.get(Number(buttons[to].dataset.case)));
+      openCase(place.get(Number(buttons[to].dataset.case)), buttons[to]);
     });
   }
 }
@@ -499,6 +541,6 @@ function search() {
 const worst = document.querySelector(".list button");
 for (const map of maps) map.begin();
 search();
-if (worst) show(place.get(Number(worst.dataset.case)));
+if (!openLinked() && worst) show(place.get(Number(worst.dataset.case)));
 addEventListener("resize", () => at(step));
 addEventListener("beforeprint", () => at(step));
