@@ -14,6 +14,7 @@ from merge_sumo.commands import (
     cases,
     certify,
     experiments,
+    histories,
     probability,
     runs,
     scenarios,
@@ -25,7 +26,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 
 __all__ = ["app", "campaign", "cases", "certify", "experiments", "main", "probability"]
-__all__ += ["runs", "scenarios", "training", "vuts"]
+__all__ += ["histories", "runs", "scenarios", "training", "vuts"]
 
 
 @app.callback(invoke_without_command=True)

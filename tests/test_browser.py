@@ -13,7 +13,7 @@ from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.campaigns.avoidance import Avoidance, write_avoidance
-from merge_sumo.campaigns.run import Run, failures, spread_failures
+from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report, report_facts
 from merge_sumo.reports.coordinates import WRITTEN
 from merge_sumo.scenarios.scenario_file import named_scenario
@@ -208,6 +208,72 @@ def test_a_link_opens_its_case(browser, made, size):
         assert chosen(page) == 7
 
 
+def rows(page) -> list[int]:
+    """Return the cases of the table of all cases, from top to bottom."""
+    return [int(text) for text in page.locator("#table td button").all_inner_texts()]
+
+
+def column(page, name: str) -> list[str]:
+    names = [text.strip() for text in page.locator("#table th").all_inner_texts()]
+    cells = page.locator(f"#table td:nth-child({names.index(name) + 1})")
+    return cells.all_inner_texts()
+
+
+@WINDOWS
+def test_all_cases_sort_and_open(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        worst = sorted((round(o.score, 1), o.index) for o in failures(made.outcomes))
+        assert rows(page)[: len(worst)] == [index for _, index in worst]
+        assert len(rows(page)) == 100
+        page.locator("#more").click()
+        assert sorted(rows(page)) == [o.index for o in made.outcomes]
+        by_gap = page.locator("#table th button", has_text="gap at M")
+        for way, order in (("ascending", 1), ("descending", -1)):
+            by_gap.click()
+            assert page.locator(f"#table th[aria-sort={way}]").inner_text().startswith("gap at M")
+            told = [o for o in made.outcomes if o.measures.dx_m is not None]
+            told.sort(key=lambda o: (order * round(o.measures.dx_m, 2), o.index))
+            assert rows(page) == [o.index for o in told[:100]]
+        row = page.locator("#table tbody tr").nth(5)
+        row.click()
+        assert chosen(page) == rows(page)[5]
+        assert in_sight(page, "#case-title")
+        assert in_sight(page, "#table tr.on td:first-child")
+        row.locator("button").focus()
+        page.keyboard.press("ArrowDown")
+        assert chosen(page) == rows(page)[6]
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+
+
+def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser, made):
+    found = failures(made.outcomes)
+    region = regions_of(found)
+    with shown(browser, made.folder / report.REPORT) as page:
+        filters = page.locator("#filters")
+        filters.locator("[name=verdict]").select_option("failure")
+        assert sorted(rows(page)) == sorted(o.index for o in found)
+        filters.locator("[name=level]").select_option("1")
+        of_level = [o for o in found if o.case.level == 1]
+        assert sorted(rows(page)) == sorted(o.index for o in of_level)
+        filters.locator("[name=region]").select_option("1:0")
+        assert sorted(rows(page)) == sorted(o.index for o in of_level if region[o.index] == 0)
+        assert set(column(page, "region")) == {"1"}
+        filters.locator("button[type=reset]").click()
+        page.wait_for_function("byId('matching').textContent.startsWith('180 of')")
+        kind = filters.locator("[name=kind] option").nth(1).get_attribute("value")
+        filters.locator("[name=kind]").select_option(kind)
+        assert set(column(page, "kind")) == {kind}
+        filters.locator("button[type=reset]").click()
+        page.wait_for_function("byId('matching').textContent.startsWith('180 of')")
+        filters.locator("[name=measure]").select_option(label="gap at M m")
+        filters.locator("[name=from]").fill("-8")
+        filters.locator("[name=to]").fill("-6")
+        inside = [o.index for o in made.outcomes if -8 <= round(o.measures.dx_m or 0, 2) <= -6]
+        assert sorted(rows(page)) == inside
+        assert inside
+
+
 def test_a_command_breaks_between_words_only(browser, made):
     viewport = {"width": 390, "height": 800}
     with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
@@ -306,8 +372,24 @@ def test_errors_and_timeouts_are_drawn_as_no_result_and_shown_first(browser, tmp
         )
         assert sorted(map(int, drawn)) == [0, 3, 4, 6]
         assert page.inner_text("#case-words").startswith("VUT_ERROR: boom")
-        page.locator("[data-case='3']").last.click()
+        page.locator(".list [data-case='3']").click()
         assert page.inner_text("#case-words").startswith("Timeout: the VUT did not arrive")
+
+
+def test_errors_and_timeouts_are_grouped_by_message_in_the_table(browser, tmp_path):
+    run = write_run(tmp_path / "run", 20, errors={4: "boom", 9: EVIL, 11: "boom"}, timeouts=(0, 6))
+    with shown(browser, report.write_report(run)) as page:
+        verdict = page.locator("#filters [name=verdict]")
+        for label, expected in (
+            ("boom (2)", [4, 11]),
+            (f"{EVIL[:60]} (1)", [9]),
+            ("VUT_ERROR (3)", [4, 9, 11]),
+            ("TIMEOUT (2)", [0, 6]),
+        ):
+            verdict.select_option(label=label)
+            assert sorted(rows(page)) == expected
+        verdict.select_option(label="boom (2)")
+        assert set(column(page, "verdict")) == {"VUT_ERROR: boom"}
 
 
 def test_a_long_campaign_opens_too(browser, made, tmp_path, monkeypatch):

@@ -128,6 +128,54 @@ class TestOpenScenario:
         assert again.read_bytes() == scenario.read_bytes()
 
 
+class TestAFreeVut:
+    @pytest.fixture
+    def free(self, scenario):
+        return scenario.with_name(f"{scenario.stem}-free.xosc")
+
+    def test_is_valid_by_the_schema_of_the_standard_and_is_read_back(self, free):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read = xosc.ParseOpenScenario(str(free))
+        assert {car.name for car in read.entities.scenario_objects} == {"pov", "vut"}
+
+    def test_starts_where_it_started_and_then_nobody_tells_it_where_to_go(self, scenario, free):
+        recorded, tree = etree.parse(scenario), etree.parse(free)
+        start = ".//Private[@entityRef='vut']/PrivateAction"
+        for path in (f"{start}/TeleportAction", f"{start}/LongitudinalAction"):
+            (here,), (there,) = recorded.findall(path), tree.findall(path)
+            assert etree.tostring(here) == etree.tostring(there)
+        assert {e.get("entityRef") for e in tree.iterfind(".//Story//EntityRef")} == {"pov"}
+        assert vertices(tree, "vut") == []
+
+    def test_has_the_controller_that_a_parameter_names(self, free):
+        tree = etree.parse(free)
+        (assigned,) = tree.findall(".//Private[@entityRef='vut']//AssignControllerAction")
+        assert assigned.get("activateLateral") == assigned.get("activateLongitudinal") == "true"
+        assert assigned.find("Controller").get("name") == "$EgoController"
+        (declared,) = tree.findall("ParameterDeclarations/ParameterDeclaration")
+        assert (declared.get("name"), declared.get("value")) == ("EgoController", "user")
+
+    def test_meets_a_pov_that_does_what_it_did_and_then_keeps_its_speed(self, made, scenario, free):
+        trajectory = made.trajectory(failures(made.outcomes)[0].index)
+        tree = etree.parse(free)
+        assert vertices(tree, "pov") == vertices(etree.parse(scenario), "pov")
+        after = tree.find(".//Event[@name='pov afterwards']")
+        assert float(after.find(".//SimulationTimeCondition").get("value")) == trajectory.t_end_s
+        assert float(after.find(".//AbsoluteTargetSpeed").get("value")) == trajectory.v_pov_mps[-1]
+        stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
+        assert float(stop.get("value")) == US23.timeout_s
+
+    def test_meets_all_cars_of_the_traffic(self, tmp_path):
+        run = write_run(
+            *(tmp_path / "run", 2), levels=(1,), error=None, scenario=named_scenario("us23-traffic")
+        )
+        path = write_openscenario(run, 0, tmp_path / "case", road_of())
+        tree = etree.parse(path.with_name(f"{path.stem}-free.xosc"))
+        followers = {e.get("entityRef") for e in tree.iterfind(".//Story//EntityRef")}
+        assert followers == {"pov", "ahead", "behind"}
+
+
 class TestATable:
     def test_has_a_row_for_every_step_of_every_case(self, made, tmp_path):
         path = write_table(made, [0, 3], tmp_path, "csv")

@@ -176,6 +176,14 @@ class TestTwin:
         same = [plain.replay(0, [8], points[8:9]), taught.replay(0, [8], points[8:9])]
         assert same[0].tolist() == same[1].tolist()
 
+    @pytest.mark.parametrize("size", [60, 20, 7])
+    def test_learns_from_batches_of_any_size(self, seen, size):
+        outcomes, motions = seen
+        twin = Twin(Pool(levels=(0,)), Povs(), 0)
+        many = [replace(o, index=k, batch=k // size) for k, o in enumerate(outcomes * 3)]
+        twin.tell(many, {o.index: motions[o.index % len(outcomes)] for o in many})
+        assert twin.play(0, np.full((1, 2), 0.5)).shape == (2, 4, 1)
+
     def test_needs_some_cases_and_learns_nothing_from_errors(self, seen):
         outcomes, motions = seen
         twin = Twin(Pool(levels=(0,)), Povs(), 0)

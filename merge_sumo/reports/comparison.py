@@ -99,6 +99,12 @@ def _common_levels(a: Run, b: Run) -> list[int]:
     common = sorted(named[0] & named[1])
     if not common:
         raise UserError(f"{a.folder} and {b.folder} have no POV level in common")
+    check_comparable(a, b, common)
+    return common
+
+
+def check_comparable(a: Run, b: Run, levels: Iterable[int]) -> None:
+    """Raise `UserError` where campaigns asked different things, or met other POVs at a level."""
     if a.scenario != b.scenario:
         raise UserError(
             f"{a.folder} is of the scenario {a.scenario.name} and {b.folder} of another or a "
@@ -115,13 +121,12 @@ def _common_levels(a: Run, b: Run) -> list[int]:
             f"a case of {a.folder} fails when {a.criterion.text}, and one of {b.folder} when "
             f"{b.criterion.text}: compare campaigns with the same --fail-when"
         )
-    for level in common:
+    for level in levels:
         if not same_pov(a.settings, b.settings, level):
             raise UserError(
                 f"the POV of level {level_name(level)} is another in {a.folder} than in "
                 f"{b.folder}: compare campaigns with the same --policies and --pov"
             )
-    return common
 
 
 def _common_net(a: Run, b: Run, net: Corridor) -> Corridor:

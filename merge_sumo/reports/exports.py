@@ -26,12 +26,15 @@ from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder
 from merge_sumo.values.bodies import WIDTH_M
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
+from merge_sumo.values.trajectory import Trajectory
 
 TABLE: Final = "trajectories"
 ROAD: Final = "road.xodr"
 _EPOCH: Final = datetime(2000, 1, 1)
 MINOR_VERSION: Final = 2
 """OpenSCENARIO 1.2."""
+CONTROLLER: Final = "EgoController"
+"""Parameter that names the controller of a free VUT."""
 HEIGHT_M: Final = 1.5
 WHEEL_M: Final = 0.7
 
@@ -113,7 +116,12 @@ def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float | None, ...]]:
 
 
 def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Path:
-    """Write a case as OpenSCENARIO, with both cars on their recorded trajectories, and OpenDRIVE.
+    """Write a case as OpenSCENARIO, twice, and OpenDRIVE; return the path of the first.
+
+    In the first all cars follow their recorded trajectories. In the second, `...-free.xosc`, the
+    VUT is only placed at its position and speed and has a controller whose name is the parameter
+    `EgoController`; the other cars do what they did, whatever it does, and keep their last speed
+    where the record ends. That one ends by the scenario's timeout.
 
     The reference point of each car is its front bumper, as in the record: x, y and heading are
     those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
@@ -121,25 +129,51 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     """
     xosc = _need("scenariogeneration").xosc
     trajectory, name = run.trajectory(index), case_name(index)
+    recorded = _scenario(xosc, trajectory, road, name, f"{run.vut}, {name}", free=False)
+    free = _scenario(xosc, trajectory, road, name, f"{run.vut}, {name}, free VUT", free=True)
+    with new_folder(folder) as new:
+        (new / ROAD).write_bytes(opendrive(road))
+        recorded.write_xml(str(new / f"{name}.xosc"))
+        free.write_xml(str(new / f"{name}-free.xosc"))
+    return folder / f"{name}.xosc"
+
+
+def _scenario(
+    xosc: Any, trajectory: Trajectory, road: Corridor, name: str, title: str, *, free: bool
+) -> Any:
+    """Return a case as a scenario; where the VUT is free, somebody else's controller drives it."""
+    scenario = trajectory.case.scenario
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
     for row, who in enumerate(VEHICLES[: trajectory.motion.shape[1]]):
-        entities.add_scenario_object(who, _car(xosc, who, trajectory.case.scenario))
+        entities.add_scenario_object(who, _car(xosc, who, scenario))
         places = [
             _place(xosc, road, x_m, on_ramp=row == VUT)
             for x_m in trajectory.motion[:, row, 0].tolist()
         ]
         init.add_init_action(who, xosc.TeleportAction(places[0]))
         init.add_init_action(who, _speed(xosc, float(trajectory.motion[0, row, 1])))
-        act.add_maneuver_group(_follow(xosc, who, places))
+        if not free:
+            act.add_maneuver_group(_follow(xosc, who, places))
+        elif row == VUT:
+            controller = xosc.Controller(f"${CONTROLLER}", xosc.Properties())
+            init.add_init_action(who, xosc.AssignControllerAction(controller))
+        else:
+            last_mps = float(trajectory.motion[-1, row, 1])
+            act.add_maneuver_group(_follow(xosc, who, places, last_mps))
     story = xosc.Story(name)
     story.add_act(act)
-    board = xosc.StoryBoard(init, _at_time(xosc, "end", trajectory.t_end_s))
+    end_s = scenario.timeout_s if free else trajectory.t_end_s
+    board = xosc.StoryBoard(init, _at_time(xosc, "end", end_s))
     board.add_story(story)
-    scenario = xosc.Scenario(
-        f"{run.vut}, {name}",
+    parameters = xosc.ParameterDeclarations()
+    if free:
+        kind = xosc.ParameterType.string
+        parameters.add_parameter(xosc.Parameter(CONTROLLER, kind, "user"))
+    return xosc.Scenario(
+        title,
         "merge-sumo",
-        xosc.ParameterDeclarations(),
+        parameters,
         entities,
         board,
         xosc.RoadNetwork(ROAD),
@@ -148,10 +182,6 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
         # A fixed date: the same case gives the same bytes.
         creation_date=_EPOCH,
     )
-    with new_folder(folder) as new:
-        (new / ROAD).write_bytes(opendrive(road))
-        scenario.write_xml(str(new / f"{name}.xosc"))
-    return folder / f"{name}.xosc"
 
 
 def _need(package: str) -> Any:
@@ -176,22 +206,28 @@ def _place(xosc: Any, road: Corridor, x_m: float, *, on_ramp: bool) -> Any:
     return xosc.WorldPosition(round(x, 9), round(y, 9), 0.0, round(heading, 9))
 
 
-def _follow(xosc: Any, who: str, places: Sequence[Any]) -> Any:
+def _follow(xosc: Any, who: str, places: Sequence[Any], afterwards_mps: float | None = None) -> Any:
+    """Return what lets a car follow its places, and then keep a speed, if one is given."""
     times = np.round(np.arange(len(places)) * DT_S, 1).tolist()
     track = xosc.Trajectory(f"{who} recorded", closed=False)
     track.add_shape(xosc.Polyline(times, list(places)))
-    action = xosc.FollowTrajectoryAction(
+    follow = xosc.FollowTrajectoryAction(
         track,
         xosc.FollowingMode.position,
         reference_domain=xosc.ReferenceContext.absolute,
         scale=1.0,
         offset=0.0,
     )
+    maneuver = xosc.Maneuver(f"{who} maneuver")
     event = xosc.Event(f"{who} event", xosc.Priority.override)
     event.add_trigger(_at_time(xosc, f"{who} start", 0.0))
-    event.add_action(f"{who} follows", action)
-    maneuver = xosc.Maneuver(f"{who} maneuver")
+    event.add_action(f"{who} follows", follow)
     maneuver.add_event(event)
+    if afterwards_mps is not None:
+        event = xosc.Event(f"{who} afterwards", xosc.Priority.override)
+        event.add_trigger(_at_time(xosc, f"{who} has followed", times[-1]))
+        event.add_action(f"{who} keeps its speed", _speed(xosc, afterwards_mps))
+        maneuver.add_event(event)
     group = xosc.ManeuverGroup(f"{who} group")
     group.add_actor(who)
     group.add_maneuver(maneuver)

@@ -74,8 +74,8 @@ def report_page(run: Run) -> str:
         **page_words(facts),
         style=Markup(style),  # noqa: S704 (our own file)
         script=Markup(script),  # noqa: S704 (our own file)
-        style_hash=_policy_hash(style),
-        script_hash=_policy_hash(script),
+        style_hash=policy_hash(style),
+        script_hash=policy_hash(script),
         data=Markup(data),  # noqa: S704 (JSON without "<")
         level_name=level_name,
     )
@@ -91,5 +91,6 @@ def _template() -> Template:
     return environment.get_template("report.html.jinja")
 
 
-def _policy_hash(source: str) -> str:
+def policy_hash(source: str) -> str:
+    """Return by what a page's policy names a style or a script in it."""
     return "sha256-" + base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()

@@ -140,7 +140,7 @@ class Twin:
     def _learned_by(self, group: int) -> tuple[int, ...]:
         """Return the cases that members of a group learn from, by index."""
         until = self._last_batch()
-        if len(self._batch) > AT_ONCE:
+        if len(self._batch) > AT_ONCE and until >= GROUPS:
             until -= (until - group) % GROUPS
         some = sorted(index for index, batch in self._batch.items() if batch <= until)
         if len(some) > LEARNED:

@@ -335,13 +335,15 @@ function dock(on) { // at the foot of the window, or in its place beside the lis
 }
 function openCase(i, element = null) { // asked for by the reader: it is in sight, and so is what was clicked
   tip(null);
+  const before = element?.getBoundingClientRect().top;
   show(i);
   history.replaceState(null, "", `#case-${cases.index[i]}`);
   const { top, height } = panel.getBoundingClientRect();
   if (top < 0 || top + Math.min(height, 380) > innerHeight) dock(true);
-  if (!element || !panel.classList.contains("docked")) return;
-  const hidden = element.getBoundingClientRect().bottom + 12 - panel.getBoundingClientRect().top;
-  if (hidden > 0) scrollBy({ top: hidden, behavior: "instant" });
+  if (!element) return;
+  // What was clicked stays where it is, or comes up as far as the case would hide it.
+  const at = element.getBoundingClientRect(), room = panel.classList.contains("docked") ? panel.getBoundingClientRect().top - 12 - at.height : Infinity;
+  scrollBy({ top: at.top - Math.min(before, room), behavior: "instant" });
 }
 function openLinked() { // #case-111
   const index = Number(/^#case-(\d+)$/.exec(location.hash)?.[1] ?? NaN);
@@ -514,6 +516,105 @@ for (const table of document.querySelectorAll(".list")) {
   }
 }
 
+/* ---------- all cases ---------- */
+const verdict = (i) => (failed(i) ? "failure" : tested(i) ? "no failure" : data.ends[cases.end[i]]);
+function allCases() {
+  const form = byId("filters"), head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
+  const { level, verdict: ended, region, kind, measure, from, to } = form.elements;
+  const number = (key, name, digits) => ({ name, value: (i) => cases[key][i], text: (value) => fixed(value, digits) });
+  const columns = [
+    { name: "case", value: (i) => cases.index[i] },
+    { name: "level", value: (i) => cases.level[i], text: (value) => data.level_names[value] },
+    { name: "verdict", words: true, value: verdict, text: (value, i) => (tested(i) || !data.errors[cases.index[i]] ? value : `${value}: ${data.errors[cases.index[i]]}`) },
+    { name: "kind", words: true, value: (i) => (cases.kind[i] === null ? null : data.kinds[cases.kind[i]]) },
+    { name: "region", value: (i) => cases.region[i], text: (value) => String(value + 1) },
+    ...coordinates.map((c) => number(c.field, `${c.name}${c.unit === "rad" ? "" : ` ${c.unit}`}`, c.digits)),
+    number("score", "score", 0), ...(cases.margin ? [number("margin", "margin", 2)] : []),
+    number("dx", "gap at M m", 1), number("dv", "dv m/s", 1), number("ttc", "TTC s", 1), number("pet", "PET s", 1),
+    number("vut_brake", "VUT brakes m/s\u00b2", 1), number("pov_brake", "POV brakes m/s\u00b2", 1), number("t_end", "time s", 1),
+  ];
+  const all = cases.index.map((_, i) => i), PART = 100;
+  let by = columns.find(({ name }) => name === "score"), way = 1, found = all, rows = 0;
+
+  const option = (select, value, text = value) => select.add(new Option(text, value));
+  const count = (value) => {
+    const counts = new Map();
+    for (const i of all) if (value(i) !== null) counts.set(value(i), (counts.get(value(i)) ?? 0) + 1);
+    return counts;
+  };
+  const message = (i) => (tested(i) ? null : data.errors[cases.index[i]] ?? null);
+  const where = (i) => (cases.region[i] === null ? null : `${cases.level[i]}:${cases.region[i]}`);
+  for (const [value] of count((i) => cases.level[i])) option(level, value, data.level_names[value]);
+  for (const [value, n] of count(verdict)) option(ended, value, `${value} (${n})`);
+  for (const [value, n] of count(message)) option(ended, `: ${value}`, `${value.slice(0, 60)} (${n})`);
+  const ordered = [...count(where)].map(([value, n]) => [value.split(":").map(Number), value, n]);
+  ordered.sort(([a], [b]) => a[0] - b[0] || a[1] - b[1]);
+  for (const [[l, r], value, n] of ordered) option(region, value, `level ${data.level_names[l]}, region ${r + 1} (${n})`);
+  for (const [value, n] of count(columns[3].value)) option(kind, value, `${value} (${n})`);
+  for (const [n, c] of columns.entries()) if (n > 4) option(measure, n, c.name);
+
+  for (const c of columns) {
+    const cell = head.appendChild(document.createElement("th")), button = cell.appendChild(document.createElement("button"));
+    cell.scope = "col"; cell.className = c.words ? "" : "num";
+    button.type = "button"; button.textContent = c.name;
+    button.addEventListener("click", () => { way = by === c ? -way : 1; by = c; list(); });
+  }
+  const cells = (i, row) => {
+    for (const [n, c] of columns.entries()) {
+      const value = c.value(i), cell = row.insertCell(), text = value === null ? "" : c.text ? c.text(value, i) : String(value);
+      cell.className = c.words ? "message" : "num";
+      if (n) { cell.textContent = text; continue; }
+      const button = cell.appendChild(document.createElement("button"));
+      button.type = "button"; button.textContent = text; button.dataset.case = value;
+    }
+    row.classList.toggle("on", i === chosen);
+  };
+  const extend = () => {
+    const part = document.createDocumentFragment();
+    for (const i of found.slice(rows, rows + PART)) cells(i, part.appendChild(document.createElement("tr")));
+    body.append(part);
+    rows = body.rows.length;
+    more.hidden = rows >= found.length;
+    more.textContent = `Show ${Math.min(PART, found.length - rows)} more`;
+  };
+  const list = () => {
+    const low = from.value === "" ? -Infinity : Number(from.value), high = to.value === "" ? Infinity : Number(to.value);
+    const measured = columns[measure.value].value, bounded = low > -Infinity || high < Infinity;
+    found = all.filter((i) => (!level.value || cases.level[i] === Number(level.value))
+      && (!ended.value || verdict(i) === ended.value || `: ${message(i)}` === ended.value)
+      && (!region.value || where(i) === region.value) && (!kind.value || columns[3].value(i) === kind.value)
+      && (!bounded || (measured(i) !== null && measured(i) >= low && measured(i) <= high)));
+    found.sort((a, b) => { // what has no value is last, whichever way
+      const [x, y] = [by.value(a), by.value(b)];
+      return (x === null) - (y === null) || (x < y ? -way : x > y ? way : a - b);
+    });
+    for (const [n, cell] of [...head.cells].entries()) {
+      columns[n] === by ? cell.setAttribute("aria-sort", way > 0 ? "ascending" : "descending") : cell.removeAttribute("aria-sort");
+    }
+    byId("matching").textContent = `${found.length} of ${all.length} cases.`;
+    body.replaceChildren();
+    rows = 0;
+    extend();
+  };
+  form.addEventListener("input", list);
+  form.addEventListener("reset", () => setTimeout(list));
+  form.addEventListener("submit", (event) => event.preventDefault());
+  more.addEventListener("click", extend);
+  body.addEventListener("click", (event) => {
+    const row = event.target.closest("tr");
+    if (row) openCase(found[row.sectionRowIndex], row);
+  });
+  body.addEventListener("keydown", (event) => {
+    const row = event.target.closest("tr"), to = { ArrowDown: row?.nextElementSibling, ArrowUp: row?.previousElementSibling }[event.key];
+    if (!to) return;
+    event.preventDefault();
+    to.querySelector("button").focus();
+    openCase(found[to.sectionRowIndex], to);
+  });
+  byId("all").hidden = !all.length;
+  if (all.length) list();
+}
+
 /* ---------- the search ---------- */
 function search() {
   const { batch, levels } = data.search;
@@ -541,6 +642,7 @@ function search() {
 const worst = document.querySelector(".list button");
 for (const map of maps) map.begin();
 search();
+allCases();
 if (!openLinked() && worst) show(place.get(Number(worst.dataset.case)));
 addEventListener("resize", () => at(step));
 addEventListener("beforeprint", () => at(step));
