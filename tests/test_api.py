@@ -100,10 +100,9 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
         _ = ms.nothing_like_it
 
 
-def test_the_example_of_the_readme_runs(tmp_path, monkeypatch):
-    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
-    _, section = readme.split("## Python", 1)
-    code = section.split("```python", 1)[1].split("```", 1)[0]
+def test_the_example_of_the_tutorial_runs(tmp_path, monkeypatch):
+    page = Path(__file__).parent.parent / "docs" / "tutorials" / "python.md"
+    code = page.read_text(encoding="utf-8").split("```python", 1)[1].split("```", 1)[0]
     assert "cases=400" in code
     monkeypatch.chdir(tmp_path)
     script = tmp_path / "example.py"

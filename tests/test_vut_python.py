@@ -1,4 +1,4 @@
-"""A VUT in Python: the README's example, what it may see, and what it may do wrong."""
+"""A VUT in Python: the tutorial's example, what it may see, and what it may do wrong."""
 
 from __future__ import annotations
 
@@ -296,9 +296,10 @@ def test_built_in_names_still_work():
     assert np.isfinite(run_cases(vut_factory("design2"), cases_of(2))[0].motion).all()
 
 
-def test_the_example_of_the_readme_is_ten_lines_and_drives(vut):
-    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
-    (source,) = re.findall(r"```python\n(class MyVut.*?)```", readme, flags=re.DOTALL)
+def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
+    page = Path(__file__).parent.parent / "docs" / "tutorials" / "python-vut.md"
+    text = page.read_text(encoding="utf-8")
+    (source,) = re.findall(r"```python\n(class MyVut.*?)```", text, flags=re.DOTALL)
     assert len(source.strip().splitlines()) <= 10
     trajectories = run_cases(factory(vut(source, "MyVut")), cases_of(20))
     assert {t.end for t in trajectories} == {End.MERGED}

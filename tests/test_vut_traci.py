@@ -40,9 +40,9 @@ from merge_sumo.values.trajectory import End
 
 TESTS = Path(__file__).parent
 CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
-README = (TESTS.parent / "README.md").read_text(encoding="utf-8")
-(CONTROLLER,) = re.findall(r"```python\n(import sys, traci.*?)```", README, flags=re.DOTALL)
-"""The README's controller; its law is that of level 0."""
+PAGE = (TESTS.parent / "docs/tutorials/traci-controller.md").read_text(encoding="utf-8")
+(CONTROLLER,) = re.findall(r"```python\n(import sys, traci.*?)```", PAGE, flags=re.DOTALL)
+"""The tutorial's controller; its law is that of level 0."""
 
 
 def free_port() -> int:

@@ -1,15 +1,28 @@
-"""Print the commands of README, so that CI runs what a person reads: one per line.
+"""Print the commands of the site and of README, so that CI runs what a person reads: one per line.
 
 python tools/readme_commands.py            all commands in ```sh blocks, in order
 python tools/readme_commands.py "Install"  only those under that heading
+
+The pages come in the order of the site's navigation (`mkdocs.yml`), then README, which ends with
+the tests. A ```bash block is for what CI cannot run as it stands: the start page's are a test
+(`tests/test_start_page.py`).
 """
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
-README = Path(__file__).resolve().parent.parent / "README.md"
+ROOT = Path(__file__).resolve().parent.parent
+README = ROOT / "README.md"
+
+
+def pages() -> list[Path]:
+    """Return the pages of the site that docs/ holds, in the order of the navigation, and README."""
+    _, nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:\n")
+    named = [ROOT / "docs" / name for name in re.findall(r"[\w/-]+\.md", nav)]
+    return [*(page for page in named if page.is_file()), README]
 
 
 def commands(text: str, heading: str | None = None) -> list[str]:
@@ -30,7 +43,7 @@ def commands(text: str, heading: str | None = None) -> list[str]:
 
 if __name__ == "__main__":
     wanted = sys.argv[1] if len(sys.argv) > 1 else None
-    printed = commands(README.read_text(encoding="utf-8"), wanted)
+    printed = [one for page in pages() for one in commands(page.read_text("utf-8"), wanted)]
     if not printed:
-        sys.exit(f"README has no ```sh commands under {wanted!r}")
+        sys.exit(f"no page has ```sh commands under {wanted!r}")
     print("\n".join(printed))

@@ -1,4 +1,4 @@
-"""Print the table of built-in VUTs, SUMO's models and reference drivers that README has.
+"""Print the table of built-in VUTs, SUMO's models and reference drivers that the site has.
 
 python tools/reference_table.py                         all of them, 1,000 uniform cases a level
 python tools/reference_table.py --cases 100 design2     fewer, of some
@@ -65,7 +65,7 @@ def row(vut: str, cases: int, workers: int | None) -> str:
 
 def main() -> None:
     """Print the table line by line."""
-    parser = argparse.ArgumentParser(description="Print the table of VUTs that README has.")
+    parser = argparse.ArgumentParser(description="Print the table of VUTs that the site has.")
     parser.add_argument("vuts", nargs="*", default=VUTS)
     parser.add_argument("--cases", type=int, default=1000, help="uniform cases at each level")
     parser.add_argument("--workers", type=int, help="processes; by default one a core")

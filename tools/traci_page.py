@@ -12,7 +12,7 @@ from merge_sumo.drivers.vuts.traci_session import ASKS, DRIVES, SET_VEHICLE, cha
 from merge_sumo.drivers.vuts.traci_variables import GETTERS
 from merge_sumo.sumo.traci_names import Named, named
 
-PAGE = Path(__file__).resolve().parent.parent / "TRACI.md"
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
 HEAD = """# What a TraCI controller can do
 
 Made by `python tools/traci_page.py` from SUMO's own client: do not edit.

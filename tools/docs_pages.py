@@ -1,0 +1,82 @@
+"""Pages of the site that are made from the code, and what it shows from other folders.
+
+MkDocs calls `on_files` (see `mkdocs.yml`); python tools/docs_pages.py reference/cli.md prints one.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+SHOWN = (
+    *("CHANGELOG.md", "CONTRIBUTING.md", "policies/README.md", "policies/roundabout/README.md"),
+    *("scenarios/README.md", "sumo_net/README.md", "tests/README.md"),
+)
+"""Pages that stand beside what they are about, and not in docs/."""
+PICTURES = "scenarios/**/*.png"
+
+
+def cli_page() -> str:
+    """Return the help of all commands."""
+    import typer
+    from typer.cli import get_docs_for_click
+
+    from merge_sumo import cli
+
+    command = typer.main.get_command(cli.app)
+    text = get_docs_for_click(obj=command, ctx=typer.Context(command), name="merge-sumo")
+    # An example is on a line of its own in --help, and is a block here.
+    text = re.sub(r"^Example:\s+(.*)$", r"```text\n\1\n```", text, flags=re.MULTILINE)
+    head = "# Commands\n\nThis is `merge-sumo COMMAND --help` of all commands.\n"
+    return text.replace("# `merge-sumo`\n", head, 1)
+
+
+def measures_page() -> str:
+    """Return the measures of an episode as a table."""
+    from merge_sumo.values.score import Measures
+
+    about, attributes = inspect.cleandoc(Measures.__doc__ or "").split("Attributes:\n")
+    rows = ""
+    for name, said in re.findall(r"^    (\w+): ((?:.*\n?)(?:     +.*\n?)*)", attributes, re.M):
+        told = " ".join(said.split()).replace("|", r"\|")
+        rows += f"| `{name}` | {told} |\n"
+    return f"# Measures\n\n{about.strip()}\n\n| name | what it is |\n|---|---|\n{rows}"
+
+
+def python_page() -> str:
+    """Return the functions of `merge_sumo` with their signatures and docstrings."""
+    import merge_sumo
+
+    text = "# Functions\n\n`import merge_sumo as ms`\n"
+    for name in sorted(set(merge_sumo.__all__) - {"__version__"}):
+        thing = getattr(merge_sumo, name)
+        title = f"{name}{inspect.signature(thing)}" if inspect.isfunction(thing) else name
+        text += f"\n## {name}\n\n```text\n{title}\n\n{inspect.getdoc(thing)}\n```\n"
+    return text
+
+
+GENERATED: dict[str, Callable[[], str]] = {
+    "reference/cli.md": cli_page,
+    "reference/measures.md": measures_page,
+    "reference/python.md": python_page,
+}
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add to the files of the site what docs/ does not hold (MkDocs calls this)."""
+    from mkdocs.structure.files import File
+
+    for page, made in GENERATED.items():
+        files.append(File.generated(config, page, content=made()))
+    for path in (*SHOWN, *(p.relative_to(ROOT).as_posix() for p in ROOT.glob(PICTURES))):
+        files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
+    return files
+
+
+if __name__ == "__main__":
+    print(GENERATED[sys.argv[1]]())
