@@ -274,6 +274,52 @@ def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser
         assert inside
 
 
+def test_a_map_zooms_about_the_case_and_is_dragged(page, made):
+    index = failures(made.outcomes)[0].index
+    figure = f".map[data-level='{made.outcome(index).case.level}']"
+    mark, whole = f"{figure} [data-case='{index}'].mark", page.locator(f"{figure} .mark").count()
+    click(page, mark)
+    page.keyboard.press("Escape")
+    for _ in range(2):
+        page.locator(f"{figure} [aria-label='Zoom in']").click()
+    assert page.locator(f"{figure} .mark").count() < whole
+    frame, box = (page.locator(part).bounding_box() for part in (f"{figure} .frame", mark))
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    assert frame["x"] <= x <= frame["x"] + frame["width"]
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 5, y + 5)
+    page.mouse.move(x + 20, y + 10)
+    page.mouse.up()
+    assert chosen(page) == index, "a drag is no click"
+    page.locator(f"{figure} button", has_text="All").click()
+    assert page.locator(f"{figure} .mark").count() == whole
+
+
+@WINDOWS
+def test_two_cases_are_compared(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    first, second = (o.index for o in spread_failures(made.outcomes)[:2])
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        page.locator("#keep").click()
+        page.locator(f".list [data-case='{second}']").click()
+        assert chosen(page) == second
+        assert page.inner_text("#beside-title").startswith(f"Case {first} ")
+        assert "Collision" in page.inner_text("#beside-words")
+        if size[0] < 1000:
+            assert page.locator("#case").evaluate("(panel) => panel.matches('.docked')")
+        page.evaluate("dock(true)")
+        upper, lower = (page.locator(part).bounding_box() for part in ("#keep", ".case-command"))
+        assert upper["y"] + upper["height"] <= lower["y"]
+        for chart, lines in (("speed", 2), ("position", 2), ("gap", 1)):
+            assert page.locator(f"#chart-{chart} .line.beside").count() == lines
+            assert page.locator(f"#chart-{chart} .line").count() == 2 * lines
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        page.locator("#keep").click()
+        assert page.locator(".line.beside").count() == 0
+        assert not page.locator("#beside").is_visible()
+
+
 def test_a_command_breaks_between_words_only(browser, made):
     viewport = {"width": 390, "height": 800}
     with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:

@@ -123,6 +123,16 @@ def test_a_version_without_a_level_is_passed_over_there(tmp_path):
     assert page.count('<polyline class="line level0"') == 0, "no line leads over the gap"
 
 
+def test_kinds_of_all_levels_are_drawn_where_all_levels_are(tmp_path):
+    whole, part = (
+        write_run(tmp_path / name, 20, levels=levels, error=None)
+        for name, levels in (("a", (0, 1)), ("b", (0,)))
+    )
+    page = history_page(history_of([whole, part]))
+    assert "version 1, stalemate: " in page or "version 1, forced merge: " in page
+    assert not re.search(r"version 2, (?!level)", page)
+
+
 def test_kinds_and_who_avoids_are_counted_where_they_are_known(tmp_path):
     run = write_run(tmp_path / "a", 20, levels=(0,), error=None)
     line = {"index": next(o.index for o in run.outcomes if o.failed), "avoided_by": ["careful"]}

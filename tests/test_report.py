@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import shutil
 from dataclasses import replace
 
@@ -145,6 +146,13 @@ class TestThePage:
         assert len(bars) == 3
         scales = [bar / value for bar, value in zip(bars, found, strict=True)]
         assert scales == pytest.approx([scales[0]] * 3, rel=0.01)
+
+    def test_says_when_it_was_recorded_and_how_long_it_took(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=10)
+        for file in (run.folder / "campaign.json", *(run.folder / "trajectories").iterdir()):
+            os.utime(file, (1_800_000_000, 1_800_000_000))
+        os.utime(run.folder / "trajectories" / "00000.npz", (1_800_000_090, 1_800_000_090))
+        assert "2027-01-15 08:00 UTC, in 90 s" in text_of(report_page(run))
 
     def test_says_when_a_campaign_was_interrupted(self, made, tmp_path):
         assert "interrupted" not in text_of(report_page(made))

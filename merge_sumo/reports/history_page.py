@@ -110,7 +110,10 @@ def _charts(history: History) -> list[Chart]:
 
     kinds: dict[tuple[str, str], list[float | None]] = {
         (kind.value, f"kind{number}"): [
+            # A sum over fewer levels is no smaller number of failures.
             float(sum(found.kinds.get(kind, 0) for found in version.levels.values()))
+            if len(version.levels) == len(history.levels)
+            else None
             for version in history.versions
         ]
         for number, kind in enumerate(Kind)

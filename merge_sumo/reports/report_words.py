@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any, Final
 
 from merge_sumo.campaigns.avoidance import in_a_sentence
+from merge_sumo.campaigns.run import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.truth import TRUTH_CASES
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.drivers.vuts.output import LOG, end_of
@@ -123,6 +125,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "avoidable": _avoidable(facts.worst),
         "after": after_words(facts.run.outcomes),
         "batches": len({o.batch for o in facts.run.outcomes}),
+        "recorded": _recorded(facts.run),
         "driven": _duration(sum(o.measures.t_end_s for o in facts.run.outcomes)),
         "sentences": [box.sentence for box in boxes],
         "scattered": ", ".join(
@@ -361,6 +364,17 @@ def after_words(outcomes: Iterable[Outcome]) -> str | None:
         f"harder than {HARSH_MPS2:g} m/s², in {forced} harder than it can (--fail-when unsafe "
         "looks for these)."
     )
+
+
+def _recorded(run: Run) -> str | None:
+    """Return when a run was recorded and how long it took, by the times of its files."""
+    files = [run.folder / SETTINGS, *(run.folder / TRAJECTORIES).glob("*.npz")]
+    times = [file.stat().st_mtime for file in files if file.is_file()]
+    if len(times) < 2:
+        return None
+    began, took_s = datetime.fromtimestamp(min(times), UTC), max(times) - min(times)
+    took = f"{took_s:.0f} s" if took_s < 100.0 else _duration(took_s)
+    return f"{began:%Y-%m-%d %H:%M} UTC, in {took} (by the times of its files)"
 
 
 def _duration(seconds: float) -> str:

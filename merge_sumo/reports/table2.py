@@ -135,8 +135,10 @@ def table_markdown(table: Mapping[str, Result]) -> str:
         lines.append(f"| {name} / limit | " + " | ".join(cells) + " |")
     for name in ADAPTIVE:
         results = [(result, result.compared[name]) for result in table.values()]
-        early = max(len(results[0][1].cases_by_batch) // 4, 1) - 1
-        cases = results[0][1].cases_by_batch[early]
+        after = results[0][1].cases_by_batch
+        # A quarter of all cases, or where a batch ended next.
+        cases = next(number for number in after if number >= after[-1] / 4)
+        early = after.index(cases)
         cells = [
             _or_dash(
                 found.fmc_by_batch_median[early] / result.truth_fmc if result.truth_fmc else None,

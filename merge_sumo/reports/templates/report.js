@@ -137,7 +137,7 @@ function shade(svg, values, nx, ny, box) {
 }
 
 /* ---------- maps ---------- */
-const BOX = [44, 8, 346, 286]; // x, y, width, height of the plot in a map
+const BOX = [52, 8, 334, 286]; // x, y, width, height of the plot in a map
 const unit = (c, value) => (value - c.low) / (c.high - c.low);
 let chosen = -1;
 avoiders?.addEventListener("change", () => maps.forEach((map) => map.draw()));
@@ -146,13 +146,15 @@ const maps = [...document.querySelectorAll(".map")].map((figure) => new FailureM
 function FailureMap(figure) {
   const svg = figure.querySelector("svg"), level = Number(figure.dataset.level), of = data.maps[level];
   const [left, top, width, height] = BOX;
-  const X = (u) => left + u * width, Y = (u) => top + (1 - u) * height;
+  const frame = { scale: 1, u: 0, v: 0 }; // what is in the frame: from (u, v), shares of the pool, 1 / scale of it
+  const X = (u) => left + (u - frame.u) * frame.scale * width, Y = (v) => top + (1 - (v - frame.v) * frame.scale) * height;
   const own = cases.index.map((_, i) => i).filter((i) => cases.level[i] === level);
   const third = of.through === null ? null : coordinates[of.through]; // the reader moves through it
   const slider = figure.querySelector("input[type=range]"), check = figure.querySelector("input[type=checkbox]");
   const pairs = figure.querySelector("select");
   let pair = 0, at = 0, all = third === null, axes = [], marks = [];
   const apart = (i) => (all ? 0 : Math.abs(cases[third.field][i] - at));
+  const framed = (x, y) => x >= left - 1e-6 && x <= left + width + 1e-6 && y >= top - 1e-6 && y <= top + height + 1e-6;
   const near = (i) => all || apart(i) <= third.near;
 
   const place = () => {
@@ -167,10 +169,11 @@ function FailureMap(figure) {
     svg.replaceChildren();
     const clip = draw(draw(svg, "defs"), "clipPath", { id: "clip" });
     draw(clip, "rect", { x: left, y: top, width, height });
-    if (chance) shade(svg, slice(chance, share), chance.nx, chance.ny, BOX);
+    if (chance) shade(svg, slice(chance, share), chance.nx, chance.ny, [X(0), Y(1), frame.scale * width, frame.scale * height]);
     for (const [n, c] of axes.entries()) {
-      const vertical = n === 0, step = ticks((c.high - c.low) / (vertical ? 4 : 5));
-      for (let value = Math.ceil(c.low / step - 1e-9) * step; value <= c.high + 1e-9; value += step) {
+      const vertical = n === 0, span = (c.high - c.low) / frame.scale, low = c.low + (vertical ? frame.u : frame.v) * (c.high - c.low);
+      const step = ticks(span / (vertical ? 4 : 5));
+      for (let value = Math.ceil(low / step - 1e-9) * step; value <= low + span + 1e-9; value += step) {
         const u = unit(c, value);
         draw(svg, "line", vertical ? { class: "grid", x1: X(u), x2: X(u), y1: top, y2: top + height } : { class: "grid", x1: left, x2: left + width, y1: Y(u), y2: Y(u) });
         draw(svg, "text", vertical ? { x: X(u), y: top + height + 15, "text-anchor": "middle" } : { x: left - 6, y: Y(u) + 4, "text-anchor": "end" }, fixed(value, digits(step)));
@@ -185,12 +188,13 @@ function FailureMap(figure) {
       const off = all ? 0 : apart(i) / (third.high - third.low);
       if (off >= of.radius) continue;
       const r = Math.sqrt(of.radius ** 2 - off ** 2); // the slice of the ball here
-      draw(balls, "ellipse", { cx: x, cy: y, rx: r * width, ry: r * height });
+      draw(balls, "ellipse", { cx: x, cy: y, rx: r * frame.scale * width, ry: r * frame.scale * height });
     }
-    if (expected) draw(svg, "path", { class: "expected", d: contour(slice(expected, share), expected.nx, expected.ny, 127.5, X, Y) });
-    if (truth) draw(svg, "path", { class: "outline", d: contour(slice(truth, share), truth.nx, truth.ny, 127.5, X, Y) });
+    if (expected) draw(svg, "path", { class: "expected", "clip-path": "url(#clip)", d: contour(slice(expected, share), expected.nx, expected.ny, 127.5, X, Y) });
+    if (truth) draw(svg, "path", { class: "outline", "clip-path": "url(#clip)", d: contour(slice(truth, share), truth.nx, truth.ny, 127.5, X, Y) });
     draw(svg, "rect", { class: "frame", x: left, y: top, width, height });
     for (const { i, x, y } of marks) {
+      if (!framed(x, y)) continue;
       const faint = near(i) && wanted(i) ? "" : " faint";
       if (failed(i)) draw(svg, "path", { class: `mark fail${faint}`, d: `M${x} ${y - 5}l5 5l-5 5l-5 -5Z`, "data-case": cases.index[i] });
       else if (!tested(i)) draw(svg, "rect", { class: `mark error${faint}`, x: x - 3, y: y - 3, width: 6, height: 6, "data-case": cases.index[i] });
@@ -218,18 +222,52 @@ function FailureMap(figure) {
     for (let n = 0; n < grid.nx * grid.ny; n++) {
       const x = X((n % grid.nx) / grid.nx), y = Y((Math.floor(n / grid.nx) + 1) / grid.ny);
       for (const [name, count] of [["count", grid.safe[n]], ["count failing", grid.failing[n]]]) if (count) {
-        draw(svg, "rect", { class: name, x, y, width: width / grid.nx, height: height / grid.ny, "fill-opacity": (0.08 + 0.5 * count / most).toFixed(3) });
+        draw(svg, "rect", { class: name, x, y, width: frame.scale * width / grid.nx, height: frame.scale * height / grid.ny, "clip-path": "url(#clip)", "fill-opacity": (0.08 + 0.5 * count / most).toFixed(3) });
       }
     }
   };
   this.choose = () => {
     svg.querySelector(".chosen")?.remove();
     const mark = marks.find((m) => m.i === chosen);
+    if (mark && !framed(mark.x, mark.y)) return zoom(1, mark.x, mark.y, true);
     if (mark) draw(svg, "circle", { class: "chosen", cx: mark.x, cy: mark.y, r: 8 });
   };
-  const visible = () => marks.filter((m) => near(m.i) && wanted(m.i));
+  const visible = () => marks.filter((m) => near(m.i) && wanted(m.i) && framed(m.x, m.y));
+  const pan = (u, v) => {
+    frame.u = clamp(u, 0, 1 - 1 / frame.scale);
+    frame.v = clamp(v, 0, 1 - 1 / frame.scale);
+    svg.classList.toggle("zoomed", frame.scale > 1);
+    place();
+    this.draw();
+  };
+  const zoom = (factor, x, y, centre = false) => { // (x, y) stays where it is, or comes to the centre
+    const a = (x - left) / width, b = 1 - (y - top) / height, u = frame.u + a / frame.scale, v = frame.v + b / frame.scale;
+    frame.scale = clamp(frame.scale * factor, 1, 64);
+    pan(u - (centre ? 0.5 : a) / frame.scale, v - (centre ? 0.5 : b) / frame.scale);
+  };
+  const zoomBy = (factor) => { // about the case that is shown, if it is here
+    const { x, y } = marks.find((m) => m.i === chosen) ?? { x: left + width / 2, y: top + height / 2 };
+    zoom(factor, x, y, true);
+  };
+  const pointOf = (event) => new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+  for (const button of figure.querySelectorAll("[data-zoom]")) button.addEventListener("click", () => zoomBy(Number(button.dataset.zoom)));
+  svg.addEventListener("wheel", (event) => {
+    if (!event.ctrlKey) return; // the page scrolls
+    event.preventDefault();
+    const { x, y } = pointOf(event);
+    zoom(event.deltaY < 0 ? 1.25 : 0.8, x, y);
+  }, { passive: false });
+  let held = null, dragged = false;
+  svg.addEventListener("pointerdown", (event) => { held = { from: pointOf(event), ...frame }; dragged = false; });
+  addEventListener("pointerup", () => { held = null; });
+  svg.addEventListener("pointermove", (event) => {
+    if (!held || frame.scale === 1) return;
+    const { x, y } = pointOf(event), across = x - held.from.x, up = held.from.y - y;
+    dragged ||= Math.hypot(across, up) > 4;
+    if (dragged) pan(held.u - across / width / frame.scale, held.v - up / height / frame.scale);
+  });
   const under = (event) => {
-    const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+    const point = pointOf(event);
     let best = null, least = 14;
     for (const mark of visible()) {
       const distance = Math.hypot(mark.x - point.x, mark.y - point.y) - (failed(mark.i) ? 3 : 0);
@@ -238,13 +276,15 @@ function FailureMap(figure) {
     return best;
   };
   const drawn = (i) => svg.querySelector(`[data-case="${cases.index[i]}"]`);
-  svg.addEventListener("click", (event) => { const mark = under(event); if (mark) openCase(mark.i, drawn(mark.i)); });
+  svg.addEventListener("click", (event) => { const mark = dragged ? null : under(event); if (mark) openCase(mark.i, drawn(mark.i)); });
   svg.addEventListener("pointermove", (event) => {
     const mark = event.pointerType === "touch" ? null : under(event);
     mark ? tip(event, title(mark.i)) : tip(null);
   });
   svg.addEventListener("pointerleave", () => tip(null));
   svg.addEventListener("keydown", (event) => {
+    const factor = { "+": 2, "-": 0.5, 0: 1 / 64 }[event.key];
+    if (factor) return zoomBy(factor);
     const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     if (!way) return;
     event.preventDefault();
@@ -281,7 +321,7 @@ function tip(event, text) {
 /* ---------- plots over time ---------- */
 function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags = [], xTicks = 4, decimals = null }) {
   const [, , w, h] = svg.getAttribute("viewBox").split(" ").map(Number);
-  const left = 40, right = w - 8, top = 8, bottom = h - 28;
+  const left = 40, right = w - 12, top = 8, bottom = h - 28;
   const X = (x) => left + (x - xRange[0]) / (xRange[1] - xRange[0] || 1) * (right - left);
   const Y = (y) => bottom - (y - yRange[0]) / (yRange[1] - yRange[0] || 1) * (bottom - top);
   svg.replaceChildren();
@@ -305,7 +345,7 @@ function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags
     if (points.length === 1) draw(svg, "circle", { class: name, cx: X(points[0][0]), cy: Y(points[0][1]), r: 2 });
   }
   for (const { name, x, y } of flags) draw(svg, "path", { class: name, d: `M${X(x)} ${Y(y) - 2}l-4.5 -7h9Z` });
-  return { X, now: draw(svg, "line", { class: "now", x1: -9, x2: -9, y1: top, y2: bottom }), from: left, to: right };
+  return { X, now: draw(svg, "line", { class: "now", x1: -9, x2: -9, y1: top, y2: bottom }), from: left, to: right, end: xRange[1] };
 }
 function nice(step) {
   if (!(step > 0)) return 1;
@@ -324,7 +364,7 @@ function range(values, pad = 0.06) {
 
 /* ---------- a case: road, motion, charts ---------- */
 const road = byId("road"), slider = byId("time");
-let moving = null, step = 0, playing = false, last = 0, charts = [];
+let moving = null, beside = -1, step = 0, playing = false, last = 0, charts = [];
 
 const panel = byId("case");
 function dock(on) { // at the foot of the window, or in its place beside the lists
@@ -351,6 +391,10 @@ function openLinked() { // #case-111
   openCase(place.get(index));
   return true;
 }
+byId("keep").addEventListener("click", () => {
+  beside = beside < 0 ? chosen : -1;
+  show(chosen);
+});
 addEventListener("hashchange", openLinked);
 addEventListener("keydown", (event) => { if (event.key === "Escape") dock(false); });
 byId("close").addEventListener("click", () => dock(false));
@@ -375,27 +419,37 @@ function show(i) {
   for (const button of document.querySelectorAll("[data-case]")) {
     button.closest("tr")?.classList.toggle("on", Number(button.dataset.case) === cases.index[i]);
   }
+  const compared = beside >= 0 && beside !== i;
+  byId("beside").hidden = !compared;
+  byId("beside-title").textContent = compared ? title(beside) : "";
+  byId("beside-words").textContent = compared ? words(beside) : "";
+  byId("keep").hidden = false;
+  byId("keep").textContent = beside < 0 ? "Compare with the next" : "End the comparison";
   moving = motion(i);
   byId("case-motion").hidden = moving === null;
   play(false);
   if (moving) showMotion(i);
 }
 function showMotion(i) {
-  const { rows, v, x, met } = moving, end = (rows - 1) * DT;
+  const { rows, v, x, met } = moving;
+  const other = beside >= 0 && beside !== i ? motion(beside) : null, end = (Math.max(rows, other?.rows ?? 0) - 1) * DT;
   const over = (values) => values.map((value, t) => [t * DT, value]);
-  const lines = (values) => vehicles.map((name, who) => ({ name, points: over(values[who]) }));
+  const lines = (values, more = "") => vehicles.map((name, who) => ({ name: name + more, points: over(values[who]) }));
+  const both = (key) => (other ? [...lines(other[key], " beside"), ...lines(moving[key])] : lines(moving[key]));
+  const all = (key) => [...moving[key].flat(), ...(other?.[key].flat() ?? [])];
+  const otherGap = other ? other.x[other.met].map((place, t) => place - other.x[VUT][t]) : [];
   const others = vehicles.map((_, who) => who).filter((who) => who !== VUT);
   const gap = x.map((places) => places.map((place, t) => place - x[VUT][t]));
-  const inView = range([...gap[met], -12, 12]); // of the car that the VUT meets
+  const inView = range([...gap[met], ...otherGap, -12, 12]); // of the car that the VUT meets
   const flags = [[met, cases.pov_yields[i]], [VUT, cases.vut_yields[i]]]
     .filter(([, t]) => t !== null).map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] }));
   const common = { xRange: [0, end], xLabel: "time, s" };
   charts = [
-    plot(byId("chart-speed"), { ...common, yRange: range(v.flat(), 0.14), lines: lines(v), flags }),
-    plot(byId("chart-position"), { ...common, yRange: range(x.flat()), lines: lines(x) }),
+    plot(byId("chart-speed"), { ...common, yRange: range(all("v"), 0.14), lines: both("v"), flags }),
+    plot(byId("chart-position"), { ...common, yRange: range(all("x")), lines: both("x") }),
     plot(byId("chart-gap"), {
       ...common, yRange: inView, bands: [[-CRASH, CRASH]],
-      lines: others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) })),
+      lines: [...(other ? [{ name: "gap beside", points: over(otherGap) }] : []), ...others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }))],
     }),
   ];
   slider.max = rows - 1;
@@ -485,7 +539,7 @@ for (const id of ["chart-speed", "chart-position", "chart-gap"]) {
     if (event.type === "pointermove" && !event.buttons) return;
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
     play(false);
-    at((point.x - charts[0].from) / (charts[0].to - charts[0].from) * (moving.rows - 1));
+    at((point.x - charts[0].from) / (charts[0].to - charts[0].from) * charts[0].end / DT);
   };
   svg.addEventListener("pointerdown", scrub);
   svg.addEventListener("pointermove", scrub);
