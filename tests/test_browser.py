@@ -198,7 +198,7 @@ def test_a_link_opens_its_case(browser, made, size):
     with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
         for index in (111, 7):
             page.evaluate(f"location.hash = '#case-{index}'")
-            page.wait_for_function(f"byId('case-link').hash === '#case-{index}'")
+            page.locator(f"#case-link[href='#case-{index}']").wait_for()
             assert chosen(page) == index
             assert in_sight(page, "#case-title")
         page.reload()
@@ -260,12 +260,12 @@ def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser
         assert sorted(rows(page)) == sorted(o.index for o in of_level if region[o.index] == 0)
         assert set(column(page, "region")) == {"1"}
         filters.locator("button[type=reset]").click()
-        page.wait_for_function("byId('matching').textContent.startsWith('180 of')")
+        page.locator("#matching:text('180 of 180')").wait_for()
         kind = filters.locator("[name=kind] option").nth(1).get_attribute("value")
         filters.locator("[name=kind]").select_option(kind)
         assert set(column(page, "kind")) == {kind}
         filters.locator("button[type=reset]").click()
-        page.wait_for_function("byId('matching').textContent.startsWith('180 of')")
+        page.locator("#matching:text('180 of 180')").wait_for()
         filters.locator("[name=measure]").select_option(label="gap at M m")
         filters.locator("[name=from]").fill("-8")
         filters.locator("[name=to]").fill("-6")
