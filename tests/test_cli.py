@@ -16,7 +16,7 @@ from lxml import etree
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.run import Run, failures, read_settings
+from merge_sumo.campaigns.run import Run, failures, read_settings, spread_failures
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES, SUMO_VERSION, sumo_program
 from merge_sumo.sumo.replay_folder import CONFIG, RECORD
 from merge_sumo.sumo.road import default_net_path
@@ -265,7 +265,7 @@ class TestACampaign:
 
     def test_exports_its_worst_failures_as_scenarios_that_replay_identically(self, ended, call):
         folder, _ = ended
-        worst = failures(Run(folder / "run").outcomes)[:10]
+        worst = spread_failures(Run(folder / "run").outcomes)[:10]
         names = {f"case-{outcome.index:05d}" for outcome in worst}
         assert {path.name for path in (folder / "run" / "scenarios").iterdir()} == names
         for name in sorted(names)[:3]:
