@@ -90,8 +90,8 @@ def campaign(
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         sampler: who chooses the cases.
         cases: number of cases.
-        batch: cases per batch; when left out, as many as the sampler wants: 10, later 20 and 40
-            for `coverage`, 40 for the others.
+        batch: cases per batch; when left out, as many as the sampler wants: few, later more, for
+            `coverage`, 40 for the others.
         seed: same seed, same outcomes.
         v_vut0_mps: initial speed of the VUT; the scenario's when left out.
         vut_command: command that starts the controller of `vut="traci"`.

@@ -137,6 +137,8 @@ def no_cases(monkeypatch) -> None:
     def stop(*_: object) -> None:
         raise UserError(STOP)
 
+    # What runs cases, ahead or when it is asked to.
+    stop.chunks = lambda _: (chunk for chunk in ())
     monkeypatch.setattr(conductor, "runs_on", lambda *_: stop)
     monkeypatch.setattr(reproduce._Work, "column", stop)
 
@@ -252,7 +254,7 @@ class TestAHundredNames:
             assert (code, said.count("\n")) == (2, 1), name
 
     def test_of_a_probability_touch_nothing(self, world, call, run, monkeypatch, names):
-        def ran(_settings, _net, _stated, draws, lines, _on_case):
+        def ran(_settings, _net, _stated, draws, lines, _on_case, _workers):
             chosen = run.outcomes[: len(draws.level)]
             probability._append(lines, chosen, draws)
             return chosen

@@ -65,7 +65,7 @@ def campaign(
     batch: Annotated[
         int | None,
         typer.Option(
-            help="Cases per batch.  [default: 10, later 20 and 40 for coverage; 40 for the others]"
+            help="Cases per batch.  [default: few, later more, for coverage; 40 for the others]"
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same outcomes.")] = 0,

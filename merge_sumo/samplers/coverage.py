@@ -32,8 +32,8 @@ YOUNG: Final = 60
 YOUNG_BATCH: Final = 5
 """Cases of the first batch; and of a level up to which it is young, and its share of a batch by
 then: what few cases teach changes where the next ones should be."""
-BATCHES: Final = ((100, 10), (400, 20), (math.inf, 40))
-"""Cases up to which later batches have a size."""
+BATCHES: Final = ((100, 10, 5), (400, 20, 10), (math.inf, 40, 20))
+"""Cases up to which later batches have a size, and at least how many of a batch are a level's."""
 REPLAYED: Final = 40
 """Cases, the last ones of a level, by which who plays games is judged."""
 REFINED_QUERIES: Final = 600
@@ -84,7 +84,8 @@ class CoverageSampler(Sampler):
             return max(FIRST_BATCH, YOUNG_BATCH * levels)
         if proposed < YOUNG * levels:
             return YOUNG_BATCH * levels
-        return next(size for until, size in BATCHES if proposed < until)
+        most, a_level = next(sizes for until, *sizes in BATCHES if proposed < until)
+        return max(most, a_level * levels)
 
     def allocate(self, n: int) -> dict[int, int]:
         """Return the number of cases for each level; they add up to `n`."""
