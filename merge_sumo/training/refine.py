@@ -109,21 +109,22 @@ def refine(
     from threadpoolctl import threadpool_limits
 
     s = settings or RefineSettings()
-    torch.set_num_threads(1)
     rng = np.random.default_rng([seed, 1])
     model = as_torch(network)
     optimiser = torch.optim.Adam(model.parameters(), lr=s.learning_rate, fused=True)
     rounds: list[_Labelled] = []
-    for number in range(s.rounds):
-        # One thread: rounding must not depend on the number of cores.
-        with threadpool_limits(1):
+    # One thread: rounding must not depend on the number of cores. One limit for all rounds: where
+    # it ends, the BLAS beside libsumo gives torch its threads back, and they wait for each other.
+    with threadpool_limits(1):
+        torch.set_num_threads(1)
+        for number in range(s.rounds):
             labelled, mean_return = _label(game, network, rng, s)
-        rounds = [*rounds, labelled][-s.kept_rounds :]
-        cost = _fit(model, optimiser, rounds, rng, s, number)
-        network = export(model)
-        if on_progress is not None:
-            states = sum(len(r.inputs) for r in rounds)
-            on_progress(RefineProgress(number + 1, states, cost, mean_return, network))
+            rounds = [*rounds, labelled][-s.kept_rounds :]
+            cost = _fit(model, optimiser, rounds, rng, s, number)
+            network = export(model)
+            if on_progress is not None:
+                states = sum(len(r.inputs) for r in rounds)
+                on_progress(RefineProgress(number + 1, states, cost, mean_return, network))
     return network
 
 
