@@ -344,6 +344,12 @@ class TestARun:
         journal.append([episode(2, 1)])
         return tmp_path / "run"
 
+    def test_knows_what_its_folder_says(self, run):
+        read = Run(run.folder)
+        assert [o.to_record() for o in run.outcomes] == [o.to_record() for o in read.outcomes]
+        assert run.outcomes == read.outcomes
+        assert any(o.foretold for o in run.outcomes)
+
     def test_scores_its_trajectories_as_it_scored_them_when_they_ran(self, run):
         assert len(run.outcomes) == 60
         for outcome in run.outcomes:

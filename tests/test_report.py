@@ -25,6 +25,7 @@ from merge_sumo.reports.summary import summarise
 from merge_sumo.reports.surface import Surface, learn_surface
 from merge_sumo.reports.verdict import judge
 from merge_sumo.sumo.road import road_of
+from merge_sumo.system.workers import InProcess, Workers
 from merge_sumo.values.case import to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import DT_S, US23, Scenario
@@ -84,6 +85,10 @@ class TestThePage:
 
     def test_is_the_same_when_written_again(self, made, page):
         assert report_page(Run(made.folder)) == page
+
+    def test_is_the_same_where_workers_ask_the_surrogates(self, made, page):
+        with Workers(InProcess, 2) as workers:
+            assert report_page(made, workers=workers) == page
 
     def test_shows_what_comes_from_outside_as_text(self, tmp_path):
         run = write_run(tmp_path / "run", vut=EVIL, error=EVIL, sampler=EVIL)
@@ -337,7 +342,7 @@ class TestTheSurrogate:
             assert surface.plausible_fmc() >= found.fmc - 1e-3
 
     def test_finds_no_more_than_the_pool_plausible(self):
-        everywhere = Surface(np.array([[0.5, 0.5]]), lambda points: np.ones(len(points)))
+        everywhere = Surface(np.array([[0.5, 0.5]]), lambda sets: [np.ones(len(s)) for s in sets])
         assert everywhere.plausible_fmc() == 1.0
 
     def test_is_not_made_of_too_few_failures(self, made):

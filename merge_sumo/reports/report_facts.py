@@ -26,6 +26,7 @@ from merge_sumo.reports.surface import Surface, learn_surface
 from merge_sumo.reports.verdict import Trouble, judge
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, OWN
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
@@ -43,10 +44,13 @@ T = TypeVar("T")
 class Facts:
     """Everything that the page shows of a run."""
 
-    def __init__(self, run: Run, summary: Summary | None = None) -> None:
+    def __init__(
+        self, run: Run, summary: Summary | None = None, workers: Workers | None = None
+    ) -> None:
         """Read what the page shows; raises `UserError` where settings have no list of levels.
 
-        `summary` is that of the run, where it is known.
+        `summary` is that of the run, where it is known; on `workers`, where they are several
+        processes, its surrogates are asked.
         """
         levels = run.settings.get("levels")
         if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
@@ -56,7 +60,7 @@ class Facts:
         self.summary = summary or summarise(run.outcomes, levels)
         self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
-        self._surfaces = _meanwhile(partial(_surfaces, run, self.levels))
+        self._surfaces = _meanwhile(partial(_surfaces, run, self.levels, workers))
         self.coordinates = coordinates(run.scenario)
         self.worst = failures(run.outcomes)
         self.regions = regions_of(self.worst)
@@ -111,14 +115,14 @@ def _meanwhile(work: Callable[[], T]) -> Future[T]:
         thread.shutdown(wait=False)
 
 
-def _surfaces(run: Run, levels: Sequence[int]) -> dict[int, Surface | None]:
+def _surfaces(
+    run: Run, levels: Sequence[int], workers: Workers | None
+) -> dict[int, Surface | None]:
     """Return the surrogate of each level; what its map shows is worked out."""
-    surfaces = {level: learn_surface(run.outcomes, level) for level in levels}
+    surfaces = {level: learn_surface(run.outcomes, level, workers) for level in levels}
     for level, surface in surfaces.items():
         if surface is not None:
-            surface.pool()
-            if (dims := len(run.scenario.dimensions(level))) in GRID:
-                surface.over(GRID[dims])
+            surface.work_out(GRID.get(len(run.scenario.dimensions(level))))
     return surfaces
 
 
