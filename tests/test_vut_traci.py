@@ -305,7 +305,7 @@ class TestAStockClient:
         assert "'nobody' is not known" in said[6]
         assert "'lane_0' is not known" in said[7]
         assert "'nobody' is not known" in said[8]
-        assert said[9] == "merge-sumo does not carry out CMD_LOAD"
+        assert said[9].startswith("merge-sumo does not carry out CMD_LOAD: the campaign")
         assert "'none' is not known" in said[10]
 
     def test_may_close_when_the_vehicle_has_arrived_and_another_come(self):
@@ -515,6 +515,13 @@ def children() -> set[str]:
     return found
 
 
+ENDS = """
+from raw_traci import Client
+Client(int(sys.argv[1])).drive(4)
+sys.exit({words!r})
+"""
+
+
 def program(misdeed: str) -> str:
     return f"{sys.executable} {TESTS / 'raw_traci.py'} {{port}} '{misdeed}'"
 
@@ -561,6 +568,22 @@ def test_a_command_that_cannot_work_is_refused_in_a_sentence(command, said):
     with pytest.raises(UserError, match=r"controller|--vut-command") as refused:
         run_cases(factory("traci", command=command), cases_of(1))
     assert said in str(refused.value)
+
+
+def test_a_command_that_never_connects_is_told_how():
+    command = f"{sys.executable} -c 'import time; time.sleep(9)'"
+    with pytest.raises(UserError, match=r"in 0\.3 s: --vut-command is told the port as {port}"):
+        run_cases(factory("traci", command=command, connect_s=0.3), cases_of(1))
+
+
+def test_the_reason_of_an_end_is_not_that_of_a_sumo_which_the_controller_started(tmp_path):
+    words = "KeyError: 64\nError: Could not access configuration 'm.sumocfg'.\nQuitting (on error)."
+    ends = tmp_path / "ends.py"
+    ends.write_text(f"import sys\nsys.path.insert(0, {str(TESTS)!r})\n" + ENDS.format(words=words))
+    (trajectory,) = run_cases(
+        factory("traci", command=f"{sys.executable} {ends} {{port}}"), cases_of(1)
+    )
+    assert trajectory.error.endswith("the controller ended with exit code 1: KeyError: 64")
 
 
 def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):
@@ -794,6 +817,21 @@ def test_of_two_clients_the_second_waits_and_changes_nothing():
     both, one = (Played(c, steps=8) for c in (client, alone))
     assert both.reasons == one.reasons == [None]
     assert both.speeds == one.speeds
+
+
+def test_who_waits_for_a_second_client_of_its_own_is_told_that_one_is_served():
+    def client(port):
+        first = Client(port)
+        first.step()
+        second = Client(port)
+        with suppress(GoneError):
+            second.step()  # as a second connection does that is made before the first step
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason == (
+        "the controller made no step within the deadline of 0.3 s; another client waits, but one "
+        "at a time is served"
+    )
 
 
 @pytest.mark.long
