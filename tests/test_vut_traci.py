@@ -498,6 +498,35 @@ def test_traci_start_with_our_port_connects_to_us_and_not_to_the_sumo_it_starts(
     assert [t.error for t in trajectories] == [None, None]
 
 
+EPISODES = """import sys, traci
+for _ in range({episodes}):
+    traci.init(int(sys.argv[1]))
+    traci.simulationStep()
+    while "vut" in traci.vehicle.getIDList():
+        traci.vehicle.setSpeed("vut", min(traci.vehicle.getSpeed("vut") + 0.1, 28.0))
+        traci.simulationStep()
+    traci.close()
+"""
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 10])
+def test_a_program_may_connect_for_every_episode_and_is_started_again_when_it_has_ended(
+    tmp_path, episodes
+):
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    program = tmp_path / "episodes.py"
+    head = f"open({str(tmp_path / 'started')!r}, 'a').write('.')\n"
+    program.write_text(head + EPISODES.format(episodes=episodes))
+    cases = cases_of(4)
+    command = f"{sys.executable} {program} {{port}}"
+    by_traci = run_cases(factory("traci", command=command), cases)
+    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_traci, by_python, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+    assert len((tmp_path / "started").read_text()) == -(-len(cases) // episodes)
+
+
 def descriptors() -> int:
     gc.collect()
     return len(list(Path("/proc/self/fd").iterdir()))

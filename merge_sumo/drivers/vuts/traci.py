@@ -145,7 +145,8 @@ class TraciVut(Driver):
                 self._client.step_to(seen)
             except ClosedError:
                 # The listener stays: the next client may be waiting already.
-                self._drop_client(grace=True)
+                self._client.close()
+                self._client = None
                 if attempt == 2:
                     raise FaultError(
                         "the controller closed the connection before the vehicles departed"
@@ -154,41 +155,54 @@ class TraciVut(Driver):
                 return
 
     def _connect(self) -> None:
-        """Wait for a client, with a program started anew if there is a command."""
+        """Wait for a client, with a program started anew if there is a command.
+
+        A program that closed its connection may connect again, and has as long as for a step.
+        """
         patience_s = self._patience_s
         # Who did not come once is not waited for as long again.
         self._patience_s = min(patience_s, self._options.deadline_s)
         if self._listener is None:
             self._listener = _listen(self._port)
         port = self._listener.getsockname()[1]
-        if self._command is not None:
-            self._program = Program(self._command, port, self._options.log)
-        else:
-            sys.stderr.write(
-                f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
-            )
-        until = monotonic() + patience_s
-        while True:
-            # A program that ended will not connect any more: look every now and then.
-            self._listener.settimeout(max(min(0.1, until - monotonic()), 0.001))
-            try:
-                connection, _ = self._listener.accept()
-                break
-            except TimeoutError:
-                ended = self._program.ended(0.0) if self._program else ""
-                if ended or monotonic() > until:
-                    self._disconnect()
-                    late = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
-                    if self._command is not None:
-                        late += (
-                            ": --vut-command is told the port as {port} and in MERGE_SUMO_PORT, "
-                            "for traci.init(PORT) or traci.start(..., port=PORT)"
-                        )
-                    before = f"{ended} (before it connected)" if ended else late
-                    raise FaultError(before) from None
+        connection = None
+        if self._program is not None:
+            connection = self._accept(self._listener, self._options.deadline_s)
+            if connection is None:
+                self._drop_client(grace=True)
+        if connection is None:
+            if self._command is not None:
+                self._program = Program(self._command, port, self._options.log)
+            else:
+                sys.stderr.write(
+                    f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
+                )
+            connection = self._accept(self._listener, patience_s)
+        if connection is None:
+            ended = self._program.ended(0.0) if self._program else ""
+            self._disconnect()
+            late = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
+            if self._command is not None:
+                late += (
+                    ": --vut-command is told the port as {port} and in MERGE_SUMO_PORT, "
+                    "for traci.init(PORT) or traci.start(..., port=PORT)"
+                )
+            raise FaultError(f"{ended} (before it connected)" if ended else late)
         self._patience_s = self._options.connect_s
         session = Session(self._road, self._scenario, note=self._note)
         self._client = Client(connection, session, self._options.deadline_s, self._program)
+
+    def _accept(self, listener: socket.socket, patience_s: float) -> socket.socket | None:
+        """Return the next connection; None when none comes, or the program has ended."""
+        until = monotonic() + patience_s
+        while True:
+            # A program that ended will not connect any more: look every now and then.
+            listener.settimeout(max(min(0.1, until - monotonic()), 0.001))
+            try:
+                return listener.accept()[0]
+            except TimeoutError:
+                if monotonic() > until or (self._program and self._program.ended(0.0)):
+                    return None
 
     def _note(self, sentence: str) -> None:
         """Add a sentence to what the controller printed, once for all the times it is started."""
