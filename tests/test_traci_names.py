@@ -153,6 +153,22 @@ def test_the_sumo_that_answers_has_every_vehicle_where_it_is(name):
         beside.close()
 
 
+def test_who_drives_beyond_the_end_of_the_net_arrives_and_the_others_are_answered_for():
+    scenario = named_scenario("roundabout")
+    beside = Beside(road_for(scenario), scenario, 2)
+    vehicle = beside._connection.vehicle
+    try:
+        for x_m in (-50.0, 100.0, 600.0, 610.0):
+            beside.show({"pov": (x_m, 10.0, 0.0), "vut": (-40.0, 10.0, 0.0)})
+        assert vehicle.getIDList() == ("vut",)
+        assert vehicle.getSpeed("vut") == 10.0
+        beside.show({})
+        beside.show({"pov": (-50.0, 10.0, 0.0), "vut": (-40.0, 10.0, 0.0)})
+        assert set(vehicle.getIDList()) == {"pov", "vut"}
+    finally:
+        beside.close()
+
+
 class TestCommands:
     @pytest.mark.parametrize(
         ("function", "arguments"),
