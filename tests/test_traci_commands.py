@@ -164,6 +164,14 @@ class TestWhatWasSet:
             follow.append(drive.ours.vehicle.getFollowSpeed("vut", 18.0, 30.0, 10.0, 4.0))
         assert follow[0] > follow[1] + 1.0
 
+    def test_of_the_gap_counts_in_the_distance_to_the_leader_as_in_sumo(self, drive):
+        drive.begin()
+        drive.x_m, drive.v_mps = [60.0, 20.0], [20.0, 18.0]
+        drive._show()
+        assert drive.ours.vehicle.getLeader("vut", 100.0) == ("pov", pytest.approx(35.0))
+        drive.ours.vehicle.setMinGap("vut", 1.5)
+        assert drive.ours.vehicle.getLeader("vut", 100.0) == ("pov", pytest.approx(33.5))
+
     def test_of_looks_and_parameters_can_be_read_back(self, drive):
         drive.begin()
         c = drive.ours

@@ -305,7 +305,7 @@ class TestAStockClient:
         assert "'nobody' is not known" in said[6]
         assert "'lane_0' is not known" in said[7]
         assert "'nobody' is not known" in said[8]
-        assert said[9] == "merge-sumo does not carry out CMD_LOAD"
+        assert said[9].startswith("merge-sumo does not carry out CMD_LOAD: the campaign")
         assert "'none' is not known" in said[10]
 
     def test_may_close_when_the_vehicle_has_arrived_and_another_come(self):
@@ -498,6 +498,35 @@ def test_traci_start_with_our_port_connects_to_us_and_not_to_the_sumo_it_starts(
     assert [t.error for t in trajectories] == [None, None]
 
 
+EPISODES = """import sys, traci
+for _ in range({episodes}):
+    traci.init(int(sys.argv[1]))
+    traci.simulationStep()
+    while "vut" in traci.vehicle.getIDList():
+        traci.vehicle.setSpeed("vut", min(traci.vehicle.getSpeed("vut") + 0.1, 28.0))
+        traci.simulationStep()
+    traci.close()
+"""
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 10])
+def test_a_program_may_connect_for_every_episode_and_is_started_again_when_it_has_ended(
+    tmp_path, episodes
+):
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    program = tmp_path / "episodes.py"
+    head = f"open({str(tmp_path / 'started')!r}, 'a').write('.')\n"
+    program.write_text(head + EPISODES.format(episodes=episodes))
+    cases = cases_of(4)
+    command = f"{sys.executable} {program} {{port}}"
+    by_traci = run_cases(factory("traci", command=command), cases)
+    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_traci, by_python, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+    assert len((tmp_path / "started").read_text()) == -(-len(cases) // episodes)
+
+
 def descriptors() -> int:
     gc.collect()
     return len(list(Path("/proc/self/fd").iterdir()))
@@ -513,6 +542,13 @@ def children() -> set[str]:
         except OSError:
             continue
     return found
+
+
+ENDS = """
+from raw_traci import Client
+Client(int(sys.argv[1])).drive(4)
+sys.exit({words!r})
+"""
 
 
 def program(misdeed: str) -> str:
@@ -561,6 +597,22 @@ def test_a_command_that_cannot_work_is_refused_in_a_sentence(command, said):
     with pytest.raises(UserError, match=r"controller|--vut-command") as refused:
         run_cases(factory("traci", command=command), cases_of(1))
     assert said in str(refused.value)
+
+
+def test_a_command_that_never_connects_is_told_how():
+    command = f"{sys.executable} -c 'import time; time.sleep(9)'"
+    with pytest.raises(UserError, match=r"in 0\.3 s: --vut-command is told the port as {port}"):
+        run_cases(factory("traci", command=command, connect_s=0.3), cases_of(1))
+
+
+def test_the_reason_of_an_end_is_not_that_of_a_sumo_which_the_controller_started(tmp_path):
+    words = "KeyError: 64\nError: Could not access configuration 'm.sumocfg'.\nQuitting (on error)."
+    ends = tmp_path / "ends.py"
+    ends.write_text(f"import sys\nsys.path.insert(0, {str(TESTS)!r})\n" + ENDS.format(words=words))
+    (trajectory,) = run_cases(
+        factory("traci", command=f"{sys.executable} {ends} {{port}}"), cases_of(1)
+    )
+    assert trajectory.error.endswith("the controller ended with exit code 1: KeyError: 64")
 
 
 def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):
@@ -794,6 +846,21 @@ def test_of_two_clients_the_second_waits_and_changes_nothing():
     both, one = (Played(c, steps=8) for c in (client, alone))
     assert both.reasons == one.reasons == [None]
     assert both.speeds == one.speeds
+
+
+def test_who_waits_for_a_second_client_of_its_own_is_told_that_one_is_served():
+    def client(port):
+        first = Client(port)
+        first.step()
+        second = Client(port)
+        with suppress(GoneError):
+            second.step()  # as a second connection does that is made before the first step
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason == (
+        "the controller made no step within the deadline of 0.3 s; another client waits, but one "
+        "at a time is served"
+    )
 
 
 @pytest.mark.long

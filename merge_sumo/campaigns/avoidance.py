@@ -250,7 +250,7 @@ def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) ->
     """Return whether an episode ends at M without a failure."""
     if criterion.is_papers:  # which needs no measures
         return verdict(trajectory) is End.MERGED
-    outcome = criterion.outcome(0, 0, trajectory, lines)
+    outcome = criterion.judged(trajectory, lines)
     return outcome.measures.end.is_tested and not outcome.failed
 
 

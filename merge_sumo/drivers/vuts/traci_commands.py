@@ -38,9 +38,9 @@ INVALID: Final = {
 """Numbers of SUMO's car-following model, by what SUMO calls them where they are invalid."""
 OF_MODEL: Final = frozenset({*INVALID, 0x26, 0x5F})
 """All that its drivers are made of: besides those impatience and the deviation of speeds."""
-OF_TYPE: Final = frozenset({*INVALID, 0x4F, 0xB7})
-"""What a vehicle says otherwise when such a number was set: besides them its type's name and the
-speed that it is allowed."""
+OF_TYPE: Final = frozenset({*INVALID, 0x4F, 0x68, 0xB7})
+"""What a vehicle says otherwise when such a number was set: besides them its type's name, the gap
+to its leader (less the minimum gap) and the speed that it is allowed."""
 SPEED_MODE, LANE_CHANGE_MODE = 0xB3, 0xB6
 MODES: Final = {SPEED_MODE: 0x7F, LANE_CHANGE_MODE: 0xFFF}
 """The bits that SUMO knows of each mode."""
