@@ -30,6 +30,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -312,4 +313,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    # Workers find functions by the names of their modules, and do not know this one as __main__.
+    import_module("bench_scale").main()
