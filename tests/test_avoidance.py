@@ -64,7 +64,9 @@ def passes(failure, driver, until, *, in_the_povs_place=False):
         x, x_pov = x + 0.1 * v, x_pov + 0.1 * v_pov
         v, v_pov = max(v + 0.1 * a, 0.0), max(v_pov + 0.1 * a_pov, 0.0)
         if x >= 0.0:
-            return abs(x_pov - x) >= 6.0
+            gap, closing = abs(x_pov - x) - 5.0, max(v_pov - v if x_pov < x else v - v_pov, 0.0)
+            # Whoever is behind has 0.75 s, and then 4 m/s2.
+            return gap >= 1.0 and closing**2 <= 8.0 * max(gap - 0.75 * closing, 0.0)
     return False
 
 

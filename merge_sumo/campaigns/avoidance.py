@@ -49,6 +49,7 @@ from merge_sumo.system.workers import Workers
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.merge import AfterMerge, after_merge
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
 from merge_sumo.values.score import Outcome, verdict
 from merge_sumo.values.trajectory import End, Trajectory
@@ -247,7 +248,12 @@ class _Found:
 
 
 def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) -> bool:
-    """Return whether an episode ends at M without a failure."""
+    """Return whether an episode ends at M without a failure.
+
+    Nor is one avoided by a merge after which whoever is behind cannot brake hard enough.
+    """
+    if after_merge(trajectory) is AfterMerge.FORCED:
+        return False
     if criterion.is_papers:  # which needs no measures
         return verdict(trajectory) is End.MERGED
     outcome = criterion.judged(trajectory, lines)
