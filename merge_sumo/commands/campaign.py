@@ -249,8 +249,8 @@ def _conclude(
     from merge_sumo.reports.verdict import NOTHING_TESTED, judge
 
     link_latest(run.folder)
-    report_file = write_report(run)
     summary = summarise(run.outcomes, settings.levels)
+    report_file = write_report(run, summary)
     verdict = judge(run.outcomes)
     results = [gate.check(verdict, summary) for gate in gates]
     passed = verdict.tested > 0 and not any(result.met for result in results)

@@ -28,6 +28,9 @@ POOL_POINTS: Final = {2: 10_000, 3: 20_000, 4: 20_000, 5: 20_000, 6: 20_000}
 PART: Final = 4000
 """Points asked at a time, so that memory does not grow with their number."""
 
+Grid = tuple[int, int, int]
+"""Nodes in each coordinate; of two coordinates the last number is 1."""
+
 
 class Surface:
     """The surrogate of one level of a run."""
@@ -38,6 +41,7 @@ class Surface:
         self._failing = failing
         self._chance = chance
         self._pool: tuple[FloatArray, FloatArray] | None = None
+        self._over: dict[Grid, FloatArray] = {}
 
     def chance(self, points: FloatArray) -> FloatArray:
         """Return the chance that cases at points, (n, d), of the unit cube fail: (n,)."""
@@ -66,6 +70,19 @@ class Surface:
             points = np.random.default_rng(0).random((POOL_POINTS[self._dims], self._dims))
             self._pool = points, self.chance(points)
         return self._pool
+
+    def over(self, grid: Grid) -> FloatArray:
+        """Return the chance at the nodes of a grid, (n,), in the order of `nodes`."""
+        if grid not in self._over:
+            self._over[grid] = self.chance(nodes(grid))
+        return self._over[grid]
+
+
+def nodes(grid: Grid) -> FloatArray:
+    """Return the nodes of a grid of the unit cube, (n, d), the first coordinate running fastest."""
+    axes = [np.linspace(0.0, 1.0, n) for n in grid if n > 1]
+    mesh = np.meshgrid(*axes[::-1], indexing="ij")
+    return np.stack([axis.ravel() for axis in mesh[::-1]], axis=1)
 
 
 def learn_surface(outcomes: Sequence[Outcome], level: int) -> Surface | None:

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
 from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.merge import AfterMerge, after_merge, followed_up
@@ -33,6 +34,7 @@ TTC_SHARE: Final = 1.0 / 9.0
 """Part of P_safety that a short time to collision can cost; the gap has the rest."""
 
 
+@quickly_pickled
 @dataclass(frozen=True, slots=True)
 class Measures:
     """Named measures of one episode, with the verdict first.
