@@ -399,6 +399,17 @@ int main(int, char** argv) {
                 Vehicle::subscribe("vut", {libsumo::VAR_SPEED, libsumo::VAR_LANEPOSITION});
                 Vehicle::subscribeContext("vut", libsumo::CMD_GET_VEHICLE_VARIABLE, 300,
                                           {libsumo::VAR_SPEED, libsumo::VAR_POSITION});
+                Junction::subscribeContext("M", libsumo::CMD_GET_VEHICLE_VARIABLE, 2000,
+                                           {libsumo::VAR_SPEED});
+                if (Junction::getContextSubscriptionResults("M").count("vut") != 1) return 8;
+                Vehicle::setSpeedMode("vut", 6);
+                Vehicle::setMaxSpeed("vut", 45.0);
+                if (Vehicle::getMaxSpeed("vut") != 45.0) return 9;
+                try {
+                    Vehicle::openGap("vut", 1.0, 1.0, 1.0, 1.0);
+                    return 10;
+                } catch (const libsumo::TraCIException&) {
+                }
             }
         }
         const auto ids = Vehicle::getIDList();
