@@ -7,9 +7,8 @@ import json
 import pytest
 
 from merge_sumo.errors import UserError
-from merge_sumo.reports import reproduce as paper
 from merge_sumo.reports.reproduce import reproduce
-from merge_sumo.reports.table2 import TABLE_II, Scale
+from merge_sumo.reports.table2 import TABLE_II, Scale, quick
 from merge_sumo.system.workers import open_workers
 
 FIGURES = {
@@ -101,6 +100,6 @@ def test_a_quick_reproduction_is_the_same_twice(tmp_path, monkeypatch):
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
     for name, count in (("a", 2), ("b", 1)):
         with open_workers(count) as workers:
-            reproduce(tmp_path / name, paper.quick(2), workers=workers)
+            reproduce(tmp_path / name, quick(2), workers=workers)
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
