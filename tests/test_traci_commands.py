@@ -17,7 +17,7 @@ from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.traci_names import DUMMIES, named
 
 V, T = "vehicle", "vehicletype"
-SCRIPTS = {
+SCRIPTS: dict[str, list[tuple]] = {
     "a limit of acceleration": [(0, V, "setAccel", 1.0), (0, V, "setSpeed", 19.0)],
     "a limit of deceleration": [(0, V, "setDecel", 1.0), (0, V, "setSpeed", 17.0)],
     "limits above the scenario's": [

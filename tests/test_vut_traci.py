@@ -1,5 +1,7 @@
 """A controller behind TraCI: what it sees, what it may do, and what it may do wrong."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import gc
@@ -14,8 +16,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,7 +114,9 @@ def stock(function):
 class TestAStockClient:
     def test_sees_vehicles_depart_and_arrive_episode_after_episode_while_time_runs_on(self):
         def drive(c):
-            seen = [(c.simulation.getTime(), c.vehicle.getIDList(), c.vehicle.getIDCount())]
+            seen: list[tuple] = [
+                (c.simulation.getTime(), c.vehicle.getIDList(), c.vehicle.getIDCount())
+            ]
             while c.simulation.getMinExpectedNumber() > 0:
                 c.simulationStep()
                 seen.append(
@@ -708,7 +714,8 @@ class Recorder:
     """A client's socket that remembers what was sent."""
 
     def __init__(self, real: socket.socket) -> None:
-        self.real, self.sent = real, []
+        self.real = real
+        self.sent: list[bytes] = []
 
     def send(self, content: bytes) -> int:
         self.sent.append(bytes(content))
@@ -986,6 +993,7 @@ class TestTheProtocol:
         def written(v):
             if isinstance(v, tuple):
                 return tp.compound(*map(written, v))
+            forms: dict[type, Callable[[Any], bytes]]
             forms = {float: tp.double, int: tp.integer, str: tp.string}
             return forms[type(v)](v)
 
