@@ -132,18 +132,16 @@ def campaign(
     road = road_for(settings.scenario, None if net is None else Path(net))
     title = f"{spec} v level {'/'.join(map(level_name, settings.levels))}"
     quiet = not (is_watched() if progress is None else progress)
-    with (
-        open_workers(settings.workers(workers)) as there,
-        CampaignPanel(title, settings.cases, settings.levels, quiet=quiet) as panel,
-    ):
+    with open_workers(settings.workers(workers)) as there:
+        with CampaignPanel(title, settings.cases, settings.levels, quiet=quiet) as panel:
 
-        def told(outcome: Outcome) -> None:
-            panel.case_ended(outcome)
-            if on_case is not None:
-                on_case(outcome)
+            def told(outcome: Outcome) -> None:
+                panel.case_ended(outcome)
+                if on_case is not None:
+                    on_case(outcome)
 
-        done = run_campaign(settings, folder, road, told, workers=there)
-    note_avoidance(done, settings, road)
+            done = run_campaign(settings, folder, road, told, workers=there)
+        note_avoidance(done, settings, road, workers=there)
     link_latest(folder)
     run = CampaignRun(folder)
     run.report()

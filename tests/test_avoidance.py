@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from concurrent.futures import BrokenExecutor, Future
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ import pytest
 import merge_sumo as ms
 from merge_sumo.campaigns.avoidance import (
     AVOIDANCE,
+    EVERY_STEPS,
     Avoidance,
+    _Found,
     avoidance,
     in_a_sentence,
     read_avoidance,
@@ -24,13 +27,18 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import report_page
+from merge_sumo.system.workers import InProcess, Workers, open_workers
 from merge_sumo.values.scenario import US23
+
+
+def avoidance_of(run, workers=None, **other):
+    settings = settings_of(run.folder, run.settings, trust=True)
+    return avoidance(run, settings, road_for(US23), workers=workers, **other)
 
 
 @pytest.fixture(scope="module")
 def found(run):
-    settings = settings_of(run.folder, run.settings, trust=True)
-    return avoidance(run, settings, road_for(US23))
+    return avoidance_of(run)
 
 
 @pytest.fixture
@@ -60,6 +68,39 @@ def passes(failure, driver, until, *, in_the_povs_place=False):
     return False
 
 
+def last_of(passed, steps):
+    """Return the last success of all half seconds, and of the steps from there to the next one."""
+    coarse = [n for n in range(0, steps, EVERY_STEPS) if passed(n)]
+    if not coarse:
+        return None
+    return max(n for n in range(coarse[-1], min(coarse[-1] + EVERY_STEPS, steps)) if passed(n))
+
+
+def answered(search, passing):
+    """Say of each take-over that is asked for whether it passes; return which ones were."""
+    asked, case = [], next(search)
+    while True:
+        asked.append(case.until)
+        try:
+            case = search.send(case.until in passing)
+        except StopIteration:
+            return asked
+
+
+class DiesAt(InProcess):
+    """A worker that is ended by one failure, each time."""
+
+    def __init__(self, index):
+        self.index = index
+
+    def submit(self, fn, /, *args, **kwargs):
+        if self.index not in [index for index, _ in args[0]]:
+            return super().submit(fn, *args, **kwargs)
+        future = Future()
+        future.set_exception(BrokenExecutor())
+        return future
+
+
 class TestEveryFailure:
     def test_has_its_line_in_the_order_of_cases(self, run, found):
         assert [one.index for one in found] == sorted(o.index for o in failures(run.outcomes))
@@ -80,11 +121,55 @@ class TestEveryFailure:
             assert passes(failure, REFERENCES["careful"](1), until)
             assert not passes(failure, REFERENCES["careful"](1), until + 1)
 
+    def test_is_searched_from_the_end_and_finds_what_looking_everywhere_finds(self, run, found):
+        for one in found[:2]:
+            failure = run.trajectory(one.index)
+            drivers = REFERENCES["careful"]
+            last = last_of(lambda n: passes(failure, drivers(1), n), len(failure.motion) - 1)  # noqa: B023
+            assert round(10.0 * one.careful_until_s) == last
+
+    @pytest.mark.parametrize("passing", [set(), {0}, {3, 7}, {0, 5, 9}, {5, 20, 23}, {60}, {0, 61}])
+    def test_is_searched_in_as_few_episodes_as_it_takes(self, run, found, passing):
+        failure = run.trajectory(found[0].index)
+        steps = len(failure.motion) - 1
+        one = _Found(failure)
+        asked = answered(one.take_over(), passing)
+        last, said = last_of(passing.__contains__, steps), one.avoidance(7)
+        assert said.careful_until_s == (None if last is None else last / 10.0)
+        assert said.by_careful == (0 in passing)
+        # Whatever is later, and nothing before the half second in which it lies.
+        assert len(asked) == len(set(asked))
+        first = 0 if last is None else last - last % EVERY_STEPS
+        assert set(range(first, steps, EVERY_STEPS)) <= set(asked) <= {0, *range(first, steps)}
+
     def test_says_whether_a_careful_driver_on_the_mainline_avoids_it(self, run, found):
         for one in found[:3]:
             failure = run.trajectory(one.index)
             avoids = passes(failure, CarefulPov(1), 0, in_the_povs_place=True)
             assert one.pov_careful == avoids
+
+
+class TestWorkers:
+    def test_of_any_number_find_the_same(self, run, found):
+        with open_workers(2) as two:
+            assert avoidance_of(run, two) == found
+        with Workers(InProcess, 3) as three:
+            assert avoidance_of(run, three) == found
+
+    def test_that_die_at_a_failure_leave_out_that_one_and_no_other(self, run, found):
+        left_out = found[1].index
+        with Workers(lambda: DiesAt(left_out), 1) as workers:
+            assert avoidance_of(run, workers) == [one for one in found if one.index != left_out]
+
+    def test_are_asked_in_between_whether_to_stop(self, run, found):
+        class EnoughError(Exception):
+            pass
+
+        def stop():
+            raise EnoughError
+
+        with Workers(InProcess, 3) as workers, pytest.raises(EnoughError):
+            avoidance_of(run, workers, check=stop)
 
 
 class TestTheFile:

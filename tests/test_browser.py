@@ -110,6 +110,16 @@ def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options
         assert width <= page.viewport_size["width"]
 
 
+def test_a_merge_that_asks_too_much_of_others_is_no_harmless_dot(browser, made):
+    safe = [o for o in made.outcomes if o.is_tested and not o.failed]
+    asking = [o for o in safe if o.measures.after_merge in ("harsh", "forced")]
+    assert asking
+    with shown(browser, made.folder / report.REPORT) as page:
+        assert page.locator(".map .mark.harsh").count() == len(asking)
+        assert page.locator(".map .mark.safe").count() == len(safe) - len(asking)
+        assert page.locator(".legend .mark.harsh").count() == 1
+
+
 def test_it_starts_with_the_worst_case(page, made):
     assert chosen(page) == failures(made.outcomes)[0].index
     assert "Collision" in page.inner_text("#case-words")

@@ -14,7 +14,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns import certificate
-from merge_sumo.campaigns.certificate import CERTIFICATE, CaseResult, certify, lattices_of
+from merge_sumo.campaigns.certificate import CERTIFICATE, certify, lattices_of
+from merge_sumo.campaigns.certificate_runs import CaseResult
 from merge_sumo.campaigns.covering import Covering, covering
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -184,6 +185,28 @@ class TestACertificate:
         assert not done.certain
         assert "none fails; 4 gave no verdict" in done.sentence
         assert check_certificate.check(tmp_path / "c")[1] == []
+
+    @pytest.mark.parametrize("fails", [0, 1])
+    def test_is_none_of_a_vut_that_does_not_do_again_what_it_did(self, tmp_path, fails):
+        runs, steady = [], planted(np.zeros((fails, 2)), 0.01)
+
+        def moody(level, points):
+            runs.append(len(points))
+            for place, done in steady(level, points):
+                drifts = len(runs) > 1 and place < 3
+                yield place, done._replace(score=done.score + 1e-12 * drifts)
+
+        done = certify(settings(0), 0.1, tmp_path / "c", ROAD, moody)
+        assert runs == [52, 13]
+        assert not done.certain
+        assert done.sentence == (
+            f"design2 v level 0, 52 cases: {fails or 'none'} fail, and nothing is certain: 3 of 13 "
+            "that were run twice did not end as before"
+        )
+        assert check_certificate.check(tmp_path / "c")[1] == []
+        # Whoever goes on with it asks again.
+        again = certify(settings(0), 0.1, tmp_path / "c", ROAD, steady, resume=True)
+        assert again.levels[0].otherwise == 0
 
     def test_is_the_same_to_the_last_byte_however_often_it_was_stopped(self, tmp_path, monkeypatch):
         monkeypatch.setattr(certificate, "BLOCK", 70)

@@ -11,6 +11,7 @@ import pytest
 from merge_sumo.samplers.base import LevelHistory, Sampler
 from merge_sumo.samplers.belief import CALIBRATION, _as_if, _calibrated, margin_of
 from merge_sumo.samplers.coverage import NEAREST, PATIENCE, CoverageSampler, _limit, _Search, _trust
+from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin
@@ -95,6 +96,20 @@ class TestTheGround:
         places = Ground(dims)._places
         farthest = places._tree.query(points, k=places.per_ball)[0][:, -1]
         assert farthest == pytest.approx(radius_for(dims), rel=0.1)
+
+    @pytest.mark.parametrize("dims", [2, 3, 5])
+    def test_a_greedy_batch_is_that_of_who_looks_at_every_candidate_again(self, dims):
+        rng = np.random.default_rng(dims)
+        points, chance = 0.3 * rng.random((100, dims)), rng.random(100)
+        picks, gains = greedy(Ground(dims), points, chance, chance, 20)
+        ground, free = Ground(dims), np.ones(100)
+        balls = ground.balls(points)
+        for pick, gain in zip(picks, gains, strict=True):
+            new = ground.new(balls)
+            assert pick == np.argmax(free * chance * (new + EVEN_IF_COVERED))
+            assert gain == chance[pick] * new[pick]
+            ground.cover(balls[pick], max(PICKED, chance[pick]))
+            free[pick] = 0.0
 
     def test_is_new_each_time(self):
         first, second = Ground(4), Ground(4)

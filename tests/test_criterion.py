@@ -33,6 +33,23 @@ from merge_sumo.values.trajectory import End, Trajectory
 
 WORDS = {"x": None, "y": None, "who": frozenset({"A", "B"})}
 
+AB = st.sampled_from(["A", "B"])
+SIDE = st.one_of(st.sampled_from(["x", "y"]), st.integers(-3, 3).map(str))
+SIGN = st.sampled_from(["<", "<=", ">", ">="])
+CONDITIONS = st.recursive(
+    st.one_of(
+        st.builds("x {} {}".format, SIGN, SIDE),
+        st.builds("{} {} y {} {}".format, SIDE, SIGN, SIGN, SIDE),
+        st.builds("who {} {!r}".format, st.sampled_from(["==", "!="]), AB),
+    ),
+    lambda inner: st.one_of(
+        st.builds("not ({})".format, inner),
+        st.builds("({}) {} ({})".format, inner, st.sampled_from(["and", "or"]), inner),
+    ),
+    max_leaves=8,
+)
+"""Comparisons, chains of them, and what `not`, `and` and `or` make of these, as texts."""
+
 STOPS = "class Stops:\n    def act(self, seen):\n        return -4.0\n"
 
 
@@ -92,6 +109,13 @@ class TestMargins:
         expected = {"<": x < limit, "<=": x <= limit, ">": x > limit, ">=": x >= limit}[sign]
         assert (margin(f"x {sign} {limit!r}", x=x) < 0.0) is expected
         assert (margin(f"not x {sign} {limit!r}", x=x) < 0.0) is not expected
+
+    @given(CONDITIONS, *[st.one_of(st.integers(-3, 3), st.floats(allow_nan=False))] * 2, AB)
+    def test_of_any_condition_are_negative_exactly_where_python_says_it_is_met(
+        self, condition, x, y, who
+    ):
+        values = {"x": float(x), "y": float(y), "who": who}
+        assert (margin(condition, **values) < 0.0) is eval(condition, {}, values)  # noqa: S307
 
     @given(st.floats(-MOST_MARGIN, MOST_MARGIN), st.floats(-MOST_MARGIN, MOST_MARGIN))
     def test_become_scores_in_the_same_order(self, a, b):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports import reproduce as paper
 from merge_sumo.reports.reproduce import reproduce
-from merge_sumo.reports.table2 import TABLE_II, Scale
+from merge_sumo.reports.table2 import SAMPLERS, TABLE_II, Result, Scale, table_markdown
 from merge_sumo.system.workers import open_workers
 
 FIGURES = {
@@ -60,12 +62,27 @@ class TestATinyReproduction:
             assert f"{ours:.4f}" in markdown
             assert f"{column['truth_fmc']:.4f} ({column['paper_fmc']['truth']:.4f})" in markdown
             assert f"{column['limit_fmc']:.4f} (-)" in markdown
-            assert not column["dense"]
+            assert column["dense_fmc"] is None
             for sampler in column["samplers"].values():
                 assert sampler["fmc_median"] <= column["limit_fmc"]
         assert "| gpr / truth |" in markdown
         assert "| coverage / limit |" in markdown
         assert "| coverage / truth after " in markdown
+
+    def test_shows_a_dense_truth_where_there_is_one(self):
+        found = SimpleNamespace(
+            fmc_median=0.09,
+            fmc_over_truth_median=1.0,
+            fmc_over_limit_median=0.9,
+            cases_by_batch=[20],
+            fmc_by_batch_median=[0.09],
+        )
+        of_one = Result(TABLE_II[0], 0.08, 7, 1, None, 0.1, dict.fromkeys(SAMPLERS, found))
+        of_two = replace(of_one, dense_fmc=0.095)
+        markdown = table_markdown({"one": of_one, "two": of_two})
+        assert "| dense truth | - (-) | 0.0950 (-) |" in markdown
+        assert "| coverage / dense truth | - | 0.947 |" in markdown
+        assert "dense" not in table_markdown({"one": of_one})
 
     def test_says_how_far_it_is(self, tiny):
         _, said = tiny

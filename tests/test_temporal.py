@@ -94,6 +94,12 @@ class TestFormulas:
         with pytest.raises(UserError, match="merge-sumo\\[stl\\]"):
             Criterion(require="eventually (gap_m > 3)").check(US23)
 
+    def test_need_a_python_that_has_the_extra(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "rtamt", None)
+        monkeypatch.setattr("merge_sumo.values.temporal.LAST_PYTHON", (3, 10))
+        with pytest.raises(UserError, match="it runs up to Python"):
+            Criterion(require="eventually (gap_m > 3)").check(US23)
+
 
 @pytest.mark.usefixtures("rtamt")
 class TestRobustness:

@@ -93,7 +93,7 @@ class TestCommands:
         ("function", "arguments"),
         [
             ("setColor", (255, 0, 0)),
-            ("setSpeedMode", 0),
+            ("setLaneChangeMode", 0),
             ("changeLane", None),
             ("updateBestLanes", None),
             ("setParameter", None),
@@ -114,10 +114,6 @@ class TestCommands:
     @pytest.mark.parametrize(
         ("function", "values"),
         [
-            ("setMaxSpeed", (10.0,)),
-            ("setAccel", (1.0,)),
-            ("setDecel", (1.0,)),
-            ("setTau", (1.0,)),
             ("openGap", (1.0, 1.0, 1.0, 1.0)),
             ("moveTo", ("ramp_0", 1.0)),
             ("remove", ()),

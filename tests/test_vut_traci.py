@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import importlib.util
+import os
 import random
 import re
 import shutil
@@ -425,7 +427,9 @@ def cpp_client(tmp_path_factory) -> Path:
     require(compiler is not None, "g++ is not on the PATH")
     folder = tmp_path_factory.mktemp("cpp")
     (folder / "client.cpp").write_text(CPP)
-    (library,) = home.glob("lib*/libtracicpp.so")
+    library = next(home.glob("lib*/libtracicpp.so"), None)
+    require(library is not None, f"SUMO's wheel has no libtracicpp.so in {home}")
+    assert library is not None
     subprocess.run(
         [
             *(compiler, "-std=c++17", "-O1", str(folder / "client.cpp")),
@@ -443,6 +447,43 @@ def test_a_controller_in_cpp_on_libtraci_drives_like_the_same_law_in_process(cpp
     by_cpp = run_cases(factory("traci", command=f"{cpp_client} {{port}}"), cases)
     by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
     for one, other in zip(by_cpp, by_python, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+
+
+LIBTRACI = CONTROLLER.replace("import sys, traci", "import sys\nimport libtraci as traci").replace(
+    "    traci.simulationStep()\n",
+    """    traci.simulationStep()
+    if "vut" in traci.simulation.getDepartedIDList():
+        traci.vehicle.subscribe("vut", [traci.constants.VAR_SPEED])
+        context = traci.constants.CMD_GET_VEHICLE_VARIABLE, 300.0, [traci.constants.VAR_SPEED]
+        traci.vehicle.subscribeContext("vut", *context)
+        seen = traci.vehicle.getContextSubscriptionResults("vut")["vut"]
+        assert seen == traci.vehicle.getSubscriptionResults("vut")
+        traci.vehicle.setMaxSpeed("vut", 45.0)
+        try:
+            traci.vehicle.openGap("vut", 1.0, 1.0, 1.0, 1.0)
+            sys.exit(7)
+        except traci.TraCIException:
+            pass
+""",
+)
+
+
+def test_a_controller_on_the_package_libtraci_drives_like_the_same_law_in_process(tmp_path):
+    """Its wheels end at SUMO 1.18 and bring a libsumo of that, so it lives in another Python."""
+    interpreter = os.environ.get("LIBTRACI_PYTHON") or (
+        sys.executable if importlib.util.find_spec("libtraci") else None
+    )
+    if interpreter is None:
+        pytest.skip("libtraci is not here: set LIBTRACI_PYTHON to a Python that has it")
+    (tmp_path / "client.py").write_text(LIBTRACI)
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    cases = cases_of(20)
+    command = f"{interpreter} {tmp_path / 'client.py'} {{port}}"
+    by_libtraci = run_cases(factory("traci", command=command), cases)
+    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_libtraci, by_python, strict=True):
         assert one.error is None
         assert one.motion == pytest.approx(other.motion, abs=1e-9)
 

@@ -15,6 +15,7 @@ from traci.storage import Storage
 
 from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import seen_in
+from merge_sumo.drivers.vuts.traci_commands import SPEED_MODE_AT_FIRST
 from merge_sumo.drivers.vuts.traci_session import Session
 from merge_sumo.sumo.beside import COLOURS, OPTIONS, TYPES, _edges, _types
 from merge_sumo.sumo.client import end_program, open_program
@@ -125,7 +126,7 @@ class Pair:
             self.real.simulationStep()
             x_m, v_mps = [], []
             for name in starts:
-                vehicle.setSpeedMode(name, 32)
+                vehicle.setSpeedMode(name, SPEED_MODE_AT_FIRST if name == "vut" else 32)
                 vehicle.setLaneChangeMode(name, 0)
                 vehicle.setSpeed(name, vehicle.getSpeed(name) + (0.05 if name == "vut" else -0.05))
                 x_m.append(begin[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name))
@@ -136,6 +137,81 @@ class Pair:
     def close(self) -> None:
         self.session.close()
         end_program(self.process)
+
+
+class Drive:
+    """A session and a SUMO program in which the VUT drives as it is commanded, step by step.
+
+    The session's VUT is moved by eq. (4) and the scenario's limits. Both start anew in `begin`, but
+    for the programs.
+    """
+
+    def __init__(self, folder) -> None:
+        self.road = road_of()
+        (folder / TYPES).write_bytes(_types(self.road, US23, 2))
+        files = ("--net-file", str(self.road.path), "--additional-files", str(folder / TYPES))
+        self.process, self.real = open_program("sumo", [*files, *OPTIONS])
+        self.real.route.add("route.vut", _edges(self.road.ramp))
+        self.notes: list[str] = []
+        self.session = Session(self.road, US23, note=self.notes.append)
+
+    def begin(self) -> None:
+        before = self.session.beside
+        if before is not None:
+            before.show({})
+            _as_at_first(before._connection)
+        self.session = Session(self.road, US23, note=self.notes.append)
+        self.session.beside = before
+        self.notes.clear()
+        self.ours = ToSession(self.session)
+        _as_at_first(self.real)
+        if "vut" in self.real.vehicle.getIDList():
+            self.real.vehicle.remove("vut")
+        self.real.vehicle.add("vut", "route.vut", typeID="vut", departSpeed="18")
+        self.real.simulationStep()
+        self.real.vehicle.setSpeedMode("vut", SPEED_MODE_AT_FIRST)
+        self.real.vehicle.setLaneChangeMode("vut", 0)
+        self.real.vehicle.setColor("vut", COLOURS[1])
+        self.real.vehicle.setSpeed("vut", 18.0)
+        self.again()
+
+    def again(self) -> None:
+        """Let the vehicles of the session depart, after they have arrived."""
+        if self.session.vehicles:
+            self.session.clear(more=True)
+        self.x_m, self.v_mps = [-250.0, -182.0], [30.0, 18.0]
+        self._show()
+
+    def both(self, ask):
+        return ask(self.ours), ask(self.real)
+
+    def step(self) -> None:
+        a_mps2 = self.session.acceleration_mps2()
+        a_mps2 = min(max(a_mps2, US23.a_min_mps2), US23.a_max_mps2)
+        self.x_m = [x + v * DT_S for x, v in zip(self.x_m, self.v_mps, strict=True)]
+        self.v_mps[1] = max(self.v_mps[1] + a_mps2 * DT_S, 0.0)
+        self._show()
+        self.real.simulationStep()
+
+    def speeds(self) -> tuple[float, float]:
+        ours, real = self.both(lambda c: c.vehicle.getSpeed("vut"))
+        return ours, real
+
+    def _show(self) -> None:
+        self.session.show(seen_in(self.session.steps * DT_S, POV, self.x_m, self.v_mps))
+
+    def close(self) -> None:
+        self.session.close()
+        end_program(self.process)
+
+
+def _as_at_first(connection: Any) -> None:
+    """Give the VUT's type the numbers that it had."""
+    vehicletype = connection.vehicletype
+    vehicletype.setMaxSpeed("vut", road_of().speed_limit_mps)
+    vehicletype.setAccel("vut", US23.a_max_mps2)
+    vehicletype.setDecel("vut", -US23.a_min_mps2)
+    vehicletype.setEmergencyDecel("vut", -US23.a_min_mps2)
 
 
 def questions() -> Iterator[tuple[str, str, tuple[Any, ...]]]:

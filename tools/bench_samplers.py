@@ -158,10 +158,10 @@ def print_times(names: list[str]) -> None:
         print(f"{name:30s}" + " ".join(f"{s:7.2f}" for s in seconds), flush=True)
 
 
-def print_trials(seeds: int, first: int) -> None:
+def print_trials(trials: Sequence[str], seeds: int, first: int) -> None:
     """Print how samplers search VUTs on which nothing was tuned."""
     print("FMC / truth" + " ".join(f"{f'N={n}':>7s}" for n in SHOWN) + " lowest   all regions")
-    for trial in TRIALS:
+    for trial in trials:
         vut = f"{Path(__file__).with_name('trial_vuts.py')}:{trial}"
         plan = GroundPlan(vut=vut_factory(vut), corridors=32, net=road_of(), povs=Povs())
         for level in LEVELS:
@@ -182,15 +182,21 @@ def main() -> None:
     parser.add_argument("--samplers", default=",".join(SAMPLERS))
     parser.add_argument("--ablate", action="store_true", help="change the choices of gpr")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--trials", action="store_true", help="search VUTs unlike ours")
+    parser.add_argument(
+        "--trials",
+        nargs="*",
+        choices=TRIALS,
+        metavar="NAME",
+        help=f"search VUTs unlike ours: all, or some of {', '.join(TRIALS)}",
+    )
     parser.add_argument("--time", action="store_true", help="time batches up to N = 5,000")
     options = parser.parse_args()
     names = options.samplers.split(",")
     if options.time:
         print_times(names)
         return
-    if options.trials:
-        print_trials(options.seeds, options.first)
+    if options.trials is not None:
+        print_trials(options.trials or TRIALS, options.seeds, options.first)
         return
     truth = ground_truth(options.vut, options.level)
     print(f"{options.vut}, level {options.level}, FMC of the truth {fmc(truth.failures):.4f}")

@@ -7,8 +7,9 @@ It trusts neither the lattice nor the sentence, and shares no code with what wro
 1. the hashes: of certificate.json, and of all cases and verdicts;
 2. that the cases cover the pool: whatever place of the pool one takes as the centre of a ball of
    the radius, in coordinates of the unit cube, a case is in the ball. The cases may be any points;
-3. that the counts are those of the verdicts, that "certain" is said only where no case fails or has
-   no verdict, and that failing is a score below -500, which it is by every criterion.
+3. that the counts are those of the verdicts, that "certain" is said only where no case fails, has
+   no verdict or ended otherwise when it was run twice, and that failing is a score below -500,
+   which it is by every criterion.
 
 The second is decided exactly, but for rounding: the Voronoi cells of the cases, cut off at the
 faces, fill the pool, so the farthest place from all cases is a corner of such a cell. Cutting off
@@ -139,10 +140,14 @@ def check(folder: Path) -> tuple[list[str], list[str]]:
             f"{named}: {failures} cases fail, {untold} gave no verdict and {odd} contradict "
             "themselves, which is not what is stated",
         )
-        bad += failures + untold
+        bad += failures + untold + int(counted["otherwise"])
         low, high = (
             np.array([float(axis[end]) for axis in stated["coordinates"]])
             for end in ("low", "high")
+        )
+        pool = ", ".join(
+            f"{axis['field']} from {axis['low']:g} to {axis['high']:g}"
+            for axis in stated["coordinates"]
         )
         points = np.round((np.concatenate(parts) - low) / (high - low), 12)
         if not ((points >= 0.0) & (points <= 1.0)).all():
@@ -151,8 +156,8 @@ def check(folder: Path) -> tuple[list[str], list[str]]:
         far = farthest(points, radius)
         note(
             far <= radius * (1.0 + ROUNDING),
-            f"{named}: no place of the pool is farther than {far:.6f} from a case: every ball of "
-            f"radius {radius:g} has one",
+            f"{named}: no place of the pool, {pool}, is farther than {far:.6f} from a case: every "
+            f"ball of radius {radius:g} has one",
             f"{named}: a place of the pool is farther than {radius:g} from every case",
         )
     note(

@@ -48,11 +48,12 @@ def row(vut: str, cases: int, workers: int | None) -> str:
             )
             with open_workers(settings.workers(workers)) as there:
                 run = run_campaign(settings, Path(folder) / str(level), net, workers=there)
+                failing = avoidance(run, settings, net, workers=there)
             found = summarise(run.outcomes, (level,)).levels[level]
             failures.append(found.failures)
             coverage.append(f"{found.fmc:.4f}")
             timeouts += sum(o.measures.end is End.TIMEOUT for o in run.outcomes)
-            for one in avoidance(run, settings, net):
+            for one in failing:
                 known += 1
                 avoided += one.by_careful
                 if one.careful_until_s is not None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from merge_sumo.drivers.vuts.traci_session import ASKS, DRIVES, SET_VEHICLE, changes_nothing
+from merge_sumo.drivers.vuts.traci_commands import Kind, kind_of, reason_against
+from merge_sumo.drivers.vuts.traci_session import ASKS
 from merge_sumo.drivers.vuts.traci_variables import GETTERS
 from merge_sumo.sumo.traci_names import Named, named
 
@@ -23,9 +24,11 @@ answers itself. The rest is passed on to a SUMO beside it, which is started for 
 question and has the same vehicles in the same state; it holds up the first answer by a fraction \
 of a second. A question about an object that there is not is refused as by SUMO.
 
-Commands drive the VUT, or they are accepted because they can change nothing here (which is noted \
-once in `controller.log`), or they are refused by name, as an error of that command: the \
-connection stays.
+Commands drive the VUT, which moves as a car that is commanded in SUMO in speed mode 38: limits of \
+acceleration and speed that a controller sets act, SUMO's checks of safe speed, right of way and \
+red lights do not. Or they are kept for what SUMO answers, or accepted because they can change \
+nothing here (all of which is noted once in `controller.log`), or they are refused by name and \
+with a reason, as an error of that command: the connection stays.
 """
 
 
@@ -38,16 +41,20 @@ def sections() -> Iterator[str]:
     for domain, mine in sorted(domains.items(), key=lambda item: (item[0] != "vehicle", item[0])):
         asks = [f for f in mine if f.command in ASKS]
         sets = [f for f in mine if f.command not in ASKS]
-        driving = [f for f in sets if f.command == SET_VEHICLE and f.variable in DRIVES]
-        accepted = [f for f in sets if f not in driving and changes_nothing(f.functions)]
         own = [f for f in asks if f.variable in GETTERS.get(f.command, {})]
         yield f"\n## {domain}\n"
+        refused: dict[str, list[Named]] = {}
+        for found in sets:
+            if kind_of(found.functions) is Kind.REFUSED:
+                refused.setdefault(reason_against(found.functions), []).append(found)
         for what, those in (
             ("Answered here", own),
             ("Answered by SUMO", [f for f in asks if f not in own]),
-            ("Drives the VUT", driving),
-            ("Accepted, changes nothing", accepted),
-            ("Refused", [f for f in sets if f not in driving and f not in accepted]),
+            *(
+                (kind.value, [f for f in sets if kind_of(f.functions) is kind])
+                for kind in (Kind.DRIVES, Kind.KEPT, Kind.NOTHING)
+            ),
+            *((f"Refused ({reason})", those) for reason, those in refused.items()),
         ):
             names = sorted(n.partition(".")[2] for f in those for n in f.functions)
             if names:

@@ -6,7 +6,8 @@ of it:
 - by each reference driver in the VUT's place, from the start;
 - by a careful driver who takes over: until some time the VUT does what it did, by its recorded
   accelerations, and from then on the driver is at the wheel, who has to perceive and react first.
-  That is tried every half second, and after the last success every step;
+  The last such time is sought, of every half second and then of every step after that, from the
+  end backwards: there is none that is not looked at behind the one that is found;
 - with a careful driver on the mainline in the POV's place, against what the VUT did.
 
 avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases;
@@ -19,41 +20,48 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, world_to_itself
+from merge_sumo.campaigns.conductor import workers_or_here
+from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, opened_ground
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.drivers.pov import PovLibrary
-from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
+from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.sumo.world import World
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.values.score import Outcome, verdict
+from merge_sumo.values.trajectory import End, Trajectory
 
 AVOIDANCE: Final = "avoidance.jsonl"
 CAREFUL: Final = "careful"
 """The reference driver that takes over, and that the headline counts."""
 MOST: Final = 500
-"""Failures that are driven again, the worst: each takes some thirty episodes."""
+"""Failures that are driven again, the worst: each takes some fifteen episodes."""
 EVERY_STEPS: Final = 5
 """A take-over is tried every half second first."""
+CHUNK: Final = 64
+"""Failures that a worker takes at a time: enough to keep all corridors busy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,27 +105,49 @@ class _Again(Case):
     careful_pov: bool = False
 
 
-def avoidance(run: Run, settings: CampaignSettings, net: Corridor) -> list[Avoidance]:
+def avoidance(
+    run: Run,
+    settings: CampaignSettings,
+    net: Corridor,
+    *,
+    workers: Workers | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> list[Avoidance]:
     """Return who would have avoided each failure of a campaign, in the order of its cases.
 
-    Of more than `MOST` failures, of the worst ones. Failures whose trajectory is lost are left out.
-    The POVs are those of `settings`; a POV of the tester's own runs again.
+    Of more than `MOST` failures, of the worst ones. Failures whose trajectory is lost, and those
+    that end a worker each time, are left out. The POVs are those of `settings`; a POV of the
+    tester's own runs again.
+
+    Args:
+        run: the campaign.
+        settings: what it was run with.
+        net: the road.
+        workers: where the failures are driven again, by default in this process.
+        check: called whenever a worker is done with some of them; may raise to stop there.
     """
     found = sorted(failures(run.outcomes)[:MOST], key=lambda outcome: outcome.index)
-    motion = {o.index: kept for o in found if (kept := _trajectory(run, o)) is not None}
-    failing = [outcome for outcome in found if outcome.index in motion]
-    if not failing:
+    known = {o.index: motion for o in found if (motion := _trajectory(run, o)) is not None}
+    if not known:
         return []
-    corridors = settings.povs.corridors(MAX_CORRIDORS, settings.scenario.vehicles - 1)
-    own = settings.povs.own
-    car_type = None if own is None else own.vut.vut_type
-    with ExitStack() as opened:
-        opened.enter_context(world_to_itself())
-        world = World(corridors, net, None, settings.scenario, car_type)
-        opened.callback(world.close)
-        povs = _Mainline(corridors * (world.vehicles - 1), settings.povs, world)
-        opened.callback(povs.close)
-        return _avoidance(run, failing, motion, world, povs)
+    # No code of the VUT: a driver of the package is in its place.
+    plan = GroundPlan(
+        vut=vut_factory(CAREFUL),
+        corridors=MAX_CORRIDORS,
+        net=net,
+        scenario=settings.scenario,
+        povs=settings.povs.with_log(run.folder.resolve() / LOG),
+        criterion=run.criterion,
+    )
+    again, failing = partial(_drive_again, plan), list(known.items())
+    avoided: list[Avoidance] = []
+    with workers_or_here(workers) as there:
+        size = min(CHUNK, math.ceil(len(failing) / there.count))
+        with closing(there.run(again, failing, _nothing_known, chunk=size)) as results:
+            for _, one in results:
+                avoided += [] if one is None else [one]
+                check()
+    return sorted(avoided, key=lambda one: one.index)
 
 
 def _trajectory(run: Run, outcome: Outcome) -> Trajectory | None:
@@ -127,100 +157,128 @@ def _trajectory(run: Run, outcome: Outcome) -> Trajectory | None:
         return None
 
 
-def _avoidance(
-    run: Run,
-    failing: Sequence[Outcome],
-    motion: Mapping[int, Trajectory],
-    world: World,
-    povs: Driver,
-) -> list[Avoidance]:
-    rows = max(len(kept.motion) for kept in motion.values())
-    substitutes, lines = _Substitutes(world.corridors, rows), centre_lines(world.road)
+_Failure = tuple[int, Trajectory]
+"""The index of a failing case, and what happened in it."""
 
-    def pass_again(asked: Sequence[tuple[int, dict[str, Any]]]) -> list[bool]:
-        """Return which episodes are passed: (index of the failure, what is different)."""
-        cases = [_again(motion[index], **other) for index, other in asked]
-        passed = [False] * len(cases)
-        for place, trajectory in rollout(world, povs, substitutes, cases):
-            passed[place] = _passes(run, trajectory, lines)
-        return passed
 
-    steps = {index: len(kept.motion) - 1 for index, kept in motion.items()}
-    asked: list[tuple[int, dict[str, Any]]] = []
-    for o in failing:
-        asked += [(o.index, {"by": name}) for name in REFERENCES if name != CAREFUL]
-        asked.append((o.index, {"until": steps[o.index], "careful_pov": True}))
-        asked += [(o.index, {"until": n}) for n in range(0, steps[o.index], EVERY_STEPS)]
-    avoided: dict[int, set[str]] = {o.index: set() for o in failing}
-    last: dict[int, int] = {}
-    pov_careful: set[int] = set()
-    for (index, other), passed in zip(asked, pass_again(asked), strict=True):
-        if not passed:
-            continue
-        if "careful_pov" in other:
-            pov_careful.add(index)
-        elif "by" in other:
-            avoided[index].add(other["by"])
+def _nothing_known(_: _Failure) -> None:
+    """Return what is said of a failure that ended every worker that drove it again."""
+
+
+def _drive_again(plan: GroundPlan, failing: Sequence[_Failure]) -> list[Avoidance | None]:
+    """Return who would have avoided failures, by driving them again in this process."""
+    found = [_Found(failure) for _, failure in failing]
+    searches = [one.take_over() for one in found]
+    searches += [one.on_the_mainline() for one in found]
+    # One driver after the other: who is in no corridor costs nothing.
+    searches += [one.in_its_place(by) for by in REFERENCES if by != CAREFUL for one in found]
+    lines = centre_lines(plan.net)
+    with opened_ground(plan) as ground:
+        world, povs = ground.world, _Mainline(ground.pov)
+        substitutes = _Substitutes(world.corridors, plan.scenario.max_steps)
+        waiting = deque((search, case) for search in searches for case in islice(search, 1))
+
+        def cases(begun: list[_Search]) -> Iterator[Case]:
+            while waiting:
+                search, case = waiting.popleft()
+                begun.append(search)
+                yield case
+
+        while waiting:
+            begun: list[_Search] = []
+            for place, trajectory in rollout(world, povs, substitutes, cases(begun)):
+                try:
+                    case = begun[place].send(_passes(plan.criterion, trajectory, lines))
+                except StopIteration:
+                    continue
+                waiting.appendleft((begun[place], case))
+    return [one.avoidance(index) for (index, _), one in zip(failing, found, strict=True)]
+
+
+_Search = Generator[_Again, bool, None]
+"""Yields what is to be driven next, and is sent whether it was passed."""
+
+
+class _Found:
+    """What is known of a failure that is driven again, and what is asked about it."""
+
+    def __init__(self, failure: Trajectory) -> None:
+        """Take the failure."""
+        case = failure.case
+        self._same = {f.name: getattr(case, f.name) for f in fields(Case)}
+        self._recorded = failure.a_vut_mps2[: case.scenario.max_steps + 1]
+        self._steps = len(self._recorded) - 1
+        self._avoided_by: set[str] = set()
+        self._until: int | None = None
+        self._pov_careful = False
+
+    def take_over(self) -> _Search:
+        """Search the last step at which a careful driver may take over, from the end backwards."""
+        for until in reversed(range(0, self._steps, EVERY_STEPS)):
+            if (yield self._again(until=until)):
+                break
         else:
-            last[index] = other["until"]
-            if other["until"] == 0:
-                avoided[index].add(CAREFUL)
-    later = [
-        (index, {"until": n})
-        for index, coarse in last.items()
-        for n in range(coarse + 1, min(coarse + EVERY_STEPS, steps[index]))
-    ]
-    for (index, other), passed in zip(later, pass_again(later), strict=True):
-        if passed:
-            last[index] = max(last[index], other["until"])
-    return [
-        Avoidance(
-            o.index,
-            tuple(name for name in REFERENCES if name in avoided[o.index]),
-            round(last[o.index] * DT_S, 1) if o.index in last else None,
-            o.index in pov_careful,
-        )
-        for o in failing
-    ]
+            return
+        self._until = until
+        for later in reversed(range(until + 1, min(until + EVERY_STEPS, self._steps))):
+            if (yield self._again(until=later)):
+                self._until = later
+                break
+        if until == 0 or (yield self._again()):
+            self._avoided_by.add(CAREFUL)
+
+    def in_its_place(self, name: str) -> _Search:
+        """Ask whether a reference driver passes it in the VUT's place."""
+        if (yield self._again(by=name)):
+            self._avoided_by.add(name)
+
+    def on_the_mainline(self) -> _Search:
+        """Ask whether a careful driver on the mainline avoids it against what the VUT did."""
+        self._pov_careful = yield self._again(until=self._steps, careful_pov=True)
+
+    def avoidance(self, index: int) -> Avoidance:
+        """Return what was found."""
+        names = tuple(name for name in REFERENCES if name in self._avoided_by)
+        until_s = None if self._until is None else round(self._until * DT_S, 1)
+        return Avoidance(index, names, until_s, self._pov_careful)
+
+    def _again(self, **other: Any) -> _Again:
+        return _Again(**self._same, recorded=self._recorded, **other)
 
 
-def _again(failure: Trajectory, **other: Any) -> _Again:
-    same = {f.name: getattr(failure.case, f.name) for f in fields(Case)}
-    return _Again(**same, recorded=failure.a_vut_mps2, **other)
-
-
-def _passes(run: Run, trajectory: Trajectory, lines: CentreLines) -> bool:
-    """Return whether an episode ends at M without a failure, by the criterion of the campaign."""
-    outcome = run.criterion.outcome(0, 0, trajectory, lines)
+def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) -> bool:
+    """Return whether an episode ends at M without a failure."""
+    if criterion.is_papers:  # which needs no measures
+        return verdict(trajectory) is End.MERGED
+    outcome = criterion.outcome(0, 0, trajectory, lines)
     return outcome.measures.end.is_tested and not outcome.failed
 
 
 class _Substitutes(Driver):
     """Drives in the VUT's place: first what the VUT did, then a reference driver."""
 
-    def __init__(self, corridors: int, rows: int) -> None:
+    def __init__(self, corridors: int, steps: int) -> None:
+        """Prepare for a number of corridors, and for failures of at most so many steps."""
         super().__init__(corridors)
         self._drivers = {name: make(corridors) for name, make in REFERENCES.items()}
         self._by = np.zeros(corridors, dtype=np.int64)
         self._until = np.zeros(corridors, dtype=np.int64)
-        self._recorded = np.zeros((rows, corridors))
+        self._recorded = np.zeros((steps + 1, corridors))
 
     def begin(self, corridor: int, case: Case) -> None:
         assert isinstance(case, _Again), "only failures are driven again"  # noqa: S101
         self._by[corridor] = list(self._drivers).index(case.by)
         self._until[corridor] = case.until
         self._recorded[: len(case.recorded), corridor] = case.recorded
-        for driver in self._drivers.values():
-            driver.begin(corridor, case)
+        self._drivers[case.by].begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
         recorded = scene.step < self._until
         row = np.minimum(scene.step, len(self._recorded) - 1)
         answer: FloatArray = self._recorded[row, np.arange(self.corridors)]
         for number, driver in enumerate(self._drivers.values()):
-            mine = scene.active & (self._by == number)
-            if mine.any():
-                drives = mine & ~recorded
+            drives = scene.active & ~recorded & (self._by == number)
+            if drives.any():
                 answer[drives] = driver.act(scene)[drives]
                 driver.forget_risk(recorded)
         return answer
@@ -229,33 +287,41 @@ class _Substitutes(Driver):
 class _Mainline(Driver):
     """Drives the cars of the mainline: the POVs of the campaign, or a careful driver."""
 
-    def __init__(self, corridors: int, povs: Povs, world: World) -> None:
-        super().__init__(corridors)
-        self._povs = PovLibrary(corridors, povs, world)
-        self._careful = CarefulPov(corridors)
-        self._is_careful = np.zeros(corridors, dtype=np.bool_)
+    def __init__(self, povs: Driver) -> None:
+        """Take the drivers of the POVs."""
+        super().__init__(povs.corridors)
+        self._povs = povs
+        self._careful = CarefulPov(povs.corridors)
+        self._is_careful = np.zeros(povs.corridors, dtype=np.bool_)
 
     def begin(self, corridor: int, case: Case) -> None:
-        self._povs.begin(corridor, case)
-        self._careful.begin(corridor, case)
         self._is_careful[corridor] = isinstance(case, _Again) and case.careful_pov
+        (self._careful if self._is_careful[corridor] else self._povs).begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
-        answer = self._povs.act(scene)
-        if not self._is_careful.any():
-            return answer
-        return np.where(self._is_careful, self._careful.act(scene), answer)
+        careful = scene.active & self._is_careful
+        if not careful.any():
+            return self._povs.act(scene)
+        others = scene._replace(active=scene.active & ~careful)
+        return np.where(careful, self._careful.act(scene), self._povs.act(others))
 
     def reason(self, corridor: int) -> str | None:
         return self._povs.reason(corridor)
 
-    def close(self) -> None:
-        self._povs.close()
 
+def note_avoidance(
+    run: Run,
+    settings: CampaignSettings,
+    net: Corridor,
+    *,
+    workers: Workers | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> str | None:
+    """Find and write who would have avoided the failures of a campaign; return it in a sentence.
 
-def note_avoidance(run: Run, settings: CampaignSettings, net: Corridor) -> str | None:
-    """Find and write who would have avoided the failures of a campaign; return it in a sentence."""
-    found = avoidance(run, settings, net)
+    The arguments are those of `avoidance`.
+    """
+    found = avoidance(run, settings, net, workers=workers, check=check)
     if not found:
         return None
     write_avoidance(run.folder, found)

@@ -3,8 +3,9 @@
 A search says where it found failures, and nothing of where it did not look. A certificate says: in
 every ball of a radius, in coordinates of the unit cube and with its centre in the pool, there is a
 case that was run and did not fail. So no such ball fails throughout; and as the simulation is
-deterministic, that is certain and no estimate. What it does not say: that there is no failure at
-all. A region that is thinner than the balls may lie between the cases.
+deterministic, that is certain and no estimate. A VUT may not be: some cases run twice, and where
+one does not end as before, nothing is certain. What a certificate does not say: that there is no
+failure at all. A region that is thinner than the balls may lie between the cases.
 
 certificate.json       what was tested, by what, on which lattice; in the end what was found, hashes
 level-2/00007.npz      a block of the cases of a level, as they were run, and what became of them
@@ -18,59 +19,40 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.campaigns.certificate_runs import CaseResult, RunPoints
 from merge_sumo.campaigns.covering import Covering, covering
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, run_cases
 from merge_sumo.campaigns.settings import CampaignSettings, differences, record_of
 from merge_sumo.campaigns.truth import OnCases, sources_sha256
 from merge_sumo.drivers.vuts.files import Files, changed
-from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
-from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import Case, FloatArray, Pool
+from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import Dimension, level_name
-from merge_sumo.values.score import Outcome
 
 CERTIFICATE: Final = "certificate.json"
 BLOCK: Final = 2000
 """Cases in a file: what a kill may lose."""
 WORST: Final = 20
 """Failures of a level that are named."""
+TWICE: Final = 100
+"""Cases of a level that run twice: at most so many, and a quarter of them."""
 OF_A_SEARCH: Final = (
     *("sampler", "cases", "batch", "seed", "stop_after_converged", "learn_from"),
     *("in_process", "policies"),
 )
 """Settings of a campaign that decide nothing here."""
 UNITS: Final = {"_mps": "m/s", "_m": "m", "_rad": "rad", "_s": "s"}
-
-
-class CaseResult(NamedTuple):
-    """What became of a case: its coordinates as they were run, and the verdict.
-
-    `told` is whether there was one: the VUT reached the merge point, or failed.
-    """
-
-    case: tuple[float, ...]
-    score: float
-    failed: bool
-    told: bool
-    files: Files
-
-
-RunPoints = Callable[[int, FloatArray], Iterable[tuple[int, CaseResult]]]
-"""Runs the cases at points, (n, d), of a level's unit cube; gives (place, result) in any order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +63,8 @@ class Found:
         cases: how many were run.
         failures: how many of them fail.
         untold: how many gave no verdict: errors, and timeouts unless they are failures.
+        twice: how many were run once more, in another order.
+        otherwise: how many of these did not end as before, to the last bit of their score.
         sha256: of all cases and verdicts, in their order.
         worst: the failures with the lowest scores, coordinates by name, with their score.
     """
@@ -88,6 +72,8 @@ class Found:
     cases: int
     failures: int
     untold: int
+    twice: int
+    otherwise: int
     sha256: str
     worst: list[dict[str, float]]
 
@@ -103,7 +89,7 @@ class Certificate:
     @property
     def certain(self) -> bool:
         """Whether no ball of the radius fails throughout."""
-        return not any(found.failures or found.untold for found in self.levels.values())
+        return not any(f.failures or f.untold or f.otherwise for f in self.levels.values())
 
 
 def certify(
@@ -157,10 +143,12 @@ def certify(
                 replace_own(folder / CERTIFICATE, _text(asked | {"files": files, "found": None}))
             replace_own(_block_file(place, number), block)
             check()
-    found = {
-        level: _found(_place(folder, level), lattice, settings.scenario.dimensions(level))
-        for level, lattice in lattices.items()
-    }
+    found = {}
+    for level, lattice in lattices.items():
+        place, dims = _place(folder, level), settings.scenario.dimensions(level)
+        twice = _twice(place, lattice, partial(run, level))
+        found[level] = _found(place, lattice, dims, twice)
+        check()
     said = _sentence(radius, found, settings)
     done = Certificate(radius, found, said)
     result = {
@@ -179,53 +167,6 @@ def lattices_of(settings: CampaignSettings, radius: float) -> dict[int, Covering
         level: covering(radius, len(settings.scenario.dimensions(level)))
         for level in settings.levels
     }
-
-
-def runs_points_on(
-    workers: Workers, settings: CampaignSettings, net: Corridor, folder: Path
-) -> RunPoints:
-    """Return what runs points on workers; what a controller prints goes to the folder's log."""
-    log = folder.resolve() / LOG
-    plan = GroundPlan(
-        vut=settings.vut_factory.with_log(log),
-        corridors=MAX_CORRIDORS,
-        net=net,
-        scenario=settings.scenario,
-        povs=settings.povs.with_log(log),
-        criterion=settings.criterion,
-    )
-
-    def run(level: int, points: FloatArray) -> Iterable[tuple[int, CaseResult]]:
-        pool, rows = settings.pool, cast("Sequence[FloatArray]", points)
-
-        def lost(point: FloatArray) -> CaseResult:
-            case = pool.cases(np.asarray(point)[None], level)[0]
-            return CaseResult(_values(case), math.nan, failed=False, told=False, files={})
-
-        return workers.run(partial(_run, plan, pool, level), rows, lost)
-
-    return run
-
-
-def _run(
-    plan: GroundPlan, pool: Pool, level: int, points: Sequence[FloatArray]
-) -> Sequence[CaseResult]:
-    ran = run_cases(plan, pool.cases(np.asarray(points), level))
-    # One dictionary for a chunk: it travels once.
-    files = ran[0].files | ran[0].pov_files if ran else {}
-    return [_result(done, files) for done in ran]
-
-
-def _result(done: Ran, files: Files) -> CaseResult:
-    """Return what a certificate keeps of a case, by the criterion of the plan."""
-    case = done.trajectory.case
-    outcome = Outcome(0, 0, case, done.measures, margin=done.margin)
-    score = math.nan if outcome.score is None else outcome.score
-    return CaseResult(_values(case), score, outcome.failed, outcome.is_tested, files)
-
-
-def _values(case: Case) -> tuple[float, ...]:
-    return tuple(getattr(case, d.field) for d in case.scenario.dimensions(case.level))
 
 
 def _asked(
@@ -326,7 +267,29 @@ def _read(place: Path, number: int, lattice: Covering) -> dict[str, NDArray[Any]
     return block if fits and all(block[n].dtype == kind for n, kind in types.items()) else None
 
 
-def _found(place: Path, lattice: Covering, dims: Sequence[Dimension]) -> Found:
+def _twice(
+    place: Path, lattice: Covering, run: Callable[[FloatArray], Iterable[tuple[int, CaseResult]]]
+) -> list[bool]:
+    """Run some cases of a level once more, the last ones first; return which end as before."""
+    count = min(TWICE, -(-len(lattice) // 4))
+    numbers = np.linspace(len(lattice) - 1, 0, count).astype(np.int64).tolist()
+    points = np.concatenate([lattice.points(number, number + 1) for number in numbers])
+    same = [False] * count
+    for nth, done in run(points):
+        block, row = divmod(numbers[nth], BLOCK)
+        was = _read(place, block, lattice)
+        verdict = np.array([*done.case, done.score, done.failed, done.told])
+        same[nth] = was is not None and np.array_equal(
+            verdict,
+            [*was["case"][row], was["score"][row], was["failed"][row], was["told"][row]],
+            equal_nan=True,
+        )
+    return same
+
+
+def _found(
+    place: Path, lattice: Covering, dims: Sequence[Dimension], twice: Sequence[bool]
+) -> Found:
     """Read the blocks of a level, one after the other."""
     sha256, failures, untold = hashlib.sha256(), 0, 0
     worst: list[tuple[float, list[float]]] = []
@@ -345,25 +308,31 @@ def _found(place: Path, lattice: Covering, dims: Sequence[Dimension]) -> Found:
         worst = sorted(worst)[:WORST]
     names = [d.field for d in dims]
     named = [dict(zip(names, case, strict=True)) | {"score": score} for score, case in worst]
-    return Found(len(lattice), failures, untold, sha256.hexdigest(), named)
+    digest, otherwise = sha256.hexdigest(), twice.count(False)
+    return Found(len(lattice), failures, untold, len(twice), otherwise, digest, named)
 
 
 def _sentence(radius: float, found: Mapping[int, Found], settings: CampaignSettings) -> str:
     most = max((settings.scenario.dimensions(level) for level in found), key=len)
     parts = [f"{radius * (d.high - d.low):.2g} {_unit(d)}" for d in most]
     ball = f"ball of radius {100.0 * radius:g} % of the axes ({', '.join(parts)})"
-    cases, failures, untold = (
+    cases, failures, untold, twice, otherwise = (
         sum(getattr(of_level, name) for of_level in found.values())
-        for name in ("cases", "failures", "untold")
+        for name in ("cases", "failures", "untold", "twice", "otherwise")
     )
     levels = "/".join(level_name(level) for level in found)
     tested = f"{settings.vut} v level {levels}, {cases:,} cases"
     said = f"no {ball} fails throughout: certain, the simulation is deterministic"
-    if failures:
+    if otherwise:
+        said = (
+            f"{failures or 'none'} fail, and nothing is certain: {otherwise} of {twice} that were "
+            "run twice did not end as before"
+        )
+    elif failures:
         said = f"{failures:,} fail: every {ball} that fails throughout holds one of them"
     elif untold:
         said = "none fails"
-    if untold:
+    if untold and not otherwise:
         said += (
             f"; {untold:,} gave no verdict, and no {ball if not failures else 'ball'} is certain "
             "in which there are no others"

@@ -154,14 +154,9 @@ _one_at_a_time = RLock()
 
 def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
     """Run cases on the proving ground of this process and return what became of each."""
-    with _one_at_a_time:
-        ground = _opened_ground(plan)
-        try:
-            ran = dict(ground.run(cases))
-            files = hashed(ground.vut.files()), hashed(ground.pov.files())
-        except BaseException:
-            _close_ground()  # it stands in the middle of episodes
-            raise
+    with opened_ground(plan) as ground:
+        ran = dict(ground.run(cases))
+        files = hashed(ground.vut.files()), hashed(ground.pov.files())
     lines = None if plan.criterion.is_papers else centre_lines(plan.net)
     done: list[Ran] = []
     for place in range(len(cases)):
@@ -169,6 +164,17 @@ def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
         margin = plan.criterion.margin(ran[place], measures, lines)
         done.append(Ran(measures, ran[place], *files, margin))
     return done
+
+
+@contextmanager
+def opened_ground(plan: GroundPlan) -> Iterator[ProvingGround]:
+    """Give the proving ground of this process, which stays open for who comes next with a plan."""
+    with _one_at_a_time:
+        try:
+            yield _opened_ground(plan)
+        except BaseException:
+            _close_ground()  # it stands in the middle of episodes
+            raise
 
 
 def _opened_ground(plan: GroundPlan) -> ProvingGround:
@@ -186,14 +192,6 @@ def _close_ground() -> None:
         if _kept is not None:
             ground, _kept = _kept[1], None
             ground.__exit__(None, None, None)
-
-
-@contextmanager
-def world_to_itself() -> Iterator[None]:
-    """Let who opens a world of their own do so: no other one is open in this process meanwhile."""
-    with _one_at_a_time:
-        _close_ground()
-        yield
 
 
 def lost_case(case: Case) -> Ran:
@@ -240,9 +238,8 @@ def runs_on(workers: Workers, plan: GroundPlan) -> OnWorkers:
 
 
 def _open_ground(plan: GroundPlan, nothing: Sequence[None]) -> Sequence[None]:
-    with _one_at_a_time:
-        _opened_ground(plan)
-    return nothing
+    with opened_ground(plan):
+        return nothing
 
 
 def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from merge_sumo.campaigns.settings import CampaignSettings
     from merge_sumo.reports.summary import Summary
     from merge_sumo.reports.verdict import Gate, Verdict
-    from merge_sumo.sumo.corridor import Corridor
 
 
 @app.command()
@@ -138,6 +137,7 @@ def campaign(
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
     """
     from merge_sumo.campaigns import conductor
+    from merge_sumo.campaigns.avoidance import note_avoidance
     from merge_sumo.campaigns.ground import road_for
     from merge_sumo.campaigns.run import read_settings
     from merge_sumo.campaigns.settings import (
@@ -152,7 +152,6 @@ def campaign(
     from merge_sumo.reports.report import check_report
     from merge_sumo.reports.verdict import parse_gates
     from merge_sumo.scenarios.scenario_file import named_scenario
-    from merge_sumo.scenarios.suggestion import unseen
     from merge_sumo.system.interrupt import Interrupt, Stopped
     from merge_sumo.system.workers import open_workers
 
@@ -193,49 +192,45 @@ def campaign(
     if junit is not None:
         check_junit(junit, folder)
     road = road_for(settings.scenario, net)
-    learned = {1, 2} & set(levels)
-    if resume is None and learned and unseen(settings.scenario, settings.povs.policies):
-        named = "" if policies is None else f" --policies {quoted(policies)}"
-        say(
-            f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
-            f"`merge-sumo scenario check {quoted(scenario)}{named}` says in what it differs"
-        )
+    if resume is None:
+        _say_unseen(settings, scenario, policies)
     title = f"{settings.vut} v level {'/'.join(map(level_name, levels))}"
     try:
         with (
             Interrupt("finishing the running batch; once more stops at once") as interrupt,
             open_workers(settings.workers(workers), dask) as there,
-            CampaignPanel(title, settings.cases, levels, quiet=quiet) as progress,
         ):
-            if resume is None:
-                run = conductor.run_campaign(
-                    settings,
-                    folder,
-                    road,
-                    progress.case_ended,
-                    workers=there,
-                    check=interrupt.check,
-                )
-            else:
-                run = conductor.resume_campaign(
-                    folder,
-                    road,
-                    progress.case_ended,
-                    on_before=progress.ran_before,
-                    given=given,
-                    force=force,
-                    workers=there,
-                    check=interrupt.check,
-                    warn=say,
-                    trust=trust_vut,
-                )
+            with CampaignPanel(title, settings.cases, levels, quiet=quiet) as progress:
+                if resume is None:
+                    run = conductor.run_campaign(
+                        settings,
+                        folder,
+                        road,
+                        progress.case_ended,
+                        workers=there,
+                        check=interrupt.check,
+                    )
+                else:
+                    run = conductor.resume_campaign(
+                        folder,
+                        road,
+                        progress.case_ended,
+                        on_before=progress.ran_before,
+                        given=given,
+                        force=force,
+                        workers=there,
+                        check=interrupt.check,
+                        warn=say,
+                        trust=trust_vut,
+                    )
+            careful = note_avoidance(run, settings, road, workers=there, check=interrupt.check)
     except Stopped:
         say(_how_to_go_on(folder, net, [gate.name for gate in gates], junit))
         raise
     if resume is None and level == "all" and not set(levels) >= set(LEVELS):
         named = ", ".join(map(level_name, levels))
         say(f"--level all: policies are there for level {named}; `merge-sumo train` makes others")
-    raise typer.Exit(0 if _conclude(run, settings, gates, junit, road, as_json=as_json) else 1)
+    raise typer.Exit(0 if _conclude(run, settings, gates, junit, careful, as_json=as_json) else 1)
 
 
 def _conclude(
@@ -243,19 +238,17 @@ def _conclude(
     settings: CampaignSettings,
     gates: list[Gate],
     junit: Path | None,
-    road: Corridor,
+    careful: str | None,
     *,
     as_json: bool,
 ) -> bool:
     """Write and print what a campaign found; return whether it passed."""
-    from merge_sumo.campaigns.avoidance import note_avoidance
     from merge_sumo.reports.junit import write_junit
     from merge_sumo.reports.report import write_report
     from merge_sumo.reports.summary import summarise
     from merge_sumo.reports.verdict import NOTHING_TESTED, judge
 
     link_latest(run.folder)
-    careful = note_avoidance(run, settings, road)
     report_file = write_report(run)
     summary = summarise(run.outcomes, settings.levels)
     verdict = judge(run.outcomes)
@@ -289,6 +282,19 @@ def _conclude(
     if not verdict.tested:
         say(NOTHING_TESTED)
     return passed
+
+
+def _say_unseen(settings: CampaignSettings, scenario: str, policies: Path | None) -> None:
+    """Say where the POVs were not trained on the scenario."""
+    from merge_sumo.scenarios.suggestion import unseen
+
+    learned = {1, 2} & set(settings.levels)
+    if learned and unseen(settings.scenario, settings.povs.policies):
+        named = "" if policies is None else f" --policies {quoted(policies)}"
+        say(
+            f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
+            f"`merge-sumo scenario check {quoted(scenario)}{named}` says in what it differs"
+        )
 
 
 def _given(context: typer.Context) -> dict[str, object]:

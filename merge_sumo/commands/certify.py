@@ -68,14 +68,17 @@ def certify(
 
     Tests a lattice that covers the pool: in every ball of that radius, in coordinates of the unit
     cube, there is a case of it. Where none of them fails, no such ball fails throughout: certain,
-    as the simulation is deterministic. A failing region that is thinner than the balls may be
-    between the cases. `tools/check_certificate.py` checks the folder, and shares nothing with it.
+    as the simulation is deterministic; that the VUT is, some cases that run twice are to show. A
+    failing region that is thinner than the balls may be between the cases.
+    `tools/check_certificate.py` checks the folder, and shares nothing with it.
 
-    Exit code 0 when it is certain, 1 when a case fails or gives no verdict.
+    Exit code 0 when it is certain, 1 when a case fails, gives no verdict or ends otherwise the
+    second time.
 
     Example:  merge-sumo certify --vut design2 --radius 0.01
     """
     from merge_sumo.campaigns import certificate
+    from merge_sumo.campaigns.certificate_runs import runs_points_on
     from merge_sumo.campaigns.ground import road_for
     from merge_sumo.campaigns.settings import CampaignSettings, parse_levels, povs_of
     from merge_sumo.drivers.vuts.base import VutOptions
@@ -117,7 +120,7 @@ def certify(
                 radius,
                 folder,
                 road,
-                certificate.runs_points_on(there, settings, road, folder),
+                runs_points_on(there, settings, road, folder),
                 resume=resume is not None,
                 on_cases=counter.ended,
                 check=interrupt.check,

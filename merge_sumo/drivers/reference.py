@@ -9,9 +9,10 @@ claim of compliance follows from it. It is the same for all of them:
   the gap is |dx| at M less `dx_crash_m`, the speeds are those at M.
 - A model says of gap and speeds how hard to brake; 0 is "no risk". It does so whether the VUT
   would lead or follow: who merges must neither run into a car nor make one run into it.
-- Without risk the VUT drives the level-0 profile. A risk has to last for the perception time; then,
-  for the reaction time, the VUT holds its speed; then it brakes as the model says, by its jerk, and
-  no harder than the scenario lets it.
+- Without risk the VUT drives the level-0 profile. A risk is perceived after the perception time;
+  then, for the reaction time, the VUT holds its speed; then it brakes as the model says, by its
+  jerk, and no harder than the scenario lets it. By eq. (4) a braking moves the vehicle one step
+  later: that step is the last of the reaction time. Who has reacted stays alert.
 - To give way is to fall behind. Where braking as hard as it can does not get the VUT behind the
   other any more, it goes on.
 """
@@ -39,7 +40,7 @@ class ReferenceDriver(Level0Vut):
     """Drives the level-0 profile, and gives way as a model says when it foresees a conflict at M.
 
     Attributes:
-        perception_s: a risk has to last for so long.
+        perception_s: a risk is perceived after so long.
         reaction_s: then the driver takes so long to brake.
         jerk_mps3: braking grows by so much a second.
         hardest_mps2: up to so much, positive, and never beyond the limit of the scenario.
@@ -115,10 +116,10 @@ class ReferenceDriver(Level0Vut):
     def _answer(self, demand: FloatArray, calm: FloatArray) -> FloatArray:
         """Return accelerations, (K,): braking by perception, reaction and jerk, else calm ones."""
         at_risk = demand > 0.0
-        self._risk_steps = np.where(at_risk, self._risk_steps + 1, 0)
+        self._risk_steps += at_risk
         lasted_s = (self._risk_steps - 1) * DT_S + 1e-9
         perceives = at_risk & (lasted_s >= self.perception_s)
-        brakes = at_risk & (lasted_s >= self.perception_s + self.reaction_s)
+        brakes = at_risk & (lasted_s >= self.perception_s + self.reaction_s - DT_S)
         most = np.minimum(demand, self.limit_mps2)
         harder = np.minimum(self._braking_mps2 + self.jerk_mps3 * DT_S, most)
         self._braking_mps2 = np.where(brakes, harder, 0.0)
@@ -156,19 +157,23 @@ class Reg157Vut(ReferenceDriver):
     """What R157 asks of lane-keeping systems in a cut-in (5.2.5.2), taken as a way to drive.
 
     A system has to avoid a collision where TTC > v_rel / (2 * 6 m/s2) + 0.35 s when the other
-    intrudes into its lane. So this one brakes by 6 m/s2 at once, 0.35 s after TTC is down to that.
+    intrudes into its lane. So this one brakes by 6 m/s2 at once, 0.35 s after TTC is down to that,
+    a step earlier: looking every 0.1 s, it would else be too late for what it has to avoid.
     """
 
     reaction_s = 0.35
     jerk_mps3 = np.inf
     hardest_mps2 = 6.0
+    late_s = DT_S
+    """TTC is down to the bound up to a step before it is seen to be."""
 
     def braking_mps2(
         self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
     ) -> FloatArray:
         """Return 6 m/s2 where the time to collision is not above the bound of R157."""
         bound_s = (v_rear_mps - v_front_mps) / (2.0 * self.hardest_mps2) + self.reaction_s
-        late = ttc_s(gap_m, v_rear_mps, v_front_mps) <= np.maximum(bound_s, 0.0)
+        times_s = ttc_s(gap_m, v_rear_mps, v_front_mps)
+        late = times_s <= np.maximum(bound_s + self.late_s, 0.0)
         return np.where(late, self.hardest_mps2, 0.0)
 
 

@@ -102,8 +102,8 @@ class _Work:
             fmc(truth.failures),
             len(truth.failures),
             len(truth.real_regions()),
+            None if dense is None else fmc(dense.failures),
             limit,
-            dense is not None,
             compared,
         )
         batch = self.scale.batch

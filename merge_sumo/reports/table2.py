@@ -89,24 +89,27 @@ def quick(seeds: int) -> Scale:
 class Result:
     """A column that has run: what the truth holds, and each sampler beside it.
 
-    `limit_fmc` is the coverage of all that is known to fail, with a `dense` truth or without.
+    `dense_fmc` is that of a dense truth, if there is one; `limit_fmc` is the coverage of all that
+    is known to fail.
     """
 
     column: Column
     truth_fmc: float
     truth_failures: int
     truth_regions: int
+    dense_fmc: float | None
     limit_fmc: float
-    dense: bool
     compared: dict[str, Comparison]
 
 
 def table_rows(
     table: Mapping[str, Result],
-) -> Iterator[tuple[str, list[tuple[float, float | None]]]]:
+) -> Iterator[tuple[str, list[tuple[float | None, float | None]]]]:
     """Yield the rows of the table: a name, and (ours, the paper's) for each column."""
     results = table.values()
     yield "truth", [(r.truth_fmc, r.column.paper["truth"]) for r in results]
+    if any(r.dense_fmc is not None for r in results):
+        yield "dense truth", [(r.dense_fmc, None) for r in results]
     yield "limit", [(r.limit_fmc, None) for r in results]
     for name in SAMPLERS:
         yield name, [(r.compared[name].fmc_median, r.column.paper.get(name)) for r in results]
@@ -117,9 +120,7 @@ def table_markdown(table: Mapping[str, Result]) -> str:
     lines = ["| FMC: ours (the paper's) | " + " | ".join(table) + " |"]
     lines.append("|---|" + "---|" * len(table))
     for name, pairs in table_rows(table):
-        cells = [
-            f"{ours:.4f} ({'-' if paper is None else f'{paper:.4f}'})" for ours, paper in pairs
-        ]
+        cells = [f"{_or_dash(ours, '.4f')} ({_or_dash(paper, '.4f')})" for ours, paper in pairs]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     for name in ADAPTIVE:
         cells = []
@@ -129,6 +130,11 @@ def table_markdown(table: Mapping[str, Result]) -> str:
             ours = result.compared[name].fmc_over_truth_median
             cells.append(f"{_or_dash(ours, '.2f')} ({_or_dash(share, '.2f')})")
         lines.append(f"| {name} / truth | " + " | ".join(cells) + " |")
+    if any(result.dense_fmc for result in table.values()):
+        for name in ADAPTIVE:
+            found = ((r.compared[name].fmc_median, r.dense_fmc) for r in table.values())
+            cells = [_or_dash(ours / dense if dense else None, ".3f") for ours, dense in found]
+            lines.append(f"| {name} / dense truth | " + " | ".join(cells) + " |")
     for name in ADAPTIVE:
         shares = (result.compared[name].fmc_over_limit_median for result in table.values())
         cells = [_or_dash(share, ".2f") for share in shares]
@@ -169,7 +175,7 @@ def table_record(table: Mapping[str, Result], scale: Scale) -> dict[str, Any]:
                 "truth_failures": result.truth_failures,
                 "truth_regions": result.truth_regions,
                 "limit_fmc": result.limit_fmc,
-                "dense": result.dense,
+                "dense_fmc": result.dense_fmc,
                 "paper_fmc": dict(result.column.paper),
                 "samplers": samplers,
             }

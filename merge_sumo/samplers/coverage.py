@@ -183,14 +183,13 @@ class _Search:
         worth = probability * (self._ground.new(balls) + EVEN_IF_COVERED)
         kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
         self._candidates, self._aim = candidates[kept], probability[kept]
-        self._balls = balls[kept]
         self._probability = (
             self._aim if limit is None else trusted(Belief(history), self._candidates)
         )
 
     def batch(self, n: int) -> Proposal:
         """Return the greedy batch of `n` cases."""
-        picks, gain = greedy(self._ground, self._balls, self._aim, self._probability, n)
+        picks, gain = greedy(self._ground, self._candidates, self._aim, self._probability, n)
         return Proposal(self._candidates[picks], gain, self._probability[picks], (None,) * n)
 
 

@@ -24,11 +24,11 @@ from merge_sumo.values.score import Outcome
 
 Known = Sequence[tuple[Outcome, Foretold]]
 
-WIDTHS: Final = np.array([0.03, 0.1, 0.35, 1.2])
+WIDTHS: Final = np.array([0.01, 0.03, 0.1, 0.35, 1.2])
 """How far gaps may be off, as standard deviations on the scale of `compressed`."""
 REACH: Final = 9.0
 """Length of that scale, on which a gap may be anywhere where nobody knows anything."""
-PRIOR: Final = np.array([0.5, 1.0, 1.0, 1.0, 0.5])
+PRIOR: Final = np.array([0.5, 0.5, 1.0, 1.0, 1.0, 0.5])
 """Cases that speak for each of the widths, and for anywhere, before there is a record."""
 EM_ROUNDS: Final = 12
 """Of expectation and maximisation, which learns how often gaps are how far off."""

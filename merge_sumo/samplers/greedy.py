@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.values.case import FloatArray
@@ -37,7 +36,7 @@ class Proposal:
 
 def greedy(
     ground: Ground,
-    balls: NDArray[np.int64],
+    points: FloatArray,
     aim: FloatArray,
     probability: FloatArray,
     n: int,
@@ -51,7 +50,7 @@ def greedy(
 
     Args:
         ground: what is covered before.
-        balls: those of m candidates, (m, places).
+        points: m candidates, (m, d).
         aim: what their balls are worth, (m,).
         probability: that they fail, (m,).
         n: how many are picked.
@@ -59,9 +58,10 @@ def greedy(
     """
     picks: list[int] = []
     gains: list[float] = []
-    free = np.ones(len(balls), dtype=bool)
+    free = np.ones(len(points), dtype=bool)
+    balls = ground.balls(points)
+    new = ground.new(balls)
     for number in range(n):
-        new = ground.new(balls)
         for_this = aim if last is None or number < n - 1 else last
         worth = np.where(free, for_this * (new + EVEN_IF_COVERED), -1.0)
         best = int(np.argmax(worth))
@@ -69,4 +69,6 @@ def greedy(
         picks.append(best)
         gains.append(float(probability[best] * new[best]))
         ground.cover(balls[best], max(PICKED, float(aim[best])))
+        near = np.linalg.norm(points - points[best], axis=1) <= ground.overlap
+        new[near] = ground.new(balls[near])
     return picks, np.array(gains)

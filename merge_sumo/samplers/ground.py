@@ -7,6 +7,7 @@ fills space evenly, and a ball is the nearest so many of them to its middle.
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from functools import lru_cache
 from typing import Final, Protocol, Self
@@ -18,8 +19,9 @@ from scipy.spatial import cKDTree
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import RADIUS, fmc, radius_for
 
-CELL: Final = {2: 0.01, 3: 0.0125}
-"""Spacing of the grid, per dimension, on which coverage is counted."""
+CELL: Final = {2: 0.0025, 3: 0.0125}
+"""Spacing of the grid, per dimension, on which coverage is counted. What a case adds late in a
+search is a sliver; in two dimensions a grid that shows it is cheap."""
 PLACES_PER_BALL: Final = 64
 """Places in a ball where there is no grid."""
 MARGIN: Final = 1.1
@@ -29,11 +31,16 @@ IntArray = NDArray[np.int64]
 
 
 class Ground:
-    """The unit cube with a margin, as places with the chance not to be covered."""
+    """The unit cube with a margin, as places with the chance not to be covered.
+
+    Attributes:
+        overlap: balls of points that are farther apart have no place in common.
+    """
 
     def __init__(self, dims: int) -> None:
         """Prepare an uncovered ground of `dims` dimensions."""
         self._places = _places(dims)
+        self.overlap: Final = self._places.overlap
         self._open = np.ones(self._places.count, dtype=np.float32)
 
     def copy(self) -> Self:
@@ -48,7 +55,7 @@ class Ground:
 
     def new(self, balls: IntArray) -> FloatArray:
         """Return the expected share of each ball that is not covered, (n,)."""
-        return np.asarray(self._open[balls].mean(axis=1), dtype=np.float64)
+        return np.asarray(self._open.take(balls).mean(axis=1), dtype=np.float64)
 
     def cover(self, balls: IntArray, probability: float) -> None:
         """Cover balls with a probability."""
@@ -65,10 +72,12 @@ class _Places(Protocol):
     Attributes:
         count: their number.
         per_ball: how many of them are in a ball.
+        overlap: balls of points that are farther apart have no place in common.
     """
 
     count: int
     per_ball: int
+    overlap: float
 
     def balls(self, points: FloatArray) -> IntArray: ...
 
@@ -86,6 +95,7 @@ class _Grid:
         inside = np.square(offsets * self._cell).sum(axis=1) <= RADIUS**2
         self._ball = offsets[inside] @ self._strides
         self.count, self.per_ball = side**dims, len(self._ball)
+        self.overlap = 2.0 * RADIUS + math.sqrt(dims) * self._cell
 
     def balls(self, points: FloatArray) -> IntArray:
         corner = np.rint((points + RADIUS) / self._cell).astype(np.int64) + 2
@@ -98,7 +108,7 @@ class _Scattered:
     def __init__(self, dims: int) -> None:
         from scipy.stats.qmc import Halton
 
-        self.per_ball = PLACES_PER_BALL
+        self.per_ball, self.overlap = PLACES_PER_BALL, math.inf
         margin = MARGIN * radius_for(dims)
         density = self.per_ball / fmc(np.zeros((1, dims)))
         self.count = round(density * (1.0 + 2.0 * margin) ** dims)

@@ -88,7 +88,7 @@ def informed_batch(
     points = np.concatenate(chosen)
     known = played(points)
     for _ in range(ROUNDS):
-        batch, _ = greedy(ground.copy(), ground.balls(points), known[-1], known[-1], n)
+        batch, _ = greedy(ground.copy(), points, known[-1], known[-1], n)
         centres = np.concatenate([best(points, known[-1], n), points[batch]])
         fresh = around(centres, REFINED, REFINED_REACH * reach, rng)
         points = np.concatenate([points, fresh])
@@ -106,7 +106,7 @@ def informed_batch(
         ground.cover(ground.balls(spread), PICKED)
     gaps_m, p_twin, p_surrogate, p_fail = known
     curious = record.doubt(gaps_m) if n >= EXPLORES_FROM else None
-    picks, gain = greedy(ground, ground.balls(points), p_fail, p_fail, n - len(first), curious)
+    picks, gain = greedy(ground, points, p_fail, p_fail, n - len(first), curious)
     picks, gain = first + picks, np.concatenate([np.ones(len(first)), gain])
     said = tuple(Foretold.of(gaps_m[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks)
     return Proposal(points[picks], gain * record.trust, p_fail[picks], said)

@@ -109,7 +109,8 @@ class Beside:
         point = path.point(state[0])
         edge, _, lane = point.lane.rpartition("_")
         # It is told its own speed behind the step; SUMO lets none depart faster than the limit.
-        fastest_mps = min(path.piece(state[0]).speed_limit_mps, self._road.speed_limit_mps)
+        own_mps = self._connection.vehicletype.getMaxSpeed(name)
+        fastest_mps = min(path.piece(state[0]).speed_limit_mps, own_mps)
         speed = {"departSpeed": str(min(state[1], fastest_mps))}
         if edge != _edges(path)[0]:
             return {"departLane": "best", **speed}

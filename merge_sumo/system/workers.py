@@ -82,7 +82,7 @@ class Workers:
         lost: Callable[[T], R],
         *,
         chunk: int | None = None,
-    ) -> Iterator[tuple[int, R]]:
+    ) -> Generator[tuple[int, R], None, None]:
         """Yield (place in `items`, result) as chunks end.
 
         Args:

@@ -19,7 +19,7 @@ from merge_sumo.values.trajectory import End, Trajectory
 
 REACTION_S: Final = 0.75
 """tau: from seeing the danger to braking, as the competent and careful driver of UN Regulation
-No. 157 (annex 4, appendix 3) takes."""
+No. 157 takes (`drivers/reference.py`)."""
 
 
 HARSH_MPS2: Final = 3.0

@@ -211,21 +211,26 @@ def score_of(margin: float) -> float:
     return FAILURE_SCORE * (1.0 - margin / (1.0 + abs(margin)))
 
 
+def verdict(trajectory: Trajectory) -> End:
+    """Return why an episode ended; COLLISION where the VUT arrived with |dx| < 6 m."""
+    x_m, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
+    collides = abs(x_m[trajectory.nearest] - x_m[VUT]) < crash_m
+    return End.COLLISION if trajectory.end is End.MERGED and collides else trajectory.end
+
+
 def measure(trajectory: Trajectory) -> Measures:
     """Return the verdict and the measures of an episode."""
     nearest = trajectory.nearest
     pair = trajectory.facing(nearest)
     (x_pov, v_pov, _), (x_vut, v_vut, _) = pair.motion[-1].tolist()
-    end, crash_m = trajectory.end, trajectory.case.scenario.dx_crash_m
-    arrived = end is End.MERGED
+    end, crash_m = verdict(trajectory), trajectory.case.scenario.dx_crash_m
     dx = dv = ttc = pet = drac = impact = first = avoidable = last_avoidable = None
-    if arrived:
+    if end.is_tested:
         dx, dv = x_pov - x_vut, v_pov - v_vut
         ttc = time_to_collision(dx, dv)
         pet = _post_encroachment_time(pair)
         first = "VUT" if dx < 0 else "POV"
-        if abs(dx) < crash_m:
-            end = End.COLLISION
+        if end is End.COLLISION:
             impact = abs(dv)
             last_avoidable = _last_avoidable_s(trajectory)
             avoidable = last_avoidable is not None

@@ -9,6 +9,7 @@ only words and signs of our own get to it.
 from __future__ import annotations
 
 import re
+import sys
 from difflib import get_close_matches
 from functools import lru_cache
 from typing import Any, Final
@@ -29,6 +30,8 @@ SIGNALS: Final = (
 """What a formula may speak of, at every step; of the car that is nearest to the VUT at M."""
 NEVER_S: Final = 100.0
 """The time to collision where no gap closes, and the longest."""
+LAST_PYTHON: Final = (3, 12)
+"""The last one that the parser of rtamt runs on."""
 WORDS: Final = (
     *("always", "eventually", "until", "historically", "once", "since", "not", "and", "or"),
     *("implies", "iff", "xor", "rise", "fall", "prev", "next", "abs"),
@@ -78,7 +81,12 @@ def try_formula(text: str) -> None:
     try:
         _robustness(text, {name: np.ones(2) for name in SIGNALS})
     except ImportError as error:
-        raise UserError("--require needs rtamt: pip install 'merge-sumo[stl]'") from error
+        how = "pip install 'merge-sumo[stl]'"
+        if sys.version_info[:2] > LAST_PYTHON:
+            how = "it runs up to Python {}.{}; use that, or a condition with --fail-when".format(
+                *LAST_PYTHON
+            )
+        raise UserError(f"--require needs rtamt: {how}") from error
     # A parser that is not ours.
     except Exception as error:
         raise UserError(

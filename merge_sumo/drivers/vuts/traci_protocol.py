@@ -160,10 +160,10 @@ def commands_of(body: bytes) -> list[Command]:
     return commands
 
 
-def value_of(body: bytes) -> bytes:
-    """Return the typed value in the answer to a question, without the message's length.
+def accepted(body: bytes) -> Reader:
+    """Return what follows the status in an answer, without the message's length.
 
-    Raises `AnsweredError` where the server has none, and `ProtocolError` for no such answer.
+    Raises `AnsweredError` where the server does not do it, and `ProtocolError` for no answer.
     """
     reader = Reader(body)
     _length(reader)
@@ -171,6 +171,15 @@ def value_of(body: bytes) -> bytes:
     result, said = reader.ubyte(), reader.string()
     if result != OK:
         raise AnsweredError(said)
+    return reader
+
+
+def value_of(body: bytes) -> bytes:
+    """Return the typed value in the answer to a question, without the message's length.
+
+    Raises `AnsweredError` where the server has none, and `ProtocolError` for no such answer.
+    """
+    reader = accepted(body)
     _length(reader)
     reader.raw(2)
     reader.string()

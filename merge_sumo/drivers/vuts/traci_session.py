@@ -6,13 +6,28 @@ The session has no socket and does not decide when a step is made. What there is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Final
 
 from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen
+from merge_sumo.drivers.vuts.traci_commands import (
+    LIMITS,
+    MODES,
+    OF_MODEL,
+    OWN_TYPE,
+    SET_VEHICLE,
+    SET_VEHICLETYPE,
+    SPEED_MODE,
+    Kind,
+    Orders,
+    kind_of,
+    note_on,
+    reason_against,
+)
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
 from merge_sumo.drivers.vuts.traci_simulation import VUT, RefusedError, Simulation
 from merge_sumo.drivers.vuts.traci_variables import GET_VEHICLE, GETTERS
@@ -29,7 +44,6 @@ SIMULATION_STEP: Final = 0x02
 SET_ORDER: Final = 0x03
 CLOSE: Final = 0x7F
 
-SET_VEHICLE: Final = 0xC4
 ASKS: Final = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
 """Identifiers of the commands that ask, one for each domain."""
 SETTERS_TO_GETTERS: Final = 0x20
@@ -38,55 +52,8 @@ GETTERS_TO_CONTEXTS: Final = -0x20
 TO_RESPONSE: Final = 0x10
 """Identifiers of the kinds of command lie these distances apart, for every domain."""
 
-SLOW_DOWN, SET_SPEED, SET_ACCELERATION = 0x14, 0x40, 0x72
 PARAMETER: Final = 0x7E
-DRIVES: Final = frozenset({SLOW_DOWN, SET_SPEED, SET_ACCELERATION})
-"""What drives the VUT."""
-CHANGES_NOTHING: Final = frozenset(
-    f"vehicle.{function}"
-    for function in (
-        *("setColor", "setSignals", "highlight", "setShapeClass", "setWidth", "setHeight"),
-        *("setSpeedMode", "setLaneChangeMode", "changeLane", "changeLaneRelative"),
-        *("changeSublane", "setLateralAlignment", "setMaxSpeedLat", "setMinGapLat"),
-        *("setLine", "setVia", "setRoutingMode", "rerouteTraveltime", "rerouteEffort"),
-        *("setAdaptedTraveltime", "setEffort", "updateBestLanes", "setEmissionClass"),
-    )
-)
-"""Commands that are accepted: eq. (4), the limits of acceleration and the path hold anyway."""
-ONLY_SEEN: Final = ("gui", "poi", "polygon")
-"""Domains of what is only looked at."""
 FOR_EVER: Final = -1073741824.0
-
-
-@dataclass(slots=True)
-class SpeedWish:
-    """What the last command on the VUT's speed asks for; SUMO's own rule for each command.
-
-    Attributes:
-        target_mps: speed to reach; None to keep the present one.
-        duration_s: time in which it is reached, from the first step after the command; 0 at once.
-        start_mps: speed at that step; None before it.
-        elapsed_s: time since.
-    """
-
-    target_mps: float | None = None
-    duration_s: float = 0.0
-    start_mps: float | None = None
-    elapsed_s: float = 0.0
-
-    def next_mps(self, v_mps: float) -> float:
-        """Return the speed after the coming step; the wish ages by a step."""
-        if self.target_mps is None:
-            return v_mps
-        if self.duration_s == 0.0:
-            return self.target_mps
-        if self.start_mps is None:
-            self.start_mps = v_mps
-        if self.elapsed_s > self.duration_s + 1e-9:
-            return v_mps
-        self.elapsed_s += DT_S
-        share = min(self.elapsed_s / max(self.duration_s, DT_S), 1.0)
-        return self.start_mps + (self.target_mps - self.start_mps) * share
 
 
 @dataclass(slots=True)
@@ -106,16 +73,20 @@ class Subscription:
 class Session(Simulation):
     """The simulation as one client sees it, and what it has asked for."""
 
-    wish: SpeedWish = field(default_factory=SpeedWish)
+    orders: Orders = field(init=False)
     subscriptions: dict[tuple[int, str, int | None], Subscription] = field(default_factory=dict)
     note: Callable[[str], None] = lambda _: None
-    """Told in a sentence, once each, what a command changes nothing by."""
+    """Told in a sentence, once each, what a command does less than in SUMO."""
     noted: set[str] = field(default_factory=set)
     history: list[dict[str, State]] = field(default_factory=list)
     """The states of the episode so far, for a SUMO that is asked for the first time."""
     beside: Beside | None = None
     no_beside: str = ""
     """Why there is no such SUMO."""
+
+    def __post_init__(self) -> None:
+        """Begin without orders."""
+        self.orders = Orders(self.scenario)
 
     def show(self, seen: Seen) -> None:
         """Advance by a step, to a state with all vehicles."""
@@ -134,7 +105,7 @@ class Session(Simulation):
     def clear(self, *, more: bool) -> None:
         """Advance by a step, to an empty road; `more` vehicles may come."""
         super().clear(more=more)
-        self.wish = SpeedWish()
+        self.orders.forget_vehicle()
         self.history.clear()
         if self.beside is not None:
             self.beside.show({})
@@ -147,7 +118,7 @@ class Session(Simulation):
     def acceleration_mps2(self) -> float:
         """Return what the last commands on the VUT ask for in the coming step."""
         v_mps = self.vehicles[VUT].v_mps
-        return (self.wish.next_mps(v_mps) - v_mps) / DT_S
+        return (self.orders.next_mps(v_mps) - v_mps) / DT_S
 
     def handle(self, command: Command) -> bytes:
         """Return the answer to any command but a step or a close; raises `ProtocolError`."""
@@ -161,10 +132,7 @@ class Session(Simulation):
         if identifier in ASKS:
             return tp.status(identifier) + self._get(identifier, reader)
         if identifier - SETTERS_TO_GETTERS in ASKS:
-            if identifier == SET_VEHICLE:
-                self._set(reader)
-            else:
-                self._change(identifier, reader.ubyte())
+            self._set(identifier, reader)
             return tp.status(identifier)
         if identifier - GETTERS_TO_SUBSCRIPTIONS in ASKS:
             return self._subscribe(identifier, reader)
@@ -189,6 +157,11 @@ class Session(Simulation):
 
     def _value(self, getter: int, variable: int, object_id: str, reader: Reader) -> bytes:
         """Return the typed value of a variable; raises `RefusedError` where there is none."""
+        if getter == GET_VEHICLE and object_id == VUT and VUT in self.vehicles:
+            if variable in MODES:
+                return tp.integer(self.orders.mode(variable))
+            if self.orders.changed(variable):
+                return self._from_sumo(getter, variable, object_id, reader.raw(reader.left))
         answer = GETTERS.get(getter, {}).get(variable)
         if answer is not None:
             return answer(self, object_id, reader)
@@ -204,6 +177,9 @@ class Session(Simulation):
                 self.beside = Beside(self.road, self.scenario, self.scenario.vehicles)
                 for state in self.history:
                     self.beside.show(state)
+                for command in self.orders.all_kept():
+                    with suppress(RefusedError):
+                        self._tell(command)
             asked = bytes((getter, variable)) + tp.raw_string(object_id) + parameter
             return tp.value_of(self.beside.ask(tp.command(asked)))
         except UserError as error:
@@ -215,41 +191,47 @@ class Session(Simulation):
         self.close()
         raise RefusedError(f"{name} is not answered here: {self.no_beside}")
 
-    def _set(self, reader: Reader) -> None:
-        variable, name = reader.ubyte(), reader.string()
-        if variable not in DRIVES:
-            if name not in self.vehicles:
-                self.vehicle(name)
-            self._change(SET_VEHICLE, variable)
-            return
-        if name in VEHICLES and name != VUT:
-            raise RefusedError(f"the vehicle '{name}' is not the controller's to command")
-        self.vehicle(name)
-        value = reader.typed()
-        if variable == SET_SPEED and isinstance(value, float):
-            self.wish = SpeedWish(None if value < 0.0 else value)
-        elif variable in (SLOW_DOWN, SET_ACCELERATION) and _two_doubles(value):
-            change, duration_s = value
-            v_mps = self.vehicles[VUT].v_mps
-            target = change if variable == SLOW_DOWN else max(v_mps + change * duration_s, 0.0)
-            if duration_s < 0.0:
-                raise RefusedError(f"a duration of {duration_s} s is negative")
-            self.wish = SpeedWish(target, max(duration_s, DT_S))
-        else:
-            raise ProtocolError(f"a speed was commanded by {value!r:.60}")
+    def _set(self, command: int, reader: Reader) -> None:
+        """Carry a command out, or keep it, or note that it changes nothing, or refuse it."""
+        variable = reader.ubyte()
+        name, found = name_of(command, variable), named().get((command, variable))
+        functions = () if found is None else found.functions
+        kind = kind_of(functions)
+        if kind is Kind.REFUSED:
+            reason = reason_against(functions)
+            raise RefusedError(f"merge-sumo does not carry out {name}: {reason}")
+        object_id, typed = reader.string(), reader.raw(reader.left)
+        if command == SET_VEHICLE:
+            self.vehicle(object_id)
+        if command in (SET_VEHICLE, SET_VEHICLETYPE):
+            mine = object_id in (VUT, OWN_TYPE)
+            if mine and (kind is not Kind.NOTHING or variable in MODES):
+                v_mps = self.vehicles[VUT].v_mps if VUT in self.vehicles else 0.0
+                self.orders.carry_out(command, variable, object_id, typed, v_mps)
+                if kind is Kind.KEPT or variable in LIMITS:
+                    self._tell(bytes((command, variable)) + tp.raw_string(object_id) + typed)
+            moves = kind is Kind.DRIVES or variable in OF_MODEL
+            if moves and not mine and variable != SPEED_MODE:
+                what = "vehicle" if command == SET_VEHICLE else "type"
+                raise RefusedError(f"the {what} '{object_id}' is not the controller's to command")
+        self._note_once(note_on(name, variable, kind, typed))
 
-    def _change(self, command: int, variable: int) -> None:
-        """Accept a command that can change nothing here, and say so once; refuse others by name."""
-        name = name_of(command, variable)
-        found = named().get((command, variable))
-        if found is None or not changes_nothing(found.functions):
-            raise RefusedError(
-                f"merge-sumo does not carry out {name}: the VUT is driven by vehicle.setSpeed, "
-                "slowDown and setAcceleration"
-            )
-        if name not in self.noted:
-            self.noted.add(name)
-            self.note(f"{name} is accepted and changes nothing here")
+    def _tell(self, command: bytes) -> None:
+        """Pass a command on to the SUMO beside, if there is one; raises `RefusedError`."""
+        if self.beside is None:
+            return
+        try:
+            tp.accepted(self.beside.ask(tp.command(command)))
+        except tp.AnsweredError as error:
+            raise RefusedError(str(error)) from error
+        except (GoneError, ProtocolError):
+            self.no_beside = f"SUMO ended when it was told {name_of(command[0], command[1])}"
+            self.close()
+
+    def _note_once(self, said: str) -> None:
+        if said and said not in self.noted:
+            self.noted.add(said)
+            self.note(said)
 
     def _subscribe(self, identifier: int, reader: Reader) -> bytes:
         getter = identifier - GETTERS_TO_SUBSCRIPTIONS
@@ -318,20 +300,6 @@ class Session(Simulation):
             except RefusedError as refused:
                 parts.append(bytes((variable, tp.ERROR)) + tp.string(str(refused)))
         return b"".join(parts)
-
-
-def changes_nothing(functions: Sequence[str]) -> bool:
-    """Return whether commands can change nothing of how vehicles move here."""
-    return any(
-        function in CHANGES_NOTHING
-        or function.endswith(".setParameter")
-        or function.partition(".")[0] in ONLY_SEEN
-        for function in functions
-    )
-
-
-def _two_doubles(value: object) -> bool:
-    return isinstance(value, tuple) and len(value) == 2 and all(type(v) is float for v in value)
 
 
 _WITH_PARAMETER: Final = {(GET_VEHICLE, 0x68), (GET_VEHICLE, 0x78), (GET_VEHICLE, PARAMETER)}

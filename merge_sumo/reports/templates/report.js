@@ -48,6 +48,7 @@ function wanted(i) { // whether the reader wants to see this failure
   return who === "pov" ? cases.pov_careful[i] === 1 : who === "none" ? by.length === 0 : by.includes(who);
 }
 const tested = (i) => failed(i) || ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
+const asksTooMuch = (i) => ["harsh", "forced"].includes(cases.after[i]); // of whoever is behind after the merge
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
 function title(i) {
@@ -198,7 +199,7 @@ function FailureMap(figure) {
       const faint = near(i) && wanted(i) ? "" : " faint";
       if (failed(i)) draw(svg, "path", { class: `mark fail${faint}`, d: `M${x} ${y - 5}l5 5l-5 5l-5 -5Z`, "data-case": cases.index[i] });
       else if (!tested(i)) draw(svg, "rect", { class: `mark error${faint}`, x: x - 3, y: y - 3, width: 6, height: 6, "data-case": cases.index[i] });
-      else draw(svg, "circle", { class: `mark safe${faint}`, cx: x, cy: y, r: 2.4, "data-case": cases.index[i] });
+      else draw(svg, "circle", { class: `mark ${asksTooMuch(i) ? "harsh" : "safe"}${faint}`, cx: x, cy: y, r: 2.4, "data-case": cases.index[i] });
     }
     const most = figure.querySelector(".most");
     if (most) most.textContent = chance ? `${Math.round(100 * chance.most)} %` : "–";

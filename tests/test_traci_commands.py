@@ -1,0 +1,229 @@
+"""What a TraCI client commands, and what SUMO does with the same commands on an open road."""
+
+from __future__ import annotations
+
+import pytest
+import traci
+from traci_pair import Drive
+
+V, T = "vehicle", "vehicletype"
+SCRIPTS = {
+    "a limit of acceleration": [(0, V, "setAccel", 1.0), (0, V, "setSpeed", 19.0)],
+    "a limit of deceleration": [(0, V, "setDecel", 1.0), (0, V, "setSpeed", 17.0)],
+    "limits above the scenario's": [
+        (0, V, "setAccel", 1.5),
+        (1, V, "setDecel", 3.5),
+        (1, V, "setSpeed", 20.0),
+        (5, V, "setSpeed", 12.0),
+    ],
+    "a maximum speed below": [(0, V, "setMaxSpeed", 17.0), (4, V, "setSpeed", 19.0)],
+    "a maximum speed above, and lifted": [
+        (0, V, "setMaxSpeed", 18.1),
+        (0, V, "setSpeed", 25.0),
+        (5, V, "setMaxSpeed", 40.0),
+    ],
+    "all three": [
+        (0, V, "setAccel", 0.7),
+        (0, V, "setDecel", 1.3),
+        (0, V, "setMaxSpeed", 18.5),
+        (0, V, "setSpeed", 30.0),
+        (8, V, "setSpeed", 10.0),
+        (12, V, "setMaxSpeed", 17.9),
+    ],
+    "slowing down within a limit": [(0, V, "setDecel", 2.5), (0, V, "slowDown", 16.0, 1.5)],
+    "slowing down beyond a limit": [(0, V, "setDecel", 0.5), (0, V, "slowDown", 17.0, 1.5)],
+    "speeding up beyond a limit": [(0, V, "setAccel", 0.5), (0, V, "slowDown", 20.0, 1.5)],
+    "an acceleration beyond a limit": [
+        (0, V, "setAccel", 0.5),
+        (0, V, "setAcceleration", 1.0, 1.5),
+    ],
+    "an acceleration after another": [
+        (0, V, "setAcceleration", 1.0, 0.5),
+        (3, V, "setAcceleration", -2.0, 1.5),
+    ],
+    "no limits in mode 0": [
+        (0, V, "setAccel", 0.5),
+        (0, V, "setDecel", 0.5),
+        (0, V, "setMaxSpeed", 18.0),
+        (0, V, "setSpeedMode", 0),
+        (0, V, "setSpeed", 18.2),
+        (4, V, "setSpeed", 17.9),
+    ],
+    "one limit in mode 4": [
+        (0, V, "setAccel", 0.5),
+        (0, V, "setDecel", 0.5),
+        (0, V, "setSpeedMode", 4),
+        (0, V, "setSpeed", 18.2),
+        (4, V, "setSpeed", 17.9),
+    ],
+    "numbers of the car-following model": [
+        (0, V, "setTau", 3.0),
+        (0, V, "setMinGap", 9.0),
+        (0, V, "setImperfection", 0.5),
+        (0, V, "setApparentDecel", 2.0),
+        (0, V, "setEmergencyDecel", 9.0),
+        (0, V, "setSpeedFactor", 0.3),
+        (1, V, "setSpeed", 18.3),
+    ],
+    "limits of the type": [
+        (0, T, "setMaxSpeed", 18.4),
+        (0, T, "setAccel", 0.8),
+        (0, T, "setDecel", 0.9),
+        (1, V, "setSpeed", 25.0),
+        (9, V, "setSpeed", 10.0),
+    ],
+    "limits of the type behind its own": [
+        (0, T, "setAccel", 0.8),
+        (0, V, "setDecel", 1.1),
+        (1, T, "setAccel", 0.1),
+        (1, T, "setDecel", 0.1),
+        (1, V, "setSpeed", 25.0),
+        (7, V, "setSpeed", 10.0),
+    ],
+    "a factor of speed leaves it its type": [
+        (0, V, "setSpeedFactor", 0.5),
+        (1, T, "setAccel", 0.4),
+        (1, V, "setSpeed", 25.0),
+    ],
+}
+READS = (
+    *("getMaxSpeed", "getAccel", "getDecel", "getEmergencyDecel", "getApparentDecel", "getTau"),
+    *("getMinGap", "getImperfection", "getSpeedFactor", "getAllowedSpeed", "getTypeID"),
+    *("getSpeedMode", "getLaneChangeMode", "getSpeed", "getColor"),
+)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    made = Drive(tmp_path_factory.mktemp("drive"))
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_the_speeds_and_the_answers_that_follow_are_those_of_sumo(drive, name):
+    drive.begin()
+    for step in range(14):
+        for at, domain, function, *values in SCRIPTS[name]:
+            if at == step:
+                drive.both(
+                    lambda c, d=domain, f=function, v=values: getattr(getattr(c, d), f)("vut", *v)
+                )
+        drive.step()
+        ours, real = drive.speeds()
+        assert ours == pytest.approx(real, abs=1e-9), step
+    for question in READS:
+        ours, real = drive.both(lambda c, q=question: getattr(c.vehicle, q)("vut"))
+        assert ours == pytest.approx(real, abs=1e-9) if isinstance(real, float) else ours == real
+    for question in ("getMaxSpeed", "getAccel", "getDecel", "getTau"):
+        ours, real = drive.both(lambda c, q=question: getattr(c.vehicletype, q)("vut"))
+        assert ours == real
+
+
+@pytest.mark.parametrize("value", [-1.0, float("inf")])
+@pytest.mark.parametrize(
+    "function",
+    [
+        *("setMaxSpeed", "setAccel", "setDecel", "setEmergencyDecel", "setApparentDecel"),
+        *("setTau", "setMinGap", "setImperfection"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused_as_by_sumo(drive, function, value):
+    drive.begin()
+
+    def refused(c):
+        with pytest.raises(traci.TraCIException) as error:
+            getattr(c.vehicle, function)("vut", value)
+        return str(error.value)
+
+    ours, real = drive.both(refused)
+    assert ours == real
+    drive.both(lambda c: c.vehicle.setSpeed("vut", 18.1))
+    drive.step()
+    assert drive.speeds() == pytest.approx((18.1, 18.1))
+
+
+class TestWhatWasSet:
+    def test_is_gone_with_the_vehicle_and_that_of_its_type_stays(self, drive):
+        drive.begin()
+        c = drive.ours
+        c.vehicle.setAccel("vut", 0.5)
+        c.vehicletype.setMaxSpeed("vut", 18.1)
+        drive.again()
+        assert c.vehicle.getAccel("vut") == 2.0
+        assert c.vehicle.getMaxSpeed("vut") == 18.1
+        c.vehicle.setSpeed("vut", 30.0)
+        drive.step()
+        assert drive.speeds()[0] == pytest.approx(18.1)
+
+    def test_is_known_to_a_sumo_that_is_asked_later(self, drive):
+        drive.begin()
+        follow = []
+        for tau_s in (1.0, 3.0):
+            drive.ours.vehicle.setTau("vut", tau_s)
+            follow.append(drive.ours.vehicle.getFollowSpeed("vut", 18.0, 30.0, 10.0, 4.0))
+        assert follow[0] > follow[1] + 1.0
+
+    def test_of_looks_and_parameters_can_be_read_back(self, drive):
+        drive.begin()
+        c = drive.ours
+        assert c.vehicle.getColor("vut") == (26, 89, 230, 255)
+        c.vehicle.setColor("vut", (1, 2, 3, 4))
+        c.vehicle.setParameter("vut", "mine", "7")
+        c.vehicle.setSpeedMode("vut", 31)
+        c.vehicle.setLaneChangeMode("vut", 512)
+        assert c.vehicle.getColor("vut") == (1, 2, 3, 4)
+        assert c.vehicle.getParameter("vut", "mine") == "7"
+        assert c.vehicle.getSpeedMode("vut") == 31
+        assert c.vehicle.getLaneChangeMode("vut") == 512
+
+
+class TestNotes:
+    @pytest.mark.parametrize(
+        ("function", "values", "note"),
+        [
+            ("setTau", (0.5,), "vehicle.setTau is kept for what SUMO answers and moves nothing"),
+            ("setSpeedMode", (31,), "SUMO's checks of safe speed, right of way and red lights"),
+            ("setSpeed", (-1.0,), "it keeps its speed"),
+            ("changeLane", (0, 1.0), "vehicle.changeLane"),
+        ],
+    )
+    def test_say_once_what_does_less_than_in_sumo(self, drive, function, values, note):
+        drive.begin()
+        for _ in range(2):
+            getattr(drive.ours.vehicle, function)("vut", *values)
+        (said,) = drive.notes
+        assert note in said
+
+    def test_are_not_taken_of_what_acts_as_in_sumo(self, drive):
+        drive.begin()
+        drive.ours.vehicle.setSpeedMode("vut", 0)
+        drive.ours.vehicle.setMaxSpeed("vut", 20.0)
+        drive.ours.vehicle.setSpeed("vut", 18.0)
+        assert drive.notes == []
+
+
+@pytest.mark.parametrize(
+    ("domain", "function", "arguments", "reason"),
+    [
+        ("vehicle", "openGap", ("vut", 3.0, 20.0, 5.0, 1.0), "car-following model, which does not"),
+        ("vehicle", "setPreviousSpeed", ("vut", 10.0), "as the scenario says"),
+        ("vehicle", "add", ("new", "route.vut"), "as the scenario says"),
+        ("vehicle", "setStop", ("vut", "ramp"), "nothing stops here but by a speed of 0"),
+        ("vehicle", "setActionStepLength", ("vut", 1.0), "the VUT acts in every step of 0.1 s"),
+        ("vehicle", "setLength", ("vut", 1.0), "what the vehicles are is the scenario's"),
+        ("vehicle", "setTau", ("pov", 1.0), "the vehicle 'pov' is not the controller's to command"),
+        ("vehicletype", "setTau", ("pov", 1.0), "the type 'pov' is not the controller's"),
+        ("vehicletype", "copy", ("vut", "other"), "what the vehicles are is the scenario's"),
+        ("edge", "setMaxSpeed", ("ramp", 5.0), "the road is the scenario's"),
+        ("simulation", "saveState", ("x.xml",), "the campaign runs the simulation"),
+        ("calibrator", "setFlow", ("c", 0.0, 1.0, 1.0, 1.0, "t", "r"), "none of that kind here"),
+    ],
+)
+def test_what_is_refused_is_named_with_its_reason(drive, domain, function, arguments, reason):
+    drive.begin()
+    with pytest.raises(traci.TraCIException) as error:
+        getattr(getattr(drive.ours, domain), function)(*arguments)
+    assert reason in str(error.value)
+    assert "'" in reason or f"{domain}." in str(error.value)
+    assert drive.ours.vehicle.getSpeed("vut") == 18.0
