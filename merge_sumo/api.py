@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from merge_sumo.campaigns.avoidance import note_avoidance
 from merge_sumo.campaigns.conductor import OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.settings import (
@@ -32,20 +31,27 @@ from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.here import AnyVut, drivers_of, is_here
 from merge_sumo.errors import UserError
-from merge_sumo.recorded import compare_runs, export, history, open_run, rerun
-from merge_sumo.reports.progress import CampaignPanel, is_watched
+from merge_sumo.recorded import (
+    compare_runs,
+    concluded,
+    export,
+    going_on,
+    history,
+    open_run,
+    rerun,
+    resume,
+)
 from merge_sumo.results import CampaignRun, CaseRun
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.system.folders import check_new, dated, link_latest
+from merge_sumo.system.folders import check_new, dated
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
-from merge_sumo.values.score import Outcome
 
 __all__ = ["CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "history", "open_run"]
-__all__ += ["rerun", "run_case", "truth"]
+__all__ += ["rerun", "resume", "run_case", "truth"]
 
 
 def campaign(
@@ -103,7 +109,8 @@ def campaign(
         on_case: told of every case as it ends.
         progress: show how far it is; by default in a notebook and on a terminal.
 
-    Raises `UserError` for values that make no campaign, or when the folder exists.
+    One that is interrupted goes on with `resume`. Raises `UserError` for values that make no
+    campaign, or when the folder exists.
     """
     where = _scenario(scenario)
     spec, pov_spec, workers = drivers_of(vut, pov, workers)
@@ -130,22 +137,9 @@ def campaign(
     )
     folder = dated(spec) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))
-    title = f"{spec} v level {'/'.join(map(level_name, settings.levels))}"
-    quiet = not (is_watched() if progress is None else progress)
-    with open_workers(settings.workers(workers)) as there:
-        with CampaignPanel(title, settings.cases, settings.levels, quiet=quiet) as panel:
-
-            def told(outcome: Outcome) -> None:
-                panel.case_ended(outcome)
-                if on_case is not None:
-                    on_case(outcome)
-
-            done = run_campaign(settings, folder, road, told, workers=there)
-        note_avoidance(done, settings, road, workers=there)
-    link_latest(folder)
-    run = CampaignRun(folder)
-    run.report()
-    return run
+    with going_on(settings, folder, workers, on_case, progress) as (there, _, told):
+        done = run_campaign(settings, folder, road, told, workers=there)
+    return concluded(done, settings, road)
 
 
 def run_case(

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.conductor import SCENARIOS
+from merge_sumo.campaigns.avoidance import note_avoidance
+from merge_sumo.campaigns.conductor import SCENARIOS, OnCase, resume_campaign
 from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.run import Run, read_settings
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.drivers.vuts.here import AnyVut, drivers_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison, exports
 from merge_sumo.reports.changes import RunComparison
 from merge_sumo.reports.history import History, history_of
 from merge_sumo.reports.history_page import write_history
+from merge_sumo.reports.progress import CampaignPanel, is_watched
+from merge_sumo.reports.report import check_report
 from merge_sumo.reports.rerun import Rerun, settings_today
 from merge_sumo.reports.rerun import rerun as run_again
 from merge_sumo.results import CampaignRun
-from merge_sumo.system.folders import check_new_file
-from merge_sumo.system.workers import open_workers
+from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.system.folders import check_new_file, link_latest
+from merge_sumo.system.workers import Workers, open_workers
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
 
 AnyRun = CampaignRun | Path | str
 """A campaign, or its folder."""
@@ -27,6 +37,105 @@ AnyRun = CampaignRun | Path | str
 def open_run(folder: Path | str) -> CampaignRun:
     """Open the folder of a campaign; `UserError` when it is none."""
     return CampaignRun(folder)
+
+
+def resume(
+    run: AnyRun,
+    *,
+    vut: AnyVut | None = None,
+    pov: AnyVut | None = None,
+    cases: int | None = None,
+    workers: int = 1,
+    net: Path | str | None = None,
+    force: bool = False,
+    trust_vut: bool = False,
+    on_case: OnCase | None = None,
+    progress: bool | None = None,
+) -> CampaignRun:
+    """Go on with a campaign that was stopped; the same as `merge-sumo campaign --resume`.
+
+    Args:
+        run: the campaign, or its folder.
+        vut: the campaign's when left out. An object of a process that is gone is to be given again,
+            and nothing but its name tells that it is the same.
+        pov: as `vut`, where the campaign had one.
+        cases: how many in all, where there are to be more than it had.
+        workers: processes that run cases; the outcomes are the same.
+        net: net for that; must be the one of the campaign.
+        force: go on although something differs that decides outcomes.
+        trust_vut: run the controller that a folder names although it was not made here.
+        on_case: told of every case as it ends.
+        progress: show how far it is; by default in a notebook and on a terminal.
+
+    Raises `UserError` as the command says.
+    """
+    folder = run.folder if isinstance(run, CampaignRun) else Path(run)
+    recorded = read_settings(folder)
+    spec, pov_spec, workers = drivers_of(
+        str(recorded.get("vut")) if vut is None else vut,
+        recorded.get("pov") if pov is None else pov,
+        workers,
+    )
+    named = {"vut": vut and spec, "pov": pov and pov_spec, "cases": cases}
+    given = {name: value for name, value in named.items() if value is not None}
+    settings = settings_of(folder, recorded, given, trust=trust_vut)
+    check_report(folder)
+    road = road_for(settings.scenario, None if net is None else Path(net))
+    with going_on(settings, folder, workers, on_case, progress) as (there, panel, told):
+        done = resume_campaign(
+            folder,
+            road,
+            told,
+            on_before=panel.ran_before,
+            given=given,
+            force=force,
+            workers=there,
+            warn=warnings.warn,
+            trust=trust_vut,
+        )
+    return concluded(done, settings, road)
+
+
+@contextmanager
+def going_on(
+    settings: CampaignSettings,
+    folder: Path,
+    workers: int,
+    on_case: OnCase | None,
+    progress: bool | None,
+) -> Iterator[tuple[Workers, CampaignPanel, OnCase]]:
+    """Give workers, what shows how far a campaign is, and what is to be told of its cases.
+
+    Of a campaign that is interrupted it is noted how to go on.
+    """
+    title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
+    quiet = not (is_watched() if progress is None else progress)
+    try:
+        with (
+            open_workers(settings.workers(workers)) as there,
+            CampaignPanel(title, settings.cases, settings.levels, quiet=quiet) as panel,
+        ):
+
+            def told(outcome: Outcome) -> None:
+                panel.case_ended(outcome)
+                if on_case is not None:
+                    on_case(outcome)
+
+            yield there, panel, told
+    except KeyboardInterrupt as stop:
+        if folder.exists():
+            link_latest(folder)
+            stop.add_note(f"stopped; go on with ms.resume({str(folder)!r})")
+        raise
+
+
+def concluded(done: Run, settings: CampaignSettings, road: Corridor) -> CampaignRun:
+    """Return a campaign that has ended, with what is found out of it behind its end."""
+    note_avoidance(done, settings, road)
+    link_latest(done.folder)
+    run = CampaignRun(done.folder)
+    run.report()
+    return run
 
 
 def rerun(

@@ -127,6 +127,25 @@ class TestACampaign:
         with pytest.warns(UserWarning, match="and without workers"):
             ms.campaign(lambda _: 0.0, **SMALL, workers=2, out=tmp_path / "run")
 
+    def test_that_was_interrupted_goes_on_and_takes_more_cases(self, tmp_path):
+        def stop(outcome):
+            if outcome.index == 3:
+                raise KeyboardInterrupt
+
+        small = {**SMALL, "batch": 2, "sampler": "subset"}
+        folder, whole = tmp_path / "run", ms.campaign("level0", **small, out=tmp_path / "whole")
+        with pytest.raises(KeyboardInterrupt) as stopped:
+            ms.campaign("level0", **small, out=folder, on_case=stop)
+        assert stopped.value.__notes__ == [f"stopped; go on with ms.resume({str(folder)!r})"]
+        assert len(ms.open_run(folder).cases) == 2
+        again = []
+        done = ms.resume(folder, on_case=lambda outcome: again.append(outcome.index))
+        assert again == [2, 3]
+        assert list(done.cases) == list(whole.cases)
+        assert len(ms.resume(done, cases=6).cases) == 6
+        with pytest.raises(ms.UserError, match="vut"):
+            ms.resume(folder, vut="design2", cases=8)
+
     def test_takes_a_pov_of_the_same_kinds(self, tmp_path):
         with pytest.warns(UserWarning, match="drives"):
             run = ms.campaign(
