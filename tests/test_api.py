@@ -92,7 +92,7 @@ def test_the_import_costs_nothing():
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == ["False", "11"]
+    assert done.stdout.split() == ["False", "13"]
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():

@@ -191,7 +191,7 @@ class TestWhatWasNotTested:
         assert [[cell.text_content() for cell in row] for row in rows] == [
             [f"{EVIL}\\x1b[31m", "VUT_ERROR", "2", "3"],
             ["other", "VUT_ERROR", "1", "9"],
-            ["the VUT did not reach the merge point in 9.1 s", "TIMEOUT", "4", "0"],
+            ["the VUT did not reach the merge point in 12 s", "TIMEOUT", "4", "0"],
         ]
         assert broken.index('id="untested"') < broken.index("Failure mode coverage")
         assert root.xpath("//p[contains(@class, 'verdict')]/@class") == ["verdict broken"]

@@ -64,7 +64,7 @@ class TestErrorsAndTimeouts:
         assert [(t.end, t.message, t.cases) for t in found.troubles] == [
             (End.VUT_ERROR, "other", (5, 6)),
             (End.VUT_ERROR, "boom", (2,)),
-            (End.TIMEOUT, "the VUT did not reach the merge point in 9.1 s", (0, 1, 3, 4)),
+            (End.TIMEOUT, "the VUT did not reach the merge point in 12 s", (0, 1, 3, 4)),
         ]
         assert (found.cases, found.errors, found.timeouts, found.tested) == (10, 3, 4, 3)
         number = len(failures(run.outcomes))
