@@ -256,7 +256,7 @@ def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) ->
         return False
     if criterion.is_papers:  # which needs no measures
         return verdict(trajectory) is End.MERGED
-    outcome = criterion.outcome(0, 0, trajectory, lines)
+    outcome = criterion.judged(trajectory, lines)
     return outcome.measures.end.is_tested and not outcome.failed
 
 

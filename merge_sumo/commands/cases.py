@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,7 +24,6 @@ from merge_sumo.commands.shared import (
     VutMemoryOption,
     app,
     check_tolerance,
-    print_troubles,
     say,
     show,
     written,
@@ -196,30 +195,14 @@ def rerun(
     raise typer.Exit(1 if why else 0)
 
 
-MOST_CHANGED: Final = 40
-"""Cases that are printed; JSON has all."""
-
-
 def _print_rerun(found: Rerun, folder: Path) -> None:
-    from merge_sumo.reports.verdict import judge
-
-    show(f"recorded:  {judge(found.before).counts}")
-    show(f"now:       {judge(found.after).counts} ({found.vut})")
-    print_troubles(judge(found.after))
-    changed = found.changed
-    if not changed:
-        show("no verdict changed")
-        return
-    show(f"{len(changed)} verdicts changed:" if len(changed) > 1 else "one verdict changed:")
-    for one in changed[:MOST_CHANGED]:
-        ends = f"{one.before.measures.end} -> {one.after.measures.end}"
-        show(f"  case {one.before.index}: {ends} ({one.change})")
-    if len(changed) > MOST_CHANGED:
-        show(f"  and {len(changed) - MOST_CHANGED} others; --json has them all")
-    show(
-        f"look at one: merge-sumo run --case {quoted(folder)} {changed[0].before.index} "
-        f"--vut {quoted(found.vut)} --gui"
-    )
+    for line in found.lines():
+        show(line)
+    if found.changed:
+        show(
+            f"look at one: merge-sumo run --case {quoted(folder)} {found.changed[0].before.index} "
+            f"--vut {quoted(found.vut)} --gui"
+        )
 
 
 def _case_and_settings(context: typer.Context) -> tuple[CampaignSettings, Case]:

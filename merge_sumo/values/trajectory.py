@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
+from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, POV, VUT
@@ -45,6 +46,7 @@ def as_reason(text: str) -> str:
     return printable(without[:REASON_CHARACTERS])[:REASON_CHARACTERS]
 
 
+@quickly_pickled
 @dataclass(frozen=True, slots=True)
 class Trajectory:
     """Positions, speeds and accelerations of all vehicles in one episode.
@@ -66,6 +68,11 @@ class Trajectory:
     error: str | None = None
     clipped_steps: int = 0
     after: FloatArray | None = None
+
+    def __repr__(self) -> str:
+        """Return its end in a line: the motion is an array of hundreds of numbers."""
+        cars, rows = self.motion.shape[1], len(self.motion)
+        return f"<Trajectory: {cars} vehicles, {rows} rows, {self.end} at {self.t_end_s:.1f} s>"
 
     @property
     def x_pov_m(self) -> FloatArray:
