@@ -387,6 +387,9 @@ class TestTheCommand:
         criterion = ("--fail-when", 'end == "MERGED"')
         code, out, err = command_line(*plan, *criterion, "--out", tmp_path / "c", "--json")
         assert code == 1, err
+        assert 'cases that may fail by end == "MERGED": ' in json.loads(out)["sentence"].replace(
+            "'", '"'
+        )
         found = json.loads(out)["levels"]["0"]
         assert found["failures"] == found["cases"] == len(covering(0.3, 2))
         assert check_certificate.check(tmp_path / "c")[1] == []
