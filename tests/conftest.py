@@ -1,5 +1,7 @@
 """Fixtures for all tests: real SUMO worlds and finished campaigns."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import os

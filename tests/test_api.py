@@ -66,7 +66,7 @@ class TestARun:
 
 class TestACampaign:
     def test_is_the_one_of_the_command_line(self, tmp_path, run):
-        seen = []
+        seen: list = []
         again = ms.campaign(
             "design1", level=0, cases=60, batch=20, seed=1, out=tmp_path / "r", on_case=seen.append
         )

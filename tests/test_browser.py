@@ -1,10 +1,12 @@
 """The report in a real browser: Debian's Chromium without a window."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -67,8 +69,8 @@ def shown(browser, file: Path, **options) -> Iterator:
     page.on("dialog", lambda dialog: complaints.append(f"dialog {dialog.message}"))
     page.on(
         "request",
-        lambda request: (
-            request.url.startswith(("file:", "data:")) or complaints.append(request.url)
+        lambda request: complaints.extend(
+            [] if request.url.startswith(("file:", "data:")) else [request.url]
         ),
     )
     try:
@@ -543,7 +545,7 @@ def in_traffic(tmp_path_factory) -> Run:
     return run
 
 
-def drawn_at(page, outcome, axes: tuple[str, str]) -> tuple[float, float]:
+def drawn_at(page, outcome, axes: Sequence[str]) -> tuple[float, float]:
     """Return how far a mark is from where a case is in two coordinates, as shares of the map."""
     level = outcome.case.level
     dims = {d.field: d for d in outcome.case.scenario.dimensions(level)}

@@ -23,6 +23,7 @@ from merge_sumo.reports.rerun import rerun
 from merge_sumo.reports.verdict import judge
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.centre_lines import centre_lines
+from merge_sumo.values import score
 from merge_sumo.values.bodies import SPACING_M, CentreLines, clearance_before_m
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import COLLISION, VOCABULARY, Criterion
@@ -265,6 +266,27 @@ class TestNamed:
         assert Criterion("unsafe").outcome(0, 0, harsh).margin == pytest.approx(-1.0 / 3.0)
         assert not Criterion("contact").outcome(0, 0, harsh).failed
         assert not Criterion("unsafe").outcome(0, 0, ending(-25.0, v_pov=27.0)).failed
+
+
+class TestTheVerdictAlone:
+    @pytest.mark.parametrize("dx", [0.0, 5.5, -4.9, -25.0, 80.0])
+    @pytest.mark.parametrize(
+        "text",
+        ["collision", "contact", "unsafe", "ttc_s < 1.5", "last_avoidable_s < 2 or gap_m < 3"],
+    )
+    def test_is_that_of_the_whole_outcome(self, text, dx):
+        episode = ending(dx, v_pov=36.0, v_vut=26.0)
+        whole, alone = Criterion(text).outcome(0, 0, episode), Criterion(text).judged(episode)
+        assert (alone.failed, alone.margin) == (whole.failed, whole.margin)
+        assert alone.signed_gap_m == whole.signed_gap_m
+
+    def test_looks_for_a_way_out_where_the_criterion_speaks_of_it_alone(self, monkeypatch):
+        asked = []
+        monkeypatch.setattr(score, "_last_avoidable_s", lambda _: asked.append(1))
+        Criterion("ttc_s < 1.5").judged(ending(0.0))
+        assert not asked
+        Criterion("last_avoidable_s < 2").judged(ending(0.0))
+        assert asked
 
 
 def lines(apart_m, ends_m=-20.0):

@@ -1,5 +1,7 @@
 """Ground truth and comparison of samplers, in worker processes with a SUMO each."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
@@ -8,6 +10,7 @@ import shutil
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +25,7 @@ from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
-NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +48,7 @@ def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
 
 def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch):
     (kept,) = cache.glob("truth-*.npz")
-    counted = []
+    counted: list[int] = []
     again = ground_truth("design1", 0, 600, cache=cache, on_cases=counted.append)
     assert np.array_equal(again.score, truth.score)
     assert counted == []

@@ -1,5 +1,7 @@
 """Episodes on roads that are not ours: replayed, exported, drawn, and driven over TraCI."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import hashlib
@@ -12,6 +14,7 @@ import subprocess
 import threading
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -383,7 +386,7 @@ def free_port() -> int:
 
 @pytest.mark.parametrize("name", ["curved", "lane drop"])
 def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net(corridor, name):
-    road, port, seen = corridor(name), free_port(), []
+    road, port, seen = corridor(name), free_port(), list[Any]()
 
     def drive() -> None:
         c = traci.connect(port, numRetries=200, waitBetweenRetries=0.02)

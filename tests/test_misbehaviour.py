@@ -1,5 +1,7 @@
 """What a user's VUT does wrong, of a catalogue of all kinds: it is its own case's outcome."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json

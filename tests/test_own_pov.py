@@ -1,5 +1,7 @@
 """A POV of one's own: any kind of VUT in the POV's seat, at a level of its own."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
@@ -9,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from textwrap import dedent
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,7 +82,7 @@ def call(monkeypatch, capfd):
         try:
             cli.main()
         except SystemExit as end:
-            code = end.code or 0
+            code = int(end.code or 0)
         return code, *capfd.readouterr()
 
     return main
@@ -175,8 +178,10 @@ class TestTheSeat:
             def act(self, _scene):
                 raise VutLostError("died", 3, final=True)
 
+        zeros = np.zeros(4)
+        nothing = Scene.of_pair(zeros > 0, zeros.astype(int), zeros, zeros, zeros, zeros)
         with pytest.raises(PovLostError, match=r"^died$") as lost:
-            OtherSeat(Losing(4)).act(Scene.of_pair(*[np.zeros(4)] * 6))
+            OtherSeat(Losing(4)).act(nothing)
         assert (lost.value.corridor, lost.value.final) == (3, True)
 
 
@@ -297,7 +302,11 @@ class TestWhatItDoesWrong:
         # Guilty is, as there, the case with the fastest POV: now that is itself.
         source = how.source.replace("seen.v_pov_mps", "seen.v_vut_mps")
         spec = pov(source).replace("Pov", "Vut")
-        options = {"deadline_s": DEADLINE_S, "memory_gib": 1.0, "log": Path("controller.log")}
+        options: dict[str, Any] = {
+            "deadline_s": DEADLINE_S,
+            "memory_gib": 1.0,
+            "log": Path("controller.log"),
+        }
         with none_left():
             if how.refused:
                 with pytest.raises(UserError) as refused:
@@ -456,7 +465,7 @@ class TestResuming:
             resume_campaign(stopped, given={"pov": other})
 
     def test_with_force_takes_a_pov_that_was_not_there(self, call, tmp_path):
-        values = {**SMALL, "levels": (0,)}
+        values: dict[str, Any] = {**SMALL, "levels": (0,)}
         folder = run_campaign(CampaignSettings(**values), tmp_path / "run").folder
         pov(YIELDS)
         forced = ("campaign", "--resume", folder, "--pov", "my_pov.py:Pov", "--level", "own")
@@ -509,7 +518,7 @@ class TestTrust:
         self, tmp_path, forged
     ):
         pov(TELLTALE)
-        values = {**SMALL, "levels": (0,)}
+        values: dict[str, Any] = {**SMALL, "levels": (0,)}
         folder = run_campaign(CampaignSettings(**values), tmp_path / "run").folder
         record = json.loads((folder / SETTINGS).read_text())
         record.pop(CHECKSUM)
@@ -582,7 +591,11 @@ class TestOtherCommands:
 
 
 def test_settings_know_a_scenario_with_its_own_speeds():
-    slow = {"v_vut0_mps": 9.0, "v_pov0_mps": (5.0, 12.0), "x_pov0_m": (-80.0, -20.0)}
+    slow: dict[str, Any] = {
+        "v_vut0_mps": 9.0,
+        "v_pov0_mps": (5.0, 12.0),
+        "x_pov0_m": (-80.0, -20.0),
+    }
     scenario = Scenario(name="slow", **slow)
     cases = from_unit(np.random.default_rng(1).random((3, 2)), OWN, scenario=scenario)
     assert all(motion.error is None for motion in run("sumo:IDM", cases))

@@ -8,6 +8,7 @@ import threading
 import types
 import warnings
 from importlib import import_module
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ import merge_sumo as ms
 from merge_sumo.drivers.vuts.here import is_here, keep, object_of, spec_of, travels
 from merge_sumo.system.spawning import without_main
 
-SMALL = {"level": 0, "cases": 4, "seed": 1}
+SMALL: dict[str, Any] = {"level": 0, "cases": 4, "seed": 1}
 
 
 class Steady:
@@ -76,11 +77,11 @@ class TestWhatTravels:
 
     def test_a_lambda_an_object_with_a_lock_and_what_is_of_the_main_module_do_not(self):
         with_lock, of_main = Batched(1.0), Batched(1.0)
-        with_lock.lock = threading.Lock()
+        vars(with_lock).update(lock=threading.Lock())
         main = types.new_class(
             "Main", (Steady,), exec_body=lambda n: n.update(__module__="__main__")
         )
-        of_main.part = main
+        vars(of_main).update(part=main)
         for vut in (lambda _: 0.0, with_lock, main, of_main):
             assert not travels(spec_of(vut))
 

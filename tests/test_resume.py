@@ -1,5 +1,7 @@
 """A campaign that was stopped, however it was, goes on as if it had not been."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import contextlib
@@ -103,7 +105,7 @@ class TestResuming:
         kept = {"a line": 15, "a batch and a half": 4}.get(lost)
         text = outcomes(folder)[:-lost] if kept is None else b"".join(lines[:kept])
         (folder / OUTCOMES).write_bytes(text)
-        said = []
+        said: list = []
         resume_campaign(folder, warn=said.append)
         assert outcomes(folder) == outcomes(whole)
         (sentence,) = said
@@ -135,7 +137,8 @@ class TestResuming:
         assert differences(once, {**run.settings, "seal": once.get("seal")}) == {}
 
     def test_tells_what_ran_before_apart(self, folder):
-        before, after = [], []
+        before: list = []
+        after: list = []
         resume_campaign(folder, None, after.append, on_before=before.append)
         assert [len(before), len(after)] == [2 * BATCH, 28 - 2 * BATCH]
 
@@ -347,7 +350,7 @@ class TestASignal:
 
     def test_is_noted_in_this_process_and_the_second_one_raises(self, monkeypatch):
         before = signal.getsignal(signal.SIGINT)
-        said = []
+        said: list = []
         monkeypatch.setattr(os, "write", lambda file, text: said.append((file, text)))
         with Interrupt("wait") as stop:
             stop.check()

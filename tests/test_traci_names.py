@@ -1,11 +1,13 @@
 """Everything that a TraCI client can ask and command, against a real SUMO."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import pytest
 import traci
 import traci_page
-from traci_pair import Pair, answer, questions
+from traci_pair import Pair, answer, questions, shown
 
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.drivers.vuts.traci_session import ASKS
@@ -47,6 +49,11 @@ class TestQuestions:
     def test_of_the_road_and_its_types_are_all_answered_the_same(self, answers, domain):
         assert {q: b for q, b in answers.items() if q[0] == domain and b[0] != b[1]} == {}
 
+    def test_of_a_lane_that_no_car_uses_are_answered_the_same(self, pair):
+        for ask in ("getLength", "getMaxSpeed", "getEdgeID", "getLastStepVehicleIDs", "getShape"):
+            ours, real = (getattr(c.lane, ask)("main_in_1") for c in (pair.ours, pair.real))
+            assert ours == real
+
     def test_of_the_vehicle_differ_in_what_depends_on_how_it_was_commanded_alone(self, answers):
         differ = {q[1] for q, b in answers.items() if q[0] == "vehicle" and b[0] != b[1]}
         assert differ <= {"getSpeedWithoutTraCI", "getTimeLoss"}
@@ -60,6 +67,66 @@ class TestQuestions:
                 with pytest.raises(traci.TraCIException, match="SUMO ended when it was asked for"):
                     mine.ours.vehicle.getTau("vut")
             assert mine.ours.vehicle.getSpeed("vut") == pytest.approx(19.5, abs=0.1)
+        finally:
+            mine.close()
+
+
+SPEED, POSITION = traci.constants.VAR_SPEED, traci.constants.VAR_LANEPOSITION
+VEHICLES_OF, LANES_OF = (
+    traci.constants.CMD_GET_VEHICLE_VARIABLE,
+    traci.constants.CMD_GET_LANE_VARIABLE,
+)
+
+
+class TestSubscriptions:
+    @pytest.mark.parametrize(
+        ("domain", "name", "of", "range_m", "variable"),
+        [
+            ("junction", "M", VEHICLES_OF, 150.0, SPEED),
+            ("junction", "M", VEHICLES_OF, 1000.0, SPEED),
+            ("edge", "ramp", VEHICLES_OF, 5.0, SPEED),
+            ("lane", "main_out_0", LANES_OF, 10.0, traci.constants.VAR_LENGTH),
+            ("vehicle", "vut", LANES_OF, 100.0, traci.constants.LAST_STEP_VEHICLE_NUMBER),
+        ],
+    )
+    def test_to_what_is_around_anything_are_answered_as_by_sumo(
+        self, pair, domain, name, of, range_m, variable
+    ):
+        def around(connection):
+            mine = getattr(connection, domain)
+            mine.subscribeContext(name, of, range_m, [variable])
+            return shown(dict(sorted(mine.getContextSubscriptionResults(name).items())))
+
+        assert around(pair.ours) == around(pair.real)
+
+    def test_that_follow_each_other_add_up_as_in_sumo(self, pair):
+        def seen(connection):
+            vehicle = connection.vehicle
+            vehicle.subscribe("vut", [SPEED])
+            vehicle.subscribe("vut", [POSITION])
+            found = set(vehicle.getSubscriptionResults("vut"))
+            vehicle.subscribeLeader("vut", 10.0)
+            return found, set(vehicle.getSubscriptionResults("vut"))
+
+        assert seen(pair.ours) == seen(pair.real)
+        pair.ours.vehicle.unsubscribe("vut")
+        assert not [s for s in pair.session.subscriptions if s.of == (VEHICLES_OF, "vut", None)]
+
+    def test_of_an_object_that_there_is_not_are_refused_as_by_sumo(self, pair):
+        said = []
+        for connection in (pair.ours, pair.real):
+            with pytest.raises(traci.TraCIException) as error:
+                connection.junction.subscribeContext("none", VEHICLES_OF, 10.0, [SPEED])
+            said.append(str(error.value))
+        assert said[0] == said[1]
+
+    def test_that_sumo_cannot_answer_any_more_do_not_end_the_step(self, tmp_path):
+        mine = Pair(tmp_path)
+        try:
+            mine.ours.junction.subscribeContext("M", VEHICLES_OF, 10.0, [SPEED])
+            mine.ours.vehicle.subscribe("vut", [SPEED])
+            mine.session.beside._connection._socket.close()
+            assert mine.session.results()[:4] == (1).to_bytes(4)
         finally:
             mine.close()
 
@@ -88,6 +155,22 @@ def test_the_sumo_that_answers_has_every_vehicle_where_it_is(name):
         beside.close()
 
 
+def test_who_drives_beyond_the_end_of_the_net_arrives_and_the_others_are_answered_for():
+    scenario = named_scenario("roundabout")
+    beside = Beside(road_for(scenario), scenario, 2)
+    vehicle = beside._connection.vehicle
+    try:
+        for x_m in (-50.0, 100.0, 600.0, 610.0):
+            beside.show({"pov": (x_m, 10.0, 0.0), "vut": (-40.0, 10.0, 0.0)})
+        assert vehicle.getIDList() == ("vut",)
+        assert vehicle.getSpeed("vut") == 10.0
+        beside.show({})
+        beside.show({"pov": (-50.0, 10.0, 0.0), "vut": (-40.0, 10.0, 0.0)})
+        assert set(vehicle.getIDList()) == {"pov", "vut"}
+    finally:
+        beside.close()
+
+
 class TestCommands:
     @pytest.mark.parametrize(
         ("function", "arguments"),
@@ -103,7 +186,7 @@ class TestCommands:
     def test_that_change_nothing_are_accepted_and_noted_once(self, pair, function, arguments):
         pair.notes.clear()
         pair.session.noted.clear()
-        values = {"changeLane": (0, 5.0), "setParameter": ("a", "b")}.get(function, ())
+        values: tuple = {"changeLane": (0, 5.0), "setParameter": ("a", "b")}.get(function, ())
         values = values or (() if arguments is None else (arguments,))
         for _ in range(2):
             getattr(pair.ours.vehicle, function)("vut", *values)

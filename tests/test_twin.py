@@ -7,6 +7,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
-NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2)
 SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 

@@ -1,5 +1,7 @@
 """A VUT as an FMU of FMI 2.0 and 3.0, compiled here from C."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import tempfile

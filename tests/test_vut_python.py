@@ -1,5 +1,7 @@
 """A VUT in Python: the tutorial's example, what it may see, and what it may do wrong."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
@@ -56,7 +58,7 @@ def Vut(seen):
 def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
     vut, tmp_path, source, name
 ):
-    lines = []
+    lines: list = []
     for spec in ("level0", vut(source, name)):
         settings = CampaignSettings(vut=spec, levels=(0, 2), cases=60, batch=20, seed=3)
         folder = tmp_path / f"run{len(lines)}"

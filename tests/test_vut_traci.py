@@ -1,5 +1,7 @@
 """A controller behind TraCI: what it sees, what it may do, and what it may do wrong."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import gc
@@ -14,8 +16,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,7 +114,9 @@ def stock(function):
 class TestAStockClient:
     def test_sees_vehicles_depart_and_arrive_episode_after_episode_while_time_runs_on(self):
         def drive(c):
-            seen = [(c.simulation.getTime(), c.vehicle.getIDList(), c.vehicle.getIDCount())]
+            seen: list[tuple] = [
+                (c.simulation.getTime(), c.vehicle.getIDList(), c.vehicle.getIDCount())
+            ]
             while c.simulation.getMinExpectedNumber() > 0:
                 c.simulationStep()
                 seen.append(
@@ -305,7 +311,7 @@ class TestAStockClient:
         assert "'nobody' is not known" in said[6]
         assert "'lane_0' is not known" in said[7]
         assert "'nobody' is not known" in said[8]
-        assert said[9] == "merge-sumo does not carry out CMD_LOAD"
+        assert said[9].startswith("merge-sumo does not carry out CMD_LOAD: the campaign")
         assert "'none' is not known" in said[10]
 
     def test_may_close_when_the_vehicle_has_arrived_and_another_come(self):
@@ -399,6 +405,17 @@ int main(int, char** argv) {
                 Vehicle::subscribe("vut", {libsumo::VAR_SPEED, libsumo::VAR_LANEPOSITION});
                 Vehicle::subscribeContext("vut", libsumo::CMD_GET_VEHICLE_VARIABLE, 300,
                                           {libsumo::VAR_SPEED, libsumo::VAR_POSITION});
+                Junction::subscribeContext("M", libsumo::CMD_GET_VEHICLE_VARIABLE, 2000,
+                                           {libsumo::VAR_SPEED});
+                if (Junction::getContextSubscriptionResults("M").count("vut") != 1) return 8;
+                Vehicle::setSpeedMode("vut", 6);
+                Vehicle::setMaxSpeed("vut", 45.0);
+                if (Vehicle::getMaxSpeed("vut") != 45.0) return 9;
+                try {
+                    Vehicle::openGap("vut", 1.0, 1.0, 1.0, 1.0);
+                    return 10;
+                } catch (const libsumo::TraCIException&) {
+                }
             }
         }
         const auto ids = Vehicle::getIDList();
@@ -498,6 +515,35 @@ def test_traci_start_with_our_port_connects_to_us_and_not_to_the_sumo_it_starts(
     assert [t.error for t in trajectories] == [None, None]
 
 
+EPISODES = """import sys, traci
+for _ in range({episodes}):
+    traci.init(int(sys.argv[1]))
+    traci.simulationStep()
+    while "vut" in traci.vehicle.getIDList():
+        traci.vehicle.setSpeed("vut", min(traci.vehicle.getSpeed("vut") + 0.1, 28.0))
+        traci.simulationStep()
+    traci.close()
+"""
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 10])
+def test_a_program_may_connect_for_every_episode_and_is_started_again_when_it_has_ended(
+    tmp_path, episodes
+):
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    program = tmp_path / "episodes.py"
+    head = f"open({str(tmp_path / 'started')!r}, 'a').write('.')\n"
+    program.write_text(head + EPISODES.format(episodes=episodes))
+    cases = cases_of(4)
+    command = f"{sys.executable} {program} {{port}}"
+    by_traci = run_cases(factory("traci", command=command), cases)
+    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_traci, by_python, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+    assert len((tmp_path / "started").read_text()) == -(-len(cases) // episodes)
+
+
 def descriptors() -> int:
     gc.collect()
     return len(list(Path("/proc/self/fd").iterdir()))
@@ -513,6 +559,13 @@ def children() -> set[str]:
         except OSError:
             continue
     return found
+
+
+ENDS = """
+from raw_traci import Client
+Client(int(sys.argv[1])).drive(4)
+sys.exit({words!r})
+"""
 
 
 def program(misdeed: str) -> str:
@@ -561,6 +614,22 @@ def test_a_command_that_cannot_work_is_refused_in_a_sentence(command, said):
     with pytest.raises(UserError, match=r"controller|--vut-command") as refused:
         run_cases(factory("traci", command=command), cases_of(1))
     assert said in str(refused.value)
+
+
+def test_a_command_that_never_connects_is_told_how():
+    command = f"{sys.executable} -c 'import time; time.sleep(9)'"
+    with pytest.raises(UserError, match=r"in 0\.3 s: --vut-command is told the port as {port}"):
+        run_cases(factory("traci", command=command, connect_s=0.3), cases_of(1))
+
+
+def test_the_reason_of_an_end_is_not_that_of_a_sumo_which_the_controller_started(tmp_path):
+    words = "KeyError: 64\nError: Could not access configuration 'm.sumocfg'.\nQuitting (on error)."
+    ends = tmp_path / "ends.py"
+    ends.write_text(f"import sys\nsys.path.insert(0, {str(TESTS)!r})\n" + ENDS.format(words=words))
+    (trajectory,) = run_cases(
+        factory("traci", command=f"{sys.executable} {ends} {{port}}"), cases_of(1)
+    )
+    assert trajectory.error.endswith("the controller ended with exit code 1: KeyError: 64")
 
 
 def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):
@@ -645,7 +714,8 @@ class Recorder:
     """A client's socket that remembers what was sent."""
 
     def __init__(self, real: socket.socket) -> None:
-        self.real, self.sent = real, []
+        self.real = real
+        self.sent: list[bytes] = []
 
     def send(self, content: bytes) -> int:
         self.sent.append(bytes(content))
@@ -796,6 +866,21 @@ def test_of_two_clients_the_second_waits_and_changes_nothing():
     assert both.speeds == one.speeds
 
 
+def test_who_waits_for_a_second_client_of_its_own_is_told_that_one_is_served():
+    def client(port):
+        first = Client(port)
+        first.step()
+        second = Client(port)
+        with suppress(GoneError):
+            second.step()  # as a second connection does that is made before the first step
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason == (
+        "the controller made no step within the deadline of 0.3 s; another client waits, but one "
+        "at a time is served"
+    )
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_storm_of_connections_ends_with_a_verdict_or_a_reason_for_every_case(seed):
@@ -908,6 +993,7 @@ class TestTheProtocol:
         def written(v):
             if isinstance(v, tuple):
                 return tp.compound(*map(written, v))
+            forms: dict[type, Callable[[Any], bytes]]
             forms = {float: tp.double, int: tp.integer, str: tp.string}
             return forms[type(v)](v)
 

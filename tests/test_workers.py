@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -140,6 +141,18 @@ class TestAWorkerThatDies:
         assert "worker process died 2 times" in ran[2].measures.error
         assert ran[2].measures.score is None
         assert End.SIM_ERROR not in ends[:2] + ends[3:]
+
+
+class TestWhatTravels:
+    def test_arrives_as_it_was_sent(self):
+        cases = from_unit(np.random.default_rng(0).random((1, 3)), 2)
+        plan = GroundPlan(vut=vut_factory("level0"), corridors=1, net=road_of(), povs=Povs())
+        (sent,) = run_cases(plan, cases)
+        came = pickle.loads(pickle.dumps(sent))  # noqa: S301 (our own)
+        assert came.trajectory.case == sent.trajectory.case == cases[0]
+        assert came.measures == sent.measures
+        assert (came.trajectory.motion == sent.trajectory.motion).all()
+        assert came.trajectory.end is sent.trajectory.end
 
 
 class TestLocalProcesses:

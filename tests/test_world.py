@@ -1,5 +1,7 @@
 """The SUMO world against the paper's equations of motion, and episodes in it."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import numpy as np
@@ -15,7 +17,7 @@ from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, POV, VUT
 from merge_sumo.values.score import measure
-from merge_sumo.values.trajectory import End
+from merge_sumo.values.trajectory import End, Trajectory
 
 EXACT = 1e-9
 
@@ -29,7 +31,7 @@ class RandomDriver(Driver):
 
     def __init__(self, corridors, brake_first_steps=0):
         super().__init__(corridors)
-        self.rngs = [None] * corridors
+        self.rngs: list[np.random.Generator] = [None] * corridors
         self.brake_first_steps = brake_first_steps
 
     def begin(self, corridor, case):
@@ -47,7 +49,7 @@ class RandomDriver(Driver):
 
 
 def run_all(world, pov, vut, cases):
-    trajectories = [None] * len(cases)
+    trajectories: list[Trajectory] = [None] * len(cases)
     for index, trajectory in rollout(world, pov, vut, cases):
         assert trajectories[index] is None
         trajectories[index] = trajectory

@@ -4,13 +4,15 @@
               `truth` uses: cases per second and the largest memory of a worker process
     workers   the same cases on one worker process and on two, in turns, beside a loop that only
               computes, on one process and on two: what the machine itself can give
-    campaign  the whole command of a uniform campaign, on one worker and on two, in turns
+    campaign  the whole command of a uniform campaign of design2, from its start to the report, on
+              one worker and on two, in turns
     parent    cases per second that the process takes that asks, tells and keeps, where workers are
               no limit, and how many workers like the one above that feeds
     samplers  seconds that each sampler takes for a batch, after a history of that many cases
     files     reading `outcomes.jsonl`, FMC and regions of its failures, the report
 
-Everything is measured in one run; `--most 1000000` goes on to a million uniform cases.
+Everything is measured in one run; `--most 1000000` goes on to a million uniform cases. `--only
+workers campaign parent` leaves out the others.
 """
 
 from __future__ import annotations
@@ -57,6 +59,7 @@ ROUNDS = 5
 CAMPAIGN_ROUNDS = 3
 PAIR_CASES = 2000
 BATCH = 20
+PARTS = ("truth", "workers", "campaign", "parent", "samplers", "files")
 
 
 def memory_mb() -> float:
@@ -141,8 +144,8 @@ def two_workers() -> dict[str, list[float]]:
 def whole_campaigns(cases: int, rounds: int) -> dict[str, list[float]]:
     """Return the seconds of whole commands on one worker and on two, and their ratio, by round."""
     found: dict[str, list[float]] = {"s_on_one": [], "s_on_two": [], "gain": []}
-    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", VUT, "--level", "0"]
-    command += ["--sampler", "uniform", "--cases", str(cases), "--batch", str(BATCH), "--quiet"]
+    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", "design2"]
+    command += ["--sampler", "uniform", "--cases", str(cases), "--quiet"]
     with tempfile.TemporaryDirectory() as scratch:
         for number in range(rounds):
             spent = []
@@ -238,6 +241,29 @@ def files(count: int, seen: Sequence[Outcome], folder: Path) -> dict[str, float]
     return found
 
 
+def of_campaigns(chosen: argparse.Namespace, tell: Callable[[str], None]) -> dict[str, Any]:
+    """Return what samplers and files take after more and more outcomes."""
+    result: dict[str, Any] = {"samplers": {}, "files": []}
+    with tempfile.TemporaryDirectory() as scratch:
+        settings = CampaignSettings(vut=VUT, levels=(0,), sampler="uniform", cases=400, batch=400)
+        run = run_campaign(settings, Path(scratch) / "run")
+        count = 100
+        while count <= chosen.history and "samplers" in chosen.only:
+            history = history_of(count, run.outcomes)
+            spent = {name: sampler_s(name, history) for name in SAMPLERS}
+            result["samplers"][count] = spent
+            shown = ", ".join(f"{name} {seconds:.3f}" for name, seconds in spent.items())
+            tell(f"samplers: seconds for a batch of {BATCH} after {count:,} cases: {shown}")
+            count *= 10
+        count = 10_000
+        while count <= chosen.outcomes and "files" in chosen.only:
+            row = files(count, run.outcomes, run.folder)
+            result["files"].append(row)
+            tell("files: " + ", ".join(f"{name} {value:.3g}" for name, value in row.items()))
+            count *= 10
+    return result
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -247,6 +273,7 @@ def main() -> None:
     parser.add_argument("--campaign", type=int, default=20_000, help="cases of whole campaigns")
     parser.add_argument("--history", type=int, default=10_000, help="longest history of a sampler")
     parser.add_argument("--outcomes", type=int, default=1_000_000, help="outcomes of a report")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="what to measure")
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
 
@@ -254,45 +281,32 @@ def main() -> None:
         if not chosen.json:
             print(text, flush=True)
 
-    result: dict[str, Any] = {"truth": [], "samplers": {}, "files": []}
-    for row in truth(chosen.most):
+    def tell_spread(part: str, found: dict[str, list[float]]) -> None:
+        for name, values in found.items():
+            median = statistics.median(values)
+            tell(f"{part}: {name}: {median:.2f} [{min(values):.2f}, {max(values):.2f}]")
+
+    result: dict[str, Any] = {"truth": []}
+    for row in truth(chosen.most) if "truth" in chosen.only else ():
         result["truth"].append(row)
         tell(
             f"truth: {row['cases']:9,.0f} cases at {row['cases_per_s']:6.0f} cases/s, worker at "
             f"most {row['worker_mb']:.0f} MB, this process {row['this_process_mb']:.0f} MB"
         )
-    result["workers"] = two_workers()
-    for name, values in result["workers"].items():
-        median = statistics.median(values)
-        tell(f"workers: {name}: {median:.2f} [{min(values):.2f}, {max(values):.2f}]")
-    result["campaign"] = whole_campaigns(chosen.campaign, CAMPAIGN_ROUNDS)
-    for name, values in result["campaign"].items():
-        median = statistics.median(values)
-        tell(f"campaign: {name}: {median:.2f} [{min(values):.2f}, {max(values):.2f}]")
-    taken = [parent(chosen.campaign) for _ in range(ROUNDS)]
-    feeds = statistics.median(taken) / statistics.median(result["workers"]["cases_per_s_on_one"])
-    result["parent"] = {"cases_per_s": taken, "feeds_workers": feeds}
-    tell(
-        f"parent: {statistics.median(taken):.0f} cases/s [{min(taken):.0f}, {max(taken):.0f}], "
-        f"feeds {feeds:.1f} workers"
-    )
-    with tempfile.TemporaryDirectory() as scratch:
-        settings = CampaignSettings(vut=VUT, levels=(0,), sampler="uniform", cases=400, batch=400)
-        run = run_campaign(settings, Path(scratch) / "run")
-        count = 100
-        while count <= chosen.history:
-            history = history_of(count, run.outcomes)
-            spent = {name: sampler_s(name, history) for name in SAMPLERS}
-            result["samplers"][count] = spent
-            shown = ", ".join(f"{name} {seconds:.3f}" for name, seconds in spent.items())
-            tell(f"samplers: seconds for a batch of {BATCH} after {count:,} cases: {shown}")
-            count *= 10
-        count = 10_000
-        while count <= chosen.outcomes:
-            row = files(count, run.outcomes, run.folder)
-            result["files"].append(row)
-            tell("files: " + ", ".join(f"{name} {value:.3g}" for name, value in row.items()))
-            count *= 10
+    if {"workers", "parent"} & set(chosen.only):
+        result["workers"] = two_workers()
+        tell_spread("workers", result["workers"])
+    if "campaign" in chosen.only:
+        result["campaign"] = whole_campaigns(chosen.campaign, CAMPAIGN_ROUNDS)
+        tell_spread("campaign", result["campaign"])
+    if "parent" in chosen.only:
+        taken = [parent(chosen.campaign) for _ in range(ROUNDS)]
+        one = statistics.median(result["workers"]["cases_per_s_on_one"])
+        feeds = [rate / one for rate in taken]
+        result["parent"] = {"cases_per_s": taken, "feeds_workers": feeds}
+        tell_spread("parent", result["parent"])
+    if {"samplers", "files"} & set(chosen.only):
+        result |= of_campaigns(chosen, tell)
     if chosen.json:
         print(json.dumps(result))
 

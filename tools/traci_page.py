@@ -22,7 +22,8 @@ Questions are answered as SUMO answers them, about the net as it is in its file 
 `pov` and `vut` (in traffic also `ahead` and `behind`). What is needed in every step, merge-sumo \
 answers itself. The rest is passed on to a SUMO beside it, which is started for the first such \
 question and has the same vehicles in the same state; it holds up the first answer by a fraction \
-of a second. A question about an object that there is not is refused as by SUMO.
+of a second. A question about an object that there is not is refused as by SUMO. Subscriptions \
+and context subscriptions take all of it, too, but no filters of contexts.
 
 Commands drive the VUT, which moves as a car that is commanded in SUMO in speed mode 38: limits of \
 acceleration and speed that a controller sets act, SUMO's checks of safe speed, right of way and \

@@ -49,6 +49,7 @@ from merge_sumo.system.workers import Workers
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.merge import AfterMerge, after_merge
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
 from merge_sumo.values.score import Outcome, verdict
 from merge_sumo.values.trajectory import End, Trajectory
@@ -247,10 +248,15 @@ class _Found:
 
 
 def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) -> bool:
-    """Return whether an episode ends at M without a failure."""
+    """Return whether an episode ends at M without a failure.
+
+    Nor is one avoided by a merge after which whoever is behind cannot brake hard enough.
+    """
+    if after_merge(trajectory) is AfterMerge.FORCED:
+        return False
     if criterion.is_papers:  # which needs no measures
         return verdict(trajectory) is End.MERGED
-    outcome = criterion.outcome(0, 0, trajectory, lines)
+    outcome = criterion.judged(trajectory, lines)
     return outcome.measures.end.is_tested and not outcome.failed
 
 

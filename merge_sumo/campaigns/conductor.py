@@ -100,7 +100,7 @@ def run_campaign(
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> Run:
-    """Run a campaign into a new folder and return it as read back from there.
+    """Run a campaign into a new folder and return it.
 
     Same settings, same versions: same `outcomes.jsonl`, whatever the workers. The worst failures
     are exported as folders that sumo-gui opens. Raises `UserError` when the folder exists.
@@ -241,6 +241,7 @@ def _go_on(
             yield place, done
 
     history = [] if before is None else before.outcomes
+    ended: list[Outcome] = []
     motions = None
     if before is not None and sampler.foresees:
         motions = {o.index: before.trajectory(o.index).motion for o in history}
@@ -258,12 +259,13 @@ def _go_on(
         )
         for ran in ahead.together(batches):
             journal.append(*ran)
+            ended += [outcome for batch in ran for outcome, _ in batch]
             noted = {name: known or None for name, known in files.items()}
             if noted != {name: record[name] for name in FILES}:
                 record |= noted
                 journal.rewrite_settings(record)
             check()
-    done = Run(journal.folder)
+    done = Run(journal.folder, [*history, *ended])
     for outcome in spread_failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
         if not os.path.lexists(folder):  # written whole, before the campaign was stopped

@@ -24,6 +24,7 @@ from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
+from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.resources import resource
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
@@ -122,6 +123,7 @@ class GroundPlan:
         return ProvingGround(self.vut, self.corridors, self.net, self.scenario, self.povs)
 
 
+@quickly_pickled
 @dataclass(frozen=True, slots=True)
 class Ran:
     """What became of one case, and the files that had decided on it by then.
@@ -232,7 +234,9 @@ def runs_on(workers: Workers, plan: GroundPlan) -> OnWorkers:
         pov = "" if own is None else f" or the POV {own.spec}"
         raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
 
-    for _ in workers.run(partial(_open_ground, plan), [None], died):
+    # All of them at once: a worker takes as long to start as to run hundreds of cases.
+    everywhere = [None] * min(workers.count, plan.corridors)
+    for _ in workers.run(partial(_open_ground, plan), everywhere, died, chunk=1):
         pass
     return OnWorkers(workers, plan)
 

@@ -46,23 +46,34 @@ UNREADABLE_RECORD: Final = (
 
 
 class Run:
-    """A finished or interrupted campaign, read from its folder.
+    """A finished or interrupted campaign, as its folder holds it.
 
     Raises `UserError` when the folder is no campaign, a line of it cannot be read, or something is
     not as it was written.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Read settings and outcomes; trajectories are read when they are asked for."""
+    def __init__(self, folder: Path, outcomes: list[Outcome] | None = None) -> None:
+        """Read settings and outcomes; trajectories are read when they are asked for.
+
+        `outcomes` are those of the folder, where who has written it knows them.
+        """
         self.folder = folder
         self.settings = read_settings(folder)
+        self.scenario = scenario_of(self.settings, folder / SETTINGS)
+        self.criterion = _criterion_of(self.settings, folder / SETTINGS)
+        self._batches: dict[int, dict[int, FloatArray]] = {}
+        if outcomes is None:
+            self._read()
+        else:
+            self.outcomes, self.torn = outcomes, False
+
+    def _read(self) -> None:
+        folder = self.folder
         try:
             text = regular(folder / OUTCOMES).read_bytes()
         except OSError as error:
             raise _no_campaign(folder, error) from error
-        self.scenario = scenario_of(self.settings, folder / SETTINGS)
         self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES), self.scenario)
-        self.criterion = _criterion_of(self.settings, folder / SETTINGS)
         for outcome in self.outcomes:
             needs = not (self.criterion.is_papers or outcome.measures.end.is_error)
             if needs != (outcome.margin is not None):
@@ -71,7 +82,6 @@ class Run:
                     f"that {SETTINGS} names, {self.criterion.text}"
                 )
         _check_lines(folder, text, self.outcomes)
-        self._batches: dict[int, dict[int, FloatArray]] = {}
 
     @property
     def vut(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from merge_sumo.campaigns.settings import CampaignSettings
     from merge_sumo.reports.summary import Summary
     from merge_sumo.reports.verdict import Gate, Verdict
+    from merge_sumo.sumo.corridor import Corridor
+    from merge_sumo.system.interrupt import Interrupt
+    from merge_sumo.system.workers import Workers
 
 
 @app.command()
@@ -137,7 +140,6 @@ def campaign(
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
     """
     from merge_sumo.campaigns import conductor
-    from merge_sumo.campaigns.avoidance import note_avoidance
     from merge_sumo.campaigns.ground import road_for
     from merge_sumo.campaigns.run import read_settings
     from merge_sumo.campaigns.settings import (
@@ -223,34 +225,60 @@ def campaign(
                         warn=say,
                         trust=trust_vut,
                     )
-            careful = note_avoidance(run, settings, road, workers=there, check=interrupt.check)
+            found = _looked_back(run, settings, road, there, interrupt, local=dask is None)
     except Stopped:
         say(_how_to_go_on(folder, net, [gate.name for gate in gates], junit))
         raise
     if resume is None and level == "all" and not set(levels) >= set(LEVELS):
         named = ", ".join(map(level_name, levels))
         say(f"--level all: policies are there for level {named}; `merge-sumo train` makes others")
-    raise typer.Exit(0 if _conclude(run, settings, gates, junit, careful, as_json=as_json) else 1)
+    raise typer.Exit(0 if _conclude(found, settings, gates, junit, as_json=as_json) else 1)
+
+
+class _Found(NamedTuple):
+    """What a campaign found, and where it is told."""
+
+    run: Run
+    summary: Summary
+    careful: str | None
+    report_file: Path
+
+
+def _looked_back(
+    run: Run,
+    settings: CampaignSettings,
+    road: Corridor,
+    workers: Workers,
+    interrupt: Interrupt,
+    *,
+    local: bool,
+) -> _Found:
+    """Drive the failures of a campaign again, and write its report."""
+    from merge_sumo.campaigns.avoidance import note_avoidance
+    from merge_sumo.reports.report import write_report
+    from merge_sumo.reports.summary import summarise
+
+    careful = note_avoidance(run, settings, road, workers=workers, check=interrupt.check)
+    link_latest(run.folder)
+    summary = summarise(run.outcomes, settings.levels)
+    # Learned on another machine, surrogates may differ in a last bit.
+    report_file = write_report(run, summary, workers if local else None)
+    return _Found(run, summary, careful, report_file)
 
 
 def _conclude(
-    run: Run,
+    found: _Found,
     settings: CampaignSettings,
     gates: list[Gate],
     junit: Path | None,
-    careful: str | None,
     *,
     as_json: bool,
 ) -> bool:
-    """Write and print what a campaign found; return whether it passed."""
+    """Print what a campaign found; return whether it passed."""
     from merge_sumo.reports.junit import write_junit
-    from merge_sumo.reports.report import write_report
-    from merge_sumo.reports.summary import summarise
     from merge_sumo.reports.verdict import NOTHING_TESTED, judge
 
-    link_latest(run.folder)
-    report_file = write_report(run)
-    summary = summarise(run.outcomes, settings.levels)
+    run, summary, careful, report_file = found
     verdict = judge(run.outcomes)
     results = [gate.check(verdict, summary) for gate in gates]
     passed = verdict.tested > 0 and not any(result.met for result in results)

@@ -20,7 +20,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_facts import Facts
 from merge_sumo.reports.report_words import page_words
+from merge_sumo.reports.summary import Summary
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import level_name
 
 if TYPE_CHECKING:
@@ -32,14 +34,15 @@ GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
 HEAD_BYTES: Final = 1000
 
 
-def write_report(run: Run) -> Path:
+def write_report(run: Run, summary: Summary | None = None, workers: Workers | None = None) -> Path:
     """Write `report.html` into the folder of a run, in place of an older one; return its path.
 
-    Raises `UserError` when it cannot be written, or what is there is no report of ours.
+    `summary` is that of the run, where it is known; on `workers` its surrogates are asked. Raises
+    `UserError` when it cannot be written, or what is there is no report of ours.
     """
     check_report(run.folder)
     path = run.folder / REPORT
-    replace_own(path, report_page(run).encode(errors="backslashreplace"))
+    replace_own(path, report_page(run, summary, workers).encode(errors="backslashreplace"))
     return path
 
 
@@ -58,7 +61,7 @@ def check_report(folder: Path) -> None:
         raise UserError(f"{path} is no report of merge-sumo and is not replaced: move it away")
 
 
-def report_page(run: Run) -> str:
+def report_page(run: Run, summary: Summary | None = None, workers: Workers | None = None) -> str:
     """Return the report of a run as HTML."""
     from markupsafe import Markup
 
@@ -66,12 +69,13 @@ def report_page(run: Run) -> str:
         (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
         for name in ("report.css", "report.js")
     )
-    facts = Facts(run)
+    facts = Facts(run, summary, workers)
+    words = page_words(facts)
     data = json.dumps(page_data(facts), allow_nan=False, separators=(",", ":"))
     # No "<" in the JSON: nothing in it can end its element.
     data = data.replace("<", "\\u003c")
     return _template().render(
-        **page_words(facts),
+        **words,
         style=Markup(style),  # noqa: S704 (our own file)
         script=Markup(script),  # noqa: S704 (our own file)
         style_hash=policy_hash(style),

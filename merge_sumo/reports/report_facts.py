@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Final, TypeVar
 
 from merge_sumo.campaigns.avoidance import read_avoidance
 from merge_sumo.campaigns.ground import road_for
@@ -18,11 +20,13 @@ from merge_sumo.reports.diagnosis import (
     diagnose,
 )
 from merge_sumo.reports.foretelling import Expected, is_foretold, surprises
-from merge_sumo.reports.summary import summarise
-from merge_sumo.reports.surface import learn_surface
+from merge_sumo.reports.report_maps import GRID
+from merge_sumo.reports.summary import Summary, summarise
+from merge_sumo.reports.surface import Surface, learn_surface
 from merge_sumo.reports.verdict import Trouble, judge
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, OWN
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
@@ -34,20 +38,29 @@ SHOWN: Final = 2000
 ERROR_CHARACTERS: Final = 2000
 """Of the message of a case; `outcomes.jsonl` has the whole."""
 
+T = TypeVar("T")
+
 
 class Facts:
     """Everything that the page shows of a run."""
 
-    def __init__(self, run: Run) -> None:
-        """Read what the page shows; raises `UserError` where settings have no list of levels."""
+    def __init__(
+        self, run: Run, summary: Summary | None = None, workers: Workers | None = None
+    ) -> None:
+        """Read what the page shows; raises `UserError` where settings have no list of levels.
+
+        `summary` is that of the run, where it is known; on `workers`, where they are several
+        processes, its surrogates are asked.
+        """
         levels = run.settings.get("levels")
         if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
             raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
         self.run = run
         self.road = _road_of(run)
-        self.summary = summarise(run.outcomes, levels)
+        self.summary = summary or summarise(run.outcomes, levels)
         self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
+        self._surfaces = _meanwhile(partial(_surfaces, run, self.levels, workers))
         self.coordinates = coordinates(run.scenario)
         self.worst = failures(run.outcomes)
         self.regions = regions_of(self.worst)
@@ -73,8 +86,12 @@ class Facts:
         self.kinds: dict[int, Kind] = {
             index: found.kind for index, found in self.diagnoses.items() if found.kind is not None
         }
-        self.surfaces = {level: learn_surface(run.outcomes, level) for level in self.levels}
         self.truths = {level: _truth(run, self.road, level) for level in self.levels}
+
+    @property
+    def surfaces(self) -> dict[int, Surface | None]:
+        """What a surrogate says of each level; they are learned while the rest is read."""
+        return self._surfaces.result()
 
     def coordinates_of(self, level: int) -> tuple[Coordinate, ...]:
         """Return the coordinates of a level, in the pool's order."""
@@ -87,6 +104,26 @@ class Facts:
     def examples_of(self, trouble: Trouble) -> list[Outcome]:
         """Return the cases that are listed for a message."""
         return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
+
+
+def _meanwhile(work: Callable[[], T]) -> Future[T]:
+    """Do some work in a thread of its own."""
+    thread = ThreadPoolExecutor(1)
+    try:
+        return thread.submit(work)
+    finally:
+        thread.shutdown(wait=False)
+
+
+def _surfaces(
+    run: Run, levels: Sequence[int], workers: Workers | None
+) -> dict[int, Surface | None]:
+    """Return the surrogate of each level; what its map shows is worked out."""
+    surfaces = {level: learn_surface(run.outcomes, level, workers) for level in levels}
+    for level, surface in surfaces.items():
+        if surface is not None:
+            surface.work_out(GRID.get(len(run.scenario.dimensions(level))))
+    return surfaces
 
 
 def _expected(run: Run, levels: Sequence[int], road: Corridor) -> Expected | None:

@@ -8,7 +8,7 @@ pair comes first is what the surrogate says: the two that explain the most of wh
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, Final
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.campaigns.truth import Truth
 from merge_sumo.reports.foretelling import Expected
-from merge_sumo.reports.surface import Surface
+from merge_sumo.reports.surface import Grid, Surface, nodes
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import Scenario
@@ -138,7 +138,7 @@ def _counts(
 
 def _chance(surface: Surface, dims: int, axes: Axes) -> dict[str, Any]:
     if dims in GRID:
-        return _packed(GRID[dims], surface.chance(_nodes(dims)))
+        return _packed(GRID[dims], surface.over(GRID[dims]))
     points, chance = surface.pool()
     return _means(points[:, list(axes)], chance)
 
@@ -148,7 +148,7 @@ def _truth(truth: Truth, dims: int, axes: Axes) -> dict[str, Any]:
 
     failed = truth.score < FAILURE_SCORE
     if dims in GRID:
-        _, near = cKDTree(truth.points).query(_nodes(dims), k=NEIGHBOURS)
+        _, near = cKDTree(truth.points).query(nodes(GRID[dims]), k=NEIGHBOURS)
         return _packed(GRID[dims], failed[near].mean(axis=1))
     return _means(truth.points[:, list(axes)], failed.astype(np.float64))
 
@@ -156,25 +156,18 @@ def _truth(truth: Truth, dims: int, axes: Axes) -> dict[str, Any]:
 def _expected(expected: Expected, level: int, dims: int) -> dict[str, Any] | None:
     from scipy.ndimage import maximum_filter
 
-    nodes = COARSE_GRID.get(dims)
-    if nodes is None:
+    grid = COARSE_GRID.get(dims)
+    if grid is None:
         return None
-    near = expected.nearness(_nodes(dims, COARSE_GRID), level)
+    near = expected.nearness(nodes(grid), level)
     if near is None:
         return None
     # Failures may lie on a thin curve: what is drawn is what they would cover.
-    shape = [n for n in nodes[::-1] if n > 1]
+    shape = [n for n in grid[::-1] if n > 1]
     reach = [int(radius_for(dims) * (n - 1) + 0.5) for n in shape]
     steps = np.meshgrid(*[np.arange(-r, r + 1) / max(r, 1) for r in reach], indexing="ij")
     ball = np.square(steps).sum(axis=0) <= 1.0
-    return _packed(nodes, maximum_filter(near.reshape(shape), footprint=ball).ravel())
-
-
-def _nodes(dims: int, grid: Mapping[int, tuple[int, int, int]] = GRID) -> FloatArray:
-    """Return the nodes of a map, (n, d), the first coordinate running fastest."""
-    axes = [np.linspace(0.0, 1.0, n) for n in grid[dims] if n > 1]
-    mesh = np.meshgrid(*axes[::-1], indexing="ij")
-    return np.stack([axis.ravel() for axis in mesh[::-1]], axis=1)
+    return _packed(grid, maximum_filter(near.reshape(shape), footprint=ball).ravel())
 
 
 def _means(points: FloatArray, values: FloatArray) -> dict[str, Any]:
@@ -198,8 +191,8 @@ def _means(points: FloatArray, values: FloatArray) -> dict[str, Any]:
     return {"most": round(most, 3), **_packed((PAIR_NODES, PAIR_NODES, 1), shares)}
 
 
-def _packed(nodes: tuple[int, int, int], share: NDArray[Any]) -> dict[str, Any]:
-    nx, ny, through = nodes
+def _packed(grid: Grid, share: NDArray[Any]) -> dict[str, Any]:
+    nx, ny, through = grid
     values = np.rint(255.0 * share).astype(np.uint8)
     data = base64.b64encode(values.tobytes()).decode()
     return {"nx": nx, "ny": ny, "np": through, "data": data}

@@ -73,14 +73,14 @@ class Belief:
         self.groups = _groups(history)
         self.history = history
         values, low, high = margin_of(learned, limit)
-        smooth, rough = (
+        self._smooth, self._rough = (
             Margin(learned.points, values, low, high, rough=rough) for rough in (False, True)
         )
-        self.rotation = smooth.rotation
-        self._experts: list[Margin | Branches] = [smooth, rough]
+        self.rotation = self._smooth.rotation
+        self._branches: Branches | None = None
         positive = int((values >= 0.0).sum())
         if has_gaps(history) and min(positive, len(values) - positive) >= BRANCH_FROM:
-            self._experts.append(Branches(learned.points, values, smooth))
+            self._branches = Branches(learned.points, values, self._smooth)
         self._judge(learned)
 
     def of(self, cases: FloatArray) -> FloatArray:
@@ -88,13 +88,16 @@ class Belief:
         dims = self.history.dims
         distances = [nearest(cases, self.history.points[group]) for group in self.groups]
         chances = [
-            expit(
-                _evidence(_lowered(expert.at(cases), distances, width), distances, dims)
-                @ calibration
-            )
-            for expert, (width, calibration) in zip(self._experts, self._judged, strict=True)
+            expit(_evidence(_lowered(said, distances, width), distances, dims) @ calibration)
+            for said, (width, calibration) in zip(self._said(cases), self._judged, strict=True)
         ]
         return np.asarray(np.average(chances, axis=0, weights=self._weights), dtype=np.float64)
+
+    def _said(self, cases: FloatArray) -> list[FloatArray]:
+        """Return what each expert says of cases, (m, d); the smooth process is asked once."""
+        smooth = self._smooth.process.at(cases)
+        found = [self._smooth.probability(*smooth), self._rough.at(cases)]
+        return found if self._branches is None else [*found, self._branches.at(cases, smooth)]
 
     def _judge(self, learned: LevelHistory) -> None:
         """Weigh the experts, and learn width and calibration, by how each foretold each case."""
@@ -102,7 +105,9 @@ class Belief:
         log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
         self._judged: list[tuple[float, FloatArray]] = []
         best = []
-        for expert in self._experts:
+        experts: list[Margin | Branches] = [self._smooth, self._rough]
+        experts += [] if self._branches is None else [self._branches]
+        for expert in experts:
             chance = expert.left_out()
             found = []
             for width, prior in zip(WIDTHS.tolist(), log_prior.tolist(), strict=True):

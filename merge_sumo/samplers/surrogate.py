@@ -37,6 +37,8 @@ TREND: Final = 4.0
 CLIPPED: Final = 2.0
 """Margins are clipped at this for the slope, which is sought near the failures."""
 ITERATIONS: Final = 25
+BLOCK: Final = 128
+"""Queries whose covariances are worked out at a time: so many fit into the cache of a core."""
 
 
 class Process:
@@ -84,8 +86,14 @@ class Process:
         return cross.T @ self._alpha, prior - np.square(explained).sum(axis=0)
 
     def _covariance(self, others: FloatArray) -> FloatArray:
-        correlation, _ = _correlation(self._points, others, self._lengths, self._rough)
-        return self._variance * correlation + self._trend * (1.0 + self._points @ others.T)
+        covariance: FloatArray = np.empty((len(self._points), len(others)))
+        for first in range(0, len(others), BLOCK):
+            block = slice(first, first + BLOCK)
+            found, _ = _correlation(self._points, others[block], self._lengths, self._rough)
+            covariance[:, block] = self._variance * found
+        if self._trend:
+            covariance += self._trend * (1.0 + self._points @ others.T)
+        return covariance
 
 
 class Margin:
@@ -101,13 +109,14 @@ class Margin:
 
     def left_out(self) -> FloatArray:
         """Return for each case, (N,), its probability of failing as seen by all the others."""
-        return self._probability(*self.process.left_out())
+        return self.probability(*self.process.left_out())
 
     def at(self, queries: FloatArray) -> FloatArray:
         """Return the probability of failing at queries, (m, d)."""
-        return self._probability(*self.process.at(queries))
+        return self.probability(*self.process.at(queries))
 
-    def _probability(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
+    def probability(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
+        """Return the probability of failing, (m,), where the process has that mean and variance."""
         low, high = self._interval
         deviation = _deviation(variance)
         return np.asarray(
@@ -142,10 +151,15 @@ class Branches:
             failing.append(chance)
         return self._mixed(failing, self._both.left_out())
 
-    def at(self, queries: FloatArray) -> FloatArray:
-        """Return the probability of failing at queries, (m, d)."""
+    def at(
+        self, queries: FloatArray, sign: tuple[FloatArray, FloatArray] | None = None
+    ) -> FloatArray:
+        """Return the probability of failing at queries, (m, d).
+
+        `sign` is what the process over both signs says of them, where that is known.
+        """
         failing = [_below_one(*branch.at(queries)) for branch in self._branches]
-        return self._mixed(failing, self._both.at(queries))
+        return self._mixed(failing, self._both.at(queries) if sign is None else sign)
 
     def _mixed(self, failing: list[FloatArray], sign: tuple[FloatArray, FloatArray]) -> FloatArray:
         mean, variance = sign
@@ -210,7 +224,7 @@ def _correlation(
         factor * np.abs(points[:, axis, None] - others[None, :, axis])
         for axis, factor in enumerate((roots / lengths).tolist())
     ]
-    correlation = np.exp(-reduce(np.add, scaled))
+    correlation: FloatArray = np.exp(-reduce(np.add, scaled))
     for distance in scaled[rough:]:
         correlation *= 1.0 + distance
     return correlation, scaled

@@ -10,7 +10,7 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any, Final
 
 from lxml import etree
@@ -78,30 +78,46 @@ class Beside:
                     raise UserError(f"SUMO cannot use {name}: {error}") from error
             self._opened = opened.pop_all()
         self._there: set[str] = set()
+        self._beyond: set[str] = set()
         self._dead = False
 
     def show(self, states: Mapping[str, State]) -> None:
-        """Make a step, after which the vehicles are in these states; those not named arrive."""
+        """Make a step, after which the vehicles are in these states; those not named arrive.
+
+        So does who is beyond the end of the net, where paths go on without a road.
+        """
         if self._dead:
             return
         vehicle = self._connection.vehicle
+        self._beyond &= states.keys()
         try:
             for name in self._there - states.keys():
                 vehicle.remove(name)
-            for name in states.keys() - self._there:
+            for name in states.keys() - self._there - self._beyond:
                 vehicle.add(name, f"route.{name}", typeID=name, **self._start(name, states[name]))
                 vehicle.setColor(name, COLOURS[name == VEHICLES[VUT]])
-            self._there = set(states)
+            self._there = states.keys() - self._beyond
             self._connection.simulationStep()
-            for name, (x_m, v_mps, a_mps2) in states.items():
-                point = self._road.lane_point(x_m, on_ramp=name == VEHICLES[VUT])
-                vehicle.setSpeedMode(name, COMMANDED)
-                vehicle.setLaneChangeMode(name, 0)
-                vehicle.moveTo(name, point.lane, point.position_m)
-                vehicle.setPreviousSpeed(name, v_mps, a_mps2)
-                vehicle.setSpeed(name, v_mps)
+            for name in [name for name in states if name in self._there]:
+                try:
+                    self._place(name, *states[name])
+                except self._traci.TraCIException:
+                    with suppress(self._traci.TraCIException):  # it may have arrived by itself
+                        vehicle.remove(name)
+                    self._there.discard(name)
+                    self._beyond.add(name)
         except self._errors:
-            self._dead = True  # beyond the end of the net, or somebody ended it
+            self._dead = True  # somebody ended it
+
+    def _place(self, name: str, x_m: float, v_mps: float, a_mps2: float) -> None:
+        """Put a vehicle where it is."""
+        vehicle = self._connection.vehicle
+        point = self._road.lane_point(x_m, on_ramp=name == VEHICLES[VUT])
+        vehicle.setSpeedMode(name, COMMANDED)
+        vehicle.setLaneChangeMode(name, 0)
+        vehicle.moveTo(name, point.lane, point.position_m)
+        vehicle.setPreviousSpeed(name, v_mps, a_mps2)
+        vehicle.setSpeed(name, v_mps)
 
     def _start(self, name: str, state: State) -> dict[str, str]:
         """Return where a vehicle departs; it can do so on the first edge of its route only."""

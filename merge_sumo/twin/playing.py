@@ -93,8 +93,8 @@ class Games:
             of_row = motion[: last + 1, :, :, row].copy()
             of_row[-1, :, 2] = 0.0
             end = End.TIMEOUT if np.isnan(gap_m[row]) else End.MERGED
-            outcome = self._criterion.outcome(0, 0, Trajectory(case, of_row, end), self._lines)
-            found[row] = outcome.signed_gap_m
+            judged = self._criterion.judged(Trajectory(case, of_row, end), self._lines)
+            found[row] = judged.signed_gap_m
         return found
 
     def _play(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.values.scenario import (
     AHEAD,
     ALL_LEVELS,
@@ -42,6 +43,7 @@ def dimensions(level: int, scenario: Scenario = US23) -> tuple[Dimension, ...]:
     return scenario.dimensions(level)
 
 
+@quickly_pickled
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Case:
     """One test case, a point of a scenario; `svo_rad` is None below level 2.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Set
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
@@ -100,7 +101,7 @@ class Criterion:
         """
         if self.require is not None:
             try_formula(self.require)
-        spoken = set() if self.require else set(re.findall(r"\w+", self.words))
+        spoken = frozenset[str]() if self.require else _names(self.words)
         if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
             raise UserError(
                 f"--fail-when speaks of {min(named)}, which is measured behind M: say how long "
@@ -133,13 +134,32 @@ class Criterion:
             return None
         if self.require is not None:
             return robustness(self.require, trajectory)
-        return _condition(self.words).margin(values_of(trajectory, measures, lines))
+        names = _names(self.words)
+        return _condition(self.words).margin(values_of(trajectory, measures, lines, names))
 
     def outcome(
         self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
     ) -> Outcome:
         """Return the outcome of an episode at a place in a campaign."""
-        measures = measure(trajectory)
+        return self._outcome(index, batch, trajectory, measure(trajectory), lines)
+
+    def judged(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
+        """Return the outcome of an episode of no campaign, for its verdict alone.
+
+        No way out of a collision is searched for, which takes most of the time, where the
+        criterion does not speak of it.
+        """
+        way_out = self.require is None and "last_avoidable_s" in _names(self.words)
+        return self._outcome(0, 0, trajectory, measure(trajectory, way_out=way_out), lines)
+
+    def _outcome(
+        self,
+        index: int,
+        batch: int,
+        trajectory: Trajectory,
+        measures: Measures,
+        lines: CentreLines | None,
+    ) -> Outcome:
         margin = self.margin(trajectory, measures, lines)
         return Outcome(index, batch, trajectory.case, measures, margin=margin)
 
@@ -153,22 +173,31 @@ def _condition(text: str) -> Condition:
     return parse_condition(text, VOCABULARY, "--fail-when")[0]
 
 
+@lru_cache
+def _names(text: str) -> frozenset[str]:
+    """Return the measures that a condition speaks of."""
+    return frozenset(re.findall(r"\w+", text)) & VOCABULARY.keys()
+
+
 def values_of(
-    trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
+    trajectory: Trajectory,
+    measures: Measures,
+    lines: CentreLines | None = None,
+    names: Set[str] = VOCABULARY.keys(),
 ) -> dict[str, Value]:
     """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
     gap_m, after_m = bumper_gap_m(trajectory), measures.after_gap_m
     after_m = math.inf if after_m is None else after_m
-    before_m = math.inf if lines is None else clearance_before_m(trajectory, lines)
     missing: dict[str, Value] = NEVER | (IN_COLLISION if measures.end is End.COLLISION else {})
     if after_m <= 0.0:
         missing = missing | {"after_drac_mps2": math.inf}
-    found: dict[str, Value] = {
-        "gap_m": gap_m,
-        "clearance_m": min(gap_m, before_m, after_m),
-        "brake_after_mps2": brake_after_mps2(trajectory),
-    }
-    for name in VOCABULARY:
+    found: dict[str, Value] = {"gap_m": gap_m}
+    if "clearance_m" in names:
+        before_m = math.inf if lines is None else clearance_before_m(trajectory, lines)
+        found["clearance_m"] = min(gap_m, before_m, after_m)
+    if "brake_after_mps2" in names:
+        found["brake_after_mps2"] = brake_after_mps2(trajectory)
+    for name in names:
         if name not in found:
             value = getattr(measures, name)
             value = missing[name] if value is None else value

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
 from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.merge import AfterMerge, after_merge, followed_up
@@ -33,6 +34,7 @@ TTC_SHARE: Final = 1.0 / 9.0
 """Part of P_safety that a short time to collision can cost; the gap has the rest."""
 
 
+@quickly_pickled
 @dataclass(frozen=True, slots=True)
 class Measures:
     """Named measures of one episode, with the verdict first.
@@ -218,8 +220,12 @@ def verdict(trajectory: Trajectory) -> End:
     return End.COLLISION if trajectory.end is End.MERGED and collides else trajectory.end
 
 
-def measure(trajectory: Trajectory) -> Measures:
-    """Return the verdict and the measures of an episode."""
+def measure(trajectory: Trajectory, *, way_out: bool = True) -> Measures:
+    """Return the verdict and the measures of an episode.
+
+    Whether there was a way out of a collision is only said with `way_out`: to search for it takes
+    most of the time.
+    """
     nearest = trajectory.nearest
     pair = trajectory.facing(nearest)
     (x_pov, v_pov, _), (x_vut, v_vut, _) = pair.motion[-1].tolist()
@@ -232,8 +238,9 @@ def measure(trajectory: Trajectory) -> Measures:
         first = "VUT" if dx < 0 else "POV"
         if end is End.COLLISION:
             impact = abs(dv)
-            last_avoidable = _last_avoidable_s(trajectory)
-            avoidable = last_avoidable is not None
+            if way_out:
+                last_avoidable = _last_avoidable_s(trajectory)
+                avoidable = last_avoidable is not None
         else:
             gap = abs(dx) - crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)

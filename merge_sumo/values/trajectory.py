@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
+from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, POV, VUT
@@ -45,6 +46,7 @@ def as_reason(text: str) -> str:
     return printable(without[:REASON_CHARACTERS])[:REASON_CHARACTERS]
 
 
+@quickly_pickled
 @dataclass(frozen=True, slots=True)
 class Trajectory:
     """Positions, speeds and accelerations of all vehicles in one episode.

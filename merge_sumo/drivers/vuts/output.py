@@ -21,6 +21,7 @@ MOST_BYTES: Final = 4 << 20
 KEPT_BYTES: Final = 1 << 20
 PENDING_BYTES: Final = 1 << 16
 """What is kept of what is printed before the folder of the log is there."""
+SUMO_ENDS: Final = ("Error: ", "Quitting (on error).")
 LINE_BYTES: Final = 200
 _CAREFUL: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 """Whatever stands in the place of a log is neither followed nor waited for."""
@@ -40,7 +41,11 @@ class Output:
         """Return the last line that was printed, after a little wait for the end; "" for none."""
         self._thread.join(patience_s)
         lines = self._tail.decode("utf-8", errors="replace").strip().splitlines()
-        return as_reason(lines[-1]) if lines else ""
+        # A SUMO that a controller starts itself may end behind it, and is not why it ended.
+        said = list(lines)
+        while said and said[-1].startswith(SUMO_ENDS):
+            said.pop()
+        return as_reason((said or lines)[-1]) if lines else ""
 
     def close(self, patience_s: float = 1.0) -> None:
         """Take what is left; what a process that was left behind prints later is lost."""

@@ -10,22 +10,18 @@ from __future__ import annotations
 import math
 import socket
 import sys
-from collections import deque
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from time import monotonic
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen, Vut, VutOptions, seen_in
-from merge_sumo.drivers.vuts.process import GRACE_S, Program, split_command
-from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
-from merge_sumo.drivers.vuts.traci_session import CLOSE, SIMULATION_STEP, Session
-from merge_sumo.drivers.vuts.traci_simulation import VUT
+from merge_sumo.drivers.vuts.process import Program, split_command
+from merge_sumo.drivers.vuts.traci_client import Client, ClosedError, FaultError, LateError
+from merge_sumo.drivers.vuts.traci_session import Session
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
@@ -33,13 +29,9 @@ from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, POV, US23, Scenario
 
-T = TypeVar("T")
-
 HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8813
 """Where TraCI clients connect when they are not told otherwise."""
-FAREWELL_STEPS: Final = 10
-"""Steps on an empty road, with nobody to come, in which a client may end by itself."""
 
 
 def traci_vut(argument: str, options: VutOptions) -> Vut:
@@ -64,14 +56,6 @@ def traci_vut(argument: str, options: VutOptions) -> Vut:
     )
 
 
-class FaultError(Exception):
-    """What the client did wrong."""
-
-
-class ClosedError(Exception):
-    """The client said goodbye while no vehicle was on the road."""
-
-
 class TraciVut(Driver):
     """Drives as a TraCI client commands; one client has one vehicle `vut`, so one corridor."""
 
@@ -92,8 +76,9 @@ class TraciVut(Driver):
         self._command, self._options = command, options
         self._listener: socket.socket | None = None
         self._program: Program | None = None
-        self._client: _Client | None = None
+        self._client: Client | None = None
         self._reason: str | None = None
+        self._noted: set[str] = set()
         self._starting = True
         self._patience_s = options.connect_s
         try:
@@ -119,6 +104,8 @@ class TraciVut(Driver):
                 return np.array([self._ask(seen)])
             except FaultError as error:
                 self._reason = str(error)
+                if isinstance(error, LateError) and self._another_waits():
+                    self._reason += "; another client waits, but one at a time is served"
                 self._disconnect()
         return np.array([math.nan])
 
@@ -158,7 +145,8 @@ class TraciVut(Driver):
                 self._client.step_to(seen)
             except ClosedError:
                 # The listener stays: the next client may be waiting already.
-                self._drop_client(grace=True)
+                self._client.close()
+                self._client = None
                 if attempt == 2:
                     raise FaultError(
                         "the controller closed the connection before the vehicles departed"
@@ -167,45 +155,76 @@ class TraciVut(Driver):
                 return
 
     def _connect(self) -> None:
-        """Wait for a client, with a program started anew if there is a command."""
+        """Wait for a client, with a program started anew if there is a command.
+
+        A program that closed its connection may connect again, and has as long as for a step.
+        """
         patience_s = self._patience_s
         # Who did not come once is not waited for as long again.
         self._patience_s = min(patience_s, self._options.deadline_s)
         if self._listener is None:
             self._listener = _listen(self._port)
         port = self._listener.getsockname()[1]
-        if self._command is not None:
-            self._program = Program(self._command, port, self._options.log)
-        else:
-            sys.stderr.write(
-                f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
-            )
+        connection = None
+        if self._program is not None:
+            connection = self._accept(self._listener, self._options.deadline_s)
+            if connection is None:
+                self._drop_client(grace=True)
+        if connection is None:
+            if self._command is not None:
+                self._program = Program(self._command, port, self._options.log)
+            else:
+                sys.stderr.write(
+                    f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
+                )
+            connection = self._accept(self._listener, patience_s)
+        if connection is None:
+            ended = self._program.ended(0.0) if self._program else ""
+            self._disconnect()
+            late = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
+            if self._command is not None:
+                late += (
+                    ": --vut-command is told the port as {port} and in MERGE_SUMO_PORT, "
+                    "for traci.init(PORT) or traci.start(..., port=PORT)"
+                )
+            raise FaultError(f"{ended} (before it connected)" if ended else late)
+        self._patience_s = self._options.connect_s
+        session = Session(self._road, self._scenario, note=self._note)
+        self._client = Client(connection, session, self._options.deadline_s, self._program)
+
+    def _accept(self, listener: socket.socket, patience_s: float) -> socket.socket | None:
+        """Return the next connection; None when none comes, or the program has ended."""
         until = monotonic() + patience_s
         while True:
             # A program that ended will not connect any more: look every now and then.
-            self._listener.settimeout(max(min(0.1, until - monotonic()), 0.001))
+            listener.settimeout(max(min(0.1, until - monotonic()), 0.001))
             try:
-                connection, _ = self._listener.accept()
-                break
+                return listener.accept()[0]
             except TimeoutError:
-                ended = self._program.ended(0.0) if self._program else ""
-                if ended or monotonic() > until:
-                    self._disconnect()
-                    late = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
-                    before = f"{ended} (before it connected)" if ended else late
-                    raise FaultError(before) from None
-        self._patience_s = self._options.connect_s
-        session = Session(self._road, self._scenario, note=self._note)
-        self._client = _Client(connection, session, self._options.deadline_s, self._program)
+                if monotonic() > until or (self._program and self._program.ended(0.0)):
+                    return None
 
     def _note(self, sentence: str) -> None:
-        """Add a sentence to what the controller printed."""
+        """Add a sentence to what the controller printed, once for all the times it is started."""
+        if sentence in self._noted:
+            return
+        self._noted.add(sentence)
         log = self._options.log
         if log is None:
             sys.stderr.write(f"note: {sentence}\n")
             return
         with suppress(OSError), log.open("a", encoding="utf-8") as file:
             file.write(f"note: {sentence}\n")
+
+    def _another_waits(self) -> bool:
+        """Return whether a client has connected besides the one that is served."""
+        if self._listener is None:
+            return False
+        self._listener.settimeout(0.0)
+        with suppress(OSError):
+            self._listener.accept()[0].close()
+            return True
+        return False
 
     def _disconnect(self, *, grace: bool = False) -> None:
         """Drop the client and end its program; nobody of it is left, nor of who waits."""
@@ -237,154 +256,3 @@ def _listen(port: int) -> socket.socket:
             "--vut traci:PORT"
         ) from error
     return listener
-
-
-class _Client:
-    """A connected client: its socket, its session, and the commands that it has not been told."""
-
-    def __init__(
-        self,
-        connection: socket.socket,
-        session: Session,
-        deadline_s: float,
-        program: Program | None,
-    ) -> None:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket, self._session, self._program = connection, session, program
-        self._deadline_s = deadline_s
-        self._commands: deque[Command] = deque()
-        self._reply = bytearray()
-        self._until_step: float | None = None
-        """Time up to which the client asked to step, if it waits for a step; 0 for one step."""
-
-    def acceleration_mps2(self) -> float:
-        return self._session.acceleration_mps2()
-
-    def leave(self) -> None:
-        """End the episode that was, if there was one: its vehicles arrive."""
-        if self._session.vehicles:
-            self._session.clear(more=True)
-            self._answer_step()
-        if self._until_step is None:
-            self._serve()
-
-    def step_to(self, seen: Seen) -> None:
-        """Show the next state, and serve the client until it makes its next step."""
-        self._session.show(seen)
-        self._answer_step()
-        if self._until_step is None:
-            self._serve()
-
-    def farewell(self) -> None:
-        """Show the last arrival, with nobody to come, and give the client time to close."""
-        with suppress(FaultError, ClosedError):
-            for _ in range(FAREWELL_STEPS):
-                self._session.clear(more=False)
-                if self._until_step is not None:
-                    self._until_step = 0.0  # the time that it asked for will not come
-                self._answer_step()
-                self._serve(GRACE_S)
-
-    def close(self) -> None:
-        self._socket.close()
-        self._session.close()
-
-    def _answer_step(self) -> None:
-        """Answer the step that the client waits for, unless it asked to step on further."""
-        session = self._session
-        if self._until_step is None or self._until_step > session.time_s + 1e-9:
-            return
-        self._until_step = None
-        self._reply += tp.status(SIMULATION_STEP) + session.results()
-        self._flush()
-
-    def _serve(self, patience_s: float = math.inf) -> None:
-        """Answer commands until the client makes a step."""
-        until = monotonic() + min(self._deadline_s, patience_s)
-        session = self._session
-        while True:
-            while self._commands:
-                command = self._commands.popleft()
-                if command.identifier == SIMULATION_STEP:
-                    target = self._checked(lambda c: Reader(c.payload).double(), command)
-                    session.answered()
-                    if target == 0.0 or target > session.time_s + 1e-9:
-                        self._until_step = target
-                        return
-                    if math.isnan(target):
-                        raise FaultError("the controller stepped to time nan")
-                    self._reply += tp.status(SIMULATION_STEP) + session.results()
-                elif command.identifier == CLOSE:
-                    self._reply += tp.status(CLOSE)
-                    self._commands.clear()
-                    self._flush()
-                    if VUT in session.vehicles:
-                        raise FaultError(self._gone("closed the connection during the episode"))
-                    raise ClosedError
-                else:
-                    before_s = monotonic()
-                    self._reply += self._checked(session.handle, command)
-                    until += monotonic() - before_s  # it waits for us, and not we for it
-                self._flush()
-            self._commands.extend(self._receive(until))
-
-    def _checked(self, function: Callable[[Command], T], command: Command) -> T:
-        """Return what a function makes of a command."""
-        try:
-            return function(command)
-        except ProtocolError as error:
-            raise FaultError(
-                f"the controller sent command 0x{command.identifier:02x} that is no TraCI: {error}"
-            ) from error
-
-    def _flush(self) -> None:
-        """Send the reply once all commands of its message have been answered."""
-        if self._commands or not self._reply:
-            return
-        content = tp.message(bytes(self._reply))
-        self._reply.clear()
-        try:
-            self._socket.settimeout(self._deadline_s)
-            self._socket.sendall(content)
-        except TimeoutError as error:
-            raise FaultError(
-                f"the controller took no answer within {self._deadline_s:g} s"
-            ) from error
-        except OSError as error:
-            raise FaultError(self._gone("closed the connection")) from error
-
-    def _receive(self, until: float) -> list[Command]:
-        head = self._read(4, until, begun=False)
-        try:
-            return tp.commands_of(self._read(tp.message_length(head), until, begun=True))
-        except ProtocolError as error:
-            raise FaultError(f"the controller sent bytes that are no TraCI: {error}") from error
-
-    def _read(self, count: int, until: float, *, begun: bool) -> bytes:
-        """Return `count` bytes that come before a time; `begun` tells a half message from none."""
-        parts = bytearray()
-        while len(parts) < count:
-            left_s = until - monotonic()
-            half = begun or bool(parts)
-            try:
-                if left_s <= 0.0:
-                    raise TimeoutError
-                self._socket.settimeout(left_s)
-                part = self._socket.recv(count - len(parts))
-            except TimeoutError as error:
-                what = "sent half a message and no more" if half else "made no step"
-                raise FaultError(
-                    f"the controller {what} within the deadline of {self._deadline_s:g} s"
-                ) from error
-            except OSError as error:
-                raise FaultError(self._gone("broke the connection")) from error
-            if not part:
-                what = "closed the connection in a message" if half else "closed the connection"
-                raise FaultError(self._gone(what))
-            parts += part
-        return bytes(parts)
-
-    def _gone(self, what: str) -> str:
-        """Return why a client is gone: how its program ended, where that is known."""
-        ended = self._program.ended(0.5) if self._program is not None else ""
-        return f"the controller {what}" + (f"; {ended}" if ended else "")

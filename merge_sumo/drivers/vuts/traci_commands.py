@@ -20,7 +20,11 @@ from merge_sumo.values.scenario import DT_S, US23, Scenario
 
 SET_VEHICLE, SET_VEHICLETYPE = 0xC4, 0xC5
 SLOW_DOWN, SET_SPEED, SET_ACCELERATION = 0x14, 0x40, 0x72
-SPEEDS: Final = frozenset({SLOW_DOWN, SET_SPEED, SET_ACCELERATION})
+SPEEDS: Final = {
+    SLOW_DOWN: "vehicle.slowDown",
+    SET_SPEED: "vehicle.setSpeed",
+    SET_ACCELERATION: "vehicle.setAcceleration",
+}
 MAX_SPEED, ACCEL, DECEL = 0x41, 0x46, 0x47
 LIMITS: Final = frozenset({MAX_SPEED, ACCEL, DECEL})
 SPEED_FACTOR: Final = 0x5E
@@ -38,9 +42,9 @@ INVALID: Final = {
 """Numbers of SUMO's car-following model, by what SUMO calls them where they are invalid."""
 OF_MODEL: Final = frozenset({*INVALID, 0x26, 0x5F})
 """All that its drivers are made of: besides those impatience and the deviation of speeds."""
-OF_TYPE: Final = frozenset({*INVALID, 0x4F, 0xB7})
-"""What a vehicle says otherwise when such a number was set: besides them its type's name and the
-speed that it is allowed."""
+OF_TYPE: Final = frozenset({*INVALID, 0x4F, 0x68, 0xB7})
+"""What a vehicle says otherwise when such a number was set: besides them its type's name, the gap
+to its leader (less the minimum gap) and the speed that it is allowed."""
 SPEED_MODE, LANE_CHANGE_MODE = 0xB3, 0xB6
 MODES: Final = {SPEED_MODE: 0x7F, LANE_CHANGE_MODE: 0xFFF}
 """The bits that SUMO knows of each mode."""
@@ -65,7 +69,7 @@ class Kind(Enum):
 
 DRIVES: Final = frozenset(
     {
-        *("vehicle.setSpeed", "vehicle.slowDown", "vehicle.setAcceleration"),
+        *SPEEDS.values(),
         *("vehicle.setSpeedMode", "vehicle.setMaxSpeed", "vehicle.setAccel", "vehicle.setDecel"),
         *("vehicletype.setMaxSpeed", "vehicletype.setAccel", "vehicletype.setDecel"),
     }

@@ -174,16 +174,26 @@ def accepted(body: bytes) -> Reader:
     return reader
 
 
-def value_of(body: bytes) -> bytes:
-    """Return the typed value in the answer to a question, without the message's length.
+def value_in(answer: Reader) -> bytes:
+    """Return the typed value in the answer to a question, behind its status."""
+    _length(answer)
+    answer.raw(2)
+    answer.string()
+    return answer.raw(answer.left)
 
-    Raises `AnsweredError` where the server has none, and `ProtocolError` for no such answer.
-    """
-    reader = accepted(body)
-    _length(reader)
-    reader.raw(2)
-    reader.string()
-    return reader.raw(reader.left)
+
+def objects_in(answer: Reader) -> list[str]:
+    """Return whom the answer to a context subscription of one plain variable is about."""
+    _length(answer)
+    answer.raw(1)
+    answer.string()
+    answer.raw(2)
+    found = []
+    for _ in range(answer.integer()):
+        found.append(answer.string())
+        answer.raw(2)
+        answer.typed()
+    return found
 
 
 def _length(reader: Reader) -> None:

@@ -6,11 +6,12 @@ The session has no socket and does not decide when a step is made. What there is
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
-from typing import Final
+from typing import Final, TypeVar
 
 from merge_sumo.drivers.vuts import traci_protocol as tp
 from merge_sumo.drivers.vuts.base import Seen
@@ -22,6 +23,7 @@ from merge_sumo.drivers.vuts.traci_commands import (
     SET_VEHICLE,
     SET_VEHICLETYPE,
     SPEED_MODE,
+    SPEEDS,
     Kind,
     Orders,
     kind_of,
@@ -30,11 +32,19 @@ from merge_sumo.drivers.vuts.traci_commands import (
 )
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
 from merge_sumo.drivers.vuts.traci_simulation import VUT, RefusedError, Simulation
-from merge_sumo.drivers.vuts.traci_variables import GET_VEHICLE, GETTERS
+from merge_sumo.drivers.vuts.traci_variables import (
+    GET_EDGE,
+    GET_LANE,
+    GET_VEHICLE,
+    GETTERS,
+    ID_COUNT,
+)
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.beside import Beside, GoneError, State
 from merge_sumo.sumo.traci_names import name_of, named
 from merge_sumo.values.scenario import DT_S, VEHICLES
+
+T = TypeVar("T")
 
 API_VERSION: Final = 22
 """Of the TraCI of SUMO 1.28."""
@@ -53,6 +63,12 @@ TO_RESPONSE: Final = 0x10
 """Identifiers of the kinds of command lie these distances apart, for every domain."""
 
 PARAMETER: Final = 0x7E
+LOAD, ADD_FILTER = 0x01, 0x7E
+REASONS: Final = {
+    LOAD: "the campaign runs the simulation",
+    ADD_FILTER: "subscribe to all that is around, and choose from it",
+}
+"""Why a command on no variable is refused."""
 FOR_EVER: Final = -1073741824.0
 
 
@@ -68,13 +84,22 @@ class Subscription:
     domain: int | None = None
     range_m: float = 0.0
 
+    @property
+    def of(self) -> tuple[int, str, int | None]:
+        """What it is about."""
+        return self.getter, self.object_id, self.domain
+
+    def with_variables(self, variables: list[tuple[int, bytes]]) -> Subscription:
+        """Return the same on other variables."""
+        return replace(self, variables=variables)
+
 
 @dataclass
 class Session(Simulation):
     """The simulation as one client sees it, and what it has asked for."""
 
     orders: Orders = field(init=False)
-    subscriptions: dict[tuple[int, str, int | None], Subscription] = field(default_factory=dict)
+    subscriptions: list[Subscription] = field(default_factory=list)
     note: Callable[[str], None] = lambda _: None
     """Told in a sentence, once each, what a command does less than in SUMO."""
     noted: set[str] = field(default_factory=set)
@@ -109,11 +134,11 @@ class Session(Simulation):
         self.history.clear()
         if self.beside is not None:
             self.beside.show({})
-        self.subscriptions = {
-            key: subscription
-            for key, subscription in self.subscriptions.items()
+        self.subscriptions = [
+            subscription
+            for subscription in self.subscriptions
             if subscription.getter != GET_VEHICLE or subscription.object_id not in VEHICLES
-        }
+        ]
 
     def acceleration_mps2(self) -> float:
         """Return what the last commands on the VUT ask for in the coming step."""
@@ -145,8 +170,9 @@ class Session(Simulation):
         if identifier == SET_ORDER:
             reader.integer()
             return tp.status(identifier)
+        reason = REASONS.get(identifier, "it is made for SUMO as a program")
         raise RefusedError(
-            f"merge-sumo does not carry out {name_of(identifier)}", tp.NOT_IMPLEMENTED
+            f"merge-sumo does not carry out {name_of(identifier)}: {reason}", tp.NOT_IMPLEMENTED
         )
 
     def _get(self, identifier: int, reader: Reader) -> bytes:
@@ -163,13 +189,26 @@ class Session(Simulation):
             if self.orders.changed(variable):
                 return self._from_sumo(getter, variable, object_id, reader.raw(reader.left))
         answer = GETTERS.get(getter, {}).get(variable)
-        if answer is not None:
+        if answer is not None and self.knows(getter, object_id):
             return answer(self, object_id, reader)
         return self._from_sumo(getter, variable, object_id, reader.raw(reader.left))
 
+    def knows(self, getter: int, object_id: str) -> bool:
+        """Return whether an object is one that is answered for here, besides those of the net."""
+        if getter == GET_LANE:
+            return object_id in self.lanes()
+        return getter != GET_EDGE or object_id in self.edges()
+
     def _from_sumo(self, getter: int, variable: int, object_id: str, parameter: bytes) -> bytes:
-        """Return what the SUMO beside answers; it is started for the first such question."""
-        name = name_of(getter, variable)
+        """Return what the SUMO beside answers; raises `RefusedError`."""
+        asked = bytes((getter, variable)) + tp.raw_string(object_id) + parameter
+        return self._ask_sumo(name_of(getter, variable), asked, tp.value_in)
+
+    def _ask_sumo(self, name: str, command: bytes, read: Callable[[Reader], T]) -> T:
+        """Return what is read in SUMO's answer; it is started for the first such question.
+
+        Raises `RefusedError` where it refuses, or where there is none.
+        """
         if self.no_beside:
             raise RefusedError(f"{name} is not answered here: {self.no_beside}")
         try:
@@ -177,11 +216,12 @@ class Session(Simulation):
                 self.beside = Beside(self.road, self.scenario, self.scenario.vehicles)
                 for state in self.history:
                     self.beside.show(state)
-                for command in self.orders.all_kept():
+                for kept in self.orders.all_kept():
                     with suppress(RefusedError):
-                        self._tell(command)
-            asked = bytes((getter, variable)) + tp.raw_string(object_id) + parameter
-            return tp.value_of(self.beside.ask(tp.command(asked)))
+                        self._tell(kept)
+            if self.beside is None:
+                raise GoneError  # it was told something that ended it
+            return read(tp.accepted(self.beside.ask(tp.command(command))))
         except UserError as error:
             self.no_beside = str(error)
         except (GoneError, ProtocolError):
@@ -194,8 +234,13 @@ class Session(Simulation):
     def _set(self, command: int, reader: Reader) -> None:
         """Carry a command out, or keep it, or note that it changes nothing, or refuse it."""
         variable = reader.ubyte()
-        name, found = name_of(command, variable), named().get((command, variable))
-        functions = () if found is None else found.functions
+        functions: tuple[str, ...]
+        if command == SET_VEHICLE and variable in SPEEDS:
+            # What comes in every step needs no look at the tables of SUMO's client.
+            name, functions = SPEEDS[variable], (SPEEDS[variable],)
+        else:
+            name, found = name_of(command, variable), named().get((command, variable))
+            functions = () if found is None else found.functions
         kind = kind_of(functions)
         if kind is Kind.REFUSED:
             reason = reason_against(functions)
@@ -240,29 +285,34 @@ class Session(Simulation):
         for _ in range(reader.ubyte()):
             variable = reader.ubyte()
             variables.append((variable, _parameter(getter, variable, reader)))
-        wanted = Subscription(getter, object_id, variables, begin_s, end_s)
-        return self._keep(identifier, (getter, object_id, None), wanted)
+        return self._keep(identifier, Subscription(getter, object_id, variables, begin_s, end_s))
 
     def _subscribe_context(self, identifier: int, reader: Reader) -> bytes:
         getter = identifier - GETTERS_TO_CONTEXTS
         begin_s, end_s, object_id = reader.double(), reader.double(), reader.string()
         domain, range_m = reader.ubyte(), reader.double()
         variables = [(reader.ubyte(), b"") for _ in range(reader.ubyte())]
-        if getter != GET_VEHICLE or domain != GET_VEHICLE:
-            raise RefusedError("merge-sumo has context subscriptions of vehicles around vehicles")
-        key = (getter, object_id, domain)
         wanted = Subscription(getter, object_id, variables, begin_s, end_s, domain, range_m)
-        return self._keep(identifier, key, wanted)
+        return self._keep(identifier, wanted)
 
-    def _keep(
-        self, identifier: int, key: tuple[int, str, int | None], subscription: Subscription
-    ) -> bytes:
-        """Keep a subscription, or drop it where it names no variable; return the answer."""
-        if not subscription.variables:
-            self.subscriptions.pop(key, None)
+    def _keep(self, identifier: int, wanted: Subscription) -> bytes:
+        """Keep a subscription; return the answer.
+
+        As in SUMO it adds to one that differs in its variables alone; one without variables ends
+        all of the object, whatever their time and range.
+        """
+        if not wanted.variables:
+            self.subscriptions = [s for s in self.subscriptions if s.of != wanted.of]
             return tp.status(identifier)
-        answer = self._result(subscription)
-        self.subscriptions[key] = subscription
+        same = [s for s in self.subscriptions if s.with_variables([]) == wanted.with_variables([])]
+        before = same[0].variables if same else []
+        new = [variable for variable in wanted.variables if variable not in before]
+        added = wanted.with_variables([*before, *new])
+        answer = self._result(added)
+        if same:
+            self.subscriptions[self.subscriptions.index(same[0])] = added
+        else:
+            self.subscriptions.append(added)
         return tp.status(identifier) + answer
 
     def results(self) -> bytes:
@@ -270,11 +320,16 @@ class Session(Simulation):
         now = self.time_s
         due = [
             subscription
-            for subscription in self.subscriptions.values()
+            for subscription in self.subscriptions
             if subscription.begin_s <= now
             and (subscription.end_s == FOR_EVER or now <= subscription.end_s)
         ]
-        return tp.raw_integer(len(due)) + b"".join(map(self._result, due))
+        answers = []
+        for subscription in due:
+            # Of what SUMO cannot tell any more there is no answer.
+            with suppress(RefusedError):
+                answers.append(self._result(subscription))
+        return tp.raw_integer(len(answers)) + b"".join(answers)
 
     def _result(self, subscription: Subscription) -> bytes:
         object_id = subscription.object_id
@@ -284,11 +339,26 @@ class Session(Simulation):
         if subscription.domain is None:
             head = bytes((subscription.getter + GETTERS_TO_SUBSCRIPTIONS + TO_RESPONSE,))
             return tp.command(head + name + count + self._values(subscription, object_id))
-        around = self.around(object_id, subscription.range_m)
+        around = self._around(subscription)
         head = bytes((subscription.getter + GETTERS_TO_CONTEXTS + TO_RESPONSE,))
         head += name + bytes((subscription.domain,)) + count + tp.raw_integer(len(around))
         items = (tp.raw_string(other) + self._values(subscription, other) for other in around)
         return tp.command(head + b"".join(items))
+
+    def _around(self, subscription: Subscription) -> list[str]:
+        """Return the objects of a subscription's domain that are near its object."""
+        getter, domain, object_id = subscription.getter, subscription.domain, subscription.object_id
+        assert domain is not None, "of what is around"  # noqa: S101
+        if getter == domain == GET_VEHICLE:
+            return self.around(object_id, subscription.range_m)
+        command = getter + GETTERS_TO_CONTEXTS
+        asked = bytes((command,)) + struct.pack("!dd", FOR_EVER, FOR_EVER)
+        asked += tp.raw_string(object_id) + bytes((domain,))
+        asked += struct.pack("!d", subscription.range_m)
+        name = name_of(command)
+        around = self._ask_sumo(name, asked + bytes((1, ID_COUNT)), tp.objects_in)
+        self._ask_sumo(name, asked + bytes((0,)), lambda _: None)
+        return around
 
     def _values(self, subscription: Subscription, object_id: str) -> bytes:
         getter = subscription.domain or subscription.getter
