@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     from merge_sumo.api import campaign as campaign
     from merge_sumo.api import compare_runs as compare_runs
     from merge_sumo.api import export as export
+    from merge_sumo.api import history as history
     from merge_sumo.api import open_run as open_run
     from merge_sumo.api import rerun as rerun
+    from merge_sumo.api import resume as resume
     from merge_sumo.api import run_case as run_case
     from merge_sumo.api import truth as truth
     from merge_sumo.errors import UserError as UserError
@@ -22,12 +24,12 @@ if TYPE_CHECKING:
     __version__: str
 
 _API = (
-    *("CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "open_run", "rerun"),
-    *("run_case", "truth"),
+    *("CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "history", "open_run"),
+    *("rerun", "resume", "run_case", "truth"),
 )
 
 __all__ = ["CampaignRun", "CaseRun", "UserError", "__version__", "campaign", "compare_runs"]
-__all__ += ["export", "open_run", "rerun", "run_case", "truth"]
+__all__ += ["export", "history", "open_run", "rerun", "resume", "run_case", "truth"]
 
 
 def __getattr__(name: str) -> Any:

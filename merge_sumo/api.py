@@ -12,12 +12,11 @@ A VUT is a spec, as after `--vut`, or a class, a function, or an object with `ac
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from merge_sumo.campaigns.avoidance import note_avoidance
-from merge_sumo.campaigns.conductor import SCENARIOS, OnCase, run_campaign
+from merge_sumo.campaigns.conductor import OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.settings import (
     DEFAULT_CASES,
@@ -30,34 +29,33 @@ from merge_sumo.campaigns.single import DEBUG_DEADLINE_S, FIELDS, run_one, setti
 from merge_sumo.campaigns.truth import Truth, ground_truth
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
-from merge_sumo.drivers.vuts.here import drivers_of, is_here
+from merge_sumo.drivers.vuts.here import AnyVut, drivers_of, is_here
 from merge_sumo.errors import UserError
-from merge_sumo.reports import comparison, exports
-from merge_sumo.reports.changes import RunComparison
-from merge_sumo.reports.progress import CampaignPanel, is_watched
-from merge_sumo.reports.rerun import Rerun, settings_today
-from merge_sumo.reports.rerun import rerun as run_again
+from merge_sumo.recorded import (
+    compare_runs,
+    concluded,
+    export,
+    going_on,
+    history,
+    open_run,
+    rerun,
+    resume,
+)
 from merge_sumo.results import CampaignRun, CaseRun
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.system.folders import check_new, dated, link_latest
+from merge_sumo.system.folders import check_new, dated
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
-from merge_sumo.values.score import Outcome
 
-__all__ = ["CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "open_run", "rerun"]
-__all__ += ["run_case", "truth"]
-
-Vut = str | type | Callable[..., Any] | object
-"""A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
-AnyRun = CampaignRun | Path | str
-"""A campaign, or its folder."""
+__all__ = ["CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "history", "open_run"]
+__all__ += ["rerun", "resume", "run_case", "truth"]
 
 
 def campaign(
-    vut: Vut,
+    vut: AnyVut,
     *,
     level: int | str = "all",
     sampler: str = DEFAULT_SAMPLER,
@@ -75,7 +73,7 @@ def campaign(
     net: Path | str | None = None,
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
-    pov: Vut | None = None,
+    pov: AnyVut | None = None,
     fail_when: str = COLLISION.fail_when,
     require: str | None = None,
     learn_from: Sequence[Path | str] = (),
@@ -111,7 +109,8 @@ def campaign(
         on_case: told of every case as it ends.
         progress: show how far it is; by default in a notebook and on a terminal.
 
-    Raises `UserError` for values that make no campaign, or when the folder exists.
+    One that is interrupted goes on with `resume`. Raises `UserError` for values that make no
+    campaign, or when the folder exists.
     """
     where = _scenario(scenario)
     spec, pov_spec, workers = drivers_of(vut, pov, workers)
@@ -138,37 +137,19 @@ def campaign(
     )
     folder = dated(spec) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))
-    title = f"{spec} v level {'/'.join(map(level_name, settings.levels))}"
-    quiet = not (is_watched() if progress is None else progress)
-    with open_workers(settings.workers(workers)) as there:
-        with CampaignPanel(title, settings.cases, settings.levels, quiet=quiet) as panel:
-
-            def told(outcome: Outcome) -> None:
-                panel.case_ended(outcome)
-                if on_case is not None:
-                    on_case(outcome)
-
-            done = run_campaign(settings, folder, road, told, workers=there)
-        note_avoidance(done, settings, road, workers=there)
-    link_latest(folder)
-    run = CampaignRun(folder)
-    run.report()
-    return run
-
-
-def open_run(folder: Path | str) -> CampaignRun:
-    """Open the folder of a campaign; `UserError` when it is none."""
-    return CampaignRun(folder)
+    with going_on(settings, folder, workers, on_case, progress) as (there, _, told):
+        done = run_campaign(settings, folder, road, told, workers=there)
+    return concluded(done, settings, road)
 
 
 def run_case(
-    vut: Vut,
+    vut: AnyVut,
     case: Mapping[str, Any] | None = None,
     *,
     level: int | str | None = None,
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
-    pov: Vut | None = None,
+    pov: AnyVut | None = None,
     net: Path | str | None = None,
     vut_command: str | None = None,
     deadline_s: float = DEADLINE_S,
@@ -230,48 +211,15 @@ def run_case(
     return CaseRun(found)
 
 
-def rerun(
-    run: AnyRun,
-    indices: Iterable[int] = (),
-    *,
-    vut: Vut | None = None,
-    workers: int = 1,
-    net: Path | str | None = None,
-    trust_vut: bool = False,
-    **settings: Any,
-) -> Rerun:
-    """Run recorded cases again with a changed VUT; the same as `merge-sumo rerun`.
-
-    Args:
-        run: the campaign, or its folder.
-        indices: its cases; all of them when left out.
-        vut: as of `campaign`; the campaign's, as its files are now, when left out.
-        workers: processes that run cases.
-        net: net for that; must be the one of the campaign.
-        trust_vut: run the controller that a folder names although it was not made here.
-        settings: others to change: `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`,
-            `policies`.
-
-    Raises `UserError` as the command says.
-    """
-    opened = _opened(run)
-    if vut is not None:
-        settings["vut"], _, workers = drivers_of(vut, None, workers)
-    today = settings_today(opened.run, settings, trust=trust_vut)
-    with open_workers(today.workers(workers)) as there:
-        where = None if net is None else Path(net)
-        return run_again(opened.run, today, tuple(indices), net=where, workers=there)
-
-
 def truth(
-    vut: Vut,
+    vut: AnyVut,
     level: int | str,
     *,
     cases: int | None = None,
     seed: int = 0,
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
-    pov: Vut | None = None,
+    pov: AnyVut | None = None,
     fail_when: str = COLLISION.fail_when,
     require: str | None = None,
     vut_command: str | None = None,
@@ -313,76 +261,6 @@ def truth(
             povs=povs,
             criterion=criterion,
         )
-
-
-def compare_runs(
-    a: AnyRun,
-    b: AnyRun,
-    *,
-    rerun: bool = True,
-    net: Path | str | None = None,
-    policies: Path | str | None = None,
-    trust_vut: bool = False,
-) -> RunComparison:
-    """Compare two campaigns: what got fixed, and what broke; as `merge-sumo compare-runs`.
-
-    `worse(tolerance)` of what is returned says why B is worse, if it is.
-
-    Args:
-        a: the campaign before, or its folder.
-        b: the campaign after, or its folder.
-        rerun: run the failures, errors and timeouts of each with the other's VUT.
-        net: net for that; must be the one of the campaigns.
-        policies: folder of the learned drivers, where they are elsewhere now.
-        trust_vut: run the controllers that the folders name although they were not made here.
-    """
-    first, second = _opened(a).run, _opened(b).run
-    given = {} if policies is None else {"policies": str(policies)}
-    road = road_for(first.scenario, None if net is None else Path(net)) if rerun else None
-    return comparison.compare_runs(
-        first, second, rerun=rerun, net=road, given=given, trust=trust_vut
-    )
-
-
-EXPORTS: Final = "exports"
-
-
-def export(
-    run: AnyRun,
-    indices: Iterable[int] | None = None,
-    *,
-    file_format: str = "sumo",
-    out: Path | str | None = None,
-    net: Path | str | None = None,
-) -> list[Path]:
-    """Write cases of a campaign for others, and return the paths; as `merge-sumo export`.
-
-    Args:
-        run: the campaign, or its folder.
-        indices: its cases; of a table all of them when left out.
-        file_format: "sumo" or "openscenario" for folders, "csv" or "parquet" for one table.
-        out: folder; `scenarios` or `exports` in that of the campaign when left out.
-        net: SUMO net to use instead of the scenario's.
-    """
-    loaded = _opened(run).run
-    wanted = None if indices is None else list(indices)
-    if file_format in ("csv", "parquet"):
-        wanted = wanted or [outcome.index for outcome in loaded.outcomes]
-        folder = Path(out) if out is not None else loaded.folder / EXPORTS
-        return [exports.write_table(loaded, wanted, folder, file_format)]
-    writers = {"sumo": exports.write_sumo, "openscenario": exports.write_openscenario}
-    if file_format not in writers:
-        raise UserError(f"there is no format {file_format!r}: sumo, openscenario, csv or parquet")
-    if not wanted:
-        raise UserError(f"the format {file_format} needs the indices of cases")
-    below = SCENARIOS if file_format == "sumo" else EXPORTS
-    target = Path(out) if out is not None else loaded.folder / below
-    road = road_for(loaded.scenario, None if net is None else Path(net))
-    return list(exports.write_folders(loaded, wanted, target, writers[file_format], road))
-
-
-def _opened(run: AnyRun) -> CampaignRun:
-    return run if isinstance(run, CampaignRun) else CampaignRun(run)
 
 
 def _scenario(scenario: Scenario | Path | str) -> Scenario:

@@ -14,3 +14,7 @@ class UserError(Exception):
     def __init__(self, sentence: str) -> None:
         """Take the sentence; messages of libraries that are part of it may have several lines."""
         super().__init__(" ".join(sentence[:MOST_CHARACTERS].splitlines()))
+
+    def _render_traceback_(self) -> list[str]:
+        """Return what a notebook shows: the sentence says what to do, and no line of ours helps."""
+        return [f"{type(self).__name__}: {self}"]

@@ -12,6 +12,7 @@ from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.single import Ended
 from merge_sumo.errors import UserError
 from merge_sumo.reports.coordinates import coordinates
+from merge_sumo.reports.in_lines import InLines
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.reports.summary import Summary, summarise
 from merge_sumo.reports.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
@@ -137,7 +138,7 @@ class CampaignRun:
         )
 
 
-class CaseRun:
+class CaseRun(InLines):
     """One case that was run."""
 
     def __init__(self, ended: Ended) -> None:
@@ -163,9 +164,6 @@ class CaseRun:
         """Return the verdict in a line."""
         return f"<case: {self.verdict}>"
 
-    def __str__(self) -> str:
+    def lines(self) -> list[str]:
         """Return verdict, measures and motion, as `merge-sumo run` prints them."""
-        return "\n".join(lines_of(self.outcome, self.trajectory))
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(str(self))}</pre>"
+        return lines_of(self.outcome, self.trajectory)

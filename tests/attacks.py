@@ -93,6 +93,10 @@ class World:
                 continue
         return found
 
+    def has_ended(self) -> bool:
+        """Return whether no process of this world is left."""
+        return not self.processes()
+
     def files(self) -> dict[str, bytes]:
         """Return the files below the root by name; the temporary and the cache's are left out."""
         apart = (self.temporary, self.cache)

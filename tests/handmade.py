@@ -23,16 +23,21 @@ BATCH = 20
 def drive(case: Case, error: str | None = None, *, timeout: bool = False) -> Trajectory:
     """Return an episode: the POV brakes a little at level 1 and 2, the VUT coasts from 3 s.
 
-    Other cars of the mainline keep their speed.
+    In a timeout it brakes instead, and stands until 12 s. Other cars of the mainline keep their
+    speed.
     """
     rows = []
     x, v = (list(values) for values in zip(*case.starts(), strict=True))
     step = 0
-    while x[VUT] < 0.0:
+    while x[VUT] < 0.0 and step * DT_S < 12.0:
         a = [0.0] * len(x)
         if case.level and 2.0 < step * DT_S < 5.0 + (case.svo_rad or 0.0):
             a[POV] = -0.5
-        a[VUT] = 1.0 if step * DT_S < 3.0 else max(A_MIN_MPS2, -v[VUT] / DT_S) * 0.05
+        a[VUT] = (
+            1.0
+            if step * DT_S < 3.0
+            else max(A_MIN_MPS2, -v[VUT] / DT_S) * (1.0 if timeout else 0.05)
+        )
         rows.append(list(zip(x, v, a, strict=True)))
         x = [place + speed * DT_S for place, speed in zip(x, v, strict=True)]
         v = [speed + change * DT_S for speed, change in zip(v, a, strict=True)]

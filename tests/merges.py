@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 from merge_sumo.values.scenario import US23, Scenario
 
@@ -26,7 +27,7 @@ else many ways end at M to the last bit, and rounding decides in which step."""
 def times(scenario: Scenario, factor: float, units: tuple[str, ...]) -> Scenario:
     """Return a scenario with the numbers of some units multiplied."""
 
-    def multiplied(value: object) -> object:
+    def multiplied(value: Any) -> Any:
         if isinstance(value, tuple):
             return tuple(factor * x for x in value)
         return factor * value

@@ -23,12 +23,15 @@ def marked(mark: str) -> list[str]:
 
 
 @contextmanager
-def none_left(patience_s: float = 5.0) -> Iterator[None]:
-    """Check that nothing that is started within, by whomever, is left a little later."""
+def none_left(patience_s: float = 5.0) -> Iterator[str]:
+    """Check that nothing that is started within, by whomever, is left a little later.
+
+    Yields the mark.
+    """
     with pytest.MonkeyPatch.context() as patch:
         mark = secrets.token_hex(8)
         patch.setenv("MERGE_SUMO_TEST", mark)
-        yield
+        yield mark
         until = time.monotonic() + patience_s
         while (left := marked(mark)) and time.monotonic() < until:
             time.sleep(0.05)

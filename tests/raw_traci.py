@@ -115,15 +115,19 @@ MISDEEDS = {
     "never reads": lambda c, r: [c.send(command(STEP, bytes(8))) for _ in range(100_000)],
 }
 """What a client may do wrong in an episode."""
+
+
+def stay() -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    time.sleep(600)
+
+
 ENDS = {
     "exits": lambda c, r: sys.exit(0),
     "crashes": lambda c, r: 1 / 0,
     "is killed": lambda c, r: os.kill(os.getpid(), signal.SIGKILL),
     "hangs": lambda c, r: time.sleep(600),
-    "will not be stopped": lambda c, r: (
-        signal.signal(signal.SIGTERM, signal.SIG_IGN),
-        time.sleep(600),
-    ),
+    "will not be stopped": lambda c, r: stay(),
 }
 """What a program may do wrong besides."""
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
+from test_journal import contents, episode
 
 from merge_sumo.campaigns.ahead import Ahead, proposals
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
@@ -12,12 +15,11 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.system.workers import InProcess, Workers
 from merge_sumo.values.case import Pool
-from tests.test_journal import contents, episode
 
 SETTINGS = CampaignSettings(vut="design1", levels=(0,), sampler="uniform", cases=90, batch=20)
 
 
-def recorded(folder) -> dict:
+def recorded(folder) -> dict[str, bytes]:
     """Return what a campaign has recorded, by name."""
     files = [folder / "outcomes.jsonl", *(folder / "trajectories").iterdir()]
     return {file.name: file.read_bytes() for file in files}
@@ -90,17 +92,18 @@ def test_who_learns_is_not_foreseen(name):
 def test_batches_that_ended_together_are_kept_together():
     workers = Workers(InProcess, 1)
 
-    class Run:
+    class Stub:
         def __init__(self):
             self.workers = workers
 
         def chunks(self, chunks):
             return workers.run_chunks(lambda items: [f"ran {item}" for item in items], chunks, str)
 
-    batches = [[f"case {batch}.{place}" for place in range(20)] for batch in range(5)]
-    with Ahead(Run(), iter(batches)) as ahead:
-        ran = ([done for _, done in ahead(batch)] for batch in batches)
-        together = list(ahead.together(ran))
+    run: Any = Stub()
+    batches: list[Any] = [[f"case {batch}.{place}" for place in range(20)] for batch in range(5)]
+    with Ahead(run, iter(batches)) as ahead:
+        ran: Any = ([done for _, done in ahead(batch)] for batch in batches)
+        together: list[Any] = list(ahead.together(ran))
     assert [batch for group in together for batch in group] == [
         [f"ran {case}" for case in batch] for batch in batches
     ]

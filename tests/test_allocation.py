@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -37,7 +38,7 @@ batch_sizes = st.integers(0, 300)
 
 
 def outcome(index: int, batch: int, level: int, *, failed: bool) -> Outcome:
-    nothing = dict.fromkeys(Measures.__dataclass_fields__)
+    nothing: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
     end, score = (End.COLLISION, -700.0) if failed else (End.MERGED, -3.0)
     svo = 0.5 if level == 2 else None
     case = Case(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo)

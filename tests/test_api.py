@@ -66,7 +66,7 @@ class TestARun:
 
 class TestACampaign:
     def test_is_the_one_of_the_command_line(self, tmp_path, run):
-        seen = []
+        seen: list = []
         again = ms.campaign(
             "design1", level=0, cases=60, batch=20, seed=1, out=tmp_path / "r", on_case=seen.append
         )
@@ -92,7 +92,7 @@ def test_the_import_costs_nothing():
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == ["False", "11"]
+    assert done.stdout.split() == ["False", "13"]
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():

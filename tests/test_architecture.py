@@ -137,9 +137,9 @@ def entity_calls(source: str) -> list[str]:
     """Return the calls that read XML and may follow an entity that it names."""
     found = []
     for node in ast.walk(ast.parse(source)):
-        name = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
-        if not name.startswith("etree."):
+        if not isinstance(node, ast.Call) or not ast.unparse(node.func).startswith("etree."):
             continue
+        name = ast.unparse(node.func)
         options = {option.arg: option.value for option in node.keywords}
         makes_parser = name.removeprefix("etree.") in ("XMLParser", "iterparse", "XMLPullParser")
         resolve = options.get("resolve_entities")

@@ -29,8 +29,8 @@ TRUTH = ("truth", "--vut", "design1", "--level", "0", "--cases", "300", "--worke
 COMPARE = (
     "compare",
     *("--vut", "design1", "--level", "0", "--samplers", "uniform", "--seeds", "1"),
+    *("--cases", "40", "--truth-cases", "300", "--workers", "1"),
 )
-COMPARE += ("--cases", "40", "--truth-cases", "300", "--workers", "1")
 
 
 def world_with(run, root: Path, **changes) -> World:
@@ -171,12 +171,12 @@ class TestAFolderThatIsReadOnly:
             ("probability", "run", "--cases", "4"),
         ):
             assert_refused(ended(*arguments), "cannot write")
-        for arguments in (
+        for allowed in (
             ("compare-runs", "run", "run", "--no-rerun"),
             ("export", "run", "59", "--out", "elsewhere"),
             ("probability", "run", "--cases", "4", "--out", "p.json"),
         ):
-            code, _, err = ended(*arguments)
+            code, _, err = ended(*allowed)
             assert code == 0, err
         assert tree(world.root / "run") == before
 

@@ -127,7 +127,7 @@ def test_a_command_that_is_stopped_at_any_moment_can_be_given_again(name, run, t
             time.sleep(float(rng.random()) * whole_s)
             code, err = stop(process, how)
             assert "Traceback" not in err or command.script, (how, err)
-            assert wait_for(lambda world=world: not world.processes()), (how, "left running")
+            assert wait_for(world.has_ended), (how, "left running")
             kept = world.left_in_temporary()
             seen[f"{how} exit {code}"] += 1
             seen[f"{how}: temporary folders left"] += bool(kept)

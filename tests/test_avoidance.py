@@ -1,5 +1,7 @@
 """Who would have avoided a failure: checked against eq. (4) worked out here, without SUMO."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
@@ -64,7 +66,9 @@ def passes(failure, driver, until, *, in_the_povs_place=False):
         x, x_pov = x + 0.1 * v, x_pov + 0.1 * v_pov
         v, v_pov = max(v + 0.1 * a, 0.0), max(v_pov + 0.1 * a_pov, 0.0)
         if x >= 0.0:
-            return abs(x_pov - x) >= 6.0
+            gap, closing = abs(x_pov - x) - 5.0, max(v_pov - v if x_pov < x else v - v_pov, 0.0)
+            # Whoever is behind has 0.75 s, and then 4 m/s2.
+            return gap >= 1.0 and closing**2 <= 8.0 * max(gap - 0.75 * closing, 0.0)
     return False
 
 
@@ -96,7 +100,7 @@ class DiesAt(InProcess):
     def submit(self, fn, /, *args, **kwargs):
         if self.index not in [index for index, _ in args[0]]:
             return super().submit(fn, *args, **kwargs)
-        future = Future()
+        future: Future = Future()
         future.set_exception(BrokenExecutor())
         return future
 

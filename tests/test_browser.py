@@ -1,14 +1,17 @@
 """The report in a real browser: Debian's Chromium without a window."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from conftest import require
+from conftest import require, some
 from foreign_nets import corridor_of
 from handmade import write_run
 
@@ -17,6 +20,7 @@ from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report, report_facts
 from merge_sumo.reports.coordinates import WRITTEN
 from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.values.scenario import POV
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
@@ -42,15 +46,15 @@ def made(tmp_path_factory) -> Run:
 
 
 FIELDS = {name: field for field, (name, *_) in WRITTEN.items()}
-INSIDE = """() => {
-    const all = road.getBoundingClientRect();
+INSIDE = """() => views.filter((view) => view.moving).flatMap(({ svg, cars }) => {
+    const all = svg.getBoundingClientRect();
     return Object.values(cars).map(({ group }) => {
         const car = group.getBoundingClientRect();
         return car.left >= all.left && car.right <= all.right
             && car.top >= all.top && car.bottom <= all.bottom;
     });
-}"""
-"""Whether each car is in the picture."""
+})"""
+"""Whether each car is in the picture, for all pictures."""
 
 
 @contextmanager
@@ -65,8 +69,8 @@ def shown(browser, file: Path, **options) -> Iterator:
     page.on("dialog", lambda dialog: complaints.append(f"dialog {dialog.message}"))
     page.on(
         "request",
-        lambda request: (
-            request.url.startswith(("file:", "data:")) or complaints.append(request.url)
+        lambda request: complaints.extend(
+            [] if request.url.startswith(("file:", "data:")) else [request.url]
         ),
     )
     try:
@@ -327,7 +331,62 @@ def test_two_cases_are_compared(browser, made, size):
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
         page.locator("#keep").click()
         assert page.locator(".line.beside").count() == 0
-        assert not page.locator("#beside").is_visible()
+        for part in ("#beside", "#view-beside"):
+            assert not page.locator(part).is_visible()
+
+
+def placed(page, view: str, who: str) -> tuple[float, float]:
+    """Return where a car is drawn, in metres."""
+    moved = page.locator(f"#{view} g:has(> rect.{who})").get_attribute("transform")
+    x, y = re.match(r"translate\((\S+) (\S+)\)", moved).groups()
+    return float(x), float(y)
+
+
+@WINDOWS
+def test_two_top_views_move_together_and_show_the_same_stretch_of_road(browser, tmp_path, size):
+    run = write_run(tmp_path / "run", 20, error=None, timeouts=(0,))
+    report.write_report(run)
+    first, second = failures(run.outcomes)[0].index, 0
+    rows = {index: len(run.trajectory(index).motion) for index in (first, second)}
+    last = rows[second] - 1
+    assert rows[first] < last
+    with shown(
+        browser, run.folder / report.REPORT, viewport={"width": size[0], "height": size[1]}
+    ) as page:
+        page.evaluate(f"openCase(place.get({first}))")
+        page.locator("#keep").click()
+        page.evaluate(f"openCase(place.get({second}))")
+        for part in ("#case-title", "#road", "#road-beside", "#play", "#time"):
+            assert in_sight(page, part), part
+        own, other = (page.locator(part).bounding_box() for part in ("#road", "#road-beside"))
+        side_by_side = own["y"] == other["y"] and own["x"] + own["width"] < other["x"]
+        one_below_the_other = own["x"] == other["x"] and own["y"] + own["height"] < other["y"]
+        assert (side_by_side, one_below_the_other) == (size[0] > 1000, size[0] < 1000)
+        assert (own["width"], own["height"]) == (other["width"], other["height"])
+        slider = page.locator("#time")
+        assert slider.get_attribute("max") == str(last)
+        for step in (0, 30, last):
+            slider.fill(str(step))
+            road, other_road = page.locator("#road"), page.locator("#road-beside")
+            assert road.get_attribute("viewBox") == other_road.get_attribute("viewBox")
+            assert page.evaluate(INSIDE) == [True] * 4
+            for view, index in (("view", second), ("view-beside", first)):
+                motion = run.trajectory(index).motion[min(step, rows[index] - 1)]
+                assert placed(page, view, "pov")[0] == pytest.approx(motion[POV, 0], abs=0.1)
+        slider.fill(str(last - 1))
+        assert page.inner_text("#view figcaption") == f"Case {second}"
+        ended = f"Case {first}, ended at {(rows[first] - 1) / 10:.1f} s"
+        assert page.inner_text("#view-beside figcaption") == ended
+        slider.fill("0")
+        page.locator("#play").click()
+        for _ in range(600):
+            if int(page.input_value("#time")) > 3:
+                break
+            page.wait_for_timeout(50)
+        page.locator("#play").click()
+        assert 3 < int(page.input_value("#time")) < last
+        assert placed(page, "view", "vut") == placed(page, "view-beside", "vut")
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
 
 
 def test_a_command_breaks_between_words_only(browser, made):
@@ -466,7 +525,7 @@ def test_a_campaign_without_cases_opens_too(browser, made, tmp_path):
         assert "No case has run" in page.inner_text(".verdict")
 
 
-@pytest.mark.parametrize("name", [None, "curved", "left turn"])
+@pytest.mark.parametrize("name", some([None, "curved", "left turn"], None, "left turn"))
 def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch, name):
     if name is not None:
         corridor = corridor_of(name, tmp_path)
@@ -486,7 +545,7 @@ def in_traffic(tmp_path_factory) -> Run:
     return run
 
 
-def drawn_at(page, outcome, axes: tuple[str, str]) -> tuple[float, float]:
+def drawn_at(page, outcome, axes: Sequence[str]) -> tuple[float, float]:
     """Return how far a mark is from where a case is in two coordinates, as shares of the map."""
     level = outcome.case.level
     dims = {d.field: d for d in outcome.case.scenario.dimensions(level)}

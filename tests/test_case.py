@@ -1,5 +1,7 @@
 """Cases and the pool."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import math

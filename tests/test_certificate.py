@@ -4,6 +4,7 @@ checks one trusts nothing.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 import math
@@ -212,7 +213,8 @@ class TestACertificate:
         monkeypatch.setattr(certificate, "BLOCK", 70)
         run = planted(untold=lambda unit: unit[0] < 0.3)
         certify(settings(1, 2), 0.1, tmp_path / "whole", ROAD, run)
-        left, told = [3], []
+        left: list[int] = [3]
+        told: list = []
 
         def stop():
             left[0] -= 1
@@ -285,14 +287,14 @@ class TestWhoChecksOne:
         path = folder / CERTIFICATE
         record = json.loads(path.read_text())
         del record["sha256"]
-        digest = check_certificate.hashlib.sha256()
+        digest = hashlib.sha256()
         for name in check_certificate.ARRAYS:
             digest.update(block[name].tobytes())
         record["levels"]["0"]["cases"] = cases
         record["found"]["levels"]["0"] |= {"sha256": digest.hexdigest()}
         record["found"] |= found
         text = json.dumps(record, sort_keys=True).encode()
-        record["sha256"] = check_certificate.hashlib.sha256(text).hexdigest()
+        record["sha256"] = hashlib.sha256(text).hexdigest()
         path.write_text(json.dumps(record))
 
     def test_finds_a_changed_record(self, folder):
@@ -385,6 +387,9 @@ class TestTheCommand:
         criterion = ("--fail-when", 'end == "MERGED"')
         code, out, err = command_line(*plan, *criterion, "--out", tmp_path / "c", "--json")
         assert code == 1, err
+        assert 'cases that may fail by end == "MERGED": ' in json.loads(out)["sentence"].replace(
+            "'", '"'
+        )
         found = json.loads(out)["levels"]["0"]
         assert found["failures"] == found["cases"] == len(covering(0.3, 2))
         assert check_certificate.check(tmp_path / "c")[1] == []

@@ -1,5 +1,7 @@
 """The command line: what it prints where, how it ends, and what it leaves alone."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import importlib

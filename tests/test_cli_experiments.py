@@ -63,7 +63,7 @@ class TestCompare:
     def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
         monkeypatch.setattr("merge_sumo.campaigns.truth.DENSE_CASES", 900)
         tiny = (*COMPARE, "--samplers", "uniform", "--seeds", 1, "--cases", 10, "--batch", 10)
-        found = {}
+        found: dict = {}
         for option in ("", "--dense", "--dense", "", "--no-dense"):
             code, out, err = call(*tiny, *filter(None, [option]), "--json")
             assert code == 0, err

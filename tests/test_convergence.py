@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from typing import Any
 
 import pytest
 
@@ -16,7 +17,7 @@ from merge_sumo.values.case import Case, Pool
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
-NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 
 
 class Oracle(UniformSampler):
@@ -118,7 +119,13 @@ class TestWhatIsRefused:
 
 
 def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(tmp_path):
-    plan = {"vut": "design1", "levels": (0,), "sampler": "coverage", "cases": 120, "batch": 20}
+    plan: dict[str, Any] = {
+        "vut": "design1",
+        "levels": (0,),
+        "sampler": "coverage",
+        "cases": 120,
+        "batch": 20,
+    }
     whole = run_campaign(CampaignSettings(**plan), tmp_path / "whole")
     early = run_campaign(CampaignSettings(**plan, stop_after_converged=0.9), tmp_path / "early")
     assert 80 <= len(early.outcomes) < len(whole.outcomes) == 120

@@ -67,9 +67,9 @@ class Commander:
 
     def step(self):
         shape = self.x_m.shape
-        a = self.rng.uniform(A_MIN_MPS2, A_MAX_MPS2, shape) * self.rng.integers(0, 2, shape)
+        drawn = self.rng.uniform(A_MIN_MPS2, A_MAX_MPS2, shape) * self.rng.integers(0, 2, shape)
         to_a_stand = self.rng.random(shape) < 0.02
-        a = np.where(to_a_stand, -self.v_mps / DT_S, a)
+        a = np.where(to_a_stand, -self.v_mps / DT_S, drawn)
         self.world.step(a)
         self.x_m = self.x_m + self.v_mps * DT_S
         self.v_mps = np.maximum(self.v_mps + a * DT_S, 0.0)
@@ -92,7 +92,7 @@ def test_sumo_drives_300_random_episodes_by_eq_4_over_every_lane_of_the_paths(co
         while commander.episodes < 300:
             commander.step()
             assert commander.worst() < EXACT
-            for k in np.flatnonzero((commander.left <= 0) | (commander.x_m.max(0) > 1700)):
+            for k in np.flatnonzero((commander.left <= 0) | (commander.x_m.max(0) > 1700)).tolist():
                 commander.refill(k)
                 assert commander.worst() < EXACT
             commander.visited |= {world._get_lane(name) for name in world._ids}

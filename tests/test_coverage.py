@@ -1,18 +1,22 @@
 """`coverage`: what it takes a case to be worth, and that it finds what others do not."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import math
 import statistics
+from typing import Any
 
 import numpy as np
 import pytest
+from conftest import some
 
 from merge_sumo.samplers.base import LevelHistory, Sampler
 from merge_sumo.samplers.belief import CALIBRATION, _as_if, _calibrated, margin_of
 from merge_sumo.samplers.coverage import NEAREST, PATIENCE, CoverageSampler, _limit, _Search, _trust
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
-from merge_sumo.samplers.ground import Ground
+from merge_sumo.samplers.ground import Ground, _Scattered
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin
 from merge_sumo.values.case import Case, Pool, to_unit
@@ -20,7 +24,7 @@ from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
-NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 
 
 def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = True) -> Outcome:
@@ -59,7 +63,7 @@ def coverage_of(outcomes: list[Outcome], level: int) -> float:
 
 
 class TestTheGround:
-    @pytest.mark.parametrize("dims", range(2, 7))
+    @pytest.mark.parametrize("dims", some(range(2, 7), 2, 3, 4))
     def test_counts_what_fmc_measures(self, dims):
         reach = 2.0 * radius_for(dims)
         points = np.random.default_rng(dims).uniform(0.5 - reach, 0.5 + reach, (30, dims))
@@ -94,6 +98,7 @@ class TestTheGround:
     def test_has_balls_of_the_radius_where_they_are_no_grid(self, dims):
         points = np.random.default_rng(1).random((200, dims))
         places = Ground(dims)._places
+        assert isinstance(places, _Scattered)
         farthest = places._tree.query(points, k=places.per_ball)[0][:, -1]
         assert farthest == pytest.approx(radius_for(dims), rel=0.1)
 
@@ -119,7 +124,7 @@ class TestTheGround:
 
 
 @pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
-@pytest.mark.parametrize("level", [0, 2])
+@pytest.mark.parametrize("level", some([0, 2], 2))
 def test_covers_more_than_twice_of_what_uniform_covers(level, blind):
     uniform, ours = (
         statistics.median(
@@ -166,7 +171,7 @@ def test_expects_less_of_the_next_batch_the_more_it_has_covered():
 def test_learns_from_a_bounded_number_of_cases_in_a_long_campaign():
     cases = make_sampler("uniform", Pool(levels=(0,)), 0).ask(1200)
     sampler = make_sampler("coverage", Pool(levels=(0,)), 0)
-    sampler.tell(outcome(i, i // 40, case, blind=False) for i, case in enumerate(cases))
+    sampler.tell([outcome(i, i // 40, case, blind=False) for i, case in enumerate(cases)])
     points = to_unit(sampler.ask(10), 0)
     assert points.shape == (10, 2)
 

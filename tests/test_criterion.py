@@ -260,6 +260,15 @@ class TestNamed:
         assert Criterion("contact").outcome(0, 0, ending(-4.9)).failed
         assert Criterion("contact").outcome(0, 0, ending(-4.9)).margin == pytest.approx(-0.1)
 
+    def test_may_be_part_of_a_condition(self):
+        either = Criterion('unsafe or end == "TIMEOUT"')
+        assert either.text == "unsafe or end == 'TIMEOUT'"
+        assert of(either.text, ending(-25.0, v_pov=36.0, v_vut=26.0)) == pytest.approx(-1.0 / 3.0)
+        assert of(either.text, ending(9.0, end=End.TIMEOUT)) == -1.0
+        assert of("not (contact or collision)", ending(-25.0, v_pov=27.0)) < 0.0
+        with pytest.raises(UserError, match="did you mean unsafe"):
+            Criterion("unsave or ttc_s < 1")
+
     def test_unsafe_is_also_who_must_brake_harder_than_3(self):
         # 20 m and 10 m/s: 4 m/s2, a third beyond 3.
         harsh = ending(-25.0, v_pov=36.0, v_vut=26.0)
@@ -413,7 +422,7 @@ class TestCampaigns:
         page = (harsh.folder / "report.html").read_text(encoding="utf-8")
         assert code == 0
         assert "A case fails when brake_after_mps2 &gt; 2" in page
-        assert "Fails in " in page
+        assert "Fails (brake_after_mps2 &gt; 2) in " in page
         assert "Collides" not in page
         assert '"margin"' in page
 

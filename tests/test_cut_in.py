@@ -60,7 +60,8 @@ def ours(name, cells, within_m=0.0):
 def published(name, cells):
     """Return where the published model collides, (n,)."""
     v, v_front, gap, aside = (row.copy() for row in cells)
-    delay_s, braking, collides = np.full(len(v), DELAY_S[name]), 0.0, np.zeros(len(v), dtype=bool)
+    delay_s, braking = np.full(len(v), DELAY_S[name]), np.zeros(len(v))
+    collides = np.zeros(len(v), dtype=bool)
     for step in range(STEPS):
         u = v - v_front
         if name == "careful":  # TTC of 2 s, 0.774 g

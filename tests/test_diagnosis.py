@@ -1,5 +1,7 @@
 """Who yielded, which kind of failure it was, and where failures lie, by hand-made trajectories."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 from dataclasses import replace

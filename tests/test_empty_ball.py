@@ -1,5 +1,7 @@
 """The largest ball that no case has entered: by hand, and against the checker's Voronoi cells."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import math

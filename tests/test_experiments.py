@@ -1,5 +1,7 @@
 """Ground truth and comparison of samplers, in worker processes with a SUMO each."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
@@ -8,6 +10,7 @@ import shutil
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +25,7 @@ from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
-NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +35,12 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def truth(cache):
-    return ground_truth("design1", 0, 600, cache=cache)
+    return ground_truth("design1", 0, 300, cache=cache)
 
 
 def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
     with open_workers(2) as workers:
-        both = ground_truth("design1", 0, 600, workers=workers, cache=tmp_path)
+        both = ground_truth("design1", 0, 300, workers=workers, cache=tmp_path)
     assert np.array_equal(both.points, truth.points)
     assert np.array_equal(both.score, truth.score)
     assert len(truth.failures) > 0
@@ -45,14 +48,14 @@ def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
 
 def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch):
     (kept,) = cache.glob("truth-*.npz")
-    counted = []
-    again = ground_truth("design1", 0, 600, cache=cache, on_cases=counted.append)
+    counted: list[int] = []
+    again = ground_truth("design1", 0, 300, cache=cache, on_cases=counted.append)
     assert np.array_equal(again.score, truth.score)
     assert counted == []
     kept.write_bytes(kept.read_bytes()[:100])
-    remade = ground_truth("design1", 0, 600, cache=cache, on_cases=counted.append)
+    remade = ground_truth("design1", 0, 300, cache=cache, on_cases=counted.append)
     assert np.array_equal(remade.score, truth.score)
-    assert sum(counted) == 600
+    assert sum(counted) == 300
 
 
 @pytest.mark.parametrize(
@@ -60,14 +63,14 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
     [
         {"vut": "design2"},
         {"level": 1},
-        {"cases": 601},
+        {"cases": 301},
         {"seed": 1},
         {"command": "./controller"},
         {"deadline_s": 1.0},
     ],
 )
 def test_the_key_of_the_cache_names_what_the_truth_depends_on(change):
-    kept = Kept("design1", 0, 600, 0, None, 5.0)
+    kept = Kept("design1", 0, 300, 0, None, 5.0)
     assert kept.path() == replace(kept).path()
     assert kept.path() != replace(kept, **change).path()
 
@@ -256,9 +259,9 @@ class TestTheLimit:
 
 
 def test_a_truth_is_known_when_it_was_made_and_not_before(truth, cache, tmp_path):
-    assert known_truth("design1", 0, 600, cache=tmp_path) is None
-    assert known_truth("design1", 0, 601, cache=cache) is None
-    known = known_truth("design1", 0, 600, cache=cache)
+    assert known_truth("design1", 0, 300, cache=tmp_path) is None
+    assert known_truth("design1", 0, 301, cache=cache) is None
+    known = known_truth("design1", 0, 300, cache=cache)
     assert known is not None
     assert np.array_equal(known.score, truth.score)
 

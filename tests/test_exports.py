@@ -1,5 +1,7 @@
 """Cases for other tools: OpenSCENARIO with OpenDRIVE, and tables of motion."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import csv

@@ -7,6 +7,8 @@ import importlib
 import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
+from matplotlib.text import Annotation
+from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 
 from merge_sumo.campaigns.experiments import Comparison, LevelShare
@@ -74,7 +76,9 @@ class TestTheCurves:
         figure = figures.coverage_curves(
             "t", {"uniform": compared(0.05), "gpr": compared(0.05)}, 0.05, {0: 0.0, 40: 0.05}, 0.05
         )
-        heights = sorted(text.xyann[1] for text in figure.axes[0].texts)
+        heights = sorted(
+            text.xyann[1] for text in figure.axes[0].texts if isinstance(text, Annotation)
+        )
         assert min(np.diff(heights)) > 0.0
 
     def test_have_axes_that_say_what_they_are(self):
@@ -88,7 +92,7 @@ class TestTheMaps:
         one = Panel(np.array([[0.5, 0.5], [1.0, 0.0]]), np.array([True, False]), 0.0079)
         (axes,) = figures.maps("t", {"gpr": one}, 0).axes
         (balls,) = (c for c in axes.collections if isinstance(c, EllipseCollection))
-        assert balls.get_offsets().tolist() == [[-260.0, 30.0]]
+        assert np.asarray(balls.get_offsets()).tolist() == [[-260.0, 30.0]]
         assert balls.get_widths() == pytest.approx([2 * RADIUS * 160.0])
         assert balls.get_heights() == pytest.approx([2 * RADIUS * 10.0])
         assert axes.get_xlim() == (-340.0, -180.0)
@@ -98,8 +102,9 @@ class TestTheMaps:
 
     def test_at_level_2_are_boxes_with_the_social_value_orientation(self):
         figure = figures.maps("t", {"truth": panel(30, 3), "gpr": panel(30, 3)}, 2)
-        assert len(figure.axes) == 2
-        assert "(rad)" in figure.axes[0].get_zlabel()
+        (axes, _) = figure.axes
+        assert isinstance(axes, Axes3D)
+        assert "(rad)" in axes.get_zlabel()
 
     def test_of_no_failures_are_drawn_too(self, tmp_path):
         for dims, level in ((2, 1), (3, 2)):
@@ -153,7 +158,7 @@ class TestAFile:
         figures.save(curves(), tmp_path / "f.png")
         with Image.open(tmp_path / "f.png") as image:
             assert image.size[0] > 1000
-            assert len(image.convert("RGB").getcolors(1 << 20)) > 50, "it is not one colour"
+            assert len(image.convert("RGB").getcolors(1 << 20) or []) > 50, "it is not one colour"
 
     def test_as_a_page_needs_no_network(self, tmp_path):
         figures.save(curves(), tmp_path / "f.html")

@@ -1,5 +1,7 @@
 """What happens behind M: both drive on, and it is measured."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json

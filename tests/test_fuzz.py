@@ -5,6 +5,8 @@ changed, and files of anything at all. A `UserError` of one line is the only exc
 `pytest -m long tests/test_fuzz.py` looks for more, and uses atheris where it is installed.
 """
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import hashlib
@@ -14,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -89,7 +92,10 @@ any_json = st.recursive(
 )
 
 
-def answer(read: Callable[[], object]) -> object:
+T = TypeVar("T")
+
+
+def answer(read: Callable[[], T]) -> T | None:
     """Return what a reader gives, or None where it refuses in a sentence."""
     try:
         return read()

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from foreign_nets import corridor_of
 from lxml import etree
 from PIL import Image
+from processes import marked, none_left
 
 from merge_sumo.campaigns.conductor import export_case
 from merge_sumo.campaigns.run import failures
@@ -113,6 +115,47 @@ def places(image: np.ndarray, colour: tuple[float, ...]) -> np.ndarray:
 def car(image: np.ndarray, who: str) -> np.ndarray:
     """Return the pixels of a car."""
     return places(image, tuple(255.0 * float(part) for part in COLOURS[who].split(",")))
+
+
+NEVER_CONNECTED = """
+import time
+from merge_sumo.cli import main
+from merge_sumo.sumo import client
+
+client.load_traci().connect = lambda *_, **__: time.sleep(600)
+main()
+"""
+STOPS = {"SIGTERM": 143, "SIGHUP": 129, "SIGKILL": -9, "SIGINT": 1}
+"""How the command ends by a signal; typer says "Aborted!" and 1 by SIGINT."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["SIGTERM", *(pytest.param(name, marks=pytest.mark.long) for name in list(STOPS)[1:])],
+)
+def test_no_window_is_left_of_a_command_that_is_stopped_before_it_is_connected(
+    name, display, tmp_path
+):
+    (tmp_path / "script.py").write_text(NEVER_CONNECTED)
+    case = ("--vut", "level0", "--x", "-300", "--v", "30", "--gui")
+    with none_left() as mark:
+        command = subprocess.Popen(
+            [sys.executable, tmp_path / "script.py", "run", *case],
+            env={**os.environ, "DISPLAY": display, "TMPDIR": str(tmp_path)},
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            while not any("sumo-gui" in program.split()[0] for program in marked(mark)):
+                assert command.poll() is None
+                time.sleep(0.05)
+            command.send_signal(signal.Signals[name])
+            assert command.wait(60) == STOPS[name]
+        finally:
+            if command.poll() is None:
+                os.killpg(command.pid, signal.SIGKILL)
+    if name != "SIGKILL":
+        assert [file.name for file in tmp_path.iterdir()] == ["script.py"]
 
 
 def test_the_picture_has_background_and_a_road_across_it(pictures):

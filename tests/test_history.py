@@ -1,17 +1,21 @@
 """Several versions in one page: regions that were fixed and that broke, by records alone."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
 import math
 import re
 from dataclasses import asdict, replace
+from html import escape
 from pathlib import Path
 
 import numpy as np
 import pytest
 from handmade import drive, write_run
 
+import merge_sumo as ms
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
@@ -108,7 +112,8 @@ def test_a_version_in_which_nothing_was_tested_has_no_fmc(tmp_path):
     a = write(tmp_path / "a", (0.5, 0.5, "fails"))
     b = write(tmp_path / "b", (0.5, 0.5, "errs"))
     first, second = (version.levels[0] for version in history_of([a, b]).versions)
-    assert (first.fmc, first.regions) == (pytest.approx(BALL), 1)
+    assert first.fmc == pytest.approx(BALL)
+    assert first.regions == 1
     assert (second.fmc, second.regions, second.errors) == (None, None, 1)
 
 
@@ -209,3 +214,29 @@ class TestTheCommand:
         assert code == 2
         assert "exists" in err
         assert (tmp_path / "history.html").read_text() == "mine"
+
+
+class TestFromPython:
+    def test_is_what_the_command_prints_and_writes(self, command_line, tmp_path):
+        a = write(tmp_path / "a", (0.5, 0.5, "fails"), (0.1, 0.1, "errs"), vut="<b>a</b>\a")
+        b = write(tmp_path / "b", (0.5, 0.5, "passes"))
+        page, other = tmp_path / "page.html", tmp_path / "other.html"
+        found = ms.history([a.folder, ms.open_run(b.folder)], out=page)
+        _, said, _ = command_line("history", a.folder, b.folder, "--out", other)
+        assert said == f"{found}\npage: {other}\n"
+        assert page.read_bytes() == other.read_bytes()
+        assert found.steps[0].count(Became.FIXED) == 1
+        assert repr(found).startswith("<History: FMC went at POV level 0 from 0.0079 (version 1)")
+        assert found._repr_html_() == f"<pre>{escape(str(found))}</pre>"
+
+    def test_writes_no_page_unless_asked_and_replaces_none(self, tmp_path, monkeypatch):
+        a = write(tmp_path / "a", (0.5, 0.5, "fails"))
+        monkeypatch.chdir(tmp_path)
+        ms.history([a.folder, a.folder])
+        assert [file.name for file in tmp_path.iterdir()] == ["a"]
+        (tmp_path / "page.html").write_text("mine")
+        with pytest.raises(ms.UserError, match="exists"):
+            ms.history([a.folder, a.folder], out="page.html")
+        assert (tmp_path / "page.html").read_text() == "mine"
+        with pytest.raises(ms.UserError, match="two campaigns"):
+            ms.history([a.folder])

@@ -1,5 +1,7 @@
 """What a campaign remembers survives exactly, and what cannot be read is named."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
@@ -8,6 +10,7 @@ import os
 import resource
 import shutil
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -88,7 +91,7 @@ def lines_of(count: int) -> list[bytes]:
     return [to_line(episode(index)[0]).encode() for index in range(count)]
 
 
-def contents(folder) -> dict:
+def contents(folder: Path) -> dict[Path, bytes]:
     """Return every file below a folder with its bytes."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

@@ -6,6 +6,7 @@ import os
 import shutil
 import stat
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from unicodedata import category
 
@@ -134,11 +135,16 @@ STOP = "this test runs no cases"
 def no_cases(monkeypatch) -> None:
     """Stop campaigns and reproductions where their first case would run."""
 
-    def stop(*_: object) -> None:
-        raise UserError(STOP)
+    class Stop:
+        """What runs cases, ahead or when it is asked to."""
 
-    # What runs cases, ahead or when it is asked to.
-    stop.chunks = lambda _: (chunk for chunk in ())
+        def __call__(self, *_: object) -> None:
+            raise UserError(STOP)
+
+        def chunks(self, _: object) -> Iterator:
+            return iter(())
+
+    stop = Stop()
     monkeypatch.setattr(conductor, "runs_on", lambda *_: stop)
     monkeypatch.setattr(reproduce._Work, "column", stop)
 
@@ -492,8 +498,13 @@ class TestAFolderOfPolicies:
         assert not (tmp_path / "elsewhere").exists()
 
     def test_that_was_begun_is_gone_on_with(self, tmp_path, monkeypatch):
-        asked = []
-        monkeypatch.setattr(helix, "_train_beside", lambda *a: asked.append(a[0]) or [])
+        asked: list[Path] = []
+
+        def train(folder: Path, *_: object) -> list:
+            asked.append(folder)
+            return []
+
+        monkeypatch.setattr(helix, "_train_beside", train)
         for _ in range(2):
             helix.train_library(tmp_path / "new", ("pov1",))
             (tmp_path / "new" / "pov1.training.jsonl").write_text("{}\n")

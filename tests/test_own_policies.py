@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -99,7 +100,7 @@ class TestACampaign:
 
     def test_has_its_learned_vut_from_there_too(self, swapped, tmp_path):
         for name, folder in (("shipped", None), ("swapped", swapped)):
-            values = {**SMALL, "levels": (0,)}
+            values: dict[str, Any] = {**SMALL, "levels": (0,)}
             named = None if folder is None else str(folder)
             level1 = CampaignSettings(vut="level1", policies=named, **values)
             run_campaign(level1, tmp_path / name)
@@ -281,7 +282,7 @@ class TestOtherCommands:
 class TestAFolder:
     @pytest.mark.parametrize("level", [1, 2])
     def test_without_a_network_says_how_to_make_it(self, one, level):
-        values = {**SMALL, "levels": (level,)}
+        values: dict[str, Any] = {**SMALL, "levels": (level,)}
         if level == 1:
             CampaignSettings(vut="design1", policies=str(one), **values)
             return

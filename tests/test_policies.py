@@ -109,7 +109,8 @@ def test_features_are_finite_and_bounded_wherever_a_vut_may_take_a_driver():
     )  # fmt: skip
     assert found.shape == (n, 28)
     assert np.isfinite(found).all()
-    standing = features(*(np.array([x]) for x in (-200.0, 0.0, -100.0, 0.0)))
+    zero = np.zeros(1)
+    standing = features(zero - 200.0, zero, zero - 100.0, zero)
     assert np.isfinite(standing).all()
 
 
@@ -156,7 +157,8 @@ class TestOtherScenarios:
         assert actions_mps2(US23).tolist() == [-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0]
 
     def test_in_a_merge_of_half_the_size_they_see_the_same_and_act_half(self):
-        half = features(*(states(20_000) / 2).T, scenario=HALF)
+        x_pov, v_pov, x_vut, v_vut = (states(20_000) / 2).T
+        half = features(x_pov, v_pov, x_vut, v_vut, scenario=HALF)
         assert np.array_equal(half, features(*states(20_000).T))
         assert np.array_equal(actions_mps2(HALF), actions_mps2(US23) / 2)
 

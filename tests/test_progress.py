@@ -66,7 +66,7 @@ def test_nothing_is_shown_before_the_first_case():
 def clock(monkeypatch):
     """Return a clock that goes when it is told to."""
     now = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr("merge_sumo.reports.progress.time.monotonic", lambda: now[0])
     return now
 
 
@@ -123,11 +123,10 @@ class TestInANotebook:
         texts: list[str] = []
         handle = types.SimpleNamespace(update=texts.append)
         module = types.ModuleType("IPython.display")
-        module.HTML = str
-        module.display = lambda _text, display_id: handle
+        vars(module).update(HTML=str, display=lambda _text, display_id: handle)
         shell = types.SimpleNamespace(kernel=object())
         notebook = types.ModuleType("IPython")
-        notebook.get_ipython = lambda: shell
+        vars(notebook).update(get_ipython=lambda: shell)
         monkeypatch.setitem(sys.modules, "IPython", notebook)
         monkeypatch.setitem(sys.modules, "IPython.display", module)
         return texts

@@ -8,6 +8,7 @@ import threading
 import types
 import warnings
 from importlib import import_module
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ import merge_sumo as ms
 from merge_sumo.drivers.vuts.here import is_here, keep, object_of, spec_of, travels
 from merge_sumo.system.spawning import without_main
 
-SMALL = {"level": 0, "cases": 4, "seed": 1}
+SMALL: dict[str, Any] = {"level": 0, "cases": 4, "seed": 1}
 
 
 class Steady:
@@ -76,11 +77,11 @@ class TestWhatTravels:
 
     def test_a_lambda_an_object_with_a_lock_and_what_is_of_the_main_module_do_not(self):
         with_lock, of_main = Batched(1.0), Batched(1.0)
-        with_lock.lock = threading.Lock()
+        vars(with_lock).update(lock=threading.Lock())
         main = types.new_class(
             "Main", (Steady,), exec_body=lambda n: n.update(__module__="__main__")
         )
-        of_main.part = main
+        vars(of_main).update(part=main)
         for vut in (lambda _: 0.0, with_lock, main, of_main):
             assert not travels(spec_of(vut))
 
@@ -126,6 +127,25 @@ class TestACampaign:
     def test_of_what_cannot_travel_runs_without_workers(self, tmp_path):
         with pytest.warns(UserWarning, match="and without workers"):
             ms.campaign(lambda _: 0.0, **SMALL, workers=2, out=tmp_path / "run")
+
+    def test_that_was_interrupted_goes_on_and_takes_more_cases(self, tmp_path):
+        def stop(outcome):
+            if outcome.index == 3:
+                raise KeyboardInterrupt
+
+        small = {**SMALL, "batch": 2, "sampler": "subset"}
+        folder, whole = tmp_path / "run", ms.campaign("level0", **small, out=tmp_path / "whole")
+        with pytest.raises(KeyboardInterrupt) as stopped:
+            ms.campaign("level0", **small, out=folder, on_case=stop)
+        assert stopped.value.__notes__ == [f"stopped; go on with ms.resume({str(folder)!r})"]
+        assert len(ms.open_run(folder).cases) == 2
+        again = []
+        done = ms.resume(folder, on_case=lambda outcome: again.append(outcome.index))
+        assert again == [2, 3]
+        assert list(done.cases) == list(whole.cases)
+        assert len(ms.resume(done, cases=6).cases) == 6
+        with pytest.raises(ms.UserError, match="vut"):
+            ms.resume(folder, vut="design2", cases=8)
 
     def test_takes_a_pov_of_the_same_kinds(self, tmp_path):
         with pytest.warns(UserWarning, match="drives"):
@@ -193,9 +213,17 @@ class TestTheOtherFunctions:
         worst = ms.open_run(run.folder).failures[0]["index"]
         found = ms.rerun(run.folder, [worst], vut="design2")
         assert [(c.before.index, c.change) for c in found.changed] == [(worst, "fixed")]
+        assert repr(found) == "<Rerun: recorded: 1 failure in 1 case>"
+        assert str(found).endswith(f"  case {worst}: COLLISION -> MERGED (fixed)")
+        assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
 
     def test_campaigns_are_compared_by_their_folders(self, run):
-        assert ms.compare_runs(run.folder, ms.open_run(run.folder)).worse(0.0) == []
+        found = ms.compare_runs(run.folder, ms.open_run(run.folder))
+        assert found.worse(0.0) == []
+        (level,) = found.levels.values()
+        fmc = f"{level.fmc_a:.4f}"
+        assert repr(found) == f"<RunComparison: level 0: FMC {fmc} -> {fmc}>"
+        assert str(found).splitlines()[1].split()[:3] == ["0", fmc, fmc]
 
     def test_cases_are_exported(self, run, tmp_path):
         (config,) = ms.export(run.folder, [3], out=tmp_path / "sumo")

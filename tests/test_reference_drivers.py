@@ -27,8 +27,8 @@ from merge_sumo.values.trajectory import End
 CASE = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0)
 
 
-def one(*values):
-    return (np.array([float(value)]) for value in values)
+def one(value):
+    return np.array([float(value)])
 
 
 def started(driver, scenario=None):
@@ -43,7 +43,7 @@ def started(driver, scenario=None):
 
 
 def scene(x_pov_m, v_pov_mps, x_vut_m, v_vut_mps):
-    state = one(x_pov_m, v_pov_mps, x_vut_m, v_vut_mps)
+    state = map(one, (x_pov_m, v_pov_mps, x_vut_m, v_vut_mps))
     return Scene.of_pair(np.array([True]), np.array([0]), *state)
 
 
@@ -54,14 +54,14 @@ def at_m(dx_m, v_pov_mps=30.0, x_vut_m=-140.0):
 
 class TestFormulas:
     def test_time_to_collision(self):
-        assert ttc_s(*one(10, 25, 20)) == 2.0
-        assert ttc_s(*one(10, 20, 25)) == np.inf
-        assert ttc_s(*one(-1, 20, 25)) == 0.0
+        assert ttc_s(one(10), one(25), one(20)) == 2.0
+        assert ttc_s(one(10), one(20), one(25)) == np.inf
+        assert ttc_s(one(-1), one(20), one(25)) == 0.0
 
     def test_rss_distance(self):
         # 15 + 2 * 0.75^2 / 2 + 21.5^2 / 8 - 20^2 / 8
-        assert rss_distance_m(*one(20, 20), 0.75, 2.0, 4.0, 4.0) == pytest.approx(23.34375)
-        assert rss_distance_m(*one(5, 40), 0.75, 2.0, 4.0, 4.0) == 0.0
+        assert rss_distance_m(one(20), one(20), 0.75, 2.0, 4.0, 4.0) == pytest.approx(23.34375)
+        assert rss_distance_m(one(5), one(40), 0.75, 2.0, 4.0, 4.0) == 0.0
 
     @pytest.mark.parametrize(
         ("gap_m", "wanted"),
@@ -69,11 +69,11 @@ class TestFormulas:
         [(20.0, 0.0), (18.0, 0.48), (15.8, 1.0), (0.0, 1.0)],
     )
     def test_cfs(self, gap_m, wanted):
-        assert cfs(*one(gap_m, 20, 10), 0.75, 4.0, 6.0) == pytest.approx(wanted)
+        assert cfs(one(gap_m), one(20), one(10), 0.75, 4.0, 6.0) == pytest.approx(wanted)
 
     def test_cfs_is_0_where_the_gap_opens(self):
-        assert cfs(*one(1, 20, 21), 0.75, 4.0, 6.0) == 0.0
-        assert cfs(*one(-1, 20, 21), 0.75, 4.0, 6.0) == 1.0
+        assert cfs(one(1), one(20), one(21), 0.75, 4.0, 6.0) == 0.0
+        assert cfs(one(-1), one(20), one(21), 0.75, 4.0, 6.0) == 1.0
 
     @pytest.mark.parametrize(
         ("gap_m", "wanted"),
@@ -81,32 +81,34 @@ class TestFormulas:
         [(40.5, 0.0), (30.0, (17.0 + 150.0 / 7.0 - 28.0) / (2.0 + 50.0 / 3.0)), (21.7, 1.0)],
     )
     def test_pfs(self, gap_m, wanted):
-        assert pfs(*one(gap_m, 20, 20), 0.75, 4.0, 6.0, 7.0, 2.0) == pytest.approx(wanted)
+        assert pfs(one(gap_m), one(20), one(20), 0.75, 4.0, 6.0, 7.0, 2.0) == pytest.approx(wanted)
 
 
 class TestModels:
     @pytest.mark.parametrize(("gap_m", "brakes"), [(9.9, True), (10.1, False)])
     def test_the_careful_driver_fears_a_time_to_collision_of_two_seconds(self, gap_m, brakes):
-        found = started(CarefulVut).braking_mps2(*one(gap_m, 30, 25))
+        found = started(CarefulVut).braking_mps2(one(gap_m), one(30), one(25))
         assert found == pytest.approx(0.774 * 9.81 if brakes else 0.0)
 
     @pytest.mark.parametrize(("gap_m", "brakes"), [(5.69, True), (5.71, False)])
     def test_reg157_waits_until_it_has_to(self, gap_m, brakes):
         # v_rel / 12 + 0.35 = 0.85 s at 6 m/s, and a step of 0.1 s.
-        assert started(Reg157Vut).braking_mps2(*one(gap_m, 30, 24)) == (6.0 if brakes else 0.0)
+        assert started(Reg157Vut).braking_mps2(one(gap_m), one(30), one(24)) == (
+            6.0 if brakes else 0.0
+        )
 
     def test_rss_keeps_its_distance_with_the_limits_of_the_scenario(self):
         rss = started(RssVut)
-        assert rss.braking_mps2(*one(23.3, 20, 20)) > 0.0
-        assert rss.braking_mps2(*one(23.4, 20, 20)) == 0.0
+        assert rss.braking_mps2(one(23.3), one(20), one(20)) > 0.0
+        assert rss.braking_mps2(one(23.4), one(20), one(20)) == 0.0
 
     def test_fsm_brakes_as_far_as_the_situation_is_unsafe(self):
         fsm = started(FsmVut, Scenario(a_min_mps2=-7.0))
         # CFS 0.48 between 4 and 6 m/s2.
-        assert fsm.braking_mps2(*one(18, 20, 10)) == pytest.approx(0.48 * 2.0 + 4.0)
+        assert fsm.braking_mps2(one(18), one(20), one(10)) == pytest.approx(0.48 * 2.0 + 4.0)
         # PFS alone, up to 4 m/s2, with a leader that brakes by 7.
         proactive = (17.0 + 150.0 / 7.0 - 28.0) / (2.0 + 50.0 / 3.0)
-        assert fsm.braking_mps2(*one(30, 20, 20)) == pytest.approx(4.0 * proactive)
+        assert fsm.braking_mps2(one(30), one(20), one(20)) == pytest.approx(4.0 * proactive)
 
 
 class TestReactions:
@@ -116,7 +118,7 @@ class TestReactions:
     def test_the_careful_driver_perceives_reacts_and_brakes_by_its_jerk(self):
         # Perceived after 0.4 s. What brakes after 1.1 s moves the car from 1.2 s on, the first step
         # after 1.15 s; within the 4 m/s2 of the scenario.
-        slow = scene(-30.0 * level0_time_to(*one(100, 20))[0], 30.0, -100.0, 20.0)
+        slow = scene(-30.0 * level0_time_to(one(100), one(20))[0], 30.0, -100.0, 20.0)
         found = self.answers(started(CarefulVut), slow, 17)
         assert found == [1.0] * 4 + [0.0] * 7 + [-1.265, -2.53, -3.795, -4.0, -4.0, -4.0]
 
@@ -194,7 +196,7 @@ class TestTheCarefulPov:
 
 @pytest.mark.parametrize("name", ["level0", *REFERENCES])
 def test_only_the_blind_driver_collides_where_both_are_due_at_the_same_time(name):
-    due_s = level0_time_to(*one(182, 18))[0]
+    due_s = level0_time_to(one(182), one(18))[0]
     speeds = np.arange(25.0, 35.5, 2.0)
     cases = [Case(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v) for v in speeds.tolist()]
     with ProvingGround(name, corridors=6) as ground:

@@ -1,9 +1,12 @@
 """The maps of the report: which two coordinates come first, and what they show of the others."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import base64
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,12 +70,12 @@ class TestWhatAPairExplains:
 
 class TestPairs:
     def test_of_two_and_three_coordinates_are_the_first_two(self):
-        surface = Known(3, lambda p: p[:, 2] * 1.0)
+        surface: Any = Known(3, lambda p: p[:, 2] * 1.0)
         assert [pair.axes for pair in pairs_of(2, None)] == [(0, 1)]
         assert [pair.axes for pair in pairs_of(3, surface)] == [(0, 1)]
 
     def test_of_more_are_all_of_them_with_the_one_that_explains_most_first(self):
-        surface = Known(5, lambda p: ((p[:, 1] < 0.3) & (p[:, 3] > 0.6)) * 1.0)
+        surface: Any = Known(5, lambda p: ((p[:, 1] < 0.3) & (p[:, 3] > 0.6)) * 1.0)
         pairs = pairs_of(5, surface)
         assert len(pairs) == 10
         assert pairs[0].axes == (1, 3)
@@ -89,7 +92,7 @@ class TestPairs:
 class TestAMap:
     def test_of_a_pair_has_the_mean_over_the_other_coordinates(self):
         # Fails where x > 1/2, for half of the values of another coordinate.
-        surface = Known(4, lambda p: ((p[:, 0] > 0.5) & (p[:, 3] < 0.5)) * 1.0)
+        surface: Any = Known(4, lambda p: ((p[:, 0] > 0.5) & (p[:, 3] < 0.5)) * 1.0)
         found = maps_of(TRAFFIC, 0, [], surface, None)
         place = [tuple(pair["axes"]) for pair in found["pairs"]].index((0, 1))
         grid = found["grids"][place]["chance"]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from merge_sumo.errors import UserError
-from merge_sumo.reports import reproduce as paper
 from merge_sumo.reports.reproduce import reproduce
-from merge_sumo.reports.table2 import SAMPLERS, TABLE_II, Result, Scale, table_markdown
+from merge_sumo.reports.table2 import SAMPLERS, TABLE_II, Result, Scale, quick, table_markdown
 from merge_sumo.system.workers import open_workers
 
 FIGURES = {
@@ -70,7 +70,7 @@ class TestATinyReproduction:
         assert "| coverage / truth after " in markdown
 
     def test_shows_a_dense_truth_where_there_is_one(self):
-        found = SimpleNamespace(
+        found: Any = SimpleNamespace(
             fmc_median=0.09,
             fmc_over_truth_median=1.0,
             fmc_over_limit_median=0.9,
@@ -118,6 +118,6 @@ def test_a_quick_reproduction_is_the_same_twice(tmp_path, monkeypatch):
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
     for name, count in (("a", 2), ("b", 1)):
         with open_workers(count) as workers:
-            reproduce(tmp_path / name, paper.quick(2), workers=workers)
+            reproduce(tmp_path / name, quick(2), workers=workers)
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name

@@ -1,5 +1,7 @@
 """The second shipped scenario: its road, its pool, and that it is one data file."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import dataclasses
@@ -58,7 +60,7 @@ def road():
 
 def uniform_cases(count: int, level: int = 0, seed: int = 0):
     points = np.random.default_rng(seed).random((count, 3 if level == 2 else 2))
-    return from_unit(points, level, ROUNDABOUT.v_vut0_mps, ROUNDABOUT)
+    return from_unit(points, level, scenario=ROUNDABOUT)
 
 
 def from_the_middle_m(at) -> float:

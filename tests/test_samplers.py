@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import statistics
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from conftest import some
 
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
@@ -18,6 +20,7 @@ from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 HALF_WIDTH = 0.03
 """Of the band of failures in the unit square; about 7 % of the square."""
 
@@ -28,7 +31,7 @@ def measures(
     """Return measures that say no more than a verdict and perhaps a gap."""
     return Measures(
         **{
-            **dict.fromkeys(Measures.__dataclass_fields__),
+            **NOTHING,
             "end": end,
             "score": score,
             "dx_m": dx_m,
@@ -85,7 +88,7 @@ POOLS = {
 }
 
 
-LONG = ("4-d", "6-d")
+LONG = ("3-d", "4-d and 5-d", "6-d")
 
 
 @pytest.fixture(
@@ -179,7 +182,7 @@ class TestEverySampler:
             assert not seen & set(cases)
             seen |= set(cases)
             sampler.tell(
-                without_verdict(9 * batch + i, batch, case, end) for i, case in enumerate(cases)
+                [without_verdict(9 * batch + i, batch, case, end) for i, case in enumerate(cases)]
             )
 
     def test_reaches_every_level_even_if_no_case_gets_a_verdict(self, name, pool):
@@ -193,7 +196,7 @@ class TestEverySampler:
         _, outcomes = played
         for batches in range(3):
             resumed = make_sampler(name, pool, 5)
-            resumed.tell(outcome for outcome in outcomes if outcome.batch < batches)
+            resumed.tell([outcome for outcome in outcomes if outcome.batch < batches])
             expected = [outcome.case for outcome in outcomes if outcome.batch == batches]
             assert resumed.ask(9) == expected
 
@@ -201,7 +204,7 @@ class TestEverySampler:
         _, outcomes = played
         resumed = make_sampler(name, pool, 5)
         records = [outcome.to_record() for outcome in outcomes]
-        resumed.tell(Outcome.from_record(record, pool.scenario) for record in records)
+        resumed.tell([Outcome.from_record(record, pool.scenario) for record in records])
         assert resumed.ask(9) == expected
 
     def test_proposes_other_cases_for_another_seed(self, name, pool, played, expected):
@@ -225,9 +228,9 @@ class TestEverySampler:
     def test_neither_uses_nor_moves_the_global_random_state(self, played, expected):
         sampler, _ = played
         np.random.seed(1)  # noqa: NPY002 (the global state is what this test is about)
-        before = np.random.get_state()[1].copy()  # noqa: NPY002
+        before = np.random.get_state(legacy=False)  # noqa: NPY002
         assert sampler.ask(9) == expected
-        assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
+        assert repr(np.random.get_state(legacy=False)) == repr(before)  # noqa: NPY002
 
     def test_leaves_the_list_that_it_is_told_alone(self, name, pool, played):
         _, outcomes = played
@@ -263,7 +266,7 @@ def test_uniform_covers_the_pool_evenly():
     assert points.max() > 0.995
 
 
-@pytest.mark.parametrize("levels", [(0,), (2,)], ids=str)
+@pytest.mark.parametrize("levels", some([(0,), (2,)], (2,)), ids=str)
 def test_gpr_finds_more_failures_than_uniform_with_the_same_budget(levels):
     uniform, gpr = (
         statistics.median(failures_found(name, levels, seed, batches=6) for seed in (1, 2, 3))

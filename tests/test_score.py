@@ -1,5 +1,7 @@
 """The score and the named measures, by hand."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import math
@@ -78,7 +80,8 @@ class TestScore:
         trajectory = eq4(-250.0, 30.0, 0.0, -182.0, 0.0, 0.0)
         measures = measure(trajectory)
         assert measures.end is End.TIMEOUT
-        assert measures.dx_m is measures.ttc_s is measures.pet_s is measures.merged_first is None
+        gaps = (measures.dx_m, measures.ttc_s, measures.pet_s, measures.merged_first)
+        assert gaps == (None, None, None, None)
         # Standing for 30 s: fully slow, off the range, and not done: three quarters of 45.
         assert measures.score == pytest.approx(-45.0 * 3 / 4)
 

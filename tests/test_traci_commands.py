@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
+import struct
+import warnings
+
 import pytest
 import traci
-from traci_pair import Drive
+from traci_pair import Drive, ToSession
+
+from merge_sumo.drivers.vuts.base import Seen
+from merge_sumo.drivers.vuts.traci_commands import Kind, kind_of
+from merge_sumo.drivers.vuts.traci_session import ASKS, Session
+from merge_sumo.sumo.road import road_of
+from merge_sumo.sumo.traci_names import DUMMIES, named
 
 V, T = "vehicle", "vehicletype"
-SCRIPTS = {
+SCRIPTS: dict[str, list[tuple]] = {
     "a limit of acceleration": [(0, V, "setAccel", 1.0), (0, V, "setSpeed", 19.0)],
     "a limit of deceleration": [(0, V, "setDecel", 1.0), (0, V, "setSpeed", 17.0)],
     "limits above the scenario's": [
@@ -235,3 +245,45 @@ def test_what_is_refused_is_named_with_its_reason(drive, domain, function, argum
     assert reason in str(error.value)
     assert "'" in reason or f"{domain}." in str(error.value)
     assert drive.ours.vehicle.getSpeed("vut") == 18.0
+
+
+def commanded(connection, function: str) -> str | None:
+    """Return what is said to a command of the client on "vut"; None where it takes no dummies."""
+    domain, _, name = function.partition(".")
+    call = getattr(getattr(connection, domain), name)
+    parameters = inspect.signature(call).parameters.values()
+    needed = sum(p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters)
+    off = {p.name: False for p in parameters if p.default is True}
+    for dummy in DUMMIES:
+        try:
+            call(*["vut", *[dummy] * (needed - 1)][:needed], **off)
+        except traci.TraCIException as error:
+            return str(error)
+        except (TypeError, ValueError, LookupError, AttributeError, struct.error):
+            connection._string, connection._queue = b"", []
+        else:
+            return ""
+    return None
+
+
+def test_every_command_that_the_client_has_acts_or_moves_nothing_or_is_refused_by_name():
+    kinds = {f: kind_of(n.functions) for n in named().values() for f in n.functions}
+    functions = [f for n in named().values() if n.command not in ASKS for f in n.functions]
+    tried = 0
+    for function in functions:
+        session = Session(road_of())
+        session.show(Seen(0.1, -250.0, 30.0, -182.0, 18.0))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            said = commanded(ToSession(session), function)
+        if said is None:
+            continue
+        tried += 1
+        if kinds[function] is Kind.REFUSED:
+            assert said.startswith("merge-sumo does not carry out ")
+            assert function in said
+        else:
+            assert said == "", function
+        if kinds[function] is not Kind.DRIVES:
+            assert session.acceleration_mps2() == 0.0, function
+    assert tried > 200

@@ -1,5 +1,7 @@
 """Everything that a TraCI client can ask and command, against a real SUMO."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import pytest
@@ -184,7 +186,7 @@ class TestCommands:
     def test_that_change_nothing_are_accepted_and_noted_once(self, pair, function, arguments):
         pair.notes.clear()
         pair.session.noted.clear()
-        values = {"changeLane": (0, 5.0), "setParameter": ("a", "b")}.get(function, ())
+        values: tuple = {"changeLane": (0, 5.0), "setParameter": ("a", "b")}.get(function, ())
         values = values or (() if arguments is None else (arguments,))
         for _ in range(2):
             getattr(pair.ours.vehicle, function)("vut", *values)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ class TestThePool:
             replace(US23, **wrong)
 
     def test_refuses_a_case_without_its_headways_or_with_some_that_do_not_belong_there(self):
-        state = {"level": 0, "x_pov0_m": -300.0, "v_pov0_mps": 30.0}
+        state: dict[str, Any] = {"level": 0, "x_pov0_m": -300.0, "v_pov0_mps": 30.0}
         with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
             Case(**state, scenario=TRAFFIC)
         with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):

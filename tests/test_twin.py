@@ -7,9 +7,11 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from conftest import some
 
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
 from merge_sumo.campaigns.ground import GroundPlan, road_for, run_cases
@@ -35,7 +37,7 @@ from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
-NOTHING = dict.fromkeys(Measures.__dataclass_fields__)
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2)
 SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 
@@ -176,7 +178,7 @@ class TestTwin:
         same = [plain.replay(0, [8], points[8:9]), taught.replay(0, [8], points[8:9])]
         assert same[0].tolist() == same[1].tolist()
 
-    @pytest.mark.parametrize("size", [60, 20, 7])
+    @pytest.mark.parametrize("size", some([60, 20, 7], 7))
     def test_learns_from_batches_of_any_size(self, seen, size):
         outcomes, motions = seen
         twin = Twin(Pool(levels=(0,)), Povs(), 0)

@@ -1,5 +1,7 @@
 """The process of a user's VUT: how it starts, what ends it, what it leaves, and what it may say."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json

@@ -1,5 +1,7 @@
 """A VUT as an ONNX network, and the export of the shipped ones."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -40,7 +42,9 @@ def test_an_exported_policy_gives_the_values_of_the_policy(exported, name):
     network = load_network(name)
     fed = {"state": state} | ({"svo_rad": svo[:, None]} if network.sees_svo else {})
     (values,) = ort.InferenceSession(exported / f"{name}.onnx").run(None, fed)
-    expected = network.values(features(*state.T, svo if network.sees_svo else None))
+    x_pov, v_pov, x_vut, v_vut = state.T
+    seen = features(x_pov, v_pov, x_vut, v_vut, svo if network.sees_svo else None)
+    expected = network.values(seen)
     assert values == pytest.approx(expected, abs=1e-12)
 
 
@@ -119,7 +123,8 @@ def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
     assert weights.read_bytes().count(half) == 1
     weights.write_bytes(weights.read_bytes().replace(half, one))
     truth.append(ground_truth(vut, 0, 4, cache=tmp_path / "cache").score)
-    assert not np.array_equal(*truth)
+    before, after = truth
+    assert not np.array_equal(before, after)
 
 
 @pytest.mark.parametrize(

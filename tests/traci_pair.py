@@ -81,8 +81,10 @@ class ToSession(Connection):
     def __init__(self, session: Session) -> None:
         import threading
 
-        self._string, self._queue = b"", []
-        self._subscriptionMapping, self._lock = {}, threading.Lock()
+        self._string = b""
+        self._queue: list[Any] = []
+        self._subscriptionMapping: dict[Any, Any] = {}
+        self._lock = threading.Lock()
         self._session = session
         for domain in traci.domain.DOMAINS:
             domain._register(self, self._subscriptionMapping)
@@ -124,14 +126,17 @@ class Pair:
         for _ in range(STEPS):
             self.session.answered()
             self.real.simulationStep()
-            x_m, v_mps = [], []
+            places_m: list[float] = []
+            speeds_mps: list[float] = []
             for name in starts:
                 vehicle.setSpeedMode(name, SPEED_MODE_AT_FIRST if name == "vut" else 32)
                 vehicle.setLaneChangeMode(name, 0)
                 vehicle.setSpeed(name, vehicle.getSpeed(name) + (0.05 if name == "vut" else -0.05))
-                x_m.append(begin[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name))
-                v_mps.append(vehicle.getSpeed(name))
-            self.session.show(seen_in(self.session.steps * DT_S, POV, x_m, v_mps))
+                places_m.append(
+                    begin[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
+                )
+                speeds_mps.append(vehicle.getSpeed(name))
+            self.session.show(seen_in(self.session.steps * DT_S, POV, places_m, speeds_mps))
         self.ours = ToSession(self.session)
 
     def close(self) -> None:

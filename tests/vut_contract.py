@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from merge_sumo.campaigns.ground import ProvingGround
@@ -21,7 +23,7 @@ def cases_of(count: int, seed: int = 0) -> list[Case]:
     return from_unit(np.random.default_rng(seed).random((count, 2)), level=0)
 
 
-def factory(spec: object, **options: object) -> VutFactory:
+def factory(spec: object, **options: Any) -> VutFactory:
     return vut_factory(str(spec), VutOptions(**options))
 
 

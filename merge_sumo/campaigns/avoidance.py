@@ -6,8 +6,8 @@ of it:
 - by each reference driver in the VUT's place, from the start;
 - by a careful driver who takes over: until some time the VUT does what it did, by its recorded
   accelerations, and from then on the driver is at the wheel, who has to perceive and react first.
-  The last such time is sought, of every half second and then of every step after that, from the
-  end backwards: there is none that is not looked at behind the one that is found;
+  The last such time is sought from the end backwards, at every half second and then at every step
+  up to the next one;
 - with a careful driver on the mainline in the POV's place, against what the VUT did.
 
 avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases;
@@ -49,6 +49,7 @@ from merge_sumo.system.workers import Workers
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.merge import AfterMerge, after_merge
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
 from merge_sumo.values.score import Outcome, verdict
 from merge_sumo.values.trajectory import End, Trajectory
@@ -247,7 +248,12 @@ class _Found:
 
 
 def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) -> bool:
-    """Return whether an episode ends at M without a failure."""
+    """Return whether an episode ends at M without a failure.
+
+    Nor is one avoided by a merge after which whoever is behind cannot brake hard enough.
+    """
+    if after_merge(trajectory) is AfterMerge.FORCED:
+        return False
     if criterion.is_papers:  # which needs no measures
         return verdict(trajectory) is End.MERGED
     outcome = criterion.judged(trajectory, lines)

@@ -322,6 +322,8 @@ def _sentence(radius: float, found: Mapping[int, Found], settings: CampaignSetti
     )
     levels = "/".join(level_name(level) for level in found)
     tested = f"{settings.vut} v level {levels}, {cases:,} cases"
+    if not settings.criterion.is_papers:
+        tested += f" that may fail by {settings.criterion.in_short}"
     said = f"no {ball} fails throughout: certain, the simulation is deterministic"
     if otherwise:
         said = (

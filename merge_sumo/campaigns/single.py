@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -117,8 +118,10 @@ def run_one(
     person closes the window; `on_end` is told before that. Raises `UserError` when the window is
     closed while the case runs.
     """
-    window = Window() if live else None
-    with ProvingGround(vut, 1, net, case.scenario, povs, window) as ground:
+    with (
+        Window() if live else nullcontext() as window,
+        ProvingGround(vut, 1, net, case.scenario, povs, window) as ground,
+    ):
         episodes = ground.run([case])
         _, trajectory = next(episodes)
         ended = Ended(criterion.outcome(0, 0, trajectory, centre_lines(net)), trajectory)

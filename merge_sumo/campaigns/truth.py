@@ -28,7 +28,7 @@ from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.criterion import COLLISION, Criterion
-from merge_sumo.values.fmc import regions
+from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import OWN, US23, Scenario
 from merge_sumo.values.score import FAILURE_SCORE
 
@@ -58,6 +58,14 @@ class Truth:
     def failures(self) -> FloatArray:
         """Points of the failing cases, (m, d)."""
         return self.points[self.score < FAILURE_SCORE]
+
+    def __repr__(self) -> str:
+        """Return in a line what was found."""
+        failures = self.failures
+        return (
+            f"<Truth: {len(failures)} failures in {len(self.points)} cases, "
+            f"FMC {fmc(failures):.4f}>"
+        )
 
     def real_regions(self) -> list[FloatArray]:
         """Return the points of each disjoint region with a real share of the failures."""

@@ -291,6 +291,7 @@ def _conclude(
             "passed": passed,
             "stopped": "converged" if converged else "cases",
             "careful": careful,
+            "fail_when": run.criterion.text,
         }
         paths = {"run": str(run.folder), "report": str(report_file)}
         typer.echo(json.dumps({**judged, **paths}))
@@ -351,14 +352,22 @@ def _print_summary(
     from merge_sumo.campaigns.run import failures
 
     show(verdict.counts)
+    if not run.criterion.is_papers:
+        show(f"  a case fails when {run.criterion.words}")
     print_troubles(verdict)
     for level, found in summary.levels.items():
         if found.cases and not found.tested:
             show(f"  level {level_name(level)}: nothing was tested in {found.cases} cases")
             continue
+        unseen = found.unseen
+        empty = (
+            ""
+            if unseen is None
+            else f"; largest ball without a case: {unseen.radius:.0%} of the axes"
+        )
         show(
             f"  level {level_name(level)}: {found.failures} failures in {found.cases} cases, "
-            f"FMC {found.fmc:.4f}, {found.regions} regions"
+            f"FMC {found.fmc:.4f}, {found.regions} regions{empty}"
         )
     if careful is not None:
         show(careful)

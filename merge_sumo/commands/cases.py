@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,12 +24,12 @@ from merge_sumo.commands.shared import (
     VutMemoryOption,
     app,
     check_tolerance,
-    print_troubles,
     say,
     show,
     written,
     written_settings,
 )
+from merge_sumo.errors import UserError
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
@@ -106,6 +106,8 @@ def run(
     settings, one = _case_and_settings(context)
     if out is not None:
         check_new(out)
+    for outside in _outside(one):
+        say(f"note: {outside}")
     road = road_for(settings.scenario, net)
 
     def ended(found: Ended) -> None:
@@ -129,6 +131,18 @@ def run(
     driven = settings.vut_factory, one, road, settings.povs
     found = run_one(*driven, criterion=settings.criterion, live=gui, on_end=ended).outcome
     raise typer.Exit(0 if found.measures.end is End.MERGED and not found.failed else 1)
+
+
+def _outside(case: Case) -> list[str]:
+    """Return in sentences which coordinates of a case are outside of the pool."""
+    from merge_sumo.reports.coordinates import coordinates
+
+    return [
+        f"{c.name} {c.text(case)} {c.unit} is outside of the pool, {c.dimension.low:g} to "
+        f"{c.dimension.high:g} {c.unit}: no campaign runs such a case"
+        for c in coordinates(case.scenario, (case.level,))
+        if (value := c.of(case)) is not None and not c.dimension.low <= value <= c.dimension.high
+    ]
 
 
 @app.command()
@@ -196,30 +210,14 @@ def rerun(
     raise typer.Exit(1 if why else 0)
 
 
-MOST_CHANGED: Final = 40
-"""Cases that are printed; JSON has all."""
-
-
 def _print_rerun(found: Rerun, folder: Path) -> None:
-    from merge_sumo.reports.verdict import judge
-
-    show(f"recorded:  {judge(found.before).counts}")
-    show(f"now:       {judge(found.after).counts} ({found.vut})")
-    print_troubles(judge(found.after))
-    changed = found.changed
-    if not changed:
-        show("no verdict changed")
-        return
-    show(f"{len(changed)} verdicts changed:" if len(changed) > 1 else "one verdict changed:")
-    for one in changed[:MOST_CHANGED]:
-        ends = f"{one.before.measures.end} -> {one.after.measures.end}"
-        show(f"  case {one.before.index}: {ends} ({one.change})")
-    if len(changed) > MOST_CHANGED:
-        show(f"  and {len(changed) - MOST_CHANGED} others; --json has them all")
-    show(
-        f"look at one: merge-sumo run --case {quoted(folder)} {changed[0].before.index} "
-        f"--vut {quoted(found.vut)} --gui"
-    )
+    for line in found.lines():
+        show(line)
+    if found.changed:
+        show(
+            f"look at one: merge-sumo run --case {quoted(folder)} {found.changed[0].before.index} "
+            f"--vut {quoted(found.vut)} --gui"
+        )
 
 
 def _case_and_settings(context: typer.Context) -> tuple[CampaignSettings, Case]:
@@ -240,6 +238,8 @@ def _case_and_settings(context: typer.Context) -> tuple[CampaignSettings, Case]:
         if options[option[2:].replace("-", "_")] is not None
     }
     if options["case"] is None:
+        if not options["vut"]:
+            raise UserError("say with --vut who drives, or with --case which recorded case")
         where = named_scenario(options["scenario"])
         hosted = VutOptions(memory_gib=options["vut_memory"])
         povs = povs_of(options["policies"], where, options["pov"], hosted)

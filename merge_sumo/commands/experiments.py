@@ -105,6 +105,7 @@ def truth(
         "fmc": fmc(found.failures),
         "region_sizes": sizes,
         "real_regions": len(found.real_regions()),
+        "fail_when": criterion.text,
     }
     if as_json:
         typer.echo(json.dumps(result))
@@ -114,6 +115,8 @@ def truth(
         f"{result['cases']} cases, FMC {result['fmc']:.4f}, {result['real_regions']} regions with "
         f"at least {REAL_REGION:.0%} of the failures"
     )
+    if not criterion.is_papers:
+        show(f"  a case fails when {criterion.words}")
 
 
 @app.command()

@@ -8,9 +8,8 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands.shared import JsonOption, app, print_troubles, show
+from merge_sumo.commands.shared import JsonOption, app, show
 from merge_sumo.system.folders import check_new_file
-from merge_sumo.values.scenario import level_name
 
 
 @app.command()
@@ -32,8 +31,7 @@ def history(
     """
     from merge_sumo.campaigns.run import Run
     from merge_sumo.reports.history import history_of
-    from merge_sumo.reports.history_page import headline, write_history
-    from merge_sumo.reports.history_steps import Became
+    from merge_sumo.reports.history_page import write_history
 
     check_new_file(out)
     found = history_of([Run(folder) for folder in runs])
@@ -41,16 +39,6 @@ def history(
     if as_json:
         typer.echo(json.dumps({**found.to_record(), "page": str(out)}, allow_nan=False))
         return
-    show(headline(found))
-    for number, version in enumerate(found.versions, start=1):
-        show(f"{number}: {version.folder} ({version.vut}): {version.verdict.counts}")
-        print_troubles(version.verdict)
-    for step in found.steps:
-        counts = [f"{n} {became}" for became in Became if (n := step.count(became))]
-        show(
-            f"from {step.before} to {step.after} at POV level {level_name(step.level)}: "
-            f"{'regions: ' + ', '.join(counts) if counts else 'no failures in either'}"
-        )
-    for note in found.notes:
-        show(note)
+    for line in found.lines():
+        show(line)
     show(f"page: {out}")

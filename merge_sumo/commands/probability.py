@@ -106,6 +106,8 @@ def probability(
         f"P(fail) {how}: {found.probability:.3g}, {100.0 * confidence:g} % interval "
         f"[{found.low:.3g}, {found.high:.3g}] ({found.failures} failures in {cases} fresh cases)"
     )
+    if not campaign.criterion.is_papers:
+        show(f"  a case fails when {campaign.criterion.words}")
     if found.without_verdict:
         show(
             f"  {found.without_verdict} cases without a verdict: safe for the lower end, failures "

@@ -25,7 +25,6 @@ from merge_sumo.commands.shared import (
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_own
 from merge_sumo.system.printable import quoted
-from merge_sumo.values.scenario import level_name
 
 if TYPE_CHECKING:
     from merge_sumo.reports.changes import RunComparison
@@ -99,8 +98,14 @@ def replay(
 
     Example:  merge-sumo replay scenarios/stalemate --gui
     """
+    from merge_sumo.campaigns.run import SETTINGS
     from merge_sumo.sumo import replay as replayer
 
+    if (folder / SETTINGS).is_file():
+        raise UserError(
+            f"{folder} is a campaign: name a case in {folder / 'scenarios'}, which `merge-sumo "
+            "export` writes"
+        )
     if gui:
         raise typer.Exit(replayer.open_gui(folder))
     result = replayer.replay(folder)
@@ -191,18 +196,8 @@ def compare_runs(
 
 
 def _print_comparison(compared: RunComparison, folders: dict[str, Path]) -> None:
-    from merge_sumo.reports.changes import Change
-
-    show(
-        f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "
-        f"cases: {', '.join(Change)}"
-    )
-    for level, found in compared.levels.items():
-        show(
-            f"{level_name(level):<6} {found.fmc_a:8.4f} {found.fmc_b:8.4f} {found.fmc_fixed:8.4f} "
-            f"{found.fmc_broke:8.4f}   {', '.join(str(found.changes[change]) for change in Change)}"
-        )
-    show(f"evidence: {compared.evidence}")
+    for line in compared.lines():
+        show(line)
     first = compared.look_first()
     if first:
         show("look first at:")

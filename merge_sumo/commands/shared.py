@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from merge_sumo.reports.verdict import Verdict
     from merge_sumo.values.scenario import Scenario
 
-MOST_MESSAGES: Final = 5
-"""Messages of errors and timeouts that are printed; the report has the others."""
 
 app = typer.Typer(
     help="""Find where a merging controller fails against drivers who react to it.
@@ -189,15 +187,8 @@ def check_tolerance(tolerance: float) -> None:
 
 def print_troubles(verdict: Verdict) -> None:
     """Print what ended in an error or a timeout, by message; nothing where nothing did."""
-    for trouble in verdict.troubles[:MOST_MESSAGES]:
-        show(
-            f"  {trouble.count} {trouble.end}, the first in case {trouble.cases[0]}: "
-            f"{trouble.message}"
-        )
-    others = verdict.troubles[MOST_MESSAGES:]
-    if others:
-        number = sum(trouble.count for trouble in others)
-        show(f"  {number} with {len(others)} other messages")
+    for line in verdict.trouble_lines():
+        show(line)
 
 
 def followed_up(scenario: Scenario, seconds: float | None) -> Scenario:

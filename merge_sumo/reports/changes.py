@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from merge_sumo.reports.in_lines import InLines
 from merge_sumo.reports.verdict import counted
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import level_name
@@ -103,8 +104,8 @@ class LevelChange:
     changes: dict[str, int]
 
 
-@dataclass(frozen=True, slots=True)
-class RunComparison:
+@dataclass(frozen=True, slots=True, repr=False)
+class RunComparison(InLines):
     """What changed from campaign A to campaign B.
 
     Attributes:
@@ -128,6 +129,28 @@ class RunComparison:
         return [
             why for level, found in self.levels.items() for why in _worse(level, found, tolerance)
         ]
+
+    def lines(self) -> list[str]:
+        """Return a table of what changed, level by level, and how that is known."""
+        said = [
+            f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "
+            f"cases: {', '.join(Change)}"
+        ]
+        for level, found in self.levels.items():
+            changes = ", ".join(str(found.changes[change]) for change in Change)
+            said.append(
+                f"{level_name(level):<6} {found.fmc_a:8.4f} {found.fmc_b:8.4f} "
+                f"{found.fmc_fixed:8.4f} {found.fmc_broke:8.4f}   {changes}"
+            )
+        return [*said, f"evidence: {self.evidence}"]
+
+    def __repr__(self) -> str:
+        """Return FMC of both in a line."""
+        levels = (
+            f"level {level_name(level)}: FMC {found.fmc_a:.4f} -> {found.fmc_b:.4f}"
+            for level, found in self.levels.items()
+        )
+        return f"<RunComparison: {', '.join(levels)}>"
 
     def look_first(self) -> list[ComparedCase]:
         """Return the cases to look at first: those that broke, then those without a verdict."""

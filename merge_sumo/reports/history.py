@@ -18,8 +18,9 @@ from merge_sumo.campaigns.run import SETTINGS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison import check_comparable
 from merge_sumo.reports.diagnosis import Kind, diagnose
-from merge_sumo.reports.history_steps import Step, step_between
-from merge_sumo.reports.verdict import Verdict, judge
+from merge_sumo.reports.history_steps import Became, Step, step_between
+from merge_sumo.reports.in_lines import InLines
+from merge_sumo.reports.verdict import Verdict, in_words, judge
 from merge_sumo.values.case import to_unit
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import ALL_LEVELS, level_name
@@ -76,8 +77,8 @@ class Version:
     levels: dict[int, LevelOfVersion]
 
 
-@dataclass(frozen=True, slots=True)
-class History:
+@dataclass(frozen=True, slots=True, repr=False)
+class History(InLines):
     """Versions in the order in which they were named, and the steps between neighbours.
 
     At a level the neighbour of a version is the next one that has that level.
@@ -97,6 +98,40 @@ class History:
     versions: tuple[Version, ...]
     steps: tuple[Step, ...]
     notes: tuple[str, ...]
+
+    @property
+    def headline(self) -> str:
+        """What became of FMC from the first to the last version, in a sentence."""
+        said = []
+        for level in self.levels:
+            known = [
+                (number, found.fmc)
+                for number, version in enumerate(self.versions, start=1)
+                if (found := version.levels.get(level)) is not None and found.fmc is not None
+            ]
+            if len(known) > 1:
+                (first, before), (last, after) = known[0], known[-1]
+                said.append(
+                    f"at POV level {level_name(level)} from {before:.4f} (version {first}) to "
+                    f"{after:.4f} (version {last})"
+                )
+        if not said:
+            return "No POV level was tested in two versions."
+        return f"FMC went {in_words(said)}."
+
+    def lines(self) -> list[str]:
+        """Return what the command `history` prints."""
+        said = [self.headline]
+        for number, version in enumerate(self.versions, start=1):
+            said.append(f"{number}: {version.folder} ({version.vut}): {version.verdict.counts}")
+            said += version.verdict.trouble_lines()
+        for step in self.steps:
+            counts = [f"{n} {became}" for became in Became if (n := step.count(became))]
+            said.append(
+                f"from {step.before} to {step.after} at POV level {level_name(step.level)}: "
+                f"{'regions: ' + ', '.join(counts) if counts else 'no failures in either'}"
+            )
+        return [*said, *self.notes]
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""

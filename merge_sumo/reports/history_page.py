@@ -13,7 +13,6 @@ from merge_sumo.reports.diagnosis import Kind
 from merge_sumo.reports.history import History, LevelOfVersion
 from merge_sumo.reports.history_steps import MEANING, Became
 from merge_sumo.reports.report import policy_hash
-from merge_sumo.reports.verdict import in_words
 from merge_sumo.system.folders import write_new
 from merge_sumo.values.scenario import level_name
 
@@ -67,7 +66,6 @@ def history_page(history: History) -> str:
         style=Markup(style),  # noqa: S704 (our own files)
         style_hash=policy_hash(style),
         history=history,
-        headline=headline(history),
         charts=_charts(history),
         tables={level: _table(history, level) for level in history.levels},
         Became=Became,
@@ -75,26 +73,6 @@ def history_page(history: History) -> str:
         most=MOST_REGIONS,
         level_name=level_name,
     )
-
-
-def headline(history: History) -> str:
-    """Return in a sentence what became of FMC from the first to the last version."""
-    said = []
-    for level in history.levels:
-        known = [
-            (number, found.fmc)
-            for number, version in enumerate(history.versions, start=1)
-            if (found := version.levels.get(level)) is not None and found.fmc is not None
-        ]
-        if len(known) > 1:
-            (first, before), (last, after) = known[0], known[-1]
-            said.append(
-                f"at POV level {level_name(level)} from {before:.4f} (version {first}) to "
-                f"{after:.4f} (version {last})"
-            )
-    if not said:
-        return "No POV level was tested in two versions."
-    return f"FMC went {in_words(said)}."
 
 
 def _charts(history: History) -> list[Chart]:

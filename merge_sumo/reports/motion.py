@@ -12,6 +12,7 @@ from typing import Final
 from merge_sumo.reports.coordinates import described
 from merge_sumo.reports.diagnosis import MEANING, diagnose
 from merge_sumo.reports.verdict import message_of
+from merge_sumo.values.merge import AfterMerge
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
@@ -33,6 +34,9 @@ MEASURES: Final = (
     ("vut_max_brake_mps2", "hardest braking of the VUT", "m/s2"),
     ("pov_max_brake_mps2", "hardest braking of the POV", "m/s2"),
     ("last_avoidable_s", "avoidable until", "s"),
+    ("after_gap_m", "least gap of bumpers behind M", "m"),
+    ("after_ttc_s", "time to collision behind M", "s"),
+    ("after_drac_mps2", "braking needed behind M", "m/s2"),
 )
 
 
@@ -42,6 +46,7 @@ def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
     return [
         f"case: level {level_name(case.level)}, {described(case)}",
         verdict_of(outcome, trajectory),
+        *_margin(outcome),
         "",
         *_measures(outcome.measures),
         "",
@@ -67,11 +72,19 @@ def verdict_of(outcome: Outcome, trajectory: Trajectory) -> str:
     return f"{found.end.value} at {found.t_end_s:g} s: {message_of(found)}"
 
 
+def _margin(outcome: Outcome) -> Iterator[str]:
+    """Yield whether it fails, where that is another question than how it ended."""
+    if outcome.margin is not None:
+        yield f"{'fails' if outcome.failed else 'does not fail'}: margin {outcome.margin:.3g}"
+
+
 def _measures(found: Measures) -> Iterator[str]:
     for name, what, unit in MEASURES:
         value = getattr(found, name)
         if value is not None:
             yield f"  {what:<30} {value:10.2f} {unit}".rstrip()
+    if found.end is End.MERGED and found.after_merge in (AfterMerge.HARSH, AfterMerge.FORCED):
+        yield f"  {'asked of whoever is behind':<30} {found.after_merge:>10} braking"
     if found.clipped_steps:
         yield f"  {'steps beyond its limits':<30} {found.clipped_steps:10d}"
 

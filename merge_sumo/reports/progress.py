@@ -75,6 +75,11 @@ def _notebook() -> Any:
     return import_module("IPython.display")
 
 
+def _both(html: str, text: str) -> dict[str, str]:
+    """Return what a notebook shows, and what it shows where it can show text alone."""
+    return {"text/html": html, "text/plain": text}
+
+
 def is_watched() -> bool:
     """Return whether a person sees what this process shows: in a notebook or on a terminal."""
     return _notebook() is not None or sys.stderr.isatty()
@@ -174,8 +179,8 @@ class CampaignPanel:
         self._live: Live | None = None
         self._start_s = time.monotonic()
         self._fresh_s = 0.0
-        self._update: Callable[[Any], None] | None = None
-        """Replaces what a notebook shows."""
+        self._update: Callable[[str, str], None] | None = None
+        """Replaces what a notebook shows, as HTML and as text."""
         self._before = 0
         """Cases that ran before this process took over."""
         self._ran = self._errors = self._timeouts = 0
@@ -206,8 +211,8 @@ class CampaignPanel:
             return
         notebook = _notebook()
         if notebook is not None:
-            shown = notebook.display(notebook.HTML(""), display_id=True)
-            self._update = lambda text: shown.update(notebook.HTML(text))
+            shown = notebook.display(_both("", ""), raw=True, display_id=True)
+            self._update = lambda html, text: shown.update(_both(html, text), raw=True)
         elif self._console.is_terminal:
             self._live = Live(console=self._console, get_renderable=self._panel)
             self._live.start()
@@ -235,7 +240,7 @@ class CampaignPanel:
         self._fresh_s = time.monotonic()
         if self._update is not None:
             bar = f'<progress value="{self._ran}" max="{self._total}"></progress>'
-            self._update(f"{bar} {escape(self._line())}")
+            self._update(f"{bar} {escape(self._line())}", self._line())
 
     def _rate(self) -> str:
         return rate_text(self._ran - self._before, time.monotonic() - self._start_s, "cases")

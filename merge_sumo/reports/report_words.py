@@ -323,9 +323,10 @@ def _failures(
     if not summary.failures:
         what = "collision" if criterion.is_papers else "failure"
         others = "the other " if verdict.tested < verdict.cases else ""
+        when = "" if criterion.is_papers else f" ({criterion.in_short})"
         return (
-            f"No {what} in {others}{counted(verdict.tested, 'case')}. That is no proof: the search "
-            "saw these cases and no others."
+            f"No {what}{when} in {others}{counted(verdict.tested, 'case')}. That is no proof: the "
+            "search saw these cases and no others."
         )
     failing = {level: found for level, found in summary.levels.items() if found.failures}
     tested = {level: found for level, found in summary.levels.items() if found.tested}
@@ -335,7 +336,8 @@ def _failures(
         f"({counted(found.regions, 'region')})"
         for level, found in failing.items()
     ]
-    text = f"{'Collides' if criterion.is_papers else 'Fails'} in {in_words(parts)}"
+    verb = "Collides" if criterion.is_papers else f"Fails ({criterion.in_short})"
+    text = f"{verb} in {in_words(parts)}"
     text += f", never at level {in_words(never)}." if never else "."
     common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
     if common:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from merge_sumo.campaigns.conductor import workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, runs_on
@@ -14,7 +14,8 @@ from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov,
 from merge_sumo.errors import UserError
 from merge_sumo.reports.changes import Change, RunComparison
 from merge_sumo.reports.comparison import compared_case, level_change, telling
-from merge_sumo.reports.verdict import counted
+from merge_sumo.reports.in_lines import InLines
+from merge_sumo.reports.verdict import counted, judge
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
@@ -44,8 +45,12 @@ class ChangedVerdict:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Rerun:
+MOST_CHANGED: Final = 40
+"""Changed verdicts that are printed; `changed` has all."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Rerun(InLines):
     """Recorded cases and what the VUT of today makes of them.
 
     Attributes:
@@ -69,6 +74,23 @@ class Rerun:
             for a, b in pairs
             if (a.measures.end, a.failed) != (b.measures.end, b.failed)
         ]
+
+    def lines(self) -> list[str]:
+        """Return both verdicts, and which cases changed theirs."""
+        now, changed = judge(self.after), self.changed
+        said = [f"recorded:  {judge(self.before).counts}", f"now:       {now.counts} ({self.vut})"]
+        said += now.trouble_lines()
+        if not changed:
+            return [*said, "no verdict changed"]
+        said.append(
+            f"{len(changed)} verdicts changed:" if len(changed) > 1 else "one verdict changed:"
+        )
+        for one in changed[:MOST_CHANGED]:
+            ends = f"{one.before.measures.end} -> {one.after.measures.end}"
+            said.append(f"  case {one.before.index}: {ends} ({one.change})")
+        if len(changed) > MOST_CHANGED:
+            said.append(f"  and {len(changed) - MOST_CHANGED} others")
+        return said
 
 
 def settings_today(

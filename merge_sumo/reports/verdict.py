@@ -24,6 +24,8 @@ ERRORS: Final = {End.VUT_ERROR: "a VUT error", End.SIM_ERROR: "an error of the s
 """Ends of an episode that went wrong, in words."""
 MESSAGE_CHARACTERS: Final = 300
 """Of a message that is shown; `outcomes.jsonl` has the whole."""
+MOST_MESSAGES: Final = 5
+"""Messages of errors and timeouts that are printed; the report has the others."""
 QUOTED_CHARACTERS: Final = 120
 """Of a message within a sentence."""
 NOTHING_TESTED: Final = "nothing was tested: the VUT reached the merge point in no case"
@@ -111,6 +113,19 @@ class Verdict:
             )
         if self.cases and not self.tested:
             said.append("Nothing was tested.")
+        return said
+
+    def trouble_lines(self) -> list[str]:
+        """Return what ended in an error or a timeout, by message; empty where nothing did."""
+        said = [
+            f"  {trouble.count} {trouble.end}, the first in case {trouble.cases[0]}: "
+            f"{trouble.message}"
+            for trouble in self.troubles[:MOST_MESSAGES]
+        ]
+        others = self.troubles[MOST_MESSAGES:]
+        if others:
+            number = sum(trouble.count for trouble in others)
+            said.append(f"  {number} with {len(others)} other messages")
         return said
 
     def _cases(self, number: int) -> str:

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -100,6 +101,24 @@ def sumo_environment() -> dict[str, str]:
     return {**others, "SUMO_HOME": str(Path(sumo_program("sumo")).parents[1])}
 
 
+ENDS_WITH_US: Final = """
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
+if os.getppid() == int(sys.argv[1]):
+    os.execv(sys.argv[2], sys.argv[2:])
+"""
+
+
+def ending_with_us(command: Sequence[str]) -> list[str]:
+    """Return a command that does the same, and on Linux ends when the thread that gives it ends.
+
+    So a program that waits for us, or for a person, is not left when this process is killed.
+    """
+    if sys.platform != "linux" or not sys.executable:
+        return list(command)
+    return [sys.executable, "-I", "-S", "-c", ENDS_WITH_US, str(os.getpid()), *command]
+
+
 @dataclass(frozen=True, slots=True)
 class Ended:
     """How a program ended: its exit code, and why where that is not 0."""
@@ -116,9 +135,9 @@ def run_program(
     What SUMO takes from the environment is that of the installation. Without a limit, what the
     program says goes to the terminal.
     """
-    program = sumo_program(name)
+    command = [sumo_program(name), *arguments]
     with subprocess.Popen(
-        [program, *arguments],
+        command if limit_s is not None else ending_with_us(command),
         cwd=folder,
         env=sumo_environment(),
         stdin=subprocess.DEVNULL,

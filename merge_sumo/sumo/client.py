@@ -12,7 +12,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.binding import SUMO_VERSION, sumo_environment, sumo_program
+from merge_sumo.sumo.binding import (
+    SUMO_VERSION,
+    ending_with_us,
+    sumo_environment,
+    sumo_program,
+)
 
 TRIES: Final = 240
 BETWEEN_S: Final = 0.1
@@ -39,7 +44,7 @@ def open_program(name: str, options: Sequence[str]) -> tuple[subprocess.Popen[by
     traci = load_traci()
     port = importlib.import_module("sumolib.miscutils").getFreeSocketPort()
     process = subprocess.Popen(
-        [sumo_program(name), *options, "--remote-port", str(port)],
+        ending_with_us([sumo_program(name), *options, "--remote-port", str(port)]),
         env=sumo_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

@@ -20,6 +20,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.client import end_program, load_traci, open_program
 from merge_sumo.sumo.replay_folder import COLOURS, WINDOW, view_settings
+from merge_sumo.system.interrupt import stopping_in_order
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
 
 LEAST_M: Final = 120.0
@@ -65,16 +66,19 @@ class Window:
 
     def start(self, command: list[str]) -> None:
         """Open sumo-gui on what libsumo would be started with."""
-        stage = self._opened.enter_context(scratch_folder())
-        view = stage / "view.settings.xml"
-        settings = view_settings(LARGER, ("100", "0", "0"), label=LABEL)
-        view.write_bytes(etree.tostring(settings))
-        look = ("--gui-settings-file", str(view), "--window-size", ",".join(map(str, WINDOW)))
-        # The window reads the net behind our back, when the world has removed its files.
-        files = [_kept(argument, stage) for argument in command[1:]]
-        options = [*files, *look, "--start", "--delay", "0"]
-        self._process, self._connection = open_program("sumo-gui", options)
-        self._opened.callback(end_program, self._process)
+        with ExitStack() as opened:
+            opened.enter_context(stopping_in_order())
+            stage = opened.enter_context(scratch_folder())
+            view = stage / "view.settings.xml"
+            settings = view_settings(LARGER, ("100", "0", "0"), label=LABEL)
+            view.write_bytes(etree.tostring(settings))
+            look = ("--gui-settings-file", str(view), "--window-size", ",".join(map(str, WINDOW)))
+            # The window reads the net behind our back, when the world has removed its files.
+            files = [_kept(argument, stage) for argument in command[1:]]
+            options = [*files, *look, "--start", "--delay", "0"]
+            process, self._connection = open_program("sumo-gui", options)
+            opened.callback(end_program, process)
+            self._opened = opened.pop_all()
         self.vehicle = _Told(self._connection.vehicle, self._traci.FatalTraCIError)
         self.route = _Told(self._connection.route, self._traci.FatalTraCIError)
         self.simulation = self

@@ -30,6 +30,7 @@ from merge_sumo.sumo.replay_folder import (
     corridor_of_shipped,
     write_files,
 )
+from merge_sumo.system.interrupt import stopping_in_order
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VEHICLES, VUT
 
 REPLAYED: Final = "replayed.fcd.xml"
@@ -254,7 +255,7 @@ def open_gui(folder: Path) -> int:
     `UserError` when there is no display or the folder is no replay folder.
     """
     check_display()
-    with _staged(_received(folder)) as stage:
+    with stopping_in_order(), _staged(_received(folder)) as stage:
         return run_program("sumo-gui", ["-c", CONFIG], stage, limit_s=None).code
 
 

@@ -1,13 +1,21 @@
-"""SIGINT and SIGTERM: the first finishes what is running, the second stops at once."""
+"""SIGINT and SIGTERM: the first finishes what is running, the second stops at once.
+
+What has nothing to finish stops at the first, in good order.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final, Self
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+ENDING: Final = ("SIGTERM", "SIGHUP")
+"""SIGHUP comes when a terminal is closed; not every platform has it."""
 STDERR: Final = 2
 
 
@@ -58,3 +66,32 @@ class Interrupt:
         """Give the signals back."""
         for number, handler in zip(SIGNALS, self._before, strict=True):
             signal.signal(number, handler)
+
+
+@contextmanager
+def stopping_in_order() -> Iterator[None]:
+    """Within `with`, a signal that would end this process raises `Stopped` instead.
+
+    So what was opened is closed first. SIGINT raises KeyboardInterrupt anyway; a signal that is
+    ignored or has a handler keeps it, and outside of the main thread nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [
+        number
+        for name in ENDING
+        if (number := getattr(signal, name, None)) is not None
+        and signal.getsignal(number) is signal.SIG_DFL
+    ]
+    for number in numbers:
+        signal.signal(number, _stop)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _stop(number: int, _: FrameType | None) -> None:
+    raise Stopped(number)

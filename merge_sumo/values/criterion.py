@@ -34,6 +34,9 @@ NAMED: Final = {
 }
 """Criteria by name, and the condition that each one is."""
 
+SHORT: Final = 120
+"""Characters of a condition in a headline."""
+
 NUMBERS: Final = (
     *(
         "ttc_s",
@@ -87,7 +90,7 @@ class Criterion:
         if name not in NAMED:
             if name.isidentifier() and (near := get_close_matches(name, NAMED, n=1)):
                 raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
-            _, name = parse_condition(self.fail_when, VOCABULARY, "--fail-when")
+            _, name = parse_condition(self.fail_when, VOCABULARY, "--fail-when", NAMED)
         object.__setattr__(self, "fail_when", name)
         if self.require is not None:
             if name != PAPER:
@@ -122,6 +125,12 @@ class Criterion:
     def words(self) -> str:
         """Return when a case fails, as a condition."""
         return NAMED.get(self.text, self.text)
+
+    @property
+    def in_short(self) -> str:
+        """Return when a case fails, by name where there is one, at a length for a headline."""
+        said = f"{self.text}: {self.words}" if self.text in NAMED else self.text
+        return said if len(said) <= SHORT else f"{said[: SHORT - 3]}..."
 
     def margin(
         self, trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
@@ -170,7 +179,7 @@ COLLISION: Final = Criterion()
 
 @lru_cache
 def _condition(text: str) -> Condition:
-    return parse_condition(text, VOCABULARY, "--fail-when")[0]
+    return parse_condition(text, VOCABULARY, "--fail-when", NAMED)[0]
 
 
 @lru_cache

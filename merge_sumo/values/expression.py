@@ -32,6 +32,8 @@ MOST_CHARACTERS: Final = 1000
 
 Vocabulary = Mapping[str, Set[str] | None]
 """The values that there are by name: the texts that one may have, None for a number."""
+NONE: Final[Mapping[str, str]] = {}
+"""No conditions that are named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +108,16 @@ def _number(side: str | float, values: Mapping[str, Value]) -> float:
     return value
 
 
-def parse_condition(text: str, vocabulary: Vocabulary, what: str) -> tuple[Condition, str]:
+def parse_condition(
+    text: str, vocabulary: Vocabulary, what: str, named: Mapping[str, str] = NONE
+) -> tuple[Condition, str]:
     """Return the condition that a text states, and the text as Python would write it.
 
     Args:
         text: what a person wrote.
         vocabulary: the values that it may speak of.
         what: where it stands, which begins every complaint.
+        named: conditions that it may name, by their names.
 
     Raises `UserError` where it is none.
     """
@@ -122,7 +127,7 @@ def parse_condition(text: str, vocabulary: Vocabulary, what: str) -> tuple[Condi
     try:
         with warnings.catch_warnings(action="ignore"):  # "1.5or" is odd, and means what it says
             tree = ast.parse(text.strip(), mode="eval").body
-        parser = _Parser(vocabulary, f"{what} {shown!r}")
+        parser = _Parser(vocabulary, f"{what} {shown!r}", named)
         return parser.condition(tree), ast.unparse(tree)
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         raise UserError(
@@ -132,8 +137,8 @@ def parse_condition(text: str, vocabulary: Vocabulary, what: str) -> tuple[Condi
 
 
 class _Parser:
-    def __init__(self, vocabulary: Vocabulary, what: str) -> None:
-        self._vocabulary, self._what = vocabulary, what
+    def __init__(self, vocabulary: Vocabulary, what: str, named: Mapping[str, str]) -> None:
+        self._vocabulary, self._what, self._named = vocabulary, what, named
 
     def condition(self, node: ast.expr) -> Condition:
         """Return the condition of a part of the tree."""
@@ -149,6 +154,8 @@ class _Parser:
                 pairs = zip(sides, signs, sides[1:], strict=False)
                 found = tuple(self._comparison(*pair) for pair in pairs)
                 return found[0] if len(found) == 1 else AllOf(found)
+            case ast.Name(id=name) if name in self._named:
+                return self.condition(ast.parse(self._named[name], mode="eval").body)
             case ast.Name(id=name) if name in self._vocabulary:
                 raise self._error(f"{name} stands alone: compare it with something")
             case ast.Name(id=name):
@@ -202,7 +209,7 @@ class _Parser:
         return found
 
     def _unknown(self, name: str) -> UserError:
-        near = get_close_matches(name, self._vocabulary, n=3, cutoff=0.5)
+        near = get_close_matches(name, (*self._vocabulary, *self._named), n=3, cutoff=0.5)
         there = (
             f"did you mean {_either(near)}?" if near else f"choose {', '.join(self._vocabulary)}"
         )

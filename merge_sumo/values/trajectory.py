@@ -69,6 +69,11 @@ class Trajectory:
     clipped_steps: int = 0
     after: FloatArray | None = None
 
+    def __repr__(self) -> str:
+        """Return its end in a line: the motion is an array of hundreds of numbers."""
+        cars, rows = self.motion.shape[1], len(self.motion)
+        return f"<Trajectory: {cars} vehicles, {rows} rows, {self.end} at {self.t_end_s:.1f} s>"
+
     @property
     def x_pov_m(self) -> FloatArray:
         """Positions of the POV, (T + 1,)."""

@@ -10,6 +10,7 @@ import copy
 import inspect
 import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -21,6 +22,8 @@ from merge_sumo.drivers.vuts.python import BatchedVut, FunctionVut, PythonVut, t
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 
+AnyVut = str | type | Callable[..., Any] | object
+"""A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
 HERE: Final = "here"
 """The part of their specs before the colon."""
 MAINS: Final = ("__main__", "__mp_main__")

@@ -20,7 +20,11 @@ from merge_sumo.values.scenario import DT_S, US23, Scenario
 
 SET_VEHICLE, SET_VEHICLETYPE = 0xC4, 0xC5
 SLOW_DOWN, SET_SPEED, SET_ACCELERATION = 0x14, 0x40, 0x72
-SPEEDS: Final = frozenset({SLOW_DOWN, SET_SPEED, SET_ACCELERATION})
+SPEEDS: Final = {
+    SLOW_DOWN: "vehicle.slowDown",
+    SET_SPEED: "vehicle.setSpeed",
+    SET_ACCELERATION: "vehicle.setAcceleration",
+}
 MAX_SPEED, ACCEL, DECEL = 0x41, 0x46, 0x47
 LIMITS: Final = frozenset({MAX_SPEED, ACCEL, DECEL})
 SPEED_FACTOR: Final = 0x5E
@@ -65,7 +69,7 @@ class Kind(Enum):
 
 DRIVES: Final = frozenset(
     {
-        *("vehicle.setSpeed", "vehicle.slowDown", "vehicle.setAcceleration"),
+        *SPEEDS.values(),
         *("vehicle.setSpeedMode", "vehicle.setMaxSpeed", "vehicle.setAccel", "vehicle.setDecel"),
         *("vehicletype.setMaxSpeed", "vehicletype.setAccel", "vehicletype.setDecel"),
     }

@@ -23,6 +23,7 @@ from merge_sumo.drivers.vuts.traci_commands import (
     SET_VEHICLE,
     SET_VEHICLETYPE,
     SPEED_MODE,
+    SPEEDS,
     Kind,
     Orders,
     kind_of,
@@ -233,8 +234,13 @@ class Session(Simulation):
     def _set(self, command: int, reader: Reader) -> None:
         """Carry a command out, or keep it, or note that it changes nothing, or refuse it."""
         variable = reader.ubyte()
-        name, found = name_of(command, variable), named().get((command, variable))
-        functions = () if found is None else found.functions
+        functions: tuple[str, ...]
+        if command == SET_VEHICLE and variable in SPEEDS:
+            # What comes in every step needs no look at the tables of SUMO's client.
+            name, functions = SPEEDS[variable], (SPEEDS[variable],)
+        else:
+            name, found = name_of(command, variable), named().get((command, variable))
+            functions = () if found is None else found.functions
         kind = kind_of(functions)
         if kind is Kind.REFUSED:
             reason = reason_against(functions)

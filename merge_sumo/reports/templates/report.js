@@ -364,8 +364,8 @@ function range(values, pad = 0.06) {
 }
 
 /* ---------- a case: road, motion, charts ---------- */
-const road = byId("road"), slider = byId("time");
-let moving = null, beside = -1, step = 0, playing = false, last = 0, charts = [];
+const slider = byId("time"), views = ["view", "view-beside"].map((id) => new TopView(byId(id)));
+let moving = null, beside = -1, step = 0, final = 0, playing = false, last = 0, charts = [];
 
 const panel = byId("case");
 function dock(on) { // at the foot of the window, or in its place beside the lists
@@ -433,7 +433,9 @@ function show(i) {
 }
 function showMotion(i) {
   const { rows, v, x, met } = moving;
-  const other = beside >= 0 && beside !== i ? motion(beside) : null, end = (Math.max(rows, other?.rows ?? 0) - 1) * DT;
+  const other = beside >= 0 && beside !== i ? motion(beside) : null;
+  final = Math.max(rows, other?.rows ?? 0) - 1;
+  const end = final * DT;
   const over = (values) => values.map((value, t) => [t * DT, value]);
   const lines = (values, more = "") => vehicles.map((name, who) => ({ name: name + more, points: over(values[who]) }));
   const both = (key) => (other ? [...lines(other[key], " beside"), ...lines(moving[key])] : lines(moving[key]));
@@ -453,24 +455,11 @@ function showMotion(i) {
       lines: [...(other ? [{ name: "gap beside", points: over(otherGap) }] : []), ...others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }))],
     }),
   ];
-  slider.max = rows - 1;
-  drawRoad();
-  at(failed(i) ? rows - 1 : 0);
-}
-let cars = {};
-function drawRoad() {
-  road.replaceChildren();
-  // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
-  for (const lane of data.lanes) draw(road, "path", { class: "lane", d: path(lane.map(([x, y]) => [x, -y])), "stroke-width": 3.05 });
-  draw(road, "line", { class: "merge", x1: 0, x2: 0, y1: -5.4, y2: 2.4, "stroke-width": 0.25 });
-  cars = {};
-  for (const who of vehicles) {
-    const group = draw(road, "g");
-    draw(group, "rect", { class: who, x: -5, y: -1, width: 5, height: 2, rx: 0.6 });
-    const brake = draw(group, "rect", { class: "brake", x: -5.3, y: -1, width: 0.6, height: 2 });
-    const label = draw(road, "text", { "text-anchor": "middle" });
-    cars[who] = { group, brake, label };
-  }
+  slider.max = final;
+  byId("views").classList.toggle("two", other !== null);
+  views[0].show(moving, `Case ${cases.index[i]}`);
+  views[1].show(other, `Case ${cases.index[beside] ?? ""}`);
+  at(failed(i) || other ? final : 0);
 }
 const extent = (values) => [Math.min(...values), Math.max(...values)];
 function pose(path, along) { // front bumper at a lane coordinate of a path
@@ -481,33 +470,67 @@ function pose(path, along) { // front bumper at a lane coordinate of a path
   const [[s0, x0, y0], [s1, x1, y1]] = [path[k - 1], path[k]], share = (along - s0) / (s1 - s0 || 1);
   return { x: x0 + share * (x1 - x0), y: y0 + share * (y1 - y0), angle: Math.atan2(y0 - y1, x1 - x0) * 180 / Math.PI };
 }
+function TopView(figure) {
+  const svg = figure.querySelector("svg"), caption = figure.querySelector("figcaption");
+  const cars = {};
+  let name = "";
+  this.svg = svg;
+  this.cars = cars;
+  this.moving = null; // what it shows
+  this.show = (moving, named) => {
+    this.moving = moving;
+    name = named;
+    figure.hidden = moving === null;
+    svg.replaceChildren();
+    // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
+    for (const lane of data.lanes) draw(svg, "path", { class: "lane", d: path(lane.map(([x, y]) => [x, -y])), "stroke-width": 3.05 });
+    draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -5.4, y2: 2.4, "stroke-width": 0.25 });
+    for (const who of vehicles) {
+      const group = draw(svg, "g");
+      draw(group, "rect", { class: who, x: -5, y: -1, width: 5, height: 2, rx: 0.6 });
+      const brake = draw(group, "rect", { class: "brake", x: -5.3, y: -1, width: 0.6, height: 2 });
+      const label = draw(svg, "text", { "text-anchor": "middle" });
+      cars[who] = { group, brake, label };
+    }
+  };
+  const row = (t) => { // the rows of the motion that a step is between; its last one stays
+    const { rows } = this.moving, s = Math.min(t, rows - 1), k = Math.min(Math.floor(s), Math.max(rows - 2, 0));
+    return { k, next: Math.min(k + 1, rows - 1), share: s - k };
+  };
+  const mix = (values, { k, next, share }) => (1 - share) * values[k] + share * values[next];
+  this.places = (t) => this.moving.x.map((x, who) => pose(who === VUT ? data.ramp : data.main, mix(x, row(t))));
+  this.at = (t, { x: middle, y: centre, width, height }) => {
+    const now = row(t), places = this.places(t), vutAbove = places[VUT].y > places[POV].y;
+    const size = Math.max(1, Math.min(width / 90, height / 22.5)); // labels fit
+    // Letters of a small picture are 11 pixels high.
+    const letters = Math.max(2.6 * size, 11 * width / (svg.clientWidth || width)), aside = 0.5 * width - 3.6 * letters;
+    svg.setAttribute("viewBox", `${middle - width / 2} ${-centre - height / 2} ${width} ${height}`);
+    for (const [who, name] of vehicles.entries()) {
+      const { x, y, angle } = places[who], v = this.moving.v[who], a = (v[now.next] - v[now.k]) / DT;
+      const { group, brake, label } = cars[name];
+      group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
+      brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
+      const up = (who === VUT) === vutAbove, named = who === VUT || who === POV;
+      label.setAttribute("x", clamp(x - 2.5, middle - aside, middle + aside));
+      label.setAttribute("y", -y + (up ? -3.8 * Math.min(size, 2) - letters : 2.8 * Math.min(size, 2) + letters));
+      label.style.fontSize = `${letters}px`;
+      label.textContent = named ? `${NAMES[name]} ${fixed(mix(v, now), 1)} m/s` : name;
+      // The POV's own label has the room where two would lie on each other.
+      label.setAttribute("visibility", named || Math.abs(x - places[POV].x) > 0.14 * width ? "visible" : "hidden");
+    }
+    const end = (this.moving.rows - 1) * DT;
+    caption.textContent = t < this.moving.rows - 1 ? name : `${name}, ended at ${fixed(end, 1)} s`;
+  };
+}
 function at(t) {
   if (!moving) return;
-  step = clamp(t, 0, moving.rows - 1);
-  const k = Math.min(Math.floor(step), Math.max(moving.rows - 2, 0)), share = step - k, next = Math.min(k + 1, moving.rows - 1);
-  const mix = (values) => (1 - share) * values[k] + share * values[next];
-  const places = vehicles.map((_, who) => pose(who === VUT ? data.ramp : data.main, mix(moving.x[who])));
+  step = clamp(t, 0, final);
+  const shown = views.filter((view) => view.moving), places = shown.flatMap((view) => view.places(step));
+  // The view follows all cars, never closer than 90 m; of two cases it is the same stretch of road.
   const [low, high] = extent(places.map(({ x }) => x)), [bottom, top] = extent(places.map(({ y }) => y));
-  const vutAbove = places[VUT].y > places[POV].y;
-  // The view follows all of them, never closer than 90 m; cars keep a size that can be seen.
-  const ratio = road.clientHeight / (road.clientWidth || 1) || 0.25;
-  const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 22) / ratio, 90), middle = (low + high) / 2;
-  const height = width * ratio, size = Math.max(1, Math.min(width / 90, height / 22.5)); // labels fit
- 
-  road.setAttribute("viewBox", `${middle - width / 2} ${-(bottom + top) / 2 - height / 2} ${width} ${height}`);
-  for (const [who, name] of vehicles.entries()) {
-    const { x, y, angle } = places[who], v = moving.v[who], a = (v[next] - v[k]) / DT;
-    const { group, brake, label } = cars[name];
-    group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
-    brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
-    const up = (who === VUT) === vutAbove, named = who === VUT || who === POV;
-    label.setAttribute("x", clamp(x - 2.5, middle - 0.38 * width, middle + 0.38 * width));
-    label.setAttribute("y", -y + (up ? -6.4 : 5.4) * Math.min(size, 2));
-    label.style.fontSize = `${2.6 * size}px`;
-    label.textContent = named ? `${NAMES[name]} ${fixed(mix(v), 1)} m/s` : name;
-    // The POV's own label has the room where two would lie on each other.
-    label.setAttribute("visibility", named || Math.abs(x - places[POV].x) > 0.14 * width ? "visible" : "hidden");
-  }
+  const { clientWidth, clientHeight } = views[0].svg, ratio = clientHeight / (clientWidth || 1) || 0.25;
+  const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 22) / ratio, 90);
+  for (const view of shown) view.at(step, { x: (low + high) / 2, y: (bottom + top) / 2, width, height: width * ratio });
   slider.value = Math.round(step);
   slider.setAttribute("aria-valuetext", `${fixed(step * DT, 1)} seconds`);
   byId("time-value").textContent = `${fixed(step * DT, 1)} s`;
@@ -519,7 +542,7 @@ function play(on) {
   button.textContent = playing ? "❚❚" : "▶";
   button.setAttribute("aria-label", playing ? "Pause" : "Play");
   if (!playing) return;
-  if (step >= moving.rows - 1) at(0);
+  if (step >= final) at(0);
   last = performance.now();
   requestAnimationFrame(frame);
 }
@@ -527,7 +550,7 @@ function frame(now) {
   if (!playing) return;
   at(step + (now - last) / 1000 / DT * Number(byId("rate").value));
   last = now;
-  step >= moving.rows - 1 ? play(false) : requestAnimationFrame(frame);
+  step >= final ? play(false) : requestAnimationFrame(frame);
 }
 slider.addEventListener("input", () => { play(false); at(Number(slider.value)); });
 byId("play").addEventListener("click", () => play(!playing));
