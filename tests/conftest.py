@@ -8,7 +8,8 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import pytest
 from foreign_nets import corridor_of
@@ -29,6 +30,11 @@ def require(available: bool, reason: str) -> None:
     if os.environ.get("CI") == "true":
         pytest.fail(f"CI must have it: {reason}")
     pytest.skip(reason)
+
+
+def some(values: Iterable[Any], *kept: object) -> list[Any]:
+    """Return parameters of a test: the default run takes the kept ones, `-m long` the others."""
+    return [v if v in kept else pytest.param(v, marks=pytest.mark.long) for v in values]
 
 
 @pytest.fixture(scope="session")

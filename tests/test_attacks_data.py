@@ -469,11 +469,11 @@ def assert_fit_for_a_terminal(said: str) -> None:
 
 SOME_TEXTS = [
     name
-    if name in ("markup", "every control", "formulas", "10 MB of markup")
+    if name in ("every control", "10 MB of markup")
     else pytest.param(name, marks=pytest.mark.long)
     for name in TEXTS
 ]
-"""In the default run one of each kind."""
+"""In the default run what is odd, and what is markup and long."""
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import some
 from scipy.spatial import cKDTree
 from scipy.special import betainc
 
@@ -16,7 +17,7 @@ from merge_sumo.values.fmc import RADIUS, fmc, fmc_and_error, radius_for, region
 FloatArray = np.ndarray
 BALL = 4 / 3 * math.pi * RADIUS**3
 SIX = pytest.param(6, marks=pytest.mark.long)
-DIMENSIONS = pytest.mark.parametrize("dimension", [4, 5, SIX])
+DIMENSIONS = pytest.mark.parametrize("dimension", some([4, 5, 6], 4))
 
 
 def lens(distance: float, dimension: int) -> float:

@@ -35,12 +35,12 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def truth(cache):
-    return ground_truth("design1", 0, 600, cache=cache)
+    return ground_truth("design1", 0, 300, cache=cache)
 
 
 def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
     with open_workers(2) as workers:
-        both = ground_truth("design1", 0, 600, workers=workers, cache=tmp_path)
+        both = ground_truth("design1", 0, 300, workers=workers, cache=tmp_path)
     assert np.array_equal(both.points, truth.points)
     assert np.array_equal(both.score, truth.score)
     assert len(truth.failures) > 0
@@ -49,13 +49,13 @@ def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
 def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch):
     (kept,) = cache.glob("truth-*.npz")
     counted: list[int] = []
-    again = ground_truth("design1", 0, 600, cache=cache, on_cases=counted.append)
+    again = ground_truth("design1", 0, 300, cache=cache, on_cases=counted.append)
     assert np.array_equal(again.score, truth.score)
     assert counted == []
     kept.write_bytes(kept.read_bytes()[:100])
-    remade = ground_truth("design1", 0, 600, cache=cache, on_cases=counted.append)
+    remade = ground_truth("design1", 0, 300, cache=cache, on_cases=counted.append)
     assert np.array_equal(remade.score, truth.score)
-    assert sum(counted) == 600
+    assert sum(counted) == 300
 
 
 @pytest.mark.parametrize(
@@ -63,14 +63,14 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
     [
         {"vut": "design2"},
         {"level": 1},
-        {"cases": 601},
+        {"cases": 301},
         {"seed": 1},
         {"command": "./controller"},
         {"deadline_s": 1.0},
     ],
 )
 def test_the_key_of_the_cache_names_what_the_truth_depends_on(change):
-    kept = Kept("design1", 0, 600, 0, None, 5.0)
+    kept = Kept("design1", 0, 300, 0, None, 5.0)
     assert kept.path() == replace(kept).path()
     assert kept.path() != replace(kept, **change).path()
 
@@ -259,9 +259,9 @@ class TestTheLimit:
 
 
 def test_a_truth_is_known_when_it_was_made_and_not_before(truth, cache, tmp_path):
-    assert known_truth("design1", 0, 600, cache=tmp_path) is None
-    assert known_truth("design1", 0, 601, cache=cache) is None
-    known = known_truth("design1", 0, 600, cache=cache)
+    assert known_truth("design1", 0, 300, cache=tmp_path) is None
+    assert known_truth("design1", 0, 301, cache=cache) is None
+    known = known_truth("design1", 0, 300, cache=cache)
     assert known is not None
     assert np.array_equal(known.score, truth.score)
 

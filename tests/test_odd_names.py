@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import some
 from handmade import write_run
 
 from merge_sumo.campaigns import conductor
@@ -33,8 +34,7 @@ TERMINALS = {
     "ASCII, strictly": {"PYTHONIOENCODING": "ascii:strict"},
 }
 SOME_TERMINALS = [
-    name if name in ("C", "Latin-1") else pytest.param(name, marks=pytest.mark.long)
-    for name in TERMINALS
+    name if name == "C" else pytest.param(name, marks=pytest.mark.long) for name in TERMINALS
 ]
 
 
@@ -158,7 +158,7 @@ SUMO_NAMES = ["a b", "a,b", "a%41b", "100%s", "${HOME}", "$HOME", "a\nb", "a:b",
 
 
 class TestSumo:
-    @pytest.mark.parametrize("name", SUMO_NAMES)
+    @pytest.mark.parametrize("name", some(SUMO_NAMES, "a,b", "${HOME}", "日本"))
     def test_plays_an_exported_folder_of_any_name_where_it_is(self, made, tmp_path, name):
         export_case(made, 0, tmp_path / name)
         done = subprocess.run(
@@ -169,7 +169,7 @@ class TestSumo:
         )
         assert done.returncode == 0, done.stderr
 
-    @pytest.mark.parametrize("name", ["a b", "$HOME", "a\nb", "日本"])
+    @pytest.mark.parametrize("name", some(["a b", "$HOME", "a\nb", "日本"], "$HOME", "日本"))
     def test_starts_with_temporary_files_in_a_folder_of_an_odd_name(
         self, tmp_path, monkeypatch, name
     ):
@@ -179,7 +179,9 @@ class TestSumo:
             pass
         assert list((tmp_path / name).iterdir()) == []
 
-    @pytest.mark.parametrize("name", ["a,b", "a%41b", "${HOME}", "a:b", NOT_UTF8])
+    @pytest.mark.parametrize(
+        "name", some(["a,b", "a%41b", "${HOME}", "a:b", NOT_UTF8], "a%41b", NOT_UTF8)
+    )
     def test_says_so_where_it_cannot_use_the_folder_for_temporary_files(
         self, tmp_path, monkeypatch, name
     ):
@@ -194,7 +196,10 @@ class TestSumo:
             ProvingGround("design1", 1)
 
 
-@pytest.mark.parametrize("size", [3990, 4000, *range(4004, 4016), 4030, 4060, 4090, 4095, 4096])
+SIZES = [3990, 4000, *range(4004, 4016), 4030, 4060, 4090, 4095, 4096]
+
+
+@pytest.mark.parametrize("size", some(SIZES, 3990, 4007, 4008, 4096))
 def test_a_path_works_or_is_too_long_before_the_first_case(tmp_path, monkeypatch, size):
     folder = tmp_path
     while size - len(os.fsencode(folder)) > 400:

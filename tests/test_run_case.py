@@ -43,12 +43,22 @@ class TestTheCommand:
         code, out, _ = command_line("run", "--vut", "design2", *SAFE)
         assert (code, "MERGED" in out) == (0, True)
 
+    def test_says_what_is_outside_of_the_pool(self, command_line):
+        case = ("--vut", "design2", "--level", "0", "--v", "34", "--x")
+        said = "note: x_POV0 -900.0 m is outside of the pool, -340 to -180 m: "
+        assert said in command_line("run", *case, "-900")[2]
+        assert command_line("run", *case, "-340")[2] == ""
+
     def test_keeps_the_case_as_a_folder_that_replays(self, command_line, tmp_path):
         command_line("run", "--vut", "design2", *SAFE, "--out", tmp_path / "kept")
         assert command_line("replay", tmp_path / "kept")[:2] == (
             0,
             f"identical: {_rows(tmp_path / 'kept')} rows of x, y, position and speed\n",
         )
+
+    def test_of_a_campaign_is_replayed_by_its_own_folder(self, command_line, run):
+        code, _, said = command_line("replay", run.folder)
+        assert (code, f"{run.folder} is a campaign: name a case in" in said) == (2, True)
 
     def test_says_the_same_of_a_recorded_case_as_its_campaign(self, command_line, run):
         code, out, _ = command_line("run", "--case", run.folder, "7", "--json")
@@ -74,6 +84,8 @@ class TestTheCommand:
     @pytest.mark.parametrize(
         ("arguments", "part"),
         [
+            (SAFE, "say with --vut who drives"),
+            (("--vut", "my_vut.py", *SAFE), "my_vut.py:NAME"),
             (("--vut", "design2", "--x", "-300"), "--v (v_pov0_mps) is missing"),
             (("--vut", "design2", *SAFE, "--psi", "0.2"), "--psi (svo_rad) is none of"),
             (("--vut", "design2", *SAFE, "--headway-ahead", "2"), "--headway-ahead"),

@@ -44,7 +44,7 @@ from merge_sumo.values.scenario import DT_S, US23
 WEIGHTS = reward.RewardWeights()
 REWARD = reward.Reward(WEIGHTS)
 ACTIONS_MPS2 = actions_mps2(US23)
-TINY = ddqn.DdqnSettings(transitions=6_000, warm_up=2_000, updates=1_000, width=16, batch=64)
+TINY = ddqn.DdqnSettings(transitions=3_000, warm_up=1_000, updates=1_000, width=16, batch=64)
 QUICK = refine.RefineSettings(rounds=2, starts=40, searched=10, beam=8, updates=50, batch=64)
 SMALL = helix.TrainingSettings(ddqn=TINY, refine=QUICK, check_cases=12)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import some
 
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
 from merge_sumo.campaigns.ground import GroundPlan, road_for, run_cases
@@ -177,7 +178,7 @@ class TestTwin:
         same = [plain.replay(0, [8], points[8:9]), taught.replay(0, [8], points[8:9])]
         assert same[0].tolist() == same[1].tolist()
 
-    @pytest.mark.parametrize("size", [60, 20, 7])
+    @pytest.mark.parametrize("size", some([60, 20, 7], 7))
     def test_learns_from_batches_of_any_size(self, seen, size):
         outcomes, motions = seen
         twin = Twin(Pool(levels=(0,)), Povs(), 0)

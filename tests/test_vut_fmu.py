@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from build_fmu import NAMES, build_fmu, compiler
-from conftest import require
+from conftest import require, some
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
 from merge_sumo.errors import UserError
@@ -48,7 +48,7 @@ def test_an_fmu_drives_like_the_same_law_in_python_and_leaves_nothing(
     assert list(scratch.iterdir()) == []
 
 
-@pytest.mark.parametrize("version", ["2.0", "3.0"])
+@pytest.mark.parametrize("version", some(["2.0", "3.0"], "3.0"))
 def test_names_of_variables_can_be_mapped(unit, version):
     path = unit(version, ("PovPos", "PovSpeed", "x_vut_m", "Speed", "Cmd"))
     spec = f"fmu:{path}?v_vut_mps=Speed&v_pov_mps=PovSpeed&acceleration_mps2=Cmd"
@@ -61,7 +61,7 @@ def test_names_of_variables_can_be_mapped(unit, version):
     ("fault", "reason"),
     [("return 3;", "failed with status 3"), ("u->v[4] = NAN; return 0;", "nan")],
 )
-@pytest.mark.parametrize("version", ["2.0", "3.0"])
+@pytest.mark.parametrize("version", some(["2.0", "3.0"], "2.0"))
 def test_what_an_fmu_does_wrong_is_the_outcome_of_its_own_case(unit, version, fault, reason):
     cases = cases_of(12)
     trajectories = run_cases(factory(f"fmu:{unit(version, fault=fault)}"), cases)

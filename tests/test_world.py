@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import some
 
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.base import Driver
@@ -67,7 +68,7 @@ def assert_eq4(trajectory):
             assert abs(v[t + 1] - expected_v) < EXACT
 
 
-@pytest.mark.parametrize("corridors", [1, 32])
+@pytest.mark.parametrize("corridors", some([1, 32], 32))
 def test_sumo_moves_random_episodes_by_eq_4_at_every_step_with_refills(corridors):
     cases = random_cases(300)
     with World(corridors) as world:

@@ -7,6 +7,7 @@ proposed, told and recorded is the same, and the journal holds whole batches in 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
@@ -44,10 +45,15 @@ def proposals(
 class Ahead:
     """Runs batches on workers, those ahead before they are asked for; to be used in `with`."""
 
-    def __init__(self, run: OnWorkers, ahead: Iterable[Sequence[Case]]) -> None:
-        """Take the batches that will be asked for, in that order; where there are none, nothing
-        runs ahead."""
+    def __init__(
+        self, run: OnWorkers, ahead: Iterable[Sequence[Case]], cases: float = math.inf
+    ) -> None:
+        """Take the batches that will be asked for, in that order, and of how many cases they are.
+
+        Where there are none, nothing runs ahead.
+        """
         self._run = run
+        self._cases = cases
         self._chunks = run.chunks(self._cut(chain.from_iterable(ahead)))
         self._sent: dict[int, Case] = {}
         """Cases that were not asked for yet, by their place,"""
@@ -87,7 +93,9 @@ class Ahead:
         first = 0
         while True:
             rate = self._ended / (time.perf_counter() - self._start_s) / self._run.workers.count
-            size = min(max(MAX_CORRIDORS, round(CHUNK_S * rate)), MAX_CHUNK)
+            # Smaller ones at the end, so that workers end at the same time.
+            share = min(CHUNK_S * rate, (self._cases - first) / self._run.workers.count)
+            size = min(max(MAX_CORRIDORS, round(share)), MAX_CHUNK)
             chunk = list(islice(cases, size))
             if not chunk:
                 return

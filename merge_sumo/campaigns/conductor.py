@@ -246,7 +246,8 @@ def _go_on(
     if before is not None and sampler.foresees:
         motions = {o.index: before.trajectory(o.index).motion for o in history}
     scout = make_sampler(settings.sampler, settings.pool, settings.seed)
-    with Ahead(run, proposals(scout, history, settings.cases, settings.batch)) as ahead:
+    proposed = proposals(scout, history, settings.cases, settings.batch)
+    with Ahead(run, proposed, settings.cases - len(history)) as ahead:
         batches = conduct(
             sampler,
             noting_files,

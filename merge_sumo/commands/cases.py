@@ -29,6 +29,7 @@ from merge_sumo.commands.shared import (
     written,
     written_settings,
 )
+from merge_sumo.errors import UserError
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
@@ -105,6 +106,8 @@ def run(
     settings, one = _case_and_settings(context)
     if out is not None:
         check_new(out)
+    for outside in _outside(one):
+        say(f"note: {outside}")
     road = road_for(settings.scenario, net)
 
     def ended(found: Ended) -> None:
@@ -128,6 +131,18 @@ def run(
     driven = settings.vut_factory, one, road, settings.povs
     found = run_one(*driven, criterion=settings.criterion, live=gui, on_end=ended).outcome
     raise typer.Exit(0 if found.measures.end is End.MERGED and not found.failed else 1)
+
+
+def _outside(case: Case) -> list[str]:
+    """Return in sentences which coordinates of a case are outside of the pool."""
+    from merge_sumo.reports.coordinates import coordinates
+
+    return [
+        f"{c.name} {c.text(case)} {c.unit} is outside of the pool, {c.dimension.low:g} to "
+        f"{c.dimension.high:g} {c.unit}: no campaign runs such a case"
+        for c in coordinates(case.scenario, (case.level,))
+        if (value := c.of(case)) is not None and not c.dimension.low <= value <= c.dimension.high
+    ]
 
 
 @app.command()
@@ -223,6 +238,8 @@ def _case_and_settings(context: typer.Context) -> tuple[CampaignSettings, Case]:
         if options[option[2:].replace("-", "_")] is not None
     }
     if options["case"] is None:
+        if not options["vut"]:
+            raise UserError("say with --vut who drives, or with --case which recorded case")
         where = named_scenario(options["scenario"])
         hosted = VutOptions(memory_gib=options["vut_memory"])
         povs = povs_of(options["policies"], where, options["pov"], hosted)

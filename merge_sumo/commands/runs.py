@@ -98,8 +98,14 @@ def replay(
 
     Example:  merge-sumo replay scenarios/stalemate --gui
     """
+    from merge_sumo.campaigns.run import SETTINGS
     from merge_sumo.sumo import replay as replayer
 
+    if (folder / SETTINGS).is_file():
+        raise UserError(
+            f"{folder} is a campaign: name a case in {folder / 'scenarios'}, which `merge-sumo "
+            "export` writes"
+        )
     if gui:
         raise typer.Exit(replayer.open_gui(folder))
     result = replayer.replay(folder)

@@ -189,6 +189,8 @@ def find_vut(spec: str, options: VutOptions) -> Vut:
     installed = installed_vuts()
     if spec in installed:
         return _prepared(INSTALLED, spec, spec, options)
+    if spec.endswith(".py"):
+        raise UserError(f"{spec} is a file: name a class or a function of it, {spec}:NAME")
     names = ", ".join([*built_in, *installed])
     raise UserError(
         f"there is no VUT {spec!r}: choose one of {names}, or bring your own "
