@@ -338,7 +338,9 @@ def test_two_cases_are_compared(browser, made, size):
 def placed(page, view: str, who: str) -> tuple[float, float]:
     """Return where a car is drawn, in metres."""
     moved = page.locator(f"#{view} g:has(> rect.{who})").get_attribute("transform")
-    x, y = re.match(r"translate\((\S+) (\S+)\)", moved).groups()
+    found = re.match(r"translate\((\S+) (\S+)\)", moved)
+    assert found is not None
+    x, y = found.groups()
     return float(x), float(y)
 
 
