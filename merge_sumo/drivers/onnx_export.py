@@ -33,7 +33,6 @@ _OPERATORS: Final = {
     "minimum": "Min",
     "sqrt": "Sqrt",
     "tanh": "Tanh",
-    "cos": "Cos",
     "sin": "Sin",
 }
 
@@ -134,6 +133,10 @@ class _Column(NDArrayOperatorsMixin):
         return value.name if isinstance(value, _Column) else self._graph.constant(value)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **_: Any) -> _Column:
+        if ufunc is np.cos:
+            # ONNX Runtime has had a sine of doubles for long, and a cosine only lately.
+            shifted: _Column = inputs[0] + np.pi / 2.0
+            return shifted.__array_ufunc__(np.sin, method, shifted)
         if method != "__call__" or ufunc.__name__ not in _OPERATORS:
             raise TypeError(f"{ufunc.__name__} has no ONNX operator here")
         operands = map(self._name_of, inputs)
