@@ -142,7 +142,7 @@ def no_cases(monkeypatch) -> None:
             raise UserError(STOP)
 
         def chunks(self, _: object) -> Iterator:
-            return iter(())
+            yield from ()
 
     stop = Stop()
     monkeypatch.setattr(conductor, "runs_on", lambda *_: stop)

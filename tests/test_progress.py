@@ -121,9 +121,9 @@ class TestInANotebook:
     def shown(self, monkeypatch):
         """Return what a notebook shows, as HTML, the newest last."""
         texts: list[str] = []
-        handle = types.SimpleNamespace(update=texts.append)
+        handle = types.SimpleNamespace(update=lambda shown, raw: texts.append(shown["text/html"]))
         module = types.ModuleType("IPython.display")
-        vars(module).update(HTML=str, display=lambda _text, display_id: handle)
+        vars(module).update(display=lambda _shown, **_: handle)
         shell = types.SimpleNamespace(kernel=object())
         notebook = types.ModuleType("IPython")
         vars(notebook).update(get_ipython=lambda: shell)

@@ -9,7 +9,6 @@ a margin m is the score lambda (1 - m / (1 + |m|)), which is below lambda exactl
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Set
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -19,7 +18,7 @@ from typing import Final
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 from merge_sumo.values.bodies import CentreLines, clearance_before_m
-from merge_sumo.values.expression import Condition, Value, Vocabulary, parse_condition
+from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
 from merge_sumo.values.merge import AfterMerge, brake_after_mps2, bumper_gap_m
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
@@ -184,8 +183,8 @@ def _condition(text: str) -> Condition:
 
 @lru_cache
 def _names(text: str) -> frozenset[str]:
-    """Return the measures that a condition speaks of."""
-    return frozenset(re.findall(r"\w+", text)) & VOCABULARY.keys()
+    """Return the measures that a condition speaks of, by their names or by those of others."""
+    return names_of(_condition(text))
 
 
 def values_of(

@@ -102,6 +102,19 @@ class AnyOf:
 Condition = Comparison | Equality | Negation | AllOf | AnyOf
 
 
+def names_of(condition: Condition) -> frozenset[str]:
+    """Return the values that a condition speaks of."""
+    match condition:
+        case Comparison(left, right):
+            return frozenset(side for side in (left, right) if isinstance(side, str))
+        case Equality(name):
+            return frozenset({name})
+        case Negation(of):
+            return names_of(of)
+        case AllOf(parts) | AnyOf(parts):
+            return frozenset[str]().union(*map(names_of, parts))
+
+
 def _number(side: str | float, values: Mapping[str, Value]) -> float:
     value = values[side] if isinstance(side, str) else side
     assert isinstance(value, float), "the vocabulary says that it is a number"  # noqa: S101
