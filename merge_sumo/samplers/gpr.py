@@ -99,7 +99,7 @@ class _Posterior:
         self._badness = badness + 1e-6
         self._variance = self._kernel.diag(queries) - np.square(self._explained).sum(axis=0)
         self._taken = np.zeros(len(queries), dtype=bool)
-        self._ground = Ground(queries.shape[1])
+        self._ground = Ground(queries.shape[1], fine=False)
         self._ground.cover(self._ground.balls(failures), 1.0)
         self._balls = self._ground.balls(queries)
 

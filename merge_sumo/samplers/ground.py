@@ -19,9 +19,11 @@ from scipy.spatial import cKDTree
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import RADIUS, fmc, radius_for
 
-CELL: Final = {2: 0.0025, 3: 0.0125}
-"""Spacing of the grid, per dimension, on which coverage is counted. What a case adds late in a
-search is a sliver; in two dimensions a grid that shows it is cheap."""
+CELL: Final = {2: 0.01, 3: 0.0125}
+"""Spacing of the grid, per dimension, on which coverage is counted,"""
+FINE_CELL: Final = {2: 0.0025, 3: 0.0125}
+"""and where slivers count, which are what a case adds late in a search: in two dimensions a grid
+that shows them is cheap."""
 PLACES_PER_BALL: Final = 64
 """Places in a ball where there is no grid."""
 MARGIN: Final = 1.1
@@ -37,9 +39,9 @@ class Ground:
         overlap: balls of points that are farther apart have no place in common.
     """
 
-    def __init__(self, dims: int) -> None:
+    def __init__(self, dims: int, *, fine: bool = True) -> None:
         """Prepare an uncovered ground of `dims` dimensions."""
-        self._places = _places(dims)
+        self._places = _places(dims, (FINE_CELL if fine else CELL).get(dims))
         self.overlap: Final = self._places.overlap
         self._open = np.ones(self._places.count, dtype=np.float32)
 
@@ -85,8 +87,8 @@ class _Places(Protocol):
 class _Grid:
     """The nodes of a regular grid."""
 
-    def __init__(self, dims: int) -> None:
-        self._cell = CELL[dims]
+    def __init__(self, dims: int, cell: float) -> None:
+        self._cell = cell
         reach = int(RADIUS / self._cell) + 1
         side = round((1.0 + 2.0 * RADIUS) / self._cell) + 5
         self._strides = side ** np.arange(dims)[::-1]
@@ -120,5 +122,5 @@ class _Scattered:
 
 
 @lru_cache
-def _places(dims: int) -> _Places:
-    return _Grid(dims) if dims in CELL else _Scattered(dims)
+def _places(dims: int, cell: float | None) -> _Places:
+    return _Scattered(dims) if cell is None else _Grid(dims, cell)
