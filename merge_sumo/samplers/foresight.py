@@ -80,12 +80,6 @@ def compressed(gap_m: FloatArray, limit_m: float) -> FloatArray:
     return np.asarray(np.arcsinh(np.nan_to_num(gap_m, nan=NO_GAP_M) / limit_m))
 
 
-def agreed(gaps_m: FloatArray, limit_m: float) -> NDArray[np.bool_]:
-    """Return where all members foretell the same verdict, (n,), by gaps, (E, G, n)."""
-    failing = (np.abs(np.nan_to_num(gaps_m, nan=NO_GAP_M)) < limit_m).reshape(-1, gaps_m.shape[-1])
-    return np.asarray(failing.all(axis=0) | ~failing.any(axis=0))
-
-
 class Record:
     """How well gaps and failures were foretold, and what that makes of the next ones.
 
