@@ -21,7 +21,7 @@ from merge_sumo.values.fmc import RADIUS, fmc, radius_for
 
 CELL: Final = {2: 0.01, 3: 0.0125}
 """Spacing of the grid, per dimension, on which coverage is counted,"""
-FINE_CELL: Final = {2: 0.0025, 3: 0.0125}
+FINE_CELL: Final = {**CELL, 2: 0.0025}
 """and where slivers count, which are what a case adds late in a search: in two dimensions a grid
 that shows them is cheap."""
 PLACES_PER_BALL: Final = 64
