@@ -95,7 +95,7 @@ class TestTheSameVut:
 
 class TestRecordsOnly:
     def test_run_nothing_again(self, run, other_seed, monkeypatch):
-        monkeypatch.setattr("merge_sumo.reports.comparison.ground_of", None)
+        monkeypatch.setattr("merge_sumo.reports.comparison.ProvingGround", None)
         compared = compare_runs(run, other_seed, rerun=False)
         found = compared.levels[0]
         assert found.changes[Change.NOT_RUN_AGAIN] == len(compared.cases)

@@ -22,7 +22,8 @@ from merge_sumo import cli
 from merge_sumo.campaigns.conductor import SCENARIOS, resume_campaign, run_campaign
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
-from merge_sumo.campaigns.settings import CampaignSettings, differences
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.software import differences
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system import folders, interrupt

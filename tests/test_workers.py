@@ -18,7 +18,8 @@ import pytest
 from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.ground import GroundPlan, lost_case, run_cases, runs_on
 from merge_sumo.campaigns.run import OUTCOMES
-from merge_sumo.campaigns.settings import CampaignSettings, software
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.software import software
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from merge_sumo.campaigns.certificate_runs import CaseResult, RunPoints
 from merge_sumo.campaigns.covering import Covering, covering
-from merge_sumo.campaigns.settings import CampaignSettings, differences, record_of
+from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.campaigns.software import differences
 from merge_sumo.campaigns.truth import OnCases, sources_sha256
 from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError

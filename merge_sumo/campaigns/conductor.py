@@ -24,10 +24,10 @@ from merge_sumo.campaigns.run import SETTINGS, Run, spread_failures
 from merge_sumo.campaigns.settings import (
     RECORDED_BY_DEFAULT,
     CampaignSettings,
-    differences,
     record_of,
     settings_of,
 )
+from merge_sumo.campaigns.software import differences
 from merge_sumo.drivers.vuts.files import Files, sha256_of
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError

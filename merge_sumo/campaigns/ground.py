@@ -13,7 +13,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from merge_sumo.campaigns.rollout import rollout
-from merge_sumo.campaigns.settings import POLICY, CampaignSettings, differences, software
+from merge_sumo.campaigns.software import POLICY, differences, software
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.povs import Povs
@@ -78,12 +78,6 @@ class ProvingGround:
     def __exit__(self, *_: object) -> None:
         """Stop the POVs, the VUT, then SUMO."""
         self._opened.close()
-
-
-def ground_of(settings: CampaignSettings, cases: int, net: Corridor) -> ProvingGround:
-    """Open the proving ground of a campaign's settings in this process, for some cases."""
-    corridors = min(MAX_CORRIDORS, cases)
-    return ProvingGround(settings.vut_factory, corridors, net, settings.scenario, settings.povs)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
 from merge_sumo.campaigns.convergence import StoppingRule
 from merge_sumo.campaigns.learning import hashes, lessons
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
+from merge_sumo.campaigns.software import versions
 from merge_sumo.drivers.policies import how_to_train, policies_in, policies_of
 from merge_sumo.drivers.povs import POLICIES, Povs, own_pov
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
@@ -236,22 +235,6 @@ def one_level(text: str, povs: Povs) -> int:
     return parse_levels(text, povs)[0]
 
 
-def versions() -> dict[str, str]:
-    """Return the versions that decide the outcome of a case."""
-    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn")
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}
-
-
-POLICY: Final = "policy "
-"""Begins the name of a policy among the software."""
-
-
-def software(povs: Povs | None = None) -> dict[str, str]:
-    """Return the versions, and the hashes of the policies, by name."""
-    policies = (povs or Povs()).sha256()
-    return versions() | {f"{POLICY}{name}": sha256 for name, sha256 in policies.items()}
-
-
 def record_of(settings: CampaignSettings, net: Corridor) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
     povs = settings.povs
@@ -339,15 +322,3 @@ def _fits(value: object, hint: Any) -> bool:
     if parts:
         return any(_fits(value, part) for part in parts)
     return type(value) is hint or (hint is float and type(value) is int and abs(value) < 2**53)
-
-
-def differences(was: Any, now: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
-    """Return by name where two records differ, with both values; None where there is none."""
-    if isinstance(was, dict) and isinstance(now, dict):
-        found: dict[str, tuple[Any, Any]] = {}
-        for key in now | was:
-            inner = f"{name}.{key}" if name else key
-            found |= differences(was.get(key), now.get(key), inner)
-        return found
-    was, now = (list(value) if isinstance(value, tuple) else value for value in (was, now))
-    return {} if was == now else {name: (was, now)}

@@ -15,7 +15,8 @@ import numpy as np
 
 from merge_sumo.campaigns.conductor import workers_or_here
 from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
-from merge_sumo.campaigns.settings import check_level, versions
+from merge_sumo.campaigns.settings import check_level
+from merge_sumo.campaigns.software import versions
 from merge_sumo.drivers.policies import policies_of, policies_sha256
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory

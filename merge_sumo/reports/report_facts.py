@@ -10,7 +10,7 @@ from typing import Final, TypeVar
 from merge_sumo.campaigns.avoidance import read_avoidance
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import SETTINGS, Run, failures, regions_of, spread_failures
-from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.software import versions
 from merge_sumo.campaigns.truth import TRUTH_CASES, Kept, Truth, read_truth
 from merge_sumo.errors import UserError
 from merge_sumo.reports.coordinates import Coordinate, coordinates

@@ -15,7 +15,8 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.campaigns.experiments import Search, compare, limit_fmc, oracle, search
-from merge_sumo.campaigns.settings import check_level, versions
+from merge_sumo.campaigns.settings import check_level
+from merge_sumo.campaigns.software import versions
 from merge_sumo.campaigns.truth import DENSE_CASES, Truth, ground_truth, known_truth
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.reports import figures

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from merge_sumo.campaigns.experiments import Comparison
-from merge_sumo.campaigns.settings import versions
+from merge_sumo.campaigns.software import versions
 from merge_sumo.campaigns.truth import TRUTH_CASES
 from merge_sumo.errors import UserError
 

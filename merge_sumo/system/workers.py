@@ -27,6 +27,7 @@ from concurrent.futures import (
 from concurrent.futures.process import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Final, Generic, Self, TypeVar
 
 from merge_sumo.errors import UserError
@@ -39,6 +40,8 @@ RECYCLE_AFTER: Final = 200
 MAX_DEATHS: Final = 2
 """An item that ends so many workers on its own is not tried again."""
 DASK_TIMEOUT_S: Final = 30.0
+LOADED: Final = "merge_sumo.campaigns.ground"
+"""What a local worker is there for: loaded before it is asked to, and by its name alone."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -267,8 +270,9 @@ class LocalProcesses(ProcessPoolExecutor):
     """
 
     def __init__(self, workers: int) -> None:
-        """Prepare for a number of workers; they start with the first task."""
+        """Start a number of workers; they get ready while this process does."""
         super().__init__(workers, multiprocessing.get_context("spawn"), _begin_worker)
+        self.submit(int)  # with the first task they start
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit; workers that are started here, now or later, never see SIGINT."""
@@ -309,6 +313,7 @@ def _begin_worker() -> None:
     multiprocessing.util.Finalize(None, end_worker, exitpriority=100)
     # As many threads as workers keep all cores busy.
     threadpool_limits(1)
+    import_module(LOADED)
 
 
 def leave_signals_to_parent() -> None:
