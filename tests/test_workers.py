@@ -8,6 +8,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import sysconfig
 import time
 from functools import partial
 from pathlib import Path
@@ -48,6 +49,13 @@ def squares(items):
 
 def process_ids(items):
     return [os.getpid() for _ in items]
+
+
+def imported_beside(items):
+    """Have a process started that imports what lies in the working directory."""
+    command = [sys.executable, "-c", "import beside"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return [done.stdout for _ in items]
 
 
 def refuse(items):
@@ -106,7 +114,7 @@ class TestAnyWorkers:
         assert found == [(place, place * place) for place in range(count)]
 
     def test_raise_what_the_function_raises_and_work_on(self, workers):
-        with pytest.raises(UserError, match="nothing like 5 here"):
+        with pytest.raises(UserError, match="nothing like [56] here"):
             list(workers.run(refuse, [5, 6], no_loss))
         assert sorted(workers.run(squares, [5, 6], no_loss)) == [(0, 25), (1, 36)]
 
@@ -315,3 +323,27 @@ class TestADaskCluster:
             dask_workers("tcp://127.0.0.1:1")
         with pytest.raises(UserError, match="no scheduler at"):
             dask_workers("nonsense://")
+
+
+class TestFolderWhereAPersonIs:
+    """A folder that somebody sent is data, also where one works in it."""
+
+    SHADOWED = ("multiprocessing", "json", "numpy", "threadpoolctl", "merge_sumo")
+
+    def test_brings_no_modules(self, tmp_path):
+        for name in self.SHADOWED:
+            (tmp_path / f"{name}.py").write_text("raise SystemExit('it was run')\n")
+        script = Path(sysconfig.get_path("scripts")) / "merge-sumo"
+        command = [str(script), "campaign", "--vut", "design2", "--level", "0", "--cases", "8"]
+        command += ["--sampler", "uniform", "--workers", "2", "--out", "run"]
+        ended = subprocess.run(command, check=False, cwd=tmp_path, capture_output=True, text=True)
+        assert ended.returncode == 0, ended.stderr
+        assert "it was run" not in ended.stdout + ended.stderr
+
+    def test_is_searched_by_what_a_worker_starts(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "beside.py").write_text("print('mine')\n")
+        with open_workers(2) as workers:
+            found = dict(workers.run(imported_beside, [None, None], lambda _: None, chunk=1))
+        assert set(found.values()) == {"mine\n"}
+        assert "PYTHONSAFEPATH" not in os.environ

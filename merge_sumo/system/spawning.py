@@ -1,7 +1,8 @@
-"""Processes that do not import the program that a person runs."""
+"""Processes that import neither the program that a person runs nor what lies where it is run."""
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +10,9 @@ from typing import Any, Final
 
 NAMES: Final = ("__file__", "__spec__")
 """By which `multiprocessing` finds the main module."""
+SAFE_PATH: Final = "PYTHONSAFEPATH"
+OURS: Final = "merge-sumo"
+"""Its value where we have set it: any text does."""
 
 
 @contextmanager
@@ -27,3 +31,27 @@ def without_main() -> Iterator[None]:
     finally:
         del main["__spec__"]
         main.update(hidden)
+
+
+@contextmanager
+def without_cwd() -> Iterator[None]:
+    """Let processes that are started meanwhile import nothing from the working directory.
+
+    `multiprocessing` starts them by `python -c`, which looks there first: a `json.py` in a folder
+    that somebody sent would be run. In the process, `forget_safe_path` is due: what it starts in
+    turn may be a person's own.
+    """
+    if os.environ.get(SAFE_PATH):
+        yield
+        return
+    os.environ[SAFE_PATH] = OURS
+    try:
+        yield
+    finally:
+        os.environ.pop(SAFE_PATH, None)
+
+
+def forget_safe_path() -> None:
+    """Let what this process starts find its modules where it always does."""
+    if os.environ.get(SAFE_PATH) == OURS:
+        del os.environ[SAFE_PATH]

@@ -31,7 +31,7 @@ from importlib import import_module
 from typing import Any, Final, Generic, Self, TypeVar
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.spawning import without_main
+from merge_sumo.system.spawning import forget_safe_path, without_cwd, without_main
 
 MAX_CHUNK: Final = 500
 """Items that a worker takes at a time; what bounds its memory."""
@@ -271,12 +271,13 @@ class LocalProcesses(ProcessPoolExecutor):
 
     def __init__(self, workers: int) -> None:
         """Start a number of workers; they get ready while this process does."""
-        super().__init__(workers, multiprocessing.get_context("spawn"), _begin_worker)
+        with without_cwd():  # its locks have a process of their own
+            super().__init__(workers, multiprocessing.get_context("spawn"), _begin_worker)
         self.submit(int)  # with the first task they start
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit; workers that are started here, now or later, never see SIGINT."""
-        with _sigint_blocked(), without_main():
+        with _sigint_blocked(), without_main(), without_cwd():
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(self, *exception: Any) -> bool | None:
@@ -306,6 +307,7 @@ def end_worker() -> None:
 
 def _begin_worker() -> None:
     """Set up a worker process."""
+    forget_safe_path()
     from threadpoolctl import threadpool_limits
 
     leave_signals_to_parent()

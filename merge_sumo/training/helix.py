@@ -35,6 +35,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.folders import cannot_write, check_own, make_place, replace_own, write_new
 from merge_sumo.system.printable import quoted
+from merge_sumo.system.spawning import forget_safe_path, without_cwd
 from merge_sumo.system.workers import leave_signals_to_parent
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, QuickRegret, check_network
 from merge_sumo.training.ddqn import DdqnProgress, DdqnSettings, train
@@ -240,12 +241,14 @@ def _train_beside(
     if not tasks:
         return []
     context = get_context("spawn")
-    told = context.Queue()
     for task in tasks:
         _log(folder, task.name, "w")
-    # Spawned, because libsumo's simulation must not be forked.
-    with ProcessPoolExecutor(len(tasks), context, _report_into, (told,)) as pool:
+    with without_cwd():
+        told = context.Queue()
+        # Spawned, because libsumo's simulation must not be forked.
+        pool = ProcessPoolExecutor(len(tasks), context, _report_into, (told,))
         results = [pool.submit(_train_one, task) for task in tasks]
+    with pool:
         running: set[Future[_Trained]] = set(results)
         try:
             while running:
@@ -283,6 +286,7 @@ _told: Any = None
 def _report_into(told: Any) -> None:
     global _told  # noqa: PLW0603 (one process, one queue)
     _told = told
+    forget_safe_path()
     leave_signals_to_parent()
 
 
