@@ -23,6 +23,13 @@ from merge_sumo.sumo.corridor import Corridor
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
+    """Run in this process alone where somebody reads along, or only a few files are wanted."""
+    alone = config.option.capture == "no" or all(".py" in name for name in config.args)
+    return 0 if alone else None
+
+
 def require(available: bool, reason: str) -> None:
     """Skip with a reason where something is absent; fail instead when CI=true."""
     if available:

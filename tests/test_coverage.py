@@ -13,8 +13,8 @@ import pytest
 from conftest import some
 
 from merge_sumo.samplers.base import LevelHistory, Sampler
-from merge_sumo.samplers.belief import CALIBRATION, _as_if, _calibrated, margin_of
-from merge_sumo.samplers.coverage import NEAREST, PATIENCE, CoverageSampler, _limit, _Search, _trust
+from merge_sumo.samplers.belief import CALIBRATION, Trust, _as_if, _calibrated, margin_of
+from merge_sumo.samplers.coverage import NEAREST, PATIENCE, CoverageSampler, _limit, _Search
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.ground import Ground, _Scattered
 from merge_sumo.samplers.registry import make_sampler
@@ -297,11 +297,11 @@ class TestTheTrust:
         return LevelHistory(points, score, failed, gap_m, np.arange(200) // 20)
 
     def test_is_whole_where_the_picks_came_true(self):
-        assert _trust(self.history(failing_late=True))[0] == 1.0
+        assert Trust(self.history(failing_late=True)).factors[0] == 1.0
 
     def test_is_small_where_they_did_not(self):
-        assert _trust(self.history(failing_late=False)).min() < 0.5
+        assert Trust(self.history(failing_late=False)).factors.min() < 0.5
 
     def test_is_whole_while_there_is_little_to_judge_by(self):
         first = self.history(failing_late=False).take(slice(120))
-        assert _trust(first).tolist() == [1.0, 1.0]
+        assert Trust(first).factors.tolist() == [1.0, 1.0]

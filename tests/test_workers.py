@@ -114,7 +114,7 @@ class TestAnyWorkers:
         assert found == [(place, place * place) for place in range(count)]
 
     def test_raise_what_the_function_raises_and_work_on(self, workers):
-        with pytest.raises(UserError, match="nothing like [56] here"):
+        with pytest.raises(UserError, match=r"nothing like [56] here"):
             list(workers.run(refuse, [5, 6], no_loss))
         assert sorted(workers.run(squares, [5, 6], no_loss)) == [(0, 25), (1, 36)]
 

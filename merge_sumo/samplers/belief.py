@@ -52,6 +52,10 @@ LOG_PRIOR_WIDTH: Final = (np.log(0.02), 1.5)
 """Widths w that are tried, and mean and standard deviation of log w before anything is known."""
 SURE: Final = 1e-3
 """Probabilities nearer to 0 or 1 than this are not told apart, nor are weights of evidence."""
+FORETOLD: Final = 100
+"""Cases, the last ones, that a belief without them foretells, to see how far it can be trusted."""
+FAR: Final = 2.0
+"""Radii of the FMC from the nearest failure from which a case is far from all of them."""
 JUDGED_FROM: Final = 3
 """Failures, and safe cases, that it takes to tell somebody else P(fail)."""
 
@@ -120,6 +124,35 @@ class Belief:
         self._weights = np.exp(np.array(best) - max(best))
 
 
+class Trust:
+    """How far P(fail) is to be trusted, near failures and far from them.
+
+    Cases are picked where P(fail) is large, so among them it is too large more often than not.
+    What came of the last picks tells by how much.
+
+    Attributes:
+        factors: what it is multiplied by, near failures and far from them, (2,).
+    """
+
+    def __init__(self, history: LevelHistory) -> None:
+        """Compare what became of the last cases with what those before them let one expect."""
+        self._failing = history.points[history.failed]
+        self.factors = np.ones(2)
+        first = len(history.points) - FORETOLD
+        if first < FORETOLD // 2:
+            return
+        before, since = history.take(slice(first)), history.take(slice(first, None))
+        far = _far(since.points, before.points[before.failed])
+        foretold = np.bincount(far, Belief(before).of(since.points), minlength=2)
+        failed = np.bincount(far, since.failed, minlength=2)
+        self.factors = np.minimum((failed + 1.0) / (foretold + 1.0), 1.0)
+
+    def of(self, belief: Belief, cases: FloatArray) -> FloatArray:
+        """Return P(fail) of cases, (m, d), by a belief and what it has been worth."""
+        trusted: FloatArray = belief.of(cases) * self.factors[_far(cases, self._failing)]
+        return trusted
+
+
 def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | None:
     """Return a function that gives P(fail), (n,), at points, (n, d), of the unit cube.
 
@@ -169,6 +202,11 @@ def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
         return [history.failed, safe, safe]
     pov_first = np.nan_to_num(history.dx_m, nan=NO_GAP_M) >= 0.0
     return [history.failed, safe & ~pov_first, safe & pov_first]
+
+
+def _far(points: FloatArray, failing: FloatArray) -> NDArray[np.int64]:
+    """Return for each point, (n,), 1 where no failure is near, else 0."""
+    return (nearest(points, failing) > FAR * radius_for(points.shape[1])).astype(np.int64)
 
 
 def nearest(points: FloatArray, others: FloatArray) -> FloatArray:

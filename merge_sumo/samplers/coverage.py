@@ -12,12 +12,11 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import LevelHistory, Sampler
-from merge_sumo.samplers.belief import Belief, gap_m, has_gaps, nearest
-from merge_sumo.samplers.candidates import LOCAL_REACH, REFINED_REACH, around, of_belief, spread_out
+from merge_sumo.samplers.belief import Belief, Trust, gap_m, has_gaps
+from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
 from merge_sumo.samplers.foresight import Record
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, greedy
 from merge_sumo.samplers.ground import Ground
@@ -45,8 +44,6 @@ NEAREST: Final = 3
 """Failures that it takes to aim at failures alone, and else how many cases stand in for them."""
 PATIENCE: Final = 40
 """Cases that are run before anything stands in for failures."""
-FORETOLD: Final = 100
-"""Cases, the last ones, that a belief without them foretells, to see how far it can be trusted."""
 
 
 class CoverageSampler(Sampler):
@@ -166,55 +163,27 @@ class _Search:
         failing = history.points[history.failed]
         self._ground = Ground(history.dims)
         self._ground.cover(self._ground.balls(failing), 1.0)
-        limit, trust = _limit(history), _trust(history)
+        limit, trust = _limit(history), Trust(history)
         belief = Belief(history, limit)
-
-        def trusted(of: Belief, cases: FloatArray) -> FloatArray:
-            return of.of(cases) * trust[_far(cases, failing)]
-
         candidates = of_belief(history, belief, rng, n)
-        probability, balls = trusted(belief, candidates), self._ground.balls(candidates)
+        probability, balls = trust.of(belief, candidates), self._ground.balls(candidates)
         worth = probability * self._ground.new(balls)
         best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
         refined = around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
         candidates = np.concatenate([candidates, refined])
-        probability = np.concatenate([probability, trusted(belief, refined)])
+        probability = np.concatenate([probability, trust.of(belief, refined)])
         balls = np.concatenate([balls, self._ground.balls(refined)])
         worth = probability * (self._ground.new(balls) + EVEN_IF_COVERED)
         kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
         self._candidates, self._aim = candidates[kept], probability[kept]
         self._probability = (
-            self._aim if limit is None else trusted(Belief(history), self._candidates)
+            self._aim if limit is None else trust.of(Belief(history), self._candidates)
         )
 
     def batch(self, n: int) -> Proposal:
         """Return the greedy batch of `n` cases."""
         picks, gain = greedy(self._ground, self._candidates, self._aim, self._probability, n)
         return Proposal(self._candidates[picks], gain, self._probability[picks], (None,) * n)
-
-
-def _far(points: FloatArray, failing: FloatArray) -> NDArray[np.int64]:
-    """Return for each point, (n,), 1 where no failure is within LOCAL_REACH, else 0."""
-    reach = LOCAL_REACH * radius_for(points.shape[1])
-    return (nearest(points, failing) > reach).astype(np.int64)
-
-
-def _trust(history: LevelHistory) -> FloatArray:
-    """Return what P(fail) is multiplied by, near failures and far from them, (2,).
-
-    Cases are picked where P(fail) is large, so among them it is too large more often than not.
-    What came of the last picks tells by how much.
-    """
-    first = len(history.points) - FORETOLD
-    if first < FORETOLD // 2:
-        return np.ones(2)
-    before, since = history.take(slice(first)), history.take(slice(first, None))
-    failing = before.points[before.failed]
-    chance = Belief(before).of(since.points)
-    far = _far(since.points, failing)
-    foretold = np.bincount(far, chance, minlength=2)
-    failed = np.bincount(far, since.failed, minlength=2)
-    return np.minimum((failed + 1.0) / (foretold + 1.0), 1.0)
 
 
 def _limit(history: LevelHistory) -> float | None:

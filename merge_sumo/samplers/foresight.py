@@ -119,6 +119,14 @@ class Record:
         """Whether the record says that nothing can be foretold of this VUT."""
         return self._cases >= JUDGED_FROM and bool((self.twin < WORTHLESS).all())
 
+    @property
+    def is_past_teaching(self) -> bool:
+        """Whether, after many cases, nothing is made of the games where members disagree.
+
+        A case that they would learn most from is one that the search would have used better.
+        """
+        return self._cases >= TRUSTED_FROM and bool(self.twin[0] < WORTHLESS)
+
     def expert(self, rng: np.random.Generator) -> int:
         """Return one of the experts by chance, the better ones more often."""
         return int(rng.choice(len(self.experts), p=self.experts))

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.samplers.base import LevelHistory
-from merge_sumo.samplers.belief import Belief
+from merge_sumo.samplers.belief import Belief, Trust
 from merge_sumo.samplers.candidates import (
     LOCAL_REACH,
     REFINED_REACH,
@@ -60,6 +60,7 @@ def informed_batch(
     ground = Ground(dims)
     ground.cover(ground.balls(failing), 1.0)
     belief = Belief(history) if len(history.points) >= FEWEST else None
+    trust = Trust(history)
 
     def best(points: FloatArray, probability: FloatArray, most: int) -> FloatArray:
         """Return the candidates that are worth the most by themselves."""
@@ -70,7 +71,7 @@ def informed_batch(
         """Return gaps, (E, G, m), and P(fail) by the games, by the surrogate and by both, (m,)."""
         gaps_m = play(points)
         p_twin = record.chance(gaps_m)
-        p_surrogate = p_twin if belief is None else belief.of(points)
+        p_surrogate = p_twin if belief is None else trust.of(belief, points)
         return gaps_m, p_twin, p_surrogate, record.mixed(gaps_m, p_twin, p_surrogate)
 
     uniform = anywhere(ANYWHERE, dims, ON_FACES, rng)
@@ -78,7 +79,7 @@ def informed_batch(
     if belief is not None:
         screened.append(between(belief, BETWEEN, rng))
         proposed = rng.permutation(of_belief(history, belief, rng, n))[:ASKED]
-        chosen.append(best(proposed, belief.of(proposed), OF_THE_BELIEF))
+        chosen.append(best(proposed, trust.of(belief, proposed), OF_THE_BELIEF))
     if len(failing):
         screened.append(around(failing, NEAR, LOCAL_REACH * reach, rng))
     candidates = np.concatenate(screened)
@@ -105,7 +106,8 @@ def informed_batch(
         )
         ground.cover(ground.balls(spread), PICKED)
     gaps_m, p_twin, p_surrogate, p_fail = known
-    curious = record.doubt(gaps_m) if n >= EXPLORES_FROM else None
+    explores = n >= EXPLORES_FROM and not record.is_past_teaching
+    curious = record.doubt(gaps_m) if explores else None
     picks, gain = greedy(ground, points, p_fail, p_fail, n - len(first), curious)
     picks, gain = first + picks, np.concatenate([np.ones(len(first)), gain])
     said = tuple(Foretold.of(gaps_m[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks)
