@@ -124,6 +124,7 @@ class TestRobustness:
     def test_decides_a_campaign(self, tmp_path, command_line):
         code, out, err = command_line(
             *("campaign", "--vut", "design1", "--level", 0, "--cases", 20, "--json", "-q"),
+            *("--sampler", "gpr"),
             *("--require", NEAR, "--out", tmp_path / "run"),
         )
         assert (code, err) == (0, "")
