@@ -140,7 +140,7 @@ def concluded(done: Run, settings: CampaignSettings, road: Corridor) -> Campaign
 
 def rerun(
     run: AnyRun,
-    indices: Iterable[int] = (),
+    indices: Iterable[int] | int = (),
     *,
     vut: AnyVut | None = None,
     workers: int = 1,
@@ -168,7 +168,7 @@ def rerun(
     today = settings_today(opened.run, settings, trust=trust_vut)
     with open_workers(today.workers(workers)) as there:
         where = None if net is None else Path(net)
-        return run_again(opened.run, today, tuple(indices), net=where, workers=there)
+        return run_again(opened.run, today, _listed(indices), net=where, workers=there)
 
 
 def compare_runs(
@@ -213,6 +213,8 @@ def history(runs: Iterable[AnyRun], *, out: Path | str | None = None) -> History
     Raises `UserError` for fewer than two campaigns, and where scenario, criterion, initial speed
     of the VUT or POV differ.
     """
+    if isinstance(runs, str | Path | CampaignRun):
+        raise UserError("give several campaigns in a list, the oldest first")
     if out is not None:
         check_new_file(Path(out))
     found = history_of([_opened(run).run for run in runs])
@@ -221,12 +223,16 @@ def history(runs: Iterable[AnyRun], *, out: Path | str | None = None) -> History
     return found
 
 
+def _listed(indices: Iterable[int] | int) -> tuple[int, ...]:
+    return (indices,) if isinstance(indices, int) else tuple(indices)
+
+
 EXPORTS: Final = "exports"
 
 
 def export(
     run: AnyRun,
-    indices: Iterable[int] | None = None,
+    indices: Iterable[int] | int | None = None,
     *,
     file_format: str = "sumo",
     out: Path | str | None = None,
@@ -242,7 +248,7 @@ def export(
         net: SUMO net to use instead of the scenario's.
     """
     loaded = _opened(run).run
-    wanted = None if indices is None else list(indices)
+    wanted = None if indices is None else list(_listed(indices))
     if file_format in ("csv", "parquet"):
         wanted = wanted or [outcome.index for outcome in loaded.outcomes]
         folder = Path(out) if out is not None else loaded.folder / EXPORTS

@@ -11,7 +11,14 @@ from handmade import write_run
 from rich.console import Console
 
 from merge_sumo.reports import progress
-from merge_sumo.reports.progress import CampaignPanel, Counter, is_watched, left_text, rate_text
+from merge_sumo.reports.progress import (
+    Bars,
+    CampaignPanel,
+    Counter,
+    is_watched,
+    left_text,
+    rate_text,
+)
 from merge_sumo.reports.summary import summarise
 
 
@@ -104,11 +111,32 @@ class TestARate:
         assert "120/180 cases" in panel._line()
         assert panel._line().endswith("2.0 cases/s, 0:30 left")
 
-    def test_of_a_bar_counts_from_its_opening(self, clock):
+    def test_of_a_bar_counts_from_its_opening(self, clock, capsys):
         with Counter("runs", 4, "runs") as counter:
             clock[0] += 2.0
             counter.ended(1)
-            assert counter._progress.tasks[0].fields["note"].startswith("30 runs/min")
+        assert capsys.readouterr().err == "runs: 1/4, 30 runs/min  0:06 left\n"
+
+
+class TestABar:
+    def test_is_a_line_for_every_tenth_where_there_is_no_terminal(self, clock, capsys):
+        with Counter("truth", 1000, "cases") as counter:
+            for _ in range(40):
+                clock[0] += 0.5
+                counter.ended(25, "of 3 levels")
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 10
+        assert lines[0] == "truth: 100/1,000, 50 cases/s  of 3 levels  0:18 left"
+        assert lines[-1] == "truth: 1,000/1,000, 50 cases/s  of 3 levels"
+
+    def test_on_a_terminal_shows_the_time_that_its_rate_leaves(self, clock):
+        drawn = io.StringIO()
+        with Bars(Console(file=drawn, force_terminal=True, width=100)) as bars:
+            clock[0] += 2.0
+            bars.show("truth", 50, 200, "25 cases/s")
+        assert "50/200" in drawn.getvalue()
+        assert "0:06 left" in drawn.getvalue()
+        assert " 0/200" not in drawn.getvalue()
 
 
 def test_what_is_left_is_in_hours_where_it_takes_that_long():

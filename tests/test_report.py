@@ -109,13 +109,7 @@ class TestThePage:
 
     def test_quotes_a_folder_with_a_space(self, tmp_path):
         run = write_run(tmp_path / "a run", per_level=10)
-        assert data_of(report_page(run))["export"].endswith(" '" + str(tmp_path / "a run") + "'")
-
-    def test_gives_the_replay_of_a_case_that_is_exported(self, tmp_path):
-        run = write_run(tmp_path / "run", per_level=10)
-        folder = run.folder / "scenarios" / "case-00003"
-        folder.mkdir(parents=True)
-        assert data_of(report_page(run))["commands"] == {"3": f"merge-sumo replay {folder} --gui"}
+        assert data_of(report_page(run))["replay"].endswith(" '" + str(tmp_path / "a run") + "'")
 
     def test_lists_the_worst_and_the_nearest_misses(self, made, page):
         root = root_of(page)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -56,9 +57,22 @@ class TestTheCommand:
             f"identical: {_rows(tmp_path / 'kept')} rows of x, y, position and speed\n",
         )
 
-    def test_of_a_campaign_is_replayed_by_its_own_folder(self, command_line, run):
-        code, _, said = command_line("replay", run.folder)
-        assert (code, f"{run.folder} is a campaign: name a case in" in said) == (2, True)
+    def test_of_a_campaign_is_replayed_by_its_index_as_often_as_one_likes(
+        self, command_line, run, tmp_path
+    ):
+        folder = shutil.copytree(run.folder, tmp_path / "run")
+        index = next(o.index for o in run.outcomes if not o.failed)  # which is not exported yet
+        for _ in range(2):
+            code, out, _ = command_line("replay", folder, index)
+            assert (code, out.startswith("identical: ")) == (0, True)
+        assert (folder / "scenarios" / f"case-{index:05d}" / "replay.sumocfg").is_file()
+        code, _, said = command_line("replay", folder)
+        assert (code, f"{folder} is a campaign: say which case" in said) == (2, True)
+        assert command_line("replay", folder, 60)[0] == 2
+
+    def test_that_is_no_campaigns_has_no_index(self, command_line):
+        code, _, said = command_line("replay", "scenarios/stalemate", 3)
+        assert (code, "is no campaign, so it has no case 3" in said) == (2, True)
 
     def test_says_the_same_of_a_recorded_case_as_its_campaign(self, command_line, run):
         code, out, _ = command_line("run", "--case", run.folder, "7", "--json")

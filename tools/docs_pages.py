@@ -1,6 +1,7 @@
 """Pages of the site that are made from the code, and what it shows from other folders.
 
-MkDocs calls `on_files` (see `mkdocs.yml`); python tools/docs_pages.py reference/cli.md prints one.
+MkDocs calls `on_files` and `on_page_markdown` (see `mkdocs.yml`);
+python tools/docs_pages.py reference/cli.md prints one.
 """
 
 from __future__ import annotations
@@ -76,6 +77,17 @@ def on_files(files: Any, config: Any) -> Any:
     for path in (*SHOWN, *(p.relative_to(ROOT).as_posix() for p in ROOT.glob(PICTURES))):
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
     return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Return a page whose links out of docs/ lead to where the site has it (MkDocs calls this).
+
+    They are written as they hold in a checkout.
+    """
+    if page.file.src_uri in SHOWN:
+        return markdown
+    up = "../" * page.file.src_uri.count("/")
+    return markdown.replace(f"]({up}../", f"]({up}")
 
 
 if __name__ == "__main__":

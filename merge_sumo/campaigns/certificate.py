@@ -38,6 +38,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
+from merge_sumo.system.printable import two_digits
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import Dimension, level_name
 
@@ -315,7 +316,7 @@ def _found(
 
 def _sentence(radius: float, found: Mapping[int, Found], settings: CampaignSettings) -> str:
     most = max((settings.scenario.dimensions(level) for level in found), key=len)
-    parts = [f"{radius * (d.high - d.low):.2g} {_unit(d)}" for d in most]
+    parts = [f"{two_digits(radius * (d.high - d.low))} {_unit(d)}" for d in most]
     ball = f"ball of radius {100.0 * radius:g} % of the axes ({', '.join(parts)})"
     cases, failures, untold, twice, otherwise = (
         sum(getattr(of_level, name) for of_level in found.values())

@@ -62,6 +62,7 @@ class CampaignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels; the scenario says what is left out."""
+        self._check_types()
         if self.policies is not None:
             object.__setattr__(self, "policies", str(policies_in(self.policies)))
         fixed = self.scenario.v_vut0_mps
@@ -108,6 +109,14 @@ class CampaignSettings:
         if self.v_vut0_mps is not None and not 0.0 <= self.v_vut0_mps <= most_mps:
             raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
         self.stopping_rule()
+
+    def _check_types(self) -> None:
+        hints = get_type_hints(CampaignSettings)
+        for name, value in ((spec.name, getattr(self, spec.name)) for spec in fields(self)):
+            if not _fits(value, hints[name]):
+                parts = (hints[name], *get_args(hints[name]))
+                wanted = next((words for kind, words in KINDS.items() if kind in parts), "")
+                raise UserError(f"{name} is {value!r}: it must be {wanted or hints[name]}")
 
     def _check_sampler(self) -> None:
         sampler = make_sampler(self.sampler, self.pool, self.seed)
@@ -196,7 +205,11 @@ def povs_of(
     return Povs(policies=policies_folder(policies, scenario), own=own)
 
 
-def parse_levels(text: str, povs: Povs) -> tuple[int, ...]:
+CHOICE: Final = "0, 1, 2 or all, or own with --pov"
+ONE: Final = "0, 1 or 2, or own with --pov"
+
+
+def parse_levels(text: str, povs: Povs, choice: str = CHOICE) -> tuple[int, ...]:
     """Return the levels that `--level` names: one, or all for which there is a POV.
 
     Raises `UserError` for a name of none, and where a POV of a person's own would not drive.
@@ -205,15 +218,12 @@ def parse_levels(text: str, povs: Povs) -> tuple[int, ...]:
         return povs.levels
     by_name = {level_name(level): level for level in ALL_LEVELS}
     if text not in by_name:
-        raise UserError(f"there is no POV level {text!r}: choose {CHOICE}")
+        raise UserError(f"there is no POV level {text!r}: choose {choice}")
     level = by_name[text]
     check_level(level, povs)
     if povs.own is not None and level != OWN:
         raise UserError(f"--pov drives at --level own or all, not at --level {text}")
     return (level,)
-
-
-CHOICE: Final = "0, 1, 2 or all, or own with --pov"
 
 
 def check_level(level: int, povs: Povs) -> None:
@@ -231,8 +241,8 @@ def check_level(level: int, povs: Povs) -> None:
 def one_level(text: str, povs: Povs) -> int:
     """Return the one level that `--level` names."""
     if text == "all":
-        raise UserError("--level all does not go here: choose 0, 1 or 2, or own with --pov")
-    return parse_levels(text, povs)[0]
+        raise UserError(f"--level all does not go here: choose {ONE}")
+    return parse_levels(text, povs, ONE)[0]
 
 
 def record_of(settings: CampaignSettings, net: Corridor) -> dict[str, Any]:
@@ -312,6 +322,15 @@ def _check_still_there(folder: Path, policies: str) -> None:
             f"{folder} was run with the policies in {policies}, and there are none any more: name "
             "the folder where they are now with --policies"
         ) from None
+
+
+KINDS: Final = {
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+}
+"""What a setting may be, in words."""
 
 
 def _fits(value: object, hint: Any) -> bool:

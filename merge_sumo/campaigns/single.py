@@ -49,7 +49,12 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     Raises `UserError` for a coordinate of the pool that is missing, for one that the pool at this
     level does not have, and for values with which the scenario cannot be set up.
     """
-    given = {name: float(v) for name, v in values.items() if v is not None}
+    given: dict[str, float] = {}
+    for name, value in values.items():
+        try:
+            given |= {} if value is None else {name: float(value)}
+        except (TypeError, ValueError):
+            raise UserError(f"{name} is {value!r}: it must be a number") from None
     fixed = scenario.v_vut0_mps
     if isinstance(fixed, float):
         given.setdefault("v_vut0_mps", fixed)

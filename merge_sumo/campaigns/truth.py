@@ -121,9 +121,10 @@ def ground_truth(
     loaded while it drove is kept with the truth, and a truth is only used while those files are the
     same. Cases run on `workers`, by default in this process.
     """
-    count = cases or TRUTH_CASES[level]
-    if count < 1:
-        raise UserError(f"--cases is {count}: it must be 1 or more")
+    count = TRUTH_CASES[level] if cases is None else cases
+    for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
+        if not isinstance(number, int) or number < least:
+            raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
     factory, povs, kept = _asked(vut, level, count, seed, scenario, povs, criterion)
     path = kept.path(cache)
     found = read_truth(path, level, count, scenario)

@@ -350,6 +350,7 @@ def _print_summary(
 ) -> None:
     from merge_sumo.campaigns.conductor import SCENARIOS, case_name
     from merge_sumo.campaigns.run import failures
+    from merge_sumo.reports.verdict import counted
 
     show(verdict.counts)
     if not run.criterion.is_papers:
@@ -366,8 +367,9 @@ def _print_summary(
             else f"; largest ball without a case: {unseen.radius:.0%} of the axes"
         )
         show(
-            f"  level {level_name(level)}: {found.failures} failures in {found.cases} cases, "
-            f"FMC {found.fmc:.4f}, {found.regions} regions{empty}"
+            f"  level {level_name(level)}: {counted(found.failures, 'failure')} in "
+            f"{counted(found.cases, 'case')}, FMC {found.fmc:.4f}, "
+            f"{counted(found.regions, 'region')}{empty}"
         )
     if careful is not None:
         show(careful)

@@ -182,7 +182,7 @@ def rerun(
 
     check_tolerance(tolerance)
     recorded = Run(run)
-    total = len(case or recorded.outcomes)
+    total = len(set(case or ()) or recorded.outcomes)
     settings = again.settings_today(recorded, written_settings(context), trust=trust_vut)
     with (
         open_workers(settings.workers(workers)) as there,

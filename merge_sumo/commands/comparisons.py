@@ -39,7 +39,7 @@ def print_comparisons(compared: dict[str, Comparison]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(box=None, pad_edge=False, caption="medians [quartiles]", caption_justify="left")
+    table = Table(box=None, pad_edge=False, caption=r"medians \[quartiles]", caption_justify="left")
     table.add_column("sampler")
     for heading in HEADINGS:
         table.add_column(heading, justify="right", no_wrap=True)

@@ -75,6 +75,7 @@ def probability(
     from merge_sumo.campaigns.run import Run
     from merge_sumo.campaigns.settings import settings_of
     from merge_sumo.reports.progress import Counter
+    from merge_sumo.reports.verdict import counted
     from merge_sumo.system.workers import open_workers
 
     campaign = Run(run)
@@ -101,10 +102,11 @@ def probability(
     if as_json:
         typer.echo(json.dumps({**asdict(found), "file": str(target)}, allow_nan=False))
         return
+    failures = counted(found.failures, "failure")
     how = "under the stated distribution" if distribution else "under uniform cases"
     show(
         f"P(fail) {how}: {found.probability:.3g}, {100.0 * confidence:g} % interval "
-        f"[{found.low:.3g}, {found.high:.3g}] ({found.failures} failures in {cases} fresh cases)"
+        f"[{found.low:.3g}, {found.high:.3g}] ({failures} in {cases} fresh cases)"
     )
     if not campaign.criterion.is_papers:
         show(f"  a case fails when {campaign.criterion.words}")

@@ -88,13 +88,18 @@ def export(
 
 @app.command()
 def replay(
-    folder: Annotated[Path, typer.Argument(help="A scenario folder.")],
+    folder: Annotated[Path, typer.Argument(help="A scenario folder, or a campaign's.")],
+    case: Annotated[
+        int | None, typer.Argument(help="Index of the campaign's case in outcomes.jsonl.")
+    ] = None,
     gui: Annotated[bool, typer.Option("--gui", help="Open it in sumo-gui.")] = False,
+    net: NetOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Replay a scenario in SUMO and check every position and speed against its record.
 
-    Says "identical" (exit code 0) or "diverged at t = ..." (exit code 1).
+    A case of a campaign is exported first, where it is not yet. Says "identical" (exit code 0) or
+    "diverged at t = ..." (exit code 1).
 
     Example:  merge-sumo replay scenarios/stalemate --gui
     """
@@ -102,10 +107,9 @@ def replay(
     from merge_sumo.sumo import replay as replayer
 
     if (folder / SETTINGS).is_file():
-        raise UserError(
-            f"{folder} is a campaign: name a case in {folder / 'scenarios'}, which `merge-sumo "
-            "export` writes"
-        )
+        folder = _exported(folder, case, net)
+    elif case is not None:
+        raise UserError(f"{folder} is no campaign, so it has no case {case}: leave that away")
     if gui:
         raise typer.Exit(replayer.open_gui(folder))
     result = replayer.replay(folder)
@@ -117,6 +121,26 @@ def replay(
     else:
         show(f"diverged at t = {result.diverged_at_s:.1f} s: {result.detail}")
     raise typer.Exit(0 if identical else 1)
+
+
+def _exported(run: Path, case: int | None, net: Path | None) -> Path:
+    """Return the folder of a campaign's case, which is written where it is not there yet."""
+    from merge_sumo.campaigns.conductor import SCENARIOS, case_name
+    from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.campaigns.run import Run
+    from merge_sumo.reports import exports
+
+    if case is None:
+        raise UserError(
+            f"{run} is a campaign: say which case, as in `merge-sumo replay {quoted(run)} 3`"
+        )
+    folder = run / SCENARIOS / case_name(case)
+    if not folder.is_dir():
+        check_own(run / SCENARIOS)
+        loaded = Run(run)
+        road = road_for(loaded.scenario, net)
+        list(exports.write_folders(loaded, [case], run / SCENARIOS, exports.write_sumo, road))
+    return folder
 
 
 @app.command()

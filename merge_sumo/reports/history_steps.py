@@ -33,7 +33,7 @@ class Became(StrEnum):
 
     FIXED = "fixed"
     BROKE = "broke"
-    STILL = "still fails"
+    STILL = "still failing"
     NOT_SEEN_AFTER = "not looked at after"
     NOT_SEEN_BEFORE = "not looked at before"
 

@@ -17,7 +17,6 @@ from rich.progress import (
     Progress,
     TaskID,
     TextColumn,
-    TimeRemainingColumn,
 )
 from rich.progress_bar import ProgressBar
 from rich.table import Table
@@ -85,41 +84,62 @@ def is_watched() -> bool:
     return _notebook() is not None or sys.stderr.isatty()
 
 
+PLAIN_LINES: Final = 10
+"""Lines that are said of what goes on where there is no terminal to draw on."""
+
+
 class Bars:
     """Progress bars by title; the first appears with the first thing that is counted.
 
-    So a command that is refused shows its sentence and no bar.
+    So a command that is refused shows its sentence and no bar. Where there is no terminal to draw
+    on, a line stands after every tenth of a bar.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, console: Console | None = None) -> None:
         """Show nothing yet."""
+        self._console = console or Console(stderr=True)
         self._progress = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[note]}", markup=False),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
+            console=self._console,
         )
         self._tasks: dict[str, TaskID] = {}
         self._start_s: dict[str, float] = {}
+        self._shown: dict[str, int] = {}
+        """How much of each bar was done in its last line."""
         self._opened_s = time.monotonic()
 
     def show(self, title: str, completed: int, total: int, note: str) -> None:
         """Set a bar."""
-        if title not in self._tasks:
-            self._progress.start()
-            shown = printable(title)
+        if title not in self._start_s:
             # What ends first began before: with the others, or when the bar before was full.
             self._start_s[title] = self._opened_s
-            self._tasks[title] = self._progress.add_task(shown, total=total, note=note)
-        self._progress.update(self._tasks[title], completed=completed, note=note)
+        left = left_text(completed, total, self.elapsed_s(title)) if completed < total else ""
+        said = "  ".join(filter(None, (note.strip(), left)))
+        if not self._console.is_terminal:
+            self._say_line(title, completed, total, said)
+        elif title in self._tasks:
+            self._progress.update(self._tasks[title], completed=completed, note=said)
+        else:
+            self._progress.start()
+            self._tasks[title] = self._progress.add_task(
+                printable(title), total=total, completed=completed, note=said
+            )
         if completed >= total:
             self._opened_s = time.monotonic()
 
+    def _say_line(self, title: str, completed: int, total: int, said: str) -> None:
+        since = completed - self._shown.get(title, 0)
+        if since >= -(-total // PLAIN_LINES) or (completed >= total and since):
+            self._shown[title] = completed
+            line = f"{printable(title)}: {completed:,}/{total:,}, {said}"
+            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
     def say(self, text: str) -> None:
         """Print a line above the bars."""
-        self._progress.console.print(text)
+        self._console.print(text)
 
     def elapsed_s(self, title: str) -> float:
         """Return the seconds since the work of a bar began."""
@@ -151,8 +171,6 @@ class Counter(Bars):
         self.show(self._title, self._count, self._total, f"{rate}  {note}")
 
 
-PLAIN_LINES: Final = 10
-"""Lines that a campaign says where there is no terminal to draw on."""
 FRESH_S: Final = 0.5
 """Seconds for which a coverage that is shown may be old."""
 

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.conductor import SCENARIOS, case_name
 from merge_sumo.reports.coordinates import Coordinate
 from merge_sumo.reports.diagnosis import (
     Diagnosis,
@@ -40,7 +39,6 @@ MOST_BALLS: Final = 20_000
 def page_data(facts: Facts) -> dict[str, Any]:
     """Return what the script draws from: plain JSON."""
     speeds, offsets = _packed(facts.motion)
-    scenarios = facts.run.folder / SCENARIOS
     return {
         "dt": DT_S,
         "crash_m": facts.run.scenario.dx_crash_m,
@@ -59,9 +57,7 @@ def page_data(facts: Facts) -> dict[str, Any]:
         "speeds": speeds,
         "maps": _maps(facts),
         "search": _search(facts),
-        "commands": _commands(facts),
-        "export": f"merge-sumo export {_quoted(facts.run.folder)}",
-        "replay": f"merge-sumo replay {_quoted(scenarios / 'case-NNNNN')} --gui",
+        "replay": f"merge-sumo replay {_quoted(facts.run.folder)}",
         **_road(facts.road),
     }
 
@@ -187,16 +183,6 @@ def _median(values: FloatArray) -> float | None:
     """Return the median of those that are numbers, if there are any."""
     known = values[~np.isnan(values)]
     return round(float(np.median(known)), 3) if len(known) else None
-
-
-def _commands(facts: Facts) -> dict[int, str]:
-    """Return the commands that replay the cases that are exported already."""
-    folder = facts.run.folder / SCENARIOS
-    return {
-        o.index: f"merge-sumo replay {_quoted(folder / case_name(o.index))} --gui"
-        for o in facts.shown
-        if (folder / case_name(o.index)).is_dir()
-    }
 
 
 def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:

@@ -25,7 +25,7 @@ from merge_sumo.reports.report_maps import pairs_of
 from merge_sumo.reports.summary import LevelSummary, Summary
 from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.reports.verdict import Verdict, counted, in_words
-from merge_sumo.system.printable import printable
+from merge_sumo.system.printable import printable, two_digits
 from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.empty_ball import EmptyBall
 from merge_sumo.values.fmc import fmc, radius_for
@@ -254,7 +254,7 @@ def _unseen(facts: Facts, level: int, ball: EmptyBall) -> str:
     """Return the largest ball that no case has entered, in a clause."""
     axes = facts.coordinates_of(level)
     spans = [(c, c.dimension.high - c.dimension.low) for c in axes]
-    radii = ", ".join(f"{ball.radius * span:.2g} {c.unit}" for c, span in spans)
+    radii = ", ".join(f"{two_digits(ball.radius * span)} {c.unit}" for c, span in spans)
     centre = ", ".join(
         f"{c.name} {c.dimension.low + share * span:.{c.digits}f}"
         for (c, span), share in zip(spans, ball.centre, strict=True)

@@ -87,7 +87,8 @@ class Rerun(InLines):
         )
         for one in changed[:MOST_CHANGED]:
             ends = f"{one.before.measures.end} -> {one.after.measures.end}"
-            said.append(f"  case {one.before.index}: {ends} ({one.change})")
+            change = one.change.replace("of A", "before").replace("of B", "now")
+            said.append(f"  case {one.before.index}: {ends} ({change})")
         if len(changed) > MOST_CHANGED:
             said.append(f"  and {len(changed) - MOST_CHANGED} others")
         return said

@@ -20,6 +20,11 @@ def _escaped(letter: str) -> str:
     return letter.encode("unicode_escape").decode()
 
 
+def two_digits(value: float) -> str:
+    """Return a number with two digits that mean something: 110, 6.9, 0.42."""
+    return f"{float(f'{value:.2g}'):.12g}"
+
+
 def quoted(argument: str | Path) -> str:
     """Return an argument of a command that a person may paste into a shell.
 

@@ -206,8 +206,8 @@ def _in_a_row(chunks: Iterable[Sequence[T]]) -> Iterator[_Chunk[T]]:
 
 def workers_or_cores(workers: int | None) -> int:
     """Return the number of workers: as asked, or one for each core."""
-    if workers is not None and workers < 1:
-        raise UserError(f"--workers is {workers}: it must be 1 or more")
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise UserError(f"--workers is {workers!r}: it must be a whole number, 1 or more")
     return workers or os.cpu_count() or 1
 
 

@@ -8,6 +8,7 @@ import struct
 import sys
 import threading
 from abc import abstractmethod
+from bdb import BdbQuit
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,10 +53,14 @@ class VutOptions:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if not (math.isfinite(self.deadline_s) and self.deadline_s > 0.0):
-            raise UserError(f"--deadline is {self.deadline_s}: give seconds, more than 0")
-        if not (math.isfinite(self.memory_gib) and self.memory_gib > 0.0):
-            raise UserError(f"--vut-memory is {self.memory_gib}: give GiB, more than 0")
+        if not _is_positive(self.deadline_s):
+            raise UserError(f"--deadline is {self.deadline_s!r}: give seconds, more than 0")
+        if not _is_positive(self.memory_gib):
+            raise UserError(f"--vut-memory is {self.memory_gib!r}: give GiB, more than 0")
+
+
+def _is_positive(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value) and value > 0.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -271,6 +276,8 @@ class Watch:
             raise error
         if isinstance(error, TooLate):
             return self.too_late
+        if isinstance(error, BdbQuit):
+            return "a debugger was left; breakpoints work with `merge-sumo run --debug`"
         name = text_of(error, lambda error: type(error).__name__)
         return f"{name}: {text_of(error)}{text_of(error, _place)}"
 

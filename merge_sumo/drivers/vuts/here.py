@@ -21,6 +21,7 @@ from merge_sumo.drivers.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.drivers.vuts.python import BatchedVut, FunctionVut, PythonVut, takes_one, vut_of
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.workers import workers_or_cores
 
 AnyVut = str | type | Callable[..., Any] | object
 """A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
@@ -88,6 +89,7 @@ def drivers_of(vut: Any, pov: Any, workers: int) -> tuple[str, str | None, int]:
 
     Says in a sentence where something drives in this process that could do it harm.
     """
+    workers = workers_or_cores(workers)
     specs = spec_of(vut), None if pov is None else spec_of(pov)
     for spec in specs:
         if spec is None or object_of(spec) is None:

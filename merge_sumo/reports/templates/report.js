@@ -70,14 +70,14 @@ function words(i) {
   } else if (end === "TIMEOUT") {
     parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
   } else {
-    parts.push(`${end}: ${data.errors[cases.index[i]] || "no reason given"}`);
+    parts.push(`${end}: ${(data.errors[cases.index[i]] || "no reason given").replace(/\.?$/, ".")}`);
   }
   if (cases.margin && cases.margin[i] !== null) {
     parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
   if (yields.length) {
     parts.push(yields.map(([t, who], n) => `${n ? "the" : "The"} ${who} begins to yield at ${fixed(t, 1)} s`).join(", ") + ".");
-  } else if (cases.rows[i]) parts.push("Neither yields.");
+  } else if (cases.rows[i] && (tested(i) || end === "TIMEOUT")) parts.push("Neither yields.");
   if (end === "COLLISION") {
     const until = cases.way_out[i];
     parts.push(until === null ? "There never was a way out for the VUT." : `Full braking or full acceleration of the VUT would have avoided it until ${fixed(until, 1)} s.`);
@@ -408,7 +408,7 @@ function show(i) {
   const link = byId("case-link");
   link.hidden = false;
   link.href = link.textContent = `#case-${cases.index[i]}`;
-  const command = data.commands[cases.index[i]] || `${data.export} ${cases.index[i]} && ${data.replay.replace("NNNNN", String(cases.index[i]).padStart(5, "0"))}`;
+  const command = `${data.replay} ${cases.index[i]} --gui`;
   // Lines break between words only: a hyphen in a name is no place for it.
   byId("command").replaceChildren(...command.split(" ").flatMap((word, n) => {
     const whole = document.createElement("span");
