@@ -13,6 +13,7 @@ from handmade import write_run
 from lxml import html
 
 import merge_sumo as ms
+from merge_sumo.errors import UserError
 from merge_sumo.reports.summary import summarise
 
 
@@ -98,6 +99,49 @@ def test_the_import_costs_nothing():
 def test_a_name_that_is_not_there_is_an_attribute_error():
     with pytest.raises(AttributeError, match="nothing_like_it"):
         _ = ms.nothing_like_it
+
+
+class TestWrongValues:
+    """One sentence, and nothing is left behind."""
+
+    @pytest.mark.parametrize(
+        ("values", "sentence"),
+        [
+            ({"seed": 1.5}, "seed is 1.5: it must be a whole number"),
+            ({"cases": "40"}, "cases is '40': it must be a whole number"),
+            ({"batch": 2.5}, "batch is 2.5: it must be a whole number"),
+            ({"v_vut0_mps": "x"}, "v_vut0_mps is 'x': it must be a number"),
+            ({"in_process": 1}, "in_process is 1: it must be True or False"),
+            ({"fail_when": 3}, "fail_when is 3: it must be a text"),
+            ({"deadline_s": "x"}, "--deadline is 'x': give seconds"),
+            ({"workers": "2"}, "--workers is '2': it must be a whole number, 1 or more"),
+            ({"workers": 0}, "--workers is 0: it must be a whole number, 1 or more"),
+        ],
+    )
+    def test_of_a_campaign(self, values, sentence, tmp_path):
+        with pytest.raises(UserError) as refused:
+            ms.campaign("design2", **{"cases": 4, "out": tmp_path / "run", **values})
+        assert sentence in str(refused.value)
+        assert not (tmp_path / "run").exists()
+
+    def test_of_a_case(self):
+        with pytest.raises(UserError, match="x_pov0_m is 'a': it must be a number"):
+            ms.run_case("design2", {"x_pov0_m": "a"}, v_pov0_mps=30.0)
+
+    @pytest.mark.parametrize("values", [{"cases": 2.5}, {"cases": 0}, {"cases": "x"}, {"seed": -1}])
+    def test_of_a_truth(self, values):
+        with pytest.raises(UserError, match="it must be a whole number"):
+            ms.truth("design2", 0, **values)
+
+    def test_of_a_history(self, run):
+        with pytest.raises(UserError, match="give several campaigns in a list"):
+            ms.history(str(run.folder))
+
+
+def test_one_index_is_as_good_as_a_list(run, tmp_path):
+    assert len(ms.rerun(run.folder, 3).before) == 1
+    (path,) = ms.export(run.folder, 3, out=tmp_path / "scenarios")
+    assert path.is_file()
 
 
 def test_the_example_of_the_tutorial_runs(tmp_path, monkeypatch):

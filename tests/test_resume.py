@@ -414,6 +414,45 @@ class TestTheCommand:
         assert contents(folder) == before
 
 
+class TestFromAnotherFolder:
+    """Names of a controller's files are relative to where its campaign was begun."""
+
+    @pytest.fixture
+    def begun(self, tmp_path, monkeypatch):
+        """Return a function that begins a campaign here, stops it, and goes elsewhere."""
+
+        def begin(spec: str) -> Path:
+            (tmp_path / "my_vut.py").write_text("def drive(seen):\n    return 1.0\n")
+            monkeypatch.chdir(tmp_path)
+            values = settings(vut=spec, in_process=True)
+            with pytest.raises(Stopped):
+                run_campaign(values, tmp_path / "run", check=StopAfter(2))
+            (tmp_path / "other").mkdir()
+            monkeypatch.chdir(tmp_path / "other")
+            return tmp_path / "run"
+
+        return begin
+
+    def test_goes_on_with_a_controller_that_is_named_by_its_whole_path(self, begun, tmp_path):
+        folder = begun(f"{tmp_path / 'my_vut.py'}:drive")
+        assert len(resume_campaign(folder).outcomes) == 28
+
+    def test_of_one_that_has_changed_is_refused(self, begun, tmp_path):
+        folder = begun(f"{tmp_path / 'my_vut.py'}:drive")
+        (tmp_path / "my_vut.py").write_text("def drive(seen):\n    return 0.5\n")
+        with pytest.raises(UserError, match=r"vut_files\.my_vut\.py differs"):
+            resume_campaign(folder)
+
+    def test_says_where_to_go_for_one_beside_which_it_was_begun(self, begun, monkeypatch):
+        folder = begun("my_vut.py:drive")
+        before = contents(folder)
+        with pytest.raises(UserError, match=r"was begun where my_vut\.py is"):
+            resume_campaign(folder)
+        assert contents(folder) == before
+        monkeypatch.chdir(folder.parent)
+        assert len(resume_campaign(folder).outcomes) == 28
+
+
 def kill_campaigns(kills: int, seed: int) -> str:
     """Kill and resume campaigns, and return what was said of each."""
     done = subprocess.run(

@@ -168,7 +168,7 @@ def resume_campaign(
         recorded["policies"] = record["policies"]
         # What was loaded while it ran must be the same, too, although it is not loaded yet.
         for name in FILES:
-            record[name] = _files_again(recorded, name) | (record[name] or {}) or None
+            record[name] = _files_again(recorded, name, record[name] or {}) or None
         was = recorded.get("cases")
         grown = isinstance(was, int) and was < settings.cases
         if grown:  # which cases come next does not depend on how many there are to be
@@ -201,13 +201,23 @@ def resume_campaign(
         return _go_on(settings, record, net, journal, run, before, on_case, check)
 
 
-def _files_again(recorded: Mapping[str, Any], name: str) -> Files:
-    """Return the files that a record names, as they are now."""
+def _files_again(recorded: Mapping[str, Any], name: str, known: Files) -> Files:
+    """Return the files that a record names as they are now, and those that are known by now.
+
+    A name in the record is relative to where the campaign was begun, which may be elsewhere.
+    """
     files = recorded.get(name)
-    try:
-        return {name: sha256_of(Path(name)) for name in files} if isinstance(files, dict) else {}
-    except ValueError as error:
-        raise UserError(f"{SETTINGS} has a file that no file can be named: {error}") from error
+    again: Files = {}
+    for file in files if isinstance(files, dict) else {}:
+        try:
+            now = sha256_of(Path(file))
+        except ValueError as error:
+            raise UserError(f"{SETTINGS} has a file that no file can be named: {error}") from error
+        same = [other for other in known if other.endswith(f"/{file}")]
+        if now is None and same:
+            now, known = known[same[0]], {k: v for k, v in known.items() if k != same[0]}
+        again[file] = now
+    return again | known
 
 
 def _go_on(

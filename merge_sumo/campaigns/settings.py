@@ -285,6 +285,7 @@ def settings_of(
     record = {**recorded, **(given or {})}
     if not (trust or is_own(recorded)):
         _check_strangers(folder, record, given or {})
+    _check_begun_here(folder, record, given or {})
     hints = get_type_hints(CampaignSettings)
     values: dict[str, Any] = {}
     for spec in fields(CampaignSettings):
@@ -311,6 +312,27 @@ def _check_strangers(folder: Path, record: Mapping[str, Any], given: Mapping[str
             raise UserError(
                 f"{folder} was not made here, and to go on is to run the controller that it names, "
                 f"{started or spec}: say --trust-vut if you trust it"
+            )
+
+
+def _check_begun_here(folder: Path, record: Mapping[str, Any], given: Mapping[str, object]) -> None:
+    """Raise `UserError` where a controller is to run whose files lie where somebody else stands.
+
+    Their names are relative to where the campaign was begun.
+    """
+    for spec, files, option in (
+        ("vut_command" if record.get("vut_command") else "vut", "vut_files", "--vut"),
+        ("pov", "pov_files", "--pov"),
+    ):
+        who, names = str(record.get(spec)), record.get(files)
+        if spec in given or not isinstance(names, dict):
+            continue
+        beside = [name for name in names if not Path(name).is_absolute()]
+        found = any(Path(name).exists() or f"/{name}" in who for name in beside)
+        if beside and not found:
+            raise UserError(
+                f"{folder} was begun where {beside[0]} is, and there is none here: do this in that "
+                f"folder, or name the controller anew with {option}"
             )
 
 
