@@ -239,12 +239,12 @@ class TestTheRecord:
         assert record.is_worthless
         assert record.trust < 0.1
 
-    @pytest.mark.parametrize(("cases", "right", "past"), [(99, 0, 0), (100, 0, 1), (100, 1, 0)])
-    def test_teaches_who_is_wrong_where_members_disagree_for_a_while(self, cases, right, past):
+    @pytest.mark.parametrize(("cases", "right", "doubted"), [(99, 0, 0), (100, 0, 1), (100, 1, 0)])
+    def test_doubts_who_is_wrong_for_long_where_members_disagree(self, cases, right, doubted):
         members = np.tile([1.0, 60.0], (2, 2))
         chances = (0.1, 0.9) if right else (0.9, 0.1)
         told = [outcome(i, 50.0, Foretold.of(members, *chances, 0.5)) for i in range(cases)]
-        assert Record(told, 0, 6.0).is_past_teaching == bool(past)
+        assert Record(told, 0, 6.0).is_doubted == bool(doubted)
 
     def test_prefers_the_expert_who_is_nearer_where_he_has_not_learned(self):
         outcomes = [outcome(i, 10.0) for i in range(10)]

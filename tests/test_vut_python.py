@@ -145,6 +145,7 @@ WRONG_ANSWERS = {
     "True": "answered True (bool) instead of a number",
     "1 / 0": "ZeroDivisionError: division by zero (my_vut.py, line 6)",
     "__import__('sys').exit(3)": "SystemExit: 3",
+    "breakpoint()": "a debugger was left; breakpoints work with `merge-sumo run --debug`",
     "__import__('time').sleep(60)": "took longer than the deadline of 0.3 s",
     "exec('while True: pass')": "took longer than the deadline of 0.3 s",
 }

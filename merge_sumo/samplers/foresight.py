@@ -120,10 +120,11 @@ class Record:
         return self._cases >= JUDGED_FROM and bool((self.twin < WORTHLESS).all())
 
     @property
-    def is_past_teaching(self) -> bool:
+    def is_doubted(self) -> bool:
         """Whether, after many cases, nothing is made of the games where members disagree.
 
-        A case that they would learn most from is one that the search would have used better.
+        Then the surrogate decides, which is to be trusted as far as it has earned, and a case that
+        the games would learn most from is one that the search would have used better.
         """
         return self._cases >= TRUSTED_FROM and bool(self.twin[0] < WORTHLESS)
 

@@ -60,7 +60,10 @@ def informed_batch(
     ground = Ground(dims)
     ground.cover(ground.balls(failing), 1.0)
     belief = Belief(history) if len(history.points) >= FEWEST else None
-    trust = Trust(history)
+    trust = Trust(history) if record.is_doubted else None
+
+    def believed(belief: Belief, points: FloatArray) -> FloatArray:
+        return belief.of(points) if trust is None else trust.of(belief, points)
 
     def best(points: FloatArray, probability: FloatArray, most: int) -> FloatArray:
         """Return the candidates that are worth the most by themselves."""
@@ -71,7 +74,7 @@ def informed_batch(
         """Return gaps, (E, G, m), and P(fail) by the games, by the surrogate and by both, (m,)."""
         gaps_m = play(points)
         p_twin = record.chance(gaps_m)
-        p_surrogate = p_twin if belief is None else trust.of(belief, points)
+        p_surrogate = p_twin if belief is None else believed(belief, points)
         return gaps_m, p_twin, p_surrogate, record.mixed(gaps_m, p_twin, p_surrogate)
 
     uniform = anywhere(ANYWHERE, dims, ON_FACES, rng)
@@ -79,7 +82,7 @@ def informed_batch(
     if belief is not None:
         screened.append(between(belief, BETWEEN, rng))
         proposed = rng.permutation(of_belief(history, belief, rng, n))[:ASKED]
-        chosen.append(best(proposed, trust.of(belief, proposed), OF_THE_BELIEF))
+        chosen.append(best(proposed, believed(belief, proposed), OF_THE_BELIEF))
     if len(failing):
         screened.append(around(failing, NEAR, LOCAL_REACH * reach, rng))
     candidates = np.concatenate(screened)
@@ -106,7 +109,7 @@ def informed_batch(
         )
         ground.cover(ground.balls(spread), PICKED)
     gaps_m, p_twin, p_surrogate, p_fail = known
-    explores = n >= EXPLORES_FROM and not record.is_past_teaching
+    explores = n >= EXPLORES_FROM and not record.is_doubted
     curious = record.doubt(gaps_m) if explores else None
     picks, gain = greedy(ground, points, p_fail, p_fail, n - len(first), curious)
     picks, gain = first + picks, np.concatenate([np.ones(len(first)), gain])

@@ -512,7 +512,8 @@ function TopView(figure) {
       brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
       const up = (who === VUT) === vutAbove, named = who === VUT || who === POV;
       label.setAttribute("x", clamp(x - 2.5, middle - aside, middle + aside));
-      label.setAttribute("y", -y + (up ? -3.8 * Math.min(size, 2) - letters : 2.8 * Math.min(size, 2) + letters));
+      const below = -y + (up ? -3.8 * Math.min(size, 2) - letters : 2.8 * Math.min(size, 2) + letters);
+      label.setAttribute("y", clamp(below, letters - centre - height / 2, height / 2 - centre - 0.4 * letters));
       label.style.fontSize = `${letters}px`;
       label.textContent = named ? `${NAMES[name]} ${fixed(mix(v, now), 1)} m/s` : name;
       // The POV's own label has the room where two would lie on each other.
