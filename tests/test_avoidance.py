@@ -14,14 +14,12 @@ import pytest
 import merge_sumo as ms
 from merge_sumo.campaigns.avoidance import (
     AVOIDANCE,
-    EVERY_STEPS,
-    Avoidance,
-    _Found,
     avoidance,
     in_a_sentence,
     read_avoidance,
     write_avoidance,
 )
+from merge_sumo.campaigns.driven_again import EVERY_STEPS, Avoidance, _Found
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import settings_of

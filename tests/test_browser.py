@@ -15,7 +15,8 @@ from conftest import require, some
 from foreign_nets import corridor_of
 from handmade import write_run
 
-from merge_sumo.campaigns.avoidance import Avoidance, write_avoidance
+from merge_sumo.campaigns.avoidance import write_avoidance
+from merge_sumo.campaigns.driven_again import Avoidance
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report, report_facts
 from merge_sumo.reports.coordinates import WRITTEN

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from merge_sumo.campaigns.avoidance import Avoidance, read_avoidance
+from merge_sumo.campaigns.avoidance import read_avoidance
+from merge_sumo.campaigns.driven_again import Avoidance
 from merge_sumo.campaigns.run import SETTINGS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison import check_comparable
