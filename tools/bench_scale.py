@@ -57,7 +57,7 @@ from merge_sumo.values.score import Outcome
 
 VUT = "design1"
 ROUNDS = 5
-CAMPAIGN_ROUNDS = 3
+CAMPAIGN_ROUNDS = 5
 PAIR_CASES = 2000
 BATCH = 20
 PARTS = ("truth", "workers", "campaign", "parent", "samplers", "files")
