@@ -224,7 +224,7 @@ def history(runs: Iterable[AnyRun], *, out: Path | str | None = None) -> History
 
 
 def _listed(indices: Iterable[int] | int) -> tuple[int, ...]:
-    return (indices,) if isinstance(indices, int) else tuple(indices)
+    return tuple(indices) if isinstance(indices, Iterable) else (int(indices),)
 
 
 EXPORTS: Final = "exports"

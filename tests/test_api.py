@@ -6,7 +6,9 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas
 import pytest
 from handmade import write_run
@@ -136,6 +138,18 @@ class TestWrongValues:
     def test_of_a_history(self, run):
         with pytest.raises(UserError, match="give several campaigns in a list"):
             ms.history(str(run.folder))
+
+
+def test_numbers_of_arrays_are_numbers(tmp_path):
+    numbers: dict[str, Any] = {
+        "cases": np.int64(4),
+        "seed": np.int32(1),
+        "v_vut0_mps": np.float32(18.0),
+    }
+    of_numpy = ms.campaign("design2", level=0, out=tmp_path / "numpy", **numbers)
+    plain = {name: number.item() for name, number in numbers.items()}
+    of_python = ms.campaign("design2", level=0, out=tmp_path / "python", **plain)
+    assert of_numpy.cases == of_python.cases
 
 
 def test_one_index_is_as_good_as_a_list(run, tmp_path):

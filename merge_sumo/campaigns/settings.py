@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from merge_sumo.campaigns.convergence import StoppingRule
 from merge_sumo.campaigns.learning import hashes, lessons
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
@@ -113,6 +115,8 @@ class CampaignSettings:
     def _check_types(self) -> None:
         hints = get_type_hints(CampaignSettings)
         for name, value in ((spec.name, getattr(self, spec.name)) for spec in fields(self)):
+            if isinstance(value, np.generic):  # a number of an array is as good as one of Python
+                object.__setattr__(self, name, value := value.item())
             if not _fits(value, hints[name]):
                 parts = (hints[name], *get_args(hints[name]))
                 wanted = next((words for kind, words in KINDS.items() if kind in parts), "")
@@ -320,10 +324,8 @@ def _check_begun_here(folder: Path, record: Mapping[str, Any], given: Mapping[st
 
     Their names are relative to where the campaign was begun.
     """
-    for spec, files, option in (
-        ("vut_command" if record.get("vut_command") else "vut", "vut_files", "--vut"),
-        ("pov", "pov_files", "--pov"),
-    ):
+    vut = "vut_command" if record.get("vut_command") else "vut"
+    for spec, files in ((vut, "vut_files"), ("pov", "pov_files")):
         who, names = str(record.get(spec)), record.get(files)
         if spec in given or not isinstance(names, dict):
             continue
@@ -332,7 +334,7 @@ def _check_begun_here(folder: Path, record: Mapping[str, Any], given: Mapping[st
         if beside and not found:
             raise UserError(
                 f"{folder} was begun where {beside[0]} is, and there is none here: do this in that "
-                f"folder, or name the controller anew with {option}"
+                "folder"
             )
 
 

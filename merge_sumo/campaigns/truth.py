@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Final, cast
 
@@ -123,7 +124,7 @@ def ground_truth(
     """
     count = TRUTH_CASES[level] if cases is None else cases
     for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
-        if not isinstance(number, int) or number < least:
+        if not isinstance(number, Integral) or number < least:
             raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
     factory, povs, kept = _asked(vut, level, count, seed, scenario, povs, criterion)
     path = kept.path(cache)

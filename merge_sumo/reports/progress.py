@@ -88,6 +88,10 @@ PLAIN_LINES: Final = 10
 """Lines that are said of what goes on where there is no terminal to draw on."""
 
 
+def _tenth(total: int) -> int:
+    return -(-total // PLAIN_LINES)
+
+
 class Bars:
     """Progress bars by title; the first appears with the first thing that is counted.
 
@@ -132,7 +136,7 @@ class Bars:
 
     def _say_line(self, title: str, completed: int, total: int, said: str) -> None:
         since = completed - self._shown.get(title, 0)
-        if since >= -(-total // PLAIN_LINES) or (completed >= total and since):
+        if since >= _tenth(total) or (completed >= total and since):
             self._shown[title] = completed
             line = f"{printable(title)}: {completed:,}/{total:,}, {said}"
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -247,8 +251,7 @@ class CampaignPanel:
             self._stale.add(level)
 
     def _is_plain_line(self) -> bool:
-        tenth = -(-self._total // PLAIN_LINES)
-        return self._ran % tenth == 0 or self._ran == self._total
+        return self._ran % _tenth(self._total) == 0 or self._ran == self._total
 
     def _refresh(self) -> None:
         """Bring the coverages up to date."""

@@ -28,6 +28,7 @@ from concurrent.futures.process import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
+from numbers import Integral
 from typing import Any, Final, Generic, Self, TypeVar
 
 from merge_sumo.errors import UserError
@@ -206,7 +207,7 @@ def _in_a_row(chunks: Iterable[Sequence[T]]) -> Iterator[_Chunk[T]]:
 
 def workers_or_cores(workers: int | None) -> int:
     """Return the number of workers: as asked, or one for each core."""
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
+    if workers is not None and (not isinstance(workers, Integral) or workers < 1):
         raise UserError(f"--workers is {workers!r}: it must be a whole number, 1 or more")
     return workers or os.cpu_count() or 1
 

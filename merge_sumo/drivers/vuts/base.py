@@ -11,6 +11,7 @@ from abc import abstractmethod
 from bdb import BdbQuit
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from time import perf_counter
 from types import FrameType, TracebackType
@@ -60,7 +61,7 @@ class VutOptions:
 
 
 def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value) and value > 0.0
+    return isinstance(value, Real) and math.isfinite(value) and float(value) > 0.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
