@@ -137,9 +137,9 @@ def campaign(
     )
     folder = dated(spec) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))
-    with going_on(settings, folder, workers, on_case, progress) as (there, _, told):
+    with going_on(settings, folder, workers, on_case, progress) as (there, panel, told):
         done = run_campaign(settings, folder, road, told, workers=there)
-    return concluded(done, settings, road)
+        return concluded(done, settings, road, there, panel)
 
 
 def run_case(

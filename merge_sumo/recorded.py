@@ -16,11 +16,12 @@ from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.drivers.vuts.here import AnyVut, drivers_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison, exports
+from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
 from merge_sumo.reports.changes import RunComparison
 from merge_sumo.reports.history import History, history_of
 from merge_sumo.reports.history_page import write_history
-from merge_sumo.reports.progress import CampaignPanel, is_watched
-from merge_sumo.reports.report import check_report
+from merge_sumo.reports.progress import is_watched
+from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.rerun import Rerun, settings_today
 from merge_sumo.reports.rerun import rerun as run_again
 from merge_sumo.results import CampaignRun
@@ -93,7 +94,7 @@ def resume(
             warn=warnings.warn,
             trust=trust_vut,
         )
-    return concluded(done, settings, road)
+        return concluded(done, settings, road, there, panel)
 
 
 @contextmanager
@@ -113,7 +114,14 @@ def going_on(
     try:
         with (
             open_workers(settings.workers(workers)) as there,
-            CampaignPanel(title, settings.cases, settings.levels, quiet=quiet) as panel,
+            panel_of(
+                title,
+                settings.cases,
+                settings.levels,
+                folder,
+                workers=there.count,
+                quiet=quiet,
+            ) as panel,
         ):
 
             def told(outcome: Outcome) -> None:
@@ -129,12 +137,14 @@ def going_on(
         raise
 
 
-def concluded(done: Run, settings: CampaignSettings, road: Corridor) -> CampaignRun:
+def concluded(
+    done: Run, settings: CampaignSettings, road: Corridor, workers: Workers, panel: CampaignPanel
+) -> CampaignRun:
     """Return a campaign that has ended, with what is found out of it behind its end."""
-    note_avoidance(done, settings, road)
+    note_avoidance(done, settings, road, workers=workers, on_part=panel.driven_again)
     link_latest(done.folder)
     run = CampaignRun(done.folder)
-    run.report()
+    write_report(run.run, run.summary, workers, panel.report_part)
     return run
 
 

@@ -58,6 +58,7 @@ def avoidance(
     *,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
+    on_part: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> list[Avoidance]:
     """Return who would have avoided each failure of a campaign, in the order of its cases.
 
@@ -71,6 +72,7 @@ def avoidance(
         net: the road.
         workers: where the failures are driven again, by default in this process.
         check: called whenever a worker is done with some of them; may raise to stop there.
+        on_part: told how many failures are done, and how many there are, from 0 on.
     """
     found = sorted(failures(run.outcomes)[:MOST], key=lambda outcome: outcome.index)
     known = {o.index: motion for o in found if (motion := _trajectory(run, o)) is not None}
@@ -88,10 +90,13 @@ def avoidance(
     again, failing = partial(drive_again, plan), list(known.items())
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as there:
+        on_part(done := 0, len(failing))
         size = min(CHUNK, math.ceil(len(failing) / there.count))
-        with closing(there.run(again, failing, _nothing_known, chunk=size)) as results:
-            for _, one in results:
-                avoided += [] if one is None else [one]
+        chunks = (failing[first : first + size] for first in range(0, len(failing), size))
+        with closing(there.run_chunks(again, chunks, _nothing_known)) as results:
+            for _, some in results:
+                avoided += [one for one in some if one is not None]
+                on_part(done := done + len(some), len(failing))
                 check()
     return sorted(avoided, key=lambda one: one.index)
 
@@ -114,12 +119,13 @@ def note_avoidance(
     *,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
+    on_part: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> str | None:
     """Find and write who would have avoided the failures of a campaign; return it in a sentence.
 
     The arguments are those of `avoidance`.
     """
-    found = avoidance(run, settings, net, workers=workers, check=check)
+    found = avoidance(run, settings, net, workers=workers, check=check, on_part=on_part)
     if not found:
         return None
     write_avoidance(run.folder, found)

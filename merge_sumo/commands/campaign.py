@@ -41,6 +41,7 @@ from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, level_nam
 if TYPE_CHECKING:
     from merge_sumo.campaigns.run import Run
     from merge_sumo.campaigns.settings import CampaignSettings
+    from merge_sumo.reports.campaign_panel import CampaignPanel
     from merge_sumo.reports.summary import Summary
     from merge_sumo.reports.verdict import Gate, Verdict
     from merge_sumo.sumo.corridor import Corridor
@@ -149,8 +150,8 @@ def campaign(
         settings_of,
     )
     from merge_sumo.drivers.vuts.base import VutOptions
+    from merge_sumo.reports.campaign_panel import panel_of
     from merge_sumo.reports.junit import check_junit
-    from merge_sumo.reports.progress import CampaignPanel
     from merge_sumo.reports.report import check_report
     from merge_sumo.reports.verdict import parse_gates
     from merge_sumo.scenarios.scenario_file import named_scenario
@@ -201,31 +202,35 @@ def campaign(
         with (
             Interrupt("finishing the running batch; once more stops at once") as interrupt,
             open_workers(settings.workers(workers), dask) as there,
+            panel_of(
+                title, settings.cases, levels, folder, workers=there.count, quiet=quiet
+            ) as progress,
         ):
-            with CampaignPanel(title, settings.cases, levels, quiet=quiet) as progress:
-                if resume is None:
-                    run = conductor.run_campaign(
-                        settings,
-                        folder,
-                        road,
-                        progress.case_ended,
-                        workers=there,
-                        check=interrupt.check,
-                    )
-                else:
-                    run = conductor.resume_campaign(
-                        folder,
-                        road,
-                        progress.case_ended,
-                        on_before=progress.ran_before,
-                        given=given,
-                        force=force,
-                        workers=there,
-                        check=interrupt.check,
-                        warn=say,
-                        trust=trust_vut,
-                    )
-            found = _looked_back(run, settings, road, there, interrupt, local=dask is None)
+            if resume is None:
+                run = conductor.run_campaign(
+                    settings,
+                    folder,
+                    road,
+                    progress.case_ended,
+                    workers=there,
+                    check=interrupt.check,
+                )
+            else:
+                run = conductor.resume_campaign(
+                    folder,
+                    road,
+                    progress.case_ended,
+                    on_before=progress.ran_before,
+                    given=given,
+                    force=force,
+                    workers=there,
+                    check=interrupt.check,
+                    warn=say,
+                    trust=trust_vut,
+                )
+            found = _looked_back(
+                run, settings, road, there, interrupt, progress, local=dask is None
+            )
     except Stopped:
         say(_how_to_go_on(folder, net, [gate.name for gate in gates], junit))
         raise
@@ -250,6 +255,7 @@ def _looked_back(
     road: Corridor,
     workers: Workers,
     interrupt: Interrupt,
+    progress: CampaignPanel,
     *,
     local: bool,
 ) -> _Found:
@@ -258,11 +264,18 @@ def _looked_back(
     from merge_sumo.reports.report import write_report
     from merge_sumo.reports.summary import summarise
 
-    careful = note_avoidance(run, settings, road, workers=workers, check=interrupt.check)
+    careful = note_avoidance(
+        run,
+        settings,
+        road,
+        workers=workers,
+        check=interrupt.check,
+        on_part=progress.driven_again,
+    )
     link_latest(run.folder)
     summary = summarise(run.outcomes, settings.levels)
     # Learned on another machine, surrogates may differ in a last bit.
-    report_file = write_report(run, summary, workers if local else None)
+    report_file = write_report(run, summary, workers if local else None, progress.report_part)
     return _Found(run, summary, careful, report_file)
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report_data import page_data
-from merge_sumo.reports.report_facts import Facts
+from merge_sumo.reports.report_facts import Facts, OnPart
 from merge_sumo.reports.report_words import page_words
 from merge_sumo.reports.summary import Summary
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
@@ -34,15 +34,22 @@ GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
 HEAD_BYTES: Final = 1000
 
 
-def write_report(run: Run, summary: Summary | None = None, workers: Workers | None = None) -> Path:
+def write_report(
+    run: Run,
+    summary: Summary | None = None,
+    workers: Workers | None = None,
+    on_part: OnPart = lambda _done, _total: None,
+) -> Path:
     """Write `report.html` into the folder of a run, in place of an older one; return its path.
 
-    `summary` is that of the run, where it is known; on `workers` its surrogates are asked. Raises
-    `UserError` when it cannot be written, or what is there is no report of ours.
+    `summary` is that of the run, where it is known; on `workers` its surrogates are asked;
+    `on_part` is told how far it is. Raises `UserError` when it cannot be written, or what is there
+    is no report of ours.
     """
     check_report(run.folder)
     path = run.folder / REPORT
-    replace_own(path, report_page(run, summary, workers).encode(errors="backslashreplace"))
+    page = report_page(run, summary, workers, on_part)
+    replace_own(path, page.encode(errors="backslashreplace"))
     return path
 
 
@@ -61,7 +68,12 @@ def check_report(folder: Path) -> None:
         raise UserError(f"{path} is no report of merge-sumo and is not replaced: move it away")
 
 
-def report_page(run: Run, summary: Summary | None = None, workers: Workers | None = None) -> str:
+def report_page(
+    run: Run,
+    summary: Summary | None = None,
+    workers: Workers | None = None,
+    on_part: OnPart = lambda _done, _total: None,
+) -> str:
     """Return the report of a run as HTML."""
     from markupsafe import Markup
 
@@ -69,11 +81,13 @@ def report_page(run: Run, summary: Summary | None = None, workers: Workers | Non
         (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
         for name in ("report.css", "report.js")
     )
-    facts = Facts(run, summary, workers)
+    facts = Facts(run, summary, workers, on_part)
     words = page_words(facts)
+    facts.part_ended()
     data = json.dumps(page_data(facts), allow_nan=False, separators=(",", ":"))
     # No "<" in the JSON: nothing in it can end its element.
     data = data.replace("<", "\\u003c")
+    facts.part_ended()
     return _template().render(
         **words,
         style=Markup(style),  # noqa: S704 (our own file)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -38,6 +39,8 @@ SHOWN: Final = 2000
 ERROR_CHARACTERS: Final = 2000
 """Of the message of a case; `outcomes.jsonl` has the whole."""
 
+OnPart = Callable[[int, int], None]
+"""Told how many parts of a report are ready, and how many there are."""
 T = TypeVar("T")
 
 
@@ -45,12 +48,17 @@ class Facts:
     """Everything that the page shows of a run."""
 
     def __init__(
-        self, run: Run, summary: Summary | None = None, workers: Workers | None = None
+        self,
+        run: Run,
+        summary: Summary | None = None,
+        workers: Workers | None = None,
+        on_part: OnPart = lambda _done, _total: None,
     ) -> None:
         """Read what the page shows; raises `UserError` where settings have no list of levels.
 
         `summary` is that of the run, where it is known; on `workers`, where they are several
-        processes, its surrogates are asked.
+        processes, its surrogates are asked. `on_part` is told how many parts of the report are
+        ready, and how many there are, from 0 on; also from another thread.
         """
         levels = run.settings.get("levels")
         if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
@@ -60,7 +68,13 @@ class Facts:
         self.summary = summary or summarise(run.outcomes, levels)
         self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
-        self._surfaces = _meanwhile(partial(_surfaces, run, self.levels, workers))
+        # The surrogate of each level; the cases; the text; the data.
+        self._on_part, self._parts, self._ready = on_part, len(self.levels) + 3, 0
+        self._counting = threading.Lock()
+        on_part(0, self._parts)
+        self._surfaces = _meanwhile(
+            partial(_surfaces, run, self.levels, workers, self.part_ended),
+        )
         self.coordinates = coordinates(run.scenario)
         self.worst = failures(run.outcomes)
         self.regions = regions_of(self.worst)
@@ -87,6 +101,13 @@ class Facts:
             index: found.kind for index, found in self.diagnoses.items() if found.kind is not None
         }
         self.truths = {level: _truth(run, self.road, level) for level in self.levels}
+        self.part_ended()
+
+    def part_ended(self) -> None:
+        """Count a part of the report that is ready."""
+        with self._counting:
+            self._ready += 1
+            self._on_part(self._ready, self._parts)
 
     @property
     def surfaces(self) -> dict[int, Surface | None]:
@@ -116,13 +137,15 @@ def _meanwhile(work: Callable[[], T]) -> Future[T]:
 
 
 def _surfaces(
-    run: Run, levels: Sequence[int], workers: Workers | None
+    run: Run, levels: Sequence[int], workers: Workers | None, on_level: Callable[[], None]
 ) -> dict[int, Surface | None]:
     """Return the surrogate of each level; what its map shows is worked out."""
-    surfaces = {level: learn_surface(run.outcomes, level, workers) for level in levels}
-    for level, surface in surfaces.items():
+    surfaces = {}
+    for level in levels:
+        surface = surfaces[level] = learn_surface(run.outcomes, level, workers)
         if surface is not None:
             surface.work_out(GRID.get(len(run.scenario.dimensions(level))))
+        on_level()
     return surfaces
 
 

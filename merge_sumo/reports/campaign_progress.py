@@ -1,0 +1,191 @@
+"""How far a campaign is: its phases with their counts and rates, the time left, what it found."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from merge_sumo.campaigns.avoidance import MOST
+from merge_sumo.campaigns.run import failures
+from merge_sumo.reports.progress import clock_text, rate_text
+from merge_sumo.reports.verdict import in_counts
+from merge_sumo.system.printable import printable
+from merge_sumo.values.case import Case, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import End
+
+
+class Phase(StrEnum):
+    """What a campaign does, in this order."""
+
+    CASES = "cases"
+    CAREFUL = "careful drivers"
+    REPORT = "report"
+
+
+UNITS: Final = {Phase.CASES: "cases", Phase.CAREFUL: "failures", Phase.REPORT: "parts"}
+"""What is counted in each phase."""
+FAILURE_S: Final = 0.02
+"""Expected time per failure and worker of the phase `CAREFUL`, before it is measured.
+
+4.8 s for 238 failures of `design1` on one worker of a server of 2023.
+"""
+LEVEL_S: Final = 1.5
+"""Expected time per level of the phase `REPORT`: 4.5 s for the three levels of 400 cases."""
+KEPT: Final = 2000
+"""Outcomes that are kept to be drawn, the newest, and failures, the newest."""
+WORST: Final = 10
+"""Failures that are listed."""
+
+
+@dataclass(slots=True)
+class Work:
+    """How far a phase is.
+
+    Attributes:
+        total: things to do.
+        start_s: when it began, by the monotonic clock.
+        done: things done.
+        before: things of these that were done before this process took over.
+        end_s: when it ended; None while it goes on.
+    """
+
+    total: int
+    start_s: float
+    done: int = 0
+    before: int = 0
+    end_s: float | None = None
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds that it has taken so far."""
+        return (time.monotonic() if self.end_s is None else self.end_s) - self.start_s
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds that are left at the rate so far; None where nothing was done yet."""
+        done = self.done - self.before
+        if self.done >= self.total:
+            return 0.0
+        return (self.total - self.done) * self.elapsed_s / done if done > 0 else None
+
+
+class CampaignProgress:
+    """Counts the cases of a campaign and the parts of what follows them."""
+
+    def __init__(self, title: str, cases: int, levels: Sequence[int], workers: int = 1) -> None:
+        """Begin with the cases; `workers` is how many processes run them."""
+        self.title = printable(title)
+        self.phase = Phase.CASES
+        self.work = {Phase.CASES: Work(cases, time.monotonic())}
+        self.cases = dict.fromkeys(levels, 0)
+        self.failing: dict[int, list[Case]] = {level: [] for level in levels}
+        self.fmc = dict.fromkeys(levels, 0.0)
+        """Coverage of the failures of a level when `refresh` was last called."""
+        self.errors = self.timeouts = 0
+        self.newest: deque[Outcome] = deque(maxlen=KEPT)
+        self.failures: deque[Outcome] = deque(maxlen=KEPT)
+        self.worst: list[Outcome] = []
+        self._workers = workers
+        self._stale: set[int] = set()
+
+    def case_ended(self, outcome: Outcome) -> None:
+        """Count a case."""
+        level = outcome.case.level
+        self.work[Phase.CASES].done += 1
+        # A campaign that was forced on may have cases of a level that it has no more.
+        self.cases[level] = self.cases.get(level, 0) + 1
+        self.errors += outcome.measures.end.is_error
+        self.timeouts += outcome.measures.end is End.TIMEOUT
+        self.newest.append(outcome)
+        if outcome.failed:
+            self.failing.setdefault(level, []).append(outcome.case)
+            self.failures.append(outcome)
+            self.worst = failures([*self.worst, outcome])[:WORST]
+            self._stale.add(level)
+
+    def ran_before(self, outcome: Outcome) -> None:
+        """Count a case that ran before: it says nothing of how fast this goes."""
+        self.case_ended(outcome)
+        work = self.work[Phase.CASES]
+        work.before += 1
+        work.start_s = time.monotonic()
+
+    def counted(self, phase: Phase, done: int, total: int) -> None:
+        """Set how far a phase behind the cases is; the one before it has ended."""
+        if phase not in self.work:
+            now_s = time.monotonic()
+            self.work[self.phase].end_s = now_s
+            self.phase, self.work[phase] = phase, Work(total, now_s)
+        self.work[phase].done = done
+
+    def refresh(self) -> None:
+        """Bring the coverages up to date."""
+        for level in self._stale:
+            self.fmc[level] = fmc(to_unit(self.failing[level], level))
+        self._stale.clear()
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until the report is written; None where nobody knows.
+
+        The phase that goes on is extrapolated by its own rate, those to come by what they took
+        elsewhere.
+        """
+        left_s = self.work[self.phase].left_s
+        if left_s is None:
+            left_s = self._expected_s(self.phase)
+        to_come = list(Phase)[list(Phase).index(self.phase) + 1 :]
+        expected = [self._expected_s(phase) for phase in to_come]
+        return None if left_s is None else left_s + sum(s for s in expected if s is not None)
+
+    def _expected_s(self, phase: Phase) -> float | None:
+        """Return how long a phase is expected to take; None of cases that nobody has seen run."""
+        if phase is Phase.CASES:
+            return None
+        if phase is Phase.REPORT:
+            return LEVEL_S * len(self.cases)
+        cases = self.work[Phase.CASES]
+        found = sum(map(len, self.failing.values()))
+        if self.phase is Phase.CASES:
+            found = round(found * max(cases.total, cases.done) / max(cases.done, 1))
+        return FAILURE_S * min(found, MOST) / self._workers
+
+    @property
+    def found(self) -> str:
+        """The numbers of errors, timeouts and failures in words."""
+        failures = sum(map(len, self.failing.values()))
+        return ", ".join(in_counts(self.errors, self.timeouts, failures))
+
+    @property
+    def left(self) -> str:
+        """The time that is left for the whole, in words; empty where nobody knows."""
+        return "" if self.left_s is None else f"about {clock_text(self.left_s)} left"
+
+    def count(self, phase: Phase) -> str:
+        """Return how far a phase is: "40/800 cases"; empty where it has not begun."""
+        work = self.work.get(phase)
+        return "" if work is None else f"{work.done}/{work.total} {UNITS[phase]}"
+
+    def rate(self, phase: Phase) -> str:
+        """Return the rate of a phase in words; empty where nothing was done yet.
+
+        Parts of a report differ too much for a rate.
+        """
+        work = self.work.get(phase)
+        if work is None or work.done == work.before or phase is Phase.REPORT:
+            return ""
+        return rate_text(work.done - work.before, work.elapsed_s, UNITS[phase])
+
+    @property
+    def line(self) -> str:
+        """How far the campaign is, in a line."""
+        named = "" if self.phase is Phase.CASES else f"{self.phase}, "
+        found = [self.found] if self.phase is Phase.CASES else []
+        parts = [self.count(self.phase), *found, self.rate(self.phase), self.left]
+        return f"{self.title}: {named}{', '.join(filter(None, parts))}"

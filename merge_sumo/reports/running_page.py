@@ -1,0 +1,164 @@
+"""The page of a campaign that runs: what is known so far, in `report.html`, for a browser to watch.
+
+It is replaced as a whole every few seconds and asks the browser to load it again; it has no script
+and loads nothing. The report replaces it in the end and asks for nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from merge_sumo.errors import UserError
+from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
+from merge_sumo.reports.coordinates import Coordinate, coordinates
+from merge_sumo.reports.report import REPORT, check_report, policy_hash
+from merge_sumo.system.folders import replace_own
+from merge_sumo.system.printable import quoted
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+FIRST_S: Final = 2.0
+"""Seconds after which the page first appears: a shorter campaign goes without."""
+EVERY_S: Final = 5
+"""Seconds between two pages."""
+MOST_SHARE: Final = 0.05
+"""Of the time of a campaign that its page may take."""
+LEFT, RIGHT, TOP, BOTTOM = 52.0, 386.0, 8.0, 294.0
+"""Edges of the plot in a map of 400 by 340."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A coordinate of a map, with what stands at its two ends."""
+
+    coordinate: Coordinate
+
+    @property
+    def name(self) -> str:
+        """Name and unit."""
+        return f"{self.coordinate.name}, {self.coordinate.unit}"
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """Lowest and highest value."""
+        at = self.coordinate.dimension
+        low, high = (f"{value:.4g}".replace("-", "−") for value in (at.low, at.high))
+        return low, high
+
+    def share(self, outcome: Outcome) -> float:
+        """Return where a case is, as a share of the axis."""
+        dimension = self.coordinate.dimension
+        value = self.coordinate.of(outcome.case)
+        # No coordinate of a level's map is missing in a case of that level.
+        return ((value or 0.0) - dimension.low) / (dimension.high - dimension.low)
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A case in a map: its CSS class and its place."""
+
+    kind: str
+    x: float
+    y: float
+
+
+class RunningPage:
+    """Writes the page of a campaign into its folder when it is time to.
+
+    It never stops a campaign: where the page cannot be written, or `report.html` is of somebody
+    else's making, there is none. Both are said when the report itself is written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Write nothing yet."""
+        self._path = folder / REPORT
+        self._due_s = time.monotonic() + FIRST_S
+        self._is_there = self._is_given_up = False
+
+    @property
+    def file(self) -> Path | None:
+        """The page; None where there is none."""
+        return self._path if self._is_there else None
+
+    def show(self, progress: CampaignProgress) -> None:
+        """Write the page if its time has come."""
+        start_s = time.monotonic()
+        if start_s >= self._due_s and not self._is_given_up:
+            self._write(progress, stopped=False)
+            took_s = time.monotonic() - start_s
+            self._due_s = start_s + max(EVERY_S, took_s / MOST_SHARE)
+
+    def stopped(self, progress: CampaignProgress) -> None:
+        """Write the last page of a campaign that ends before its report is written."""
+        if self._is_there:
+            self._write(progress, stopped=True)
+
+    def _write(self, progress: CampaignProgress, *, stopped: bool) -> None:
+        self._is_there, self._is_given_up = False, True
+        with suppress(UserError):
+            check_report(self._path.parent)
+            page = running_page(progress, self._path.parent, stopped=stopped)
+            replace_own(self._path, page.encode(errors="backslashreplace"))
+            self._is_there, self._is_given_up = True, False
+
+
+def running_page(progress: CampaignProgress, folder: Path, *, stopped: bool = False) -> str:
+    """Return the page of a campaign as HTML; of one that was `stopped`, with how to go on."""
+    from markupsafe import Markup
+
+    templates = Path(__file__).parent / "templates"
+    style = (templates / "report.css").read_text(encoding="utf-8")
+    progress.refresh()
+    return _template().render(
+        style=Markup(style),  # noqa: S704 (our own file)
+        style_hash=policy_hash(style),
+        every_s=EVERY_S,
+        now=progress,
+        stopped=stopped,
+        resume=f"merge-sumo campaign --resume {quoted(folder)}",
+        replay=f"merge-sumo replay {quoted(folder)}",
+        time=f"{datetime.now().astimezone():%H:%M:%S}",
+        phases=list(Phase),
+        maps=_maps(progress),
+        worst=progress.worst,
+        level_name=level_name,
+    )
+
+
+def _maps(progress: CampaignProgress) -> dict[int, tuple[Axis, Axis, list[Mark]]]:
+    """Return by level the two axes and the marks of a map; failures lie on top."""
+    shown = [*(o for o in progress.newest if not o.failed), *progress.failures]
+    maps = {}
+    for level in progress.cases:
+        at_level = [o for o in shown if o.case.level == level]
+        if not at_level:
+            continue
+        across, up = map(Axis, coordinates(at_level[0].case.scenario, (level,))[:2])
+        maps[level] = across, up, [_mark(o, across, up) for o in at_level]
+    return maps
+
+
+def _mark(outcome: Outcome, across: Axis, up: Axis) -> Mark:
+    kind = "fail" if outcome.failed else "safe" if outcome.is_tested else "error"
+    x = LEFT + across.share(outcome) * (RIGHT - LEFT)
+    y = BOTTOM - up.share(outcome) * (BOTTOM - TOP)
+    return Mark(kind, round(x, 1), round(y, 1))
+
+
+@cache
+def _template() -> Template:
+    """Return the template, which is compiled once."""
+    from jinja2 import Environment, PackageLoader
+
+    loader = PackageLoader("merge_sumo.reports")
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
+    return environment.get_template("running.html.jinja")
