@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import safetensors.numpy
+from numpy.typing import NDArray
 
 import merge_sumo as ms
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
@@ -17,6 +22,7 @@ from merge_sumo.campaigns.ground import GroundPlan, runs_on
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.truth import Kept, ground_truth
+from merge_sumo.drivers.levelk import ACTIONS, FEATURES
 from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_of
 from merge_sumo.drivers.povs import Povs
 from merge_sumo.drivers.vut import vut_factory
@@ -24,6 +30,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.trajectory import End
 
 SMALL = {"levels": (1,), "cases": 24, "batch": 8, "seed": 2, "sampler": "uniform"}
 
@@ -77,6 +84,21 @@ def write(folder: Path, known: dict) -> None:
 
 def outcomes(folder: Path) -> bytes:
     return (folder / OUTCOMES).read_bytes()
+
+
+def with_layers(
+    policies: Path, folder: Path, name: str, weights: Sequence[NDArray[np.float64]]
+) -> Path:
+    """Return a copy of policies in which a network has other layers, with its true hash."""
+    shutil.copytree(policies, folder)
+    path = folder / f"{name}.safetensors"
+    tensors = {f"{i}.weight": weight for i, weight in enumerate(weights)}
+    biases = {f"{i}.bias": np.zeros(len(weight)) for i, weight in enumerate(weights)}
+    safetensors.numpy.save_file(tensors | biases, path)
+    known = networks(folder)
+    known[name]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    write(folder, known)
+    return folder
 
 
 def settings(policies: Path | None, **changes) -> CampaignSettings:
@@ -308,6 +330,34 @@ class TestAFolder:
         with pytest.raises(UserError, match=r"pov1\.safetensors"):
             run_campaign(settings(folder), tmp_path / "run")
         assert not (tmp_path / "run").exists()
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e39])
+    @pytest.mark.parametrize("name", ["pov1", "vut1"])
+    def test_with_a_weight_that_is_not_finite_is_refused(self, call, same, tmp_path, name, value):
+        layers = [np.zeros((ACTIONS, FEATURES))]
+        layers[0][3, 4] = value
+        folder = with_layers(same, tmp_path / "policies", name, layers)
+        vut = "level1" if name == "vut1" else "design2"
+        code, _, err = call(
+            *("campaign", "--vut", vut, "--level", "1", "--cases", 4, "--workers", 1, "-q"),
+            *("--policies", folder, "--out", tmp_path / "run"),
+        )
+        assert code == 2
+        assert err.count("\n") == 1
+        assert f"{name}.safetensors holds no action-value network: a weight is NaN" in err
+        assert not (tmp_path / "run").exists()
+
+    @pytest.mark.parametrize(("name", "end"), [("pov1", End.SIM_ERROR), ("vut1", End.VUT_ERROR)])
+    def test_whose_action_values_are_not_finite_gives_no_result(self, same, tmp_path, name, end):
+        big = np.full((2, 2), 1e38)  # finite weights whose products are not
+        layers = [np.outer([1.0, -1.0], np.ones(FEATURES)), *[big] * 9, np.full((ACTIONS, 2), 1e38)]
+        folder = with_layers(same, tmp_path / "policies", name, layers)
+        vut = "level1" if name == "vut1" else "design2"
+        asked = dataclasses.replace(settings(folder), vut=vut)
+        ran = run_campaign(asked, tmp_path / "run")
+        assert {outcome.measures.end for outcome in ran.outcomes} == {end}
+        assert {outcome.score for outcome in ran.outcomes} == {None}
+        assert "action values that are not finite" in str(ran.outcomes[0].measures.error)
 
     @pytest.mark.parametrize("manifest", [b"", b"{", b"[]", b'{"networks": 3}', b"\xff\xfe\xfd"])
     def test_with_a_spoilt_manifest_is_refused(self, tmp_path, manifest):

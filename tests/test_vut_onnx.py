@@ -136,8 +136,42 @@ def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
     ],
 )
 def test_an_answer_that_is_no_number_is_a_vut_error(tmp_path, answer):
-    path = network(tmp_path / "bad.onnx", answer=answer)
+    path = network(tmp_path / "bad.onnx", answer=np.zeros(len(answer)))
+    model = onnx.load(path)
+    model.graph.output[0].name = "shown"
+    model.graph.node.append(
+        onnx.helper.make_node("Log", ["negative"], ["spoilt"])
+        if np.isnan(answer).any()
+        else onnx.helper.make_node("Reciprocal", ["zero"], ["spoilt"])
+    )
+    for name, value in (("negative", -1.0), ("zero", 0.0)):
+        model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([value]), name))
+    model.graph.node.append(onnx.helper.make_node("Add", ["out", "spoilt"], ["shown"]))
+    path.write_bytes(model.SerializeToString())
     assert run_cases(factory(f"onnx:{path}"), cases_of(1))[0].end is End.VUT_ERROR
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_weights_that_are_not_finite_are_refused(tmp_path, value):
+    path = network(tmp_path / "bad.onnx", answer=[0.5])
+    model = onnx.load(path)
+    weight = onnx.numpy_helper.to_array(model.graph.initializer[0]).copy()
+    weight[0, 0] = value
+    model.graph.initializer[0].CopyFrom(onnx.numpy_helper.from_array(weight, "w"))
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(UserError, match=r"bad\.onnx has weights that are not finite, in 'w'"):
+        factory(f"onnx:{path}")
+
+
+def test_infinity_as_a_limit_is_no_weight(tmp_path):
+    path = network(tmp_path / "clipped.onnx", answer=[0.5])
+    model = onnx.load(path)
+    model.graph.output[0].name = "clipped"
+    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(-np.inf), "low"))
+    model.graph.node.append(onnx.helper.make_node("Clip", ["out", "low"], ["clipped"]))
+    path.write_bytes(model.SerializeToString())
+    (trajectory,) = run_cases(factory(f"onnx:{path}"), cases_of(1))
+    assert (trajectory.a_vut_mps2[:-1] == 0.5).all()
 
 
 def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):

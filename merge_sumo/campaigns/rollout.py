@@ -232,17 +232,19 @@ class _Rollout:
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
         x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
+        _check_finite(x_m, v_mps)
         scene = Scene(self.active, self.step, x_m, v_mps)
         cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
         if following is not None:
             scene = Scene(self.active, self.step, x_m, v_mps, following.met(x_m, v_mps))
         answer = np.concatenate((cars[:VUT], self.ask_vut(scene)[None], cars[VUT:]))
+        # Before the limits of car following, which would turn an infinite answer into a number.
+        if not math.isfinite(np.vdot(answer, answer)):
+            answer = self.only_numbers(answer)
         if following is not None:
             following.limit(answer, x_m, v_mps)
         if self.follow_steps:
             keep_behind_vut(answer, x_m, v_mps, self.world.scenario)
-        if not math.isfinite(np.vdot(answer, answer)):
-            answer = self.only_numbers(answer)
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
         self.now[:, 2] = acceleration
         off = answer - acceleration
@@ -306,3 +308,12 @@ class _Rollout:
         before[-1, :, 2] = 0.0
         merged = Trajectory(episode.case, before, End.MERGED, None, episode.clipped, after)
         return episode.index, merged
+
+
+def _check_finite(x_m: FloatArray, v_mps: FloatArray) -> None:
+    """Raise `SimulationError` where a position or a speed, (A, K), is not finite."""
+    # In most steps the sums of squares are enough.
+    if math.isfinite(np.vdot(x_m, x_m) + np.vdot(v_mps, v_mps)):
+        return
+    if not (np.isfinite(x_m).all() and np.isfinite(v_mps).all()):
+        raise SimulationError("a position or a speed is not finite")

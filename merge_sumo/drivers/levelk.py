@@ -144,17 +144,28 @@ class QNetwork:
         """Whether the network's input has the social value orientation."""
         return bool(self.layers[0][0].shape[1] == FEATURES + SVO_FEATURES)
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all weights and biases are finite numbers, in float32 too."""
+        with np.errstate(over="ignore"):
+            return all(
+                bool(np.isfinite(values.astype(np.float32)).all())
+                for layer in self.layers
+                for values in layer
+            )
+
     def values(self, inputs: FloatArray) -> FloatArray:
         """Return Q, (n, actions), of inputs, (n, features).
 
         Every row is a matrix-vector product of its own, so that it is the same to the last bit
-        whatever rows stand beside it.
+        whatever rows stand beside it. Q is not finite where the products are too large.
         """
         hidden = inputs[..., None]
-        for weight, bias in self.layers[:-1]:
-            hidden = np.maximum(np.matmul(weight, hidden) + bias[:, None], 0.0)
         weight, bias = self.layers[-1]
-        values: FloatArray = (np.matmul(weight, hidden) + bias[:, None])[..., 0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            for of_hidden, bias_of_hidden in self.layers[:-1]:
+                hidden = np.maximum(np.matmul(of_hidden, hidden) + bias_of_hidden[:, None], 0.0)
+            values: FloatArray = (np.matmul(weight, hidden) + bias[:, None])[..., 0]
         return values
 
     def values_at_once(self, inputs: FloatArray) -> NDArray[np.float32]:
@@ -183,6 +194,7 @@ class LevelKDriver(Driver):
         self.network = network
         self._svo_rad = np.zeros(corridors)
         self._held = np.zeros(corridors)
+        """Accelerations, (K,); NaN where the action values of the last decision were not finite."""
         self._scenarios = [US23]
         self._scenario = np.zeros(corridors, dtype=np.int64)
         """Which of them is a corridor's; a campaign has one."""
@@ -206,7 +218,10 @@ class LevelKDriver(Driver):
         return self._held
 
     def _decide(self, due: NDArray[np.int64], scene: Scene, scenario: Scenario) -> None:
-        """Choose anew in corridors, which play a scenario."""
+        """Choose anew in corridors, which play a scenario.
+
+        Where an action value is not finite, the answer is NaN: the largest of them means nothing.
+        """
         inputs = features(
             scene.x_pov_m[due],
             scene.v_pov_mps[due],
@@ -215,4 +230,11 @@ class LevelKDriver(Driver):
             self._svo_rad[due] if self.network.sees_svo else None,
             scenario,
         )
-        self._held[due] = actions_mps2(scenario)[self.network.values(inputs).argmax(axis=1)]
+        values = self.network.values(inputs)
+        self._held[due] = actions_mps2(scenario)[values.argmax(axis=1)]
+        self._held[due[~np.isfinite(values).all(axis=1)]] = np.nan
+
+    def reason(self, corridor: int) -> str | None:
+        """Return why the answer for a corridor is NaN."""
+        finite = bool(np.isfinite(self._held[corridor]))
+        return None if finite else "its policy gives action values that are not finite"

@@ -146,7 +146,10 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
     try:
         network = QNetwork.from_tensors(load(content))
         inputs, outputs = network.layers[0][0].shape[1], network.layers[-1][0].shape[0]
-        network.values(np.zeros((1, inputs)))
+        if not network.is_finite:
+            raise ValueError("a weight is NaN, infinite or beyond float32")
+        if not np.isfinite(network.values(np.zeros((1, inputs)))).all():
+            raise ValueError("its action values are not finite")
     except (SafetensorError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise UserError(f"{path} holds no action-value network: {error}") from error
     expected = FEATURES + (SVO_FEATURES if name == "pov2" else 0)
