@@ -18,6 +18,7 @@ from typing import Any
 
 from merge_sumo.campaigns.conductor import OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.plan import plan_of, resolve
 from merge_sumo.campaigns.settings import (
     DEFAULT_CASES,
     CampaignSettings,
@@ -204,8 +205,7 @@ def run_case(
     road = road_for(settings.scenario, None if net is None else Path(net))
     if out is not None:
         check_new(Path(out))
-    driven = settings.vut_factory, one, road, settings.povs
-    found = run_one(*driven, criterion=settings.criterion, live=gui)
+    found = run_one(plan_of(settings, road, cases=1), one, live=gui)
     if out is not None:
         write_scenario(Path(out), road, found.outcome, found.trajectory)
     return CaseRun(found)
@@ -237,8 +237,6 @@ def truth(
     spec, pov_spec, workers = drivers_of(vut, pov, workers)
     options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
     povs = povs_of(policies, where, pov_spec, options)
-    criterion = Criterion(fail_when, require)
-    criterion.check(where)
     own = VutOptions(
         command=vut_command,
         deadline_s=deadline_s,
@@ -246,21 +244,19 @@ def truth(
         in_process=in_process,
         policies=povs.policies,
     )
-    factory = vut_factory(spec, own)
+    plan = resolve(
+        vut_factory(spec, own),
+        scenario=where,
+        criterion=Criterion(fail_when, require),
+        povs=povs,
+    )
     with (
         tempfile.TemporaryDirectory(prefix="merge-sumo-") as forgotten,
-        open_workers(povs.workers(factory, workers)) as there,
+        open_workers(povs.workers(plan.vut, workers)) as there,
     ):
         number = one_level(str(level), povs)
         cache = Path(forgotten) if is_here(spec) or is_here(pov_spec or "") else None
-        return ground_truth(
-            *(factory, number, cases, seed),
-            workers=there,
-            cache=cache,
-            scenario=where,
-            povs=povs,
-            criterion=criterion,
-        )
+        return ground_truth(plan, number, cases, seed, workers=there, cache=cache)
 
 
 def _scenario(scenario: Scenario | Path | str) -> Scenario:

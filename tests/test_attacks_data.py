@@ -24,17 +24,19 @@ import pytest
 from attacks import tell
 from handmade import write_run
 from lxml import etree
+from plans import key_of, plan_for
 
 from merge_sumo import cli
 from merge_sumo.api import open_run
 from merge_sumo.campaigns.conductor import SCENARIOS
 from merge_sumo.campaigns.probability import LINES
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
-from merge_sumo.campaigns.truth import Kept, Truth, ground_truth, read_truth
+from merge_sumo.campaigns.truth import Truth, ground_truth, read_truth
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report import REPORT
+from merge_sumo.values.scenario import US23
 
 FLIPS = 300
 SHOWN_SETTING = rb'<tr><th scope="row">[^\n]*</tr>\n'
@@ -239,7 +241,7 @@ def without_hashes(folder: Path) -> None:
 CASES = 30
 
 
-KEPT = Kept("design1", 0, CASES, 0, None, 5.0)
+KEPT = key_of(cases=CASES)
 
 
 def saved(**changes: Any) -> bytes:
@@ -347,7 +349,7 @@ SPOILT = {
 def true(tmp_path_factory) -> tuple[Truth, bytes]:
     """Return what is true of design 1 at level 0 in a few cases, and its file in the cache."""
     folder = tmp_path_factory.mktemp("true")
-    return ground_truth("design1", 0, CASES, cache=folder), KEPT.path(folder).read_bytes()
+    return ground_truth(plan_for("design1"), 0, CASES, cache=folder), KEPT.path(folder).read_bytes()
 
 
 class TestACache:
@@ -355,7 +357,7 @@ class TestACache:
         path = KEPT.path(folder)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
-        assert read_truth(path, 0, CASES) is None
+        assert read_truth(path, 0, CASES, US23) is None
 
     @pytest.mark.parametrize("name", SPOILT)
     def test_that_is_spoilt_is_not_believed(self, name, tmp_path):
@@ -364,7 +366,7 @@ class TestACache:
     def test_as_these_would_be_believed_is_what_the_test_spoils(self, tmp_path):
         path = KEPT.path(tmp_path)
         path.write_bytes(saved())
-        assert read_truth(path, 0, CASES) is not None
+        assert read_truth(path, 0, CASES, US23) is not None
 
     @pytest.mark.parametrize("bits", [100, pytest.param(400, marks=pytest.mark.long)])
     def test_with_any_bit_flipped_or_cut_off_anywhere_is_not_believed(self, true, tmp_path, bits):
@@ -376,7 +378,7 @@ class TestACache:
             spoilt = bytearray(content)
             spoilt[bit // 8] ^= 1 << bit % 8
             path.write_bytes(spoilt)
-            read = read_truth(path, 0, CASES)
+            read = read_truth(path, 0, CASES, US23)
             if read is not None:  # in a date, or a number that nobody reads
                 harmless += 1
                 assert np.array_equal(read.points, found.points)
@@ -388,19 +390,19 @@ class TestACache:
     @pytest.mark.parametrize(
         "other",
         [
-            Kept("design2", 0, CASES, 0, None, 5.0),
-            Kept("design1", 1, CASES, 0, None, 5.0),
-            Kept("design1", 0, CASES, 1, None, 5.0),
+            key_of(cases=CASES, vut="design2"),
+            key_of(cases=CASES, level=1),
+            key_of(cases=CASES, seed=1),
         ],
         ids=["another VUT", "another level", "another seed"],
     )
     def test_with_a_file_of_the_same_shape_under_another_name_runs_again(
         self, true, other, tmp_path
     ):
-        ground_truth(other.vut, other.level, CASES, other.seed, cache=tmp_path)
+        ground_truth(plan_for(other.vut), other.level, CASES, other.seed, cache=tmp_path)
         other.path(tmp_path).rename(KEPT.path(tmp_path))
         counted: list[int] = []
-        again = ground_truth("design1", 0, CASES, cache=tmp_path, on_cases=counted.append)
+        again = ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path, on_cases=counted.append)
         assert sum(counted) == CASES
         assert np.array_equal(again.score, true[0].score)
         assert KEPT.path(tmp_path).read_bytes() == true[1]
@@ -416,9 +418,9 @@ class TestACache:
         else:
             target = {"link": "theirs", "loop": path.name, "device": "/dev/zero"}[kind]
             path.symlink_to(target)
-        assert read_truth(path, 0, CASES) is None
+        assert read_truth(path, 0, CASES, US23) is None
         with pytest.raises(UserError, match="cannot write"):
-            ground_truth("design1", 0, CASES, cache=tmp_path)
+            ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path)
         assert (tmp_path / "theirs").read_text() == "theirs"
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from attacks import World, tell
 from conftest import require
+from plans import plan_for
 
 from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, Run
@@ -251,8 +252,8 @@ class TestAFolderThatVanishes:
     def test_with_the_cache_is_made_again(self, tmp_path):
         (tmp_path / "cache").mkdir()
         gone = Vanishing(tmp_path / "cache", at=1)
-        truth = ground_truth("design1", 0, 200, cache=tmp_path / "cache", on_cases=gone)
-        again = ground_truth("design1", 0, 200, cache=tmp_path / "cache")
+        truth = ground_truth(plan_for("design1"), 0, 200, cache=tmp_path / "cache", on_cases=gone)
+        again = ground_truth(plan_for("design1"), 0, 200, cache=tmp_path / "cache")
         assert again.score.tobytes() == truth.score.tobytes()
         assert len(list((tmp_path / "cache").iterdir())) == 1
 

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from plans import key_of, plan_for
 from test_score import CASE, ending
 
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.campaigns.truth import Kept, ground_truth
+from merge_sumo.campaigns.truth import ground_truth
 from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison import compare_runs
 from merge_sumo.reports.rerun import rerun
@@ -480,16 +481,16 @@ class TestCampaigns:
 class TestTruth:
     def test_is_of_its_criterion(self, tmp_path):
         paths = {
-            Kept("design2", 0, 60, 0, None, 5.0, criterion=Criterion(text)).path(tmp_path)
+            key_of(criterion=Criterion(text)).path(tmp_path)
             for text in ("collision", "contact", "ttc_s < 2", "ttc_s  <2", "ttc_s < 3")
         }
         assert len(paths) == 4
 
     def test_has_the_scores_of_its_criterion(self, tmp_path):
         criterion = Criterion("merged_first == 'VUT'")
-        found = ground_truth("design2", 0, 60, cache=tmp_path, criterion=criterion)
+        found = ground_truth(plan_for("design2", criterion=criterion), 0, 60, cache=tmp_path)
         assert set(found.score.tolist()) == {score_of(-1.0), score_of(1.0)}
-        again = ground_truth("design2", 0, 60, cache=tmp_path, criterion=criterion)
+        again = ground_truth(plan_for("design2", criterion=criterion), 0, 60, cache=tmp_path)
         assert np.array_equal(found.score, again.score)
 
 

@@ -8,16 +8,17 @@ import json
 import shlex
 import shutil
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from plans import key_of, plan_for
 from vut_contract import factory
 
 from merge_sumo.campaigns.experiments import Search, compare, limit_fmc, oracle, search
-from merge_sumo.campaigns.truth import Kept, Truth, ground_truth, known_truth
+from merge_sumo.campaigns.truth import Truth, ground_truth, known_truth
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import from_unit, to_unit
@@ -35,25 +36,25 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def truth(cache):
-    return ground_truth("design1", 0, 300, cache=cache)
+    return ground_truth(plan_for("design1"), 0, 300, cache=cache)
 
 
 def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
     with open_workers(2) as workers:
-        both = ground_truth("design1", 0, 300, workers=workers, cache=tmp_path)
+        both = ground_truth(plan_for("design1"), 0, 300, workers=workers, cache=tmp_path)
     assert np.array_equal(both.points, truth.points)
     assert np.array_equal(both.score, truth.score)
     assert len(truth.failures) > 0
 
 
 def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch):
-    (kept,) = cache.glob("truth-*.npz")
+    (path,) = cache.glob("truth-*.npz")
     counted: list[int] = []
-    again = ground_truth("design1", 0, 300, cache=cache, on_cases=counted.append)
+    again = ground_truth(plan_for("design1"), 0, 300, cache=cache, on_cases=counted.append)
     assert np.array_equal(again.score, truth.score)
     assert counted == []
-    kept.write_bytes(kept.read_bytes()[:100])
-    remade = ground_truth("design1", 0, 300, cache=cache, on_cases=counted.append)
+    path.write_bytes(path.read_bytes()[:100])
+    remade = ground_truth(plan_for("design1"), 0, 300, cache=cache, on_cases=counted.append)
     assert np.array_equal(remade.score, truth.score)
     assert sum(counted) == 300
 
@@ -70,15 +71,14 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
     ],
 )
 def test_the_key_of_the_cache_names_what_the_truth_depends_on(change):
-    kept = Kept("design1", 0, 300, 0, None, 5.0)
-    assert kept.path() == replace(kept).path()
-    assert kept.path() != replace(kept, **change).path()
+    assert key_of().path() == key_of().path()
+    assert key_of().path() != key_of(**change).path()
 
 
 def truth_of(vut: str, cache, **options) -> int:
     """Return in how many cases a VUT had to drive for its truth of four cases."""
     counted: list[int] = []
-    ground_truth(factory(vut, **options), 0, 4, cache=cache, on_cases=counted.append)
+    ground_truth(plan_for(factory(vut, **options)), 0, 4, cache=cache, on_cases=counted.append)
     return sum(counted)
 
 
@@ -146,7 +146,7 @@ def test_a_truth_of_a_controller_behind_traci_is_of_its_command_and_the_files_na
 
 
 def test_a_comparison_says_what_samplers_found_of_the_truth(truth):
-    (found,) = search("design1", (0,), ["uniform"], seeds=2, cases=50, batch=20).values()
+    (found,) = search(plan_for("design1"), (0,), ["uniform"], seeds=2, cases=50, batch=20).values()
     result = compare(found, {0: truth})
     assert result.cases_by_batch == [20, 40, 50]
     assert len(result.fmc_by_batch_median) == 3
@@ -158,7 +158,9 @@ def test_a_comparison_says_what_samplers_found_of_the_truth(truth):
 
 
 def test_a_search_of_all_levels_sums_their_coverage():
-    (found,) = search("design1", (0, 1), ["uniform"], seeds=1, cases=40, batch=40)["uniform"]
+    (found,) = search(plan_for("design1"), (0, 1), ["uniform"], seeds=1, cases=40, batch=40)[
+        "uniform"
+    ]
     assert {outcome.case.level for outcome in found.outcomes} == {0, 1}
     assert found.fmc[-1] == sum(fmc(found.failures(level)) for level in (0, 1))
 
@@ -259,15 +261,15 @@ class TestTheLimit:
 
 
 def test_a_truth_is_known_when_it_was_made_and_not_before(truth, cache, tmp_path):
-    assert known_truth("design1", 0, 300, cache=tmp_path) is None
-    assert known_truth("design1", 0, 301, cache=cache) is None
-    known = known_truth("design1", 0, 300, cache=cache)
+    assert known_truth(plan_for("design1"), 0, 300, cache=tmp_path) is None
+    assert known_truth(plan_for("design1"), 0, 301, cache=cache) is None
+    known = known_truth(plan_for("design1"), 0, 300, cache=cache)
     assert known is not None
     assert np.array_equal(known.score, truth.score)
 
 
 def test_the_cases_of_a_truth_are_the_first_of_a_denser_one(truth, tmp_path):
-    few = ground_truth("design1", 0, 40, cache=tmp_path)
+    few = ground_truth(plan_for("design1"), 0, 40, cache=tmp_path)
     assert np.array_equal(few.points, truth.points[:40])
     assert np.array_equal(few.score, truth.score[:40])
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plans import plan_for
 from test_score import CASE, ending
 
-from merge_sumo.campaigns.ground import ProvingGround
 from merge_sumo.drivers.following import keep_behind_vut
 from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
@@ -90,7 +90,7 @@ def run(vut, scenario):
     """Return the trajectories of the cases in a scenario."""
     cases = [replace(case, scenario=scenario) for case in CASES]
     factory = vut_factory(vut, VutOptions(in_process=True))
-    with ProvingGround(factory, 5, scenario=scenario) as ground:
+    with plan_for(factory, scenario=scenario, corridors=5).open() as ground:
         return dict(ground.run(cases))
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from conftest import some
 from handmade import write_run
+from plans import plan_for
 
 from merge_sumo.campaigns import conductor
 from merge_sumo.campaigns.conductor import export_case, run_campaign
-from merge_sumo.campaigns.ground import ProvingGround
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
@@ -175,7 +175,7 @@ class TestSumo:
     ):
         (tmp_path / name).mkdir()
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
-        with ProvingGround("design1", 1):
+        with plan_for("design1", corridors=1).open():
             pass
         assert list((tmp_path / name).iterdir()) == []
 
@@ -188,12 +188,12 @@ class TestSumo:
         (tmp_path / name).mkdir()
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
         with pytest.raises(UserError, match="set TMPDIR to one without"):
-            ProvingGround("design1", 1)
+            plan_for("design1", corridors=1).open()
 
     def test_says_so_where_there_is_no_folder_for_temporary_files(self, tmp_path, monkeypatch):
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))
         with pytest.raises(UserError, match="set TMPDIR to a folder"):
-            ProvingGround("design1", 1)
+            plan_for("design1", corridors=1).open()
 
 
 SIZES = [3990, 4000, *range(4004, 4016), 4030, 4060, 4090, 4095, 4096]

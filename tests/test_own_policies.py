@@ -15,19 +15,18 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from numpy.typing import NDArray
+from plans import key_of, plan_for
 
 import merge_sumo as ms
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
-from merge_sumo.campaigns.ground import GroundPlan, runs_on
+from merge_sumo.campaigns.ground import runs_on
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.truth import Kept, ground_truth
+from merge_sumo.campaigns.truth import ground_truth
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES
 from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_of
 from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.trajectory import End
@@ -212,14 +211,14 @@ class TestOtherCommands:
         def counted(folder: Path | None) -> int:
             ran: list[int] = []
             povs = None if folder is None else Povs(policies=folder)
-            ground_truth(*("design2", 1, 30), cache=tmp_path, povs=povs, on_cases=ran.append)
+            plan = plan_for("design2", povs=povs)
+            ground_truth(plan, 1, 30, cache=tmp_path, on_cases=ran.append)
             return sum(ran)
 
         assert [counted(folder) for folder in (None, same, swapped, swapped)] == [30, 0, 30, 0]
 
     def test_the_key_of_a_truth_has_the_hashes(self):
-        kept = Kept("design1", 0, 600, 0, None, 5.0)
-        assert kept.path() != dataclasses.replace(kept, policies={"pov1": "another"}).path()
+        assert key_of().path() != key_of(policies={"pov1": "another"}).path()
 
     def test_a_search_and_its_truth_take_them(self, call, swapped, monkeypatch, tmp_path):
         monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
@@ -367,12 +366,7 @@ class TestAFolder:
 
     def test_that_a_worker_does_not_have_is_said_in_a_sentence(self, same, tmp_path):
         folder = Path(shutil.copytree(same, tmp_path / "policies"))
-        plan = GroundPlan(
-            vut=vut_factory("design1"),
-            corridors=2,
-            net=road_of(),
-            povs=Povs(policies=folder),
-        )
+        plan = plan_for("design1", corridors=2, povs=Povs(policies=folder))
         shutil.rmtree(folder)
         with open_workers(1) as workers, pytest.raises(UserError, match="put the same files there"):
             runs_on(workers, plan)

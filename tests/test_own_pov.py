@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from conftest import some
 from misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS
+from plans import plan_for
 from processes import none_left
 from vut_contract import cases_of, factory
 
 import merge_sumo as ms
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
-from merge_sumo.campaigns.ground import ProvingGround
 from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
@@ -113,7 +113,7 @@ def run(
     """Return what became of every case against a POV of one's own."""
     povs = Povs(own=None if spec is None else own_pov(spec, VutOptions(**options)))
     scenario = cases[0].scenario
-    with ProvingGround(factory(vut), corridors, None, scenario, povs) as ground:
+    with plan_for(factory(vut), scenario=scenario, povs=povs, corridors=corridors).open() as ground:
         found = dict(ground.run(cases))
     return [found[place] for place in range(len(cases))]
 
@@ -213,7 +213,7 @@ class TestAPov:
         spec = pov(YIELDS)
         hosted = run(spec, own(cases_of(6)), vut=spec)
         povs = Povs(own=own_pov(spec, VutOptions(in_process=True)))
-        with ProvingGround(factory(spec, in_process=True), 4, povs=povs) as ground:
+        with plan_for(factory(spec, in_process=True), povs=povs, corridors=4).open() as ground:
             found = dict(ground.run(own(cases_of(6))))
         assert same(hosted, [found[k] for k in range(6)])
         assert any(trajectory.a_pov_mps2.min() == -1.0 for trajectory in hosted)

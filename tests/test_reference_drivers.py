@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plans import plan_for
 
-from merge_sumo.campaigns.ground import ProvingGround
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.reference import (
@@ -199,7 +199,7 @@ def test_only_the_blind_driver_collides_where_both_are_due_at_the_same_time(name
     due_s = level0_time_to(one(182), one(18))[0]
     speeds = np.arange(25.0, 35.5, 2.0)
     cases = [Case(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v) for v in speeds.tolist()]
-    with ProvingGround(name, corridors=6) as ground:
+    with plan_for(name, corridors=6).open() as ground:
         ends = [
             abs(ran.x_pov_m[-1] - ran.x_vut_m[-1]) < 6.0
             for _, ran in ground.run(cases)

@@ -17,11 +17,12 @@ import make_scenarios
 import numpy as np
 import pytest
 from lxml import etree
+from plans import plan_for
 from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.ground import ProvingGround, road_for
+from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -201,7 +202,7 @@ class TestItsVut:
     )
     def test_fails_only_against_drivers_who_react(self, level, count, bounds, kinds):
         cases = uniform_cases(count, level, seed=1)
-        with ProvingGround("roundabout", scenario=ROUNDABOUT) as ground:
+        with plan_for("roundabout", scenario=ROUNDABOUT).open() as ground:
             failing = [
                 trajectory
                 for _, trajectory in ground.run(cases)

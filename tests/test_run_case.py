@@ -9,17 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plans import plan_for
 
-from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.single import case_of, run_one
-from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, motion_lines
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.live import Window
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import US23
 
 STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
 SAFE = ("--level", "0", "--x", "-300", "--v", "34")
@@ -129,7 +126,7 @@ def test_in_traffic_the_table_has_all_cars():
     where = named_scenario("us23-traffic")
     values = {"x_pov0_m": -300, "v_pov0_mps": 30, "headway_ahead_s": 2, "headway_behind_s": 2}
     case = case_of(where, 0, values)
-    ended = run_one(vut_factory("design2"), case, road_for(where), Povs())
+    ended = run_one(plan_for("design2", scenario=where), case)
     head, first, *_ = motion_lines(ended.trajectory)
     assert all(name in head for name in ("x POV", "x VUT", "x AHEAD", "x BEHIND"))
     assert [letter for letter in first[-48:] if letter.isalpha()] == ["b", "P", "a", "V"]
@@ -148,9 +145,9 @@ class TestInSumoGui:
     def test_a_case_is_run_live_and_moves_as_without_a_window(self, window):
         slept: list[float] = []
         window.setattr(Window, "__init__", _with_sleep(Window.__init__, slept.append))
-        road, factory = road_for(US23), vut_factory("design2")
-        live = run_one(factory, COLLIDES, road, Povs(), live=True)
-        without = run_one(factory, COLLIDES, road, Povs())
+        plan = plan_for("design2", corridors=1)
+        live = run_one(plan, COLLIDES, live=True)
+        without = run_one(plan, COLLIDES)
         assert (live.trajectory.motion == without.trajectory.motion).all()
         assert live.outcome == without.outcome
         assert len(slept) == len(live.trajectory.motion) - 1, "every step waits for its time"
@@ -165,7 +162,7 @@ class TestInSumoGui:
         window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
         window.setattr(Window, "step", close_window)
         with pytest.raises(UserError, match="the window was closed before the case had ended"):
-            run_one(vut_factory("design2"), COLLIDES, road_for(US23), Povs(), live=True)
+            run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
 
 
 def _with_sleep(init, sleep):

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plans import plan_for
 
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.ground import ProvingGround, road_for
+from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
@@ -40,7 +41,7 @@ def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) ->
 
 def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
     factory = vut_factory(vut, VutOptions(**options))
-    with ProvingGround(factory, corridors, scenario=cases[0].scenario) as ground:
+    with plan_for(factory, scenario=cases[0].scenario, corridors=corridors).open() as ground:
         ran = dict(ground.run(cases))
     return [ran[place] for place in range(len(cases))]
 

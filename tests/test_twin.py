@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import some
+from plans import plan_for
 
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
-from merge_sumo.campaigns.ground import GroundPlan, road_for, run_cases
+from merge_sumo.campaigns.ground import road_for, run_cases
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
 from merge_sumo.reports.foretelling import Expected, foretold_in_words, off_m, surprises
 from merge_sumo.samplers.coverage import CoverageSampler
@@ -43,10 +43,7 @@ SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 
 
 def ran(vut: str, level: int, points, scenario=US23):
-    povs = Povs(policies=policies_of(scenario))
-    plan = GroundPlan(
-        vut=vut_factory(vut), corridors=16, net=road_for(scenario), scenario=scenario, povs=povs
-    )
+    plan = plan_for(vut, scenario=scenario, corridors=16)
     pool = Pool(levels=(level,), scenario=scenario)
     done = run_cases(plan, pool.cases(points, level))
     return [
@@ -105,9 +102,7 @@ class TestGames:
         (tmp_path / "slows.py").write_text(SLOWS)
         criterion, pool, road = Criterion(text), Pool(levels=(0,)), road_for(US23)
         points = np.random.default_rng(5).random((24, 2))
-        plan = GroundPlan(
-            vut=vut_factory(f"{tmp_path / 'slows.py'}:vut"), corridors=16, net=road, povs=Povs()
-        )
+        plan = plan_for(f"{tmp_path / 'slows.py'}:vut", corridors=16)
         done = run_cases(plan, pool.cases(points, 0))
         lines = centre_lines(road)
         expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap_m for one in done]

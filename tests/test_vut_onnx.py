@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from merges import HALF, SMALLER
+from plans import plan_for
 from typer.testing import CliRunner
 from vut_contract import cases_of, factory, run_cases
 
@@ -117,12 +118,12 @@ def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
     assert sorted(Path(f).name for f in factory(vut).files) == ["a.onnx", "weights.bin"]
     separate = sorted(Path(f).name for f in factory(f"onnx:{tmp_path / 'b.onnx'}").files)
     assert separate == ["b", "b.onnx", "w"]
-    truth = [ground_truth(vut, 0, 4, cache=tmp_path / "cache").score]
+    truth = [ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").score]
     weights = tmp_path / "weights.bin"
     half, one = np.float64(0.5).tobytes(), np.float64(1.0).tobytes()
     assert weights.read_bytes().count(half) == 1
     weights.write_bytes(weights.read_bytes().replace(half, one))
-    truth.append(ground_truth(vut, 0, 4, cache=tmp_path / "cache").score)
+    truth.append(ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").score)
     before, after = truth
     assert not np.array_equal(before, after)
 

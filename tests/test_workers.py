@@ -10,21 +10,20 @@ import subprocess
 import sys
 import sysconfig
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from plans import plan_for
 
 from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.ground import GroundPlan, lost_case, run_cases, runs_on
+from merge_sumo.campaigns.ground import lost_case, run_cases, runs_on
 from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.software import software
-from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import (
     InProcess,
     LocalProcesses,
@@ -141,7 +140,7 @@ class TestAWorkerThatDies:
 
     def test_at_a_case_makes_it_a_sim_error_with_a_reason(self):
         cases = from_unit(np.random.default_rng(0).random((4, 2)), 0)
-        plan = GroundPlan(vut=vut_factory("design1"), corridors=4, net=road_of(), povs=Povs())
+        plan = plan_for("design1", corridors=4)
         with open_workers(2) as workers:
             work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
             ran = dict(workers.run(work, cases, lost_case, chunk=1))
@@ -155,7 +154,7 @@ class TestAWorkerThatDies:
 class TestWhatTravels:
     def test_arrives_as_it_was_sent(self):
         cases = from_unit(np.random.default_rng(0).random((1, 3)), 2)
-        plan = GroundPlan(vut=vut_factory("level0"), corridors=1, net=road_of(), povs=Povs())
+        plan = plan_for("level0", corridors=1)
         (sent,) = run_cases(plan, cases)
         came = pickle.loads(pickle.dumps(sent))  # noqa: S301 (our own)
         assert came.trajectory.case == sent.trajectory.case == cases[0]
@@ -239,9 +238,7 @@ class TestACampaign:
 
     def test_is_refused_by_workers_with_other_software(self):
         other = {**software(), "libsumo": "1.0"}
-        plan = GroundPlan(
-            vut=vut_factory("design1"), corridors=2, net=road_of(), povs=Povs(), software=other
-        )
+        plan = replace(plan_for("design1", corridors=2), software=other)
         with open_workers(1) as workers, pytest.raises(UserError, match="a worker has libsumo"):
             runs_on(workers, plan)
 

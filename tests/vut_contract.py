@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from plans import plan_for
 
-from merge_sumo.campaigns.ground import ProvingGround
 from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.values.case import Case, from_unit
@@ -30,7 +30,7 @@ def factory(spec: object, **options: Any) -> VutFactory:
 def run_cases(vut: VutFactory, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
     """Return what became of every case, in order; every case must come back exactly once."""
     found: dict[int, Trajectory] = {}
-    with ProvingGround(vut, corridors) as ground:
+    with plan_for(vut, corridors=corridors).open() as ground:
         for index, trajectory in ground.run(cases):
             assert index not in found
             found[index] = trajectory

@@ -26,16 +26,15 @@ import numpy as np
 
 from merge_sumo.campaigns.conductor import conduct
 from merge_sumo.campaigns.ground import GroundPlan, Ran, run_cases
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.truth import Truth, ground_truth
-from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.sumo.road import road_of
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import RADIUS, fmc
-from merge_sumo.values.scenario import LEVELS
+from merge_sumo.values.scenario import LEVELS, US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
@@ -163,9 +162,9 @@ def print_trials(trials: Sequence[str], seeds: int, first: int) -> None:
     print("FMC / truth" + " ".join(f"{f'N={n}':>7s}" for n in SHOWN) + " lowest   all regions")
     for trial in trials:
         vut = f"{Path(__file__).with_name('trial_vuts.py')}:{trial}"
-        plan = GroundPlan(vut=vut_factory(vut), corridors=32, net=road_of(), povs=Povs())
+        plan = resolve(vut, scenario=US23, criterion=Criterion())
         for level in LEVELS:
-            truth = ground_truth(vut, level)
+            truth = ground_truth(plan, level)
             if len(truth.failures) < FEWEST_FAILURES:
                 continue
             for name in ("coverage", WITHOUT, "gpr"):
@@ -198,13 +197,13 @@ def main() -> None:
     if options.trials is not None:
         print_trials(options.trials or TRIALS, options.seeds, options.first)
         return
-    truth = ground_truth(options.vut, options.level)
+    plan = resolve(options.vut, scenario=US23, criterion=Criterion(), corridors=BATCH)
+    truth = ground_truth(plan, options.level)
     print(f"{options.vut}, level {options.level}, FMC of the truth {fmc(truth.failures):.4f}")
     heads = [*(f"N={n}" for n in SHOWN), "lowest"]
     print(
         f"{'FMC / truth':30s}" + " ".join(f"{h:>7s}" for h in heads) + "   all regions   sampler s"
     )
-    plan = GroundPlan(vut=vut_factory(options.vut), corridors=BATCH, net=road_of(), povs=Povs())
     if options.ablate:
         for label, constants in ABLATIONS.items():
             with changed(constants):

@@ -39,18 +39,17 @@ import numpy as np
 
 from merge_sumo.campaigns.ahead import Ahead, proposals
 from merge_sumo.campaigns.conductor import conduct, run_campaign
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, run_cases
+from merge_sumo.campaigns.ground import GroundPlan, Ran, run_cases
 from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.truth import _scores
-from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import LocalProcesses, Workers
 from merge_sumo.values.case import Case, FloatArray, Pool, from_unit, to_unit
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
@@ -70,7 +69,7 @@ def memory_mb() -> float:
 
 def scores_and_memory(plan: GroundPlan, points: Sequence[FloatArray]) -> list[tuple[Any, ...]]:
     """Run cases of level 0 as `truth` does; say which process did and how large it is."""
-    return [(score, os.getpid(), memory_mb()) for score in _scores(plan, 0, US23, points)]
+    return [(score, os.getpid(), memory_mb()) for score in _scores(plan, 0, points)]
 
 
 def compute(seconds: Sequence[float]) -> list[int]:
@@ -97,7 +96,7 @@ def local(count: int) -> Workers:
 
 def truth(most: int) -> Iterator[dict[str, float]]:
     """Yield cost and memory for 100, 1,000, ... cases, all in the same worker process."""
-    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of(), povs=Povs())
+    plan = resolve(VUT, scenario=US23, criterion=Criterion())
     rng = np.random.default_rng(0)
     with local(1) as workers:
         list(workers.run(partial(scores_and_memory, plan), list(rng.random((32, 2))), never))
@@ -119,7 +118,7 @@ def truth(most: int) -> Iterator[dict[str, float]]:
 
 def two_workers() -> dict[str, list[float]]:
     """Return the rates on two workers over those on one, round by round."""
-    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of(), povs=Povs())
+    plan = resolve(VUT, scenario=US23, criterion=Criterion())
     points: Any = np.random.default_rng(1).random((PAIR_CASES, 2))
     found: dict[str, list[float]] = {"cases": [], "computing": [], "cases_per_s_on_one": []}
     with local(1) as one, local(2) as two:
@@ -182,7 +181,7 @@ class Served:
 
 def parent(cases: int) -> float:
     """Return how many cases per second a campaign takes that workers have run."""
-    plan = GroundPlan(vut=vut_factory(VUT), corridors=MAX_CORRIDORS, net=road_of(), povs=Povs())
+    plan = resolve(VUT, scenario=US23, criterion=Criterion())
     pool = Pool(levels=(0,))
     served: Any = Served(run_cases(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
     sampler, scout = (make_sampler("uniform", pool, 0) for _ in range(2))

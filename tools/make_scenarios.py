@@ -13,10 +13,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from merge_sumo.campaigns.ground import ProvingGround, road_for
+from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.values.case import Case
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import DT_S, US23, Scenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import Trajectory
@@ -76,7 +78,9 @@ EXAMPLES = {
 
 def play(example: Example) -> Trajectory:
     """Play one example in SUMO."""
-    with ProvingGround(example.vut, 1, scenario=example.case.scenario) as ground:
+    scenario = example.case.scenario
+    plan = resolve(example.vut, scenario=scenario, criterion=Criterion(), corridors=1)
+    with plan.open() as ground:
         ((_, trajectory),) = ground.run([example.case])
     return trajectory
 

@@ -29,7 +29,7 @@ from typing import Any, Final
 
 from merge_sumo.campaigns.conductor import workers_or_here
 from merge_sumo.campaigns.driven_again import CAREFUL, Avoidance, Failure, drive_again
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan
+from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.reference import REFERENCES
@@ -79,14 +79,8 @@ def avoidance(
     if not known:
         return []
     # No code of the VUT: a driver of the package is in its place.
-    plan = GroundPlan(
-        vut=vut_factory(CAREFUL),
-        corridors=MAX_CORRIDORS,
-        net=net,
-        scenario=settings.scenario,
-        povs=settings.povs.with_log(run.folder.resolve() / LOG),
-        criterion=run.criterion,
-    )
+    log = run.folder.resolve() / LOG
+    plan = plan_of(settings, net, log=log, vut=vut_factory(CAREFUL))
     again, failing = partial(drive_again, plan), list(known.items())
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as there:

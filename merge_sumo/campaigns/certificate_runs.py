@@ -10,7 +10,8 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, Ran, run_cases
+from merge_sumo.campaigns.ground import GroundPlan, Ran, run_cases
+from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.vuts.files import Files
 from merge_sumo.drivers.vuts.output import LOG
@@ -41,15 +42,7 @@ def runs_points_on(
     workers: Workers, settings: CampaignSettings, net: Corridor, folder: Path
 ) -> RunPoints:
     """Return what runs points on workers; what a controller prints goes to the folder's log."""
-    log = folder.resolve() / LOG
-    plan = GroundPlan(
-        vut=settings.vut_factory.with_log(log),
-        corridors=MAX_CORRIDORS,
-        net=net,
-        scenario=settings.scenario,
-        povs=settings.povs.with_log(log),
-        criterion=settings.criterion,
-    )
+    plan = plan_of(settings, net, log=folder.resolve() / LOG)
 
     def run(level: int, points: FloatArray) -> Iterable[tuple[int, CaseResult]]:
         pool, rows = settings.pool, cast("Sequence[FloatArray]", points)

@@ -10,7 +10,6 @@ from typing import Any, Final
 
 from merge_sumo.campaigns.ahead import Ahead, proposals
 from merge_sumo.campaigns.ground import (
-    MAX_CORRIDORS,
     GroundPlan,
     OnWorkers,
     Ran,
@@ -20,6 +19,7 @@ from merge_sumo.campaigns.ground import (
 )
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.learning import lessons
+from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.run import SETTINGS, Run, spread_failures
 from merge_sumo.campaigns.settings import (
     RECORDED_BY_DEFAULT,
@@ -297,14 +297,7 @@ def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
 def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> GroundPlan:
     log = folder.resolve() / LOG
     at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
-    return GroundPlan(
-        vut=settings.vut_factory.with_log(log),
-        corridors=min(MAX_CORRIDORS, at_once or settings.cases),
-        net=net,
-        scenario=settings.scenario,
-        povs=settings.povs.with_log(log),
-        criterion=settings.criterion,
-    )
+    return plan_of(settings, net, cases=at_once or settings.cases, log=log)
 
 
 def _forced(run: Run) -> list[Any]:

@@ -16,12 +16,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.conductor import conduct, workers_or_here
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
+from merge_sumo.campaigns.ground import GroundPlan, run_cases
 from merge_sumo.campaigns.settings import check_level
-from merge_sumo.campaigns.truth import Truth, factory_of
-from merge_sumo.drivers.policies import policies_of
-from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import VutFactory
+from merge_sumo.campaigns.truth import Truth
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.ground import Ground
 from merge_sumo.samplers.registry import make_sampler
@@ -29,9 +26,7 @@ from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit
-from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.fmc import fmc, radius_for
-from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
 
 
@@ -63,20 +58,19 @@ Task = tuple[str, tuple[int, ...], int, int | None, int]
 """A search: sampler, levels, cases, batch, seed."""
 
 
-def _searches(plan: GroundPlan, scenario: Scenario, tasks: Sequence[Task]) -> list[Search]:
-    return [_search(plan, scenario, *task) for task in tasks]
+def _searches(plan: GroundPlan, tasks: Sequence[Task]) -> list[Search]:
+    return [_search(plan, *task) for task in tasks]
 
 
 def _search(
     plan: GroundPlan,
-    scenario: Scenario,
     name: str,
     levels: tuple[int, ...],
     cases: int,
     batch: int | None,
     seed: int,
 ) -> Search:
-    pool = Pool(levels=levels, scenario=scenario)
+    pool = Pool(levels=levels, scenario=plan.scenario)
     lines = centre_lines(plan.net)
     games = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
     sampler = make_sampler(name, pool, seed, games)
@@ -150,7 +144,7 @@ class Comparison:
 
 
 def search(
-    vut: str | VutFactory,
+    plan: GroundPlan,
     levels: tuple[int, ...],
     samplers: Sequence[str],
     *,
@@ -159,30 +153,18 @@ def search(
     batch: int | None = None,
     workers: Workers | None = None,
     on_search: Callable[[str, int], None] | None = None,
-    scenario: Scenario = US23,
-    povs: Povs | None = None,
-    criterion: Criterion = COLLISION,
 ) -> dict[str, list[Search]]:
-    """Let samplers search a pool, with the seeds 0 to `seeds` - 1 each.
+    """Let samplers search the pool of a plan's scenario, with the seeds 0 to `seeds` - 1 each.
 
     A search runs on one of the `workers`, by default in this process.
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
-    povs = povs or Povs(policies=policies_of(scenario))
     for level in levels:
-        check_level(level, povs)
-    plan = GroundPlan(
-        vut=factory_of(vut, povs),
-        corridors=min(MAX_CORRIDORS, batch or COMPARED_BATCH),
-        net=road_for(scenario),
-        povs=povs,
-        criterion=criterion,
-    )
+        check_level(level, plan.povs)
+    plan = replace(plan, corridors=min(plan.corridors, batch or COMPARED_BATCH))
     found: dict[int, Search] = {}
     with workers_or_here(workers) as there:
-        for place, one in there.run(
-            partial(_searches, plan, scenario), tasks, _lost_search, chunk=1
-        ):
+        for place, one in there.run(partial(_searches, plan), tasks, _lost_search, chunk=1):
             found[place] = one
             if on_search is not None:
                 name, *_, seed = tasks[place]

@@ -14,10 +14,9 @@ import numpy as np
 
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.campaigns.software import POLICY, differences, software
-from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import VutFactory, vut_factory
+from merge_sumo.drivers.vut import VutFactory
 from merge_sumo.drivers.vuts.files import Files, hashed
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.centre_lines import centre_lines
@@ -28,8 +27,8 @@ from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.resources import resource
 from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
-from merge_sumo.values.criterion import COLLISION, Criterion
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.scenario import Scenario
 from merge_sumo.values.score import Measures, Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -41,27 +40,25 @@ class ProvingGround:
 
     def __init__(
         self,
-        vut: str | VutFactory,
-        corridors: int = MAX_CORRIDORS,
-        net: Corridor | None = None,
-        scenario: Scenario = US23,
-        povs: Povs | None = None,
+        vut: VutFactory,
+        corridors: int,
+        net: Corridor,
+        scenario: Scenario,
+        povs: Povs,
         binding: Any = None,
     ) -> None:
         """Start SUMO and the drivers, with fewer corridors where one cannot serve as many.
 
         `binding` takes the place of libsumo: see `World`.
         """
-        factory = vut if isinstance(vut, VutFactory) else vut_factory(vut)
-        povs = povs or Povs(policies=policies_of(scenario))
         cars = scenario.vehicles - 1
-        corridors = min(corridors, factory.vut.max_corridors or corridors)
+        corridors = min(corridors, vut.vut.max_corridors or corridors)
         corridors = povs.corridors(corridors, cars)
         with ExitStack() as opened:
             car_type = None if povs.own is None else povs.own.vut.vut_type
-            self.world = World(corridors, net, factory.vut.vut_type, scenario, car_type, binding)
+            self.world = World(corridors, net, vut.vut.vut_type, scenario, car_type, binding)
             opened.callback(self.world.close)
-            self.vut = factory(corridors, self.world)
+            self.vut = vut(corridors, self.world)
             opened.callback(self.vut.close)
             self.pov = PovLibrary(corridors * cars, povs, self.world)
             opened.callback(self.pov.close)
@@ -88,8 +85,8 @@ class GroundPlan:
     corridors: int
     net: Corridor
     povs: Povs
-    scenario: Scenario = US23
-    criterion: Criterion = COLLISION
+    scenario: Scenario
+    criterion: Criterion
     software: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -103,8 +100,11 @@ class GroundPlan:
         edges = self.net.sha256, self.net.mainline_edges, self.net.ramp_edges
         return *vut, self.corridors, *edges, self.scenario, self.povs, *self.software.items()
 
-    def open(self) -> ProvingGround:
-        """Open the proving ground; `UserError` where other software would give other outcomes."""
+    def open(self, binding: Any = None) -> ProvingGround:
+        """Open the proving ground; `UserError` where other software would give other outcomes.
+
+        `binding` takes the place of libsumo: see `World`.
+        """
         for name, (there, here) in differences(self.software, software(self.povs)).items():
             if name.startswith(POLICY):
                 raise UserError(
@@ -114,7 +114,8 @@ class GroundPlan:
             raise UserError(
                 f"a worker has {name} {here}, and this process {there}: install the same there"
             )
-        return ProvingGround(self.vut, self.corridors, self.net, self.scenario, self.povs)
+        drivers = self.vut, self.corridors, self.net, self.scenario, self.povs
+        return ProvingGround(*drivers, binding)
 
 
 @quickly_pickled

@@ -19,8 +19,9 @@ import numpy as np
 
 from merge_sumo.campaigns.conductor import OnCase, workers_or_here
 from merge_sumo.campaigns.distribution import Distribution, read_distribution
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, runs_on
+from merge_sumo.campaigns.ground import road_for, runs_on
 from merge_sumo.campaigns.interval import Estimate, estimate
+from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.proposal import DEFENSIVE, Draws, Proposal, cells, expected_chance
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
@@ -134,16 +135,8 @@ def _run(
         by_place.update(zip(places.tolist(), drawn, strict=True))
     cases = [by_place[place] for place in range(len(by_place))]
     outcomes: list[Outcome] = []
-    plan = GroundPlan(
-        vut=settings.vut_factory,
-        corridors=min(MAX_CORRIDORS, len(cases)),
-        net=net,
-        scenario=settings.scenario,
-        povs=settings.povs,
-        criterion=settings.criterion,
-    )
     with workers_or_here(workers) as there:
-        run = runs_on(there, plan)
+        run = runs_on(there, plan_of(settings, net, cases=len(cases)))
         for first in range(0, len(cases), WRITTEN):
             ran = []
             for place, done in run(cases[first : first + WRITTEN]):

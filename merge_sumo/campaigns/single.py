@@ -7,17 +7,13 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Final
 
-from merge_sumo.campaigns.ground import ProvingGround
+from merge_sumo.campaigns.ground import GroundPlan
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import VutFactory
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.centre_lines import centre_lines
-from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.live import Window
 from merge_sumo.values.case import Case
-from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.scenario import Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
@@ -108,12 +104,9 @@ def settings_and_case(
 
 
 def run_one(
-    vut: VutFactory,
+    plan: GroundPlan,
     case: Case,
-    net: Corridor,
-    povs: Povs,
     *,
-    criterion: Criterion = COLLISION,
     live: bool = False,
     on_end: Callable[[Ended], None] = lambda _: None,
 ) -> Ended:
@@ -125,11 +118,12 @@ def run_one(
     """
     with (
         Window() if live else nullcontext() as window,
-        ProvingGround(vut, 1, net, case.scenario, povs, window) as ground,
+        plan.open(window) as ground,
     ):
         episodes = ground.run([case])
         _, trajectory = next(episodes)
-        ended = Ended(criterion.outcome(0, 0, trajectory, centre_lines(net)), trajectory)
+        lines = centre_lines(plan.net)
+        ended = Ended(plan.criterion.outcome(0, 0, trajectory, lines), trajectory)
         on_end(ended)
         if window is not None:
             window.wait()  # before the corridor is made ready for the next case

@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from numbers import Integral
 from pathlib import Path
@@ -15,13 +15,10 @@ from typing import Final, cast
 import numpy as np
 
 from merge_sumo.campaigns.conductor import workers_or_here
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, run_cases
+from merge_sumo.campaigns.ground import GroundPlan, road_for, run_cases
 from merge_sumo.campaigns.settings import check_level
 from merge_sumo.campaigns.software import versions
-from merge_sumo.drivers.policies import policies_of, policies_sha256
-from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
-from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.drivers.vut import runs_code
 from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
@@ -29,9 +26,9 @@ from merge_sumo.system.folders import check_own, check_place, make_place, replac
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.criterion import COLLISION, Criterion
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
-from merge_sumo.values.scenario import OWN, US23, Scenario
+from merge_sumo.values.scenario import OWN, Scenario
 from merge_sumo.values.score import FAILURE_SCORE
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
@@ -101,7 +98,7 @@ OnCases = Callable[[int], None]
 
 
 def ground_truth(
-    vut: str | VutFactory,
+    plan: GroundPlan,
     level: int,
     cases: int | None = None,
     seed: int = 0,
@@ -109,11 +106,8 @@ def ground_truth(
     workers: Workers | None = None,
     cache: Path | None = None,
     on_cases: OnCases | None = None,
-    scenario: Scenario = US23,
-    povs: Povs | None = None,
-    criterion: Criterion = COLLISION,
 ) -> Truth:
-    """Return the ground truth of a VUT at a level, from the cache where it is there.
+    """Return the ground truth of a plan at a level, from the cache where it is there.
 
     Memory grows by 40 bytes a case and no more, whatever the number of cases.
 
@@ -126,8 +120,9 @@ def ground_truth(
     for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
         if not isinstance(number, Integral) or number < least:
             raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
-    factory, povs, kept = _asked(vut, level, count, seed, scenario, povs, criterion)
-    path = kept.path(cache)
+    plan = _at_level(plan, level)
+    path = _path(plan, level, count, seed, cache)
+    scenario = plan.scenario
     found = read_truth(path, level, count, scenario)
     if found is not None:
         return found
@@ -135,19 +130,10 @@ def ground_truth(
     check_own(path)
     points = np.random.default_rng([seed, level]).random((count, len(scenario.dimensions(level))))
     scores = np.full(count, np.nan)
-    files = (factory.files or {}) | povs.files
-    road = road_for(scenario)
-    plan = GroundPlan(
-        vut=factory,
-        corridors=MAX_CORRIDORS,
-        net=road,
-        scenario=scenario,
-        povs=povs,
-        criterion=criterion,
-    )
+    files = (plan.vut.files or {}) | plan.povs.files
     with workers_or_here(workers) as there:
         rows = cast("Sequence[FloatArray]", points)
-        scored = there.run(partial(_scores, plan, level, scenario), rows, lambda _: (np.nan, {}))
+        scored = there.run(partial(_scores, plan, level), rows, lambda _: (np.nan, {}))
         for ended, (place, (score, loaded)) in enumerate(scored, start=1):
             scores[place] = score
             for name, sha256 in loaded.items():
@@ -169,53 +155,38 @@ def ground_truth(
 
 
 def known_truth(
-    vut: str | VutFactory,
-    level: int,
-    cases: int,
-    seed: int = 0,
-    *,
-    cache: Path | None = None,
-    scenario: Scenario = US23,
-    povs: Povs | None = None,
-    criterion: Criterion = COLLISION,
+    plan: GroundPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
     """Return what `ground_truth` would find in the cache; None where it would have to run cases."""
-    _, _, kept = _asked(vut, level, cases, seed, scenario, povs, criterion)
-    return read_truth(kept.path(cache), level, cases, scenario)
+    path = _path(_at_level(plan, level), level, cases, seed, cache)
+    return read_truth(path, level, cases, plan.scenario)
 
 
-def _asked(
-    vut: str | VutFactory,
-    level: int,
-    cases: int,
-    seed: int,
-    scenario: Scenario,
-    povs: Povs | None,
-    criterion: Criterion,
-) -> tuple[VutFactory, Povs, Kept]:
-    """Return who drives, and what a truth of that is kept under."""
-    povs = povs or Povs(policies=policies_of(scenario))
-    check_level(level, povs)
-    povs = povs if level == OWN else replace(povs, own=None)
-    factory = factory_of(vut, povs)
-    options = factory.options
+def _at_level(plan: GroundPlan, level: int) -> GroundPlan:
+    """Return a plan without the drivers that no case of a level meets."""
+    check_level(level, plan.povs)
+    return plan if level == OWN else replace(plan, povs=replace(plan.povs, own=None))
+
+
+def _path(plan: GroundPlan, level: int, cases: int, seed: int, cache: Path | None) -> Path:
+    """Return the file of the cache for the truth of a plan."""
+    own, options = plan.povs.own, plan.vut.options
     kept = Kept(
-        *(factory.spec, level, cases, seed, options.command, options.deadline_s, scenario),
-        policies=povs.sha256(),
-        pov=None if povs.own is None else povs.own.spec,
-        criterion=criterion,
+        vut=plan.vut.spec,
+        level=level,
+        cases=cases,
+        seed=seed,
+        command=options.command,
+        deadline_s=options.deadline_s,
+        scenario=plan.scenario,
+        policies=plan.povs.sha256(),
+        pov=None if own is None else own.spec,
+        criterion=plan.criterion,
     )
-    return factory, povs, kept
+    return kept.path(cache)
 
 
-def factory_of(vut: str | VutFactory, povs: Povs) -> VutFactory:
-    """Return what opens a VUT that may be named only; learned ones come from where the POVs do."""
-    return (
-        vut if isinstance(vut, VutFactory) else vut_factory(vut, VutOptions(policies=povs.policies))
-    )
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Kept:
     """What a truth in the cache is of; nothing of the VUT is loaded to look for it.
 
@@ -228,10 +199,10 @@ class Kept:
     seed: int
     command: str | None
     deadline_s: float
-    scenario: Scenario = US23
-    policies: Mapping[str, str] = field(default_factory=lambda: policies_sha256(policies_of()))
-    pov: str | None = None
-    criterion: Criterion = COLLISION
+    scenario: Scenario
+    policies: Mapping[str, str]
+    pov: str | None
+    criterion: Criterion
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
@@ -249,7 +220,7 @@ class Kept:
         return (cache or cache_folder()) / f"truth-{key}.npz"
 
 
-def read_truth(path: Path, level: int, cases: int, scenario: Scenario = US23) -> Truth | None:
+def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth | None:
     """Return what a file of the cache holds.
 
     None where there is none, or it is torn or something else, such as another truth under this
@@ -273,9 +244,9 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario = US23) ->
 
 
 def _scores(
-    plan: GroundPlan, level: int, scenario: Scenario, points: Sequence[FloatArray]
+    plan: GroundPlan, level: int, points: Sequence[FloatArray]
 ) -> Sequence[tuple[float, Files]]:
-    pool = Pool(levels=(level,), scenario=scenario)
+    pool = Pool(levels=(level,), scenario=plan.scenario)
     ran = run_cases(plan, pool.cases(np.asarray(points), level))
     scores = [np.nan if done.score is None else done.score for done in ran]
     return [(score, done.files | done.pov_files) for score, done in zip(scores, ran, strict=True)]

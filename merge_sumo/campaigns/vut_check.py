@@ -11,9 +11,11 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.campaigns.ground import ProvingGround
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.drivers.vut import VutFactory
 from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.trajectory import End, Trajectory
 
 CORRIDORS: Final = 4
@@ -43,7 +45,8 @@ class VutCheck:
 
 def check_vut(factory: VutFactory) -> VutCheck:
     """Let a VUT drive a few cases, some of them again, and one from a stand."""
-    with ProvingGround(factory, CORRIDORS) as ground:
+    plan = resolve(factory, scenario=CASES[0].scenario, criterion=Criterion(), corridors=CORRIDORS)
+    with plan.open() as ground:
         timed = ground.vut = _Timed(ground.vut)
         first = _run(ground, CASES)
         problems = _errors(CASES, first)

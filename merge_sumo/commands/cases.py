@@ -99,6 +99,7 @@ def run(
     Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
     """
     from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.campaigns.plan import plan_of
     from merge_sumo.campaigns.single import run_one
     from merge_sumo.system.folders import check_new
     from merge_sumo.values.trajectory import End
@@ -128,8 +129,8 @@ def run(
         if gui:
             say("close the window to go on")
 
-    driven = settings.vut_factory, one, road, settings.povs
-    found = run_one(*driven, criterion=settings.criterion, live=gui, on_end=ended).outcome
+    plan = plan_of(settings, road, cases=1)
+    found = run_one(plan, one, live=gui, on_end=ended).outcome
     raise typer.Exit(0 if found.measures.end is End.MERGED and not found.failed else 1)
 
 

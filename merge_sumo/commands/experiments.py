@@ -35,9 +35,9 @@ from merge_sumo.system.folders import dated
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, level_name
 
 if TYPE_CHECKING:
+    from merge_sumo.campaigns.ground import GroundPlan
     from merge_sumo.campaigns.truth import Truth
     from merge_sumo.drivers.povs import Povs
-    from merge_sumo.drivers.vut import VutFactory
     from merge_sumo.drivers.vuts.base import VutOptions
     from merge_sumo.system.workers import Workers
     from merge_sumo.values.criterion import Criterion
@@ -84,13 +84,12 @@ def truth(
     where = followed_up(named_scenario(scenario), follow_up)
     options = VutOptions(deadline_s=deadline, memory_gib=vut_memory, in_process=in_process)
     criterion = Criterion(fail_when, require)
-    criterion.check(where)
     povs = povs_of(policies, where, pov, options)
     chosen = one_level(level, povs)
-    factory = _factory(vut, povs, vut_command, options)
-    with open_workers(povs.workers(factory, workers), dask) as there:
-        found = _truth(factory, povs, chosen, cases, seed, there, where, criterion)
-    if factory.vut.named_only:
+    plan = _plan(vut, vut_command, options, povs, where, criterion)
+    with open_workers(povs.workers(plan.vut, workers), dask) as there:
+        found = _truth(plan, chosen, cases, seed, there)
+    if plan.vut.vut.named_only:
         say(
             "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
             "its command and the files that are named there"
@@ -181,7 +180,7 @@ def compare(
     povs = povs_of(policies, where, pov, options)
     levels, criterion = parse_levels(level, povs), Criterion(fail_when, require)
     names = list(dict.fromkeys(name.strip() for name in samplers.split(",")))
-    factory = _factory(vut, povs, vut_command, options)
+    plan = _plan(vut, vut_command, options, povs, where, criterion)
     for name in names:
         CampaignSettings(
             vut=vut,
@@ -202,21 +201,15 @@ def compare(
         figures.check_figure(figure)
     title = f"{vut} v level {'/'.join(map(level_name, levels))}"
     with (
-        open_workers(povs.workers(factory, workers), dask) as there,
+        open_workers(povs.workers(plan.vut, workers), dask) as there,
         Counter(title, len(names) * seeds, "runs") as counter,
     ):
-        truths = {
-            level: _truth(factory, povs, level, truth_cases, 0, there, where, criterion)
-            for level in levels
-        }
-        asked = partial(partial, cases=DENSE_CASES, scenario=where, criterion=criterion)
-        made, known = (
-            asked(_truth, factory, povs, seed=0, workers=there),
-            asked(known_truth, factory, povs=povs),
-        )
+        truths = {level: _truth(plan, level, truth_cases, 0, there) for level in levels}
+        made = partial(_truth, plan, cases=DENSE_CASES, seed=0, workers=there)
+        known = partial(known_truth, plan, cases=DENSE_CASES)
         dense_truths = truths_of(levels, made if dense else known if dense is None else None)
         searches = experiments.search(
-            factory,
+            plan,
             levels,
             names,
             seeds=seeds,
@@ -224,9 +217,6 @@ def compare(
             batch=batch,
             workers=there,
             on_search=lambda name, _: counter.ended(1, name),
-            scenario=where,
-            povs=povs,
-            criterion=criterion,
         )
     limit = experiments.limit_fmc(chain.from_iterable(searches.values()), truths, dense_truths)
     compared = {name: experiments.compare(found, truths, limit) for name, found in searches.items()}
@@ -309,39 +299,28 @@ def reproduce(
     show(f"all of it: {index}")
 
 
-def _factory(vut: str, povs: Povs, command: str | None, options: VutOptions) -> VutFactory:
-    from merge_sumo.drivers.vut import vut_factory
-
-    return vut_factory(vut, replace(options, command=command, policies=povs.policies))
-
-
-def _truth(
-    factory: VutFactory,
+def _plan(
+    vut: str,
+    command: str | None,
+    options: VutOptions,
     povs: Povs,
-    level: int,
-    cases: int | None,
-    seed: int,
-    workers: Workers,
     scenario: Scenario,
     criterion: Criterion,
-) -> Truth:
+) -> GroundPlan:
+    from merge_sumo.campaigns.plan import resolve
+    from merge_sumo.drivers.vut import vut_factory
+
+    factory = vut_factory(vut, replace(options, command=command, policies=povs.policies))
+    return resolve(factory, scenario=scenario, criterion=criterion, povs=povs)
+
+
+def _truth(plan: GroundPlan, level: int, cases: int | None, seed: int, workers: Workers) -> Truth:
     from merge_sumo.campaigns.truth import TRUTH_CASES, ground_truth
     from merge_sumo.reports.progress import Counter
 
     total = TRUTH_CASES[level] if cases is None else cases
     if total < 1:
         raise UserError(f"--cases is {total}: it must be 1 or more")
-    with Counter(
-        f"truth of {factory.spec} at level {level_name(level)}", total, "cases"
-    ) as counter:
-        return ground_truth(
-            factory,
-            level,
-            total,
-            seed,
-            workers=workers,
-            on_cases=counter.ended,
-            scenario=scenario,
-            povs=povs,
-            criterion=criterion,
-        )
+    title = f"truth of {plan.vut.spec} at level {level_name(level)}"
+    with Counter(title, total, "cases") as counter:
+        return ground_truth(plan, level, total, seed, workers=workers, on_cases=counter.ended)

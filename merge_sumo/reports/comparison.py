@@ -13,7 +13,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, ProvingGround, road_for
+from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import same_pov, settings_of
 from merge_sumo.errors import UserError
@@ -164,9 +165,7 @@ def _run_again(
     again: dict[int, Outcome] = {}
     settings = settings_of(run.folder, run.settings, given, trust=trust)
     lines = centre_lines(net)
-    corridors = min(MAX_CORRIDORS, len(cases))
-    vut, povs = settings.vut_factory, settings.povs
-    with ProvingGround(vut, corridors, net, settings.scenario, povs) as ground:
+    with plan_of(settings, net, cases=len(cases)).open() as ground:
         for place, trajectory in ground.run(cases):
             again[place] = settings.criterion.outcome(place, 0, trajectory, lines)
     for place, outcome in enumerate(told):

@@ -190,13 +190,13 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
     if not same:
         return None
     kept = Kept(
-        str(settings.get("vut")),
-        level,
-        TRUTH_CASES[level],
-        0,
-        settings.get("vut_command"),
-        settings.get("deadline_s", DEADLINE_S),
-        run.scenario,
+        vut=str(settings.get("vut")),
+        level=level,
+        cases=TRUTH_CASES[level],
+        seed=0,
+        command=settings.get("vut_command"),
+        deadline_s=settings.get("deadline_s", DEADLINE_S),
+        scenario=run.scenario,
         policies=settings.get("policies_sha256", {}),
         pov=settings.get("pov") if level == OWN else None,
         criterion=run.criterion,

@@ -15,6 +15,8 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.campaigns.experiments import Search, compare, limit_fmc, oracle, search
+from merge_sumo.campaigns.ground import GroundPlan
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import check_level
 from merge_sumo.campaigns.software import versions
 from merge_sumo.campaigns.truth import DENSE_CASES, Truth, ground_truth, known_truth
@@ -37,8 +39,9 @@ from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.system.folders import make_folder, write_new
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool, to_unit
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import LEVELS
+from merge_sumo.values.scenario import LEVELS, US23
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 
 TABLE_JSON: Final = "table2.json"
@@ -90,6 +93,10 @@ class _Work:
         self.workers, self.on_run = workers, on_run
         self.pictures: dict[str, str] = {}
 
+    def plan(self, vut: str) -> GroundPlan:
+        """Return the plan for a VUT of the paper on its road, by its criterion."""
+        return resolve(vut, scenario=US23, criterion=Criterion(), povs=self.povs)
+
     def column(self, column: Column) -> Result:
         """Run one column of the table and draw its figures."""
         truth = self.truth(column, self.scale.truth_cases[column.level])
@@ -131,7 +138,7 @@ class _Work:
     def dense(self, column: Column) -> Truth | None:
         """Return the dense truth of a column, if there is one or it is to be made."""
         if self.scale.dense is None:
-            return known_truth(column.vut, column.level, DENSE_CASES, povs=self.povs)
+            return known_truth(self.plan(column.vut), column.level, DENSE_CASES)
         return self.truth(column, DENSE_CASES) if self.scale.dense else None
 
     def truth(self, column: Column, cases: int) -> Truth:
@@ -147,10 +154,7 @@ class _Work:
 
         count(0)
         truth = ground_truth(
-            *(column.vut, column.level, cases),
-            workers=self.workers,
-            on_cases=count,
-            povs=self.povs,
+            self.plan(column.vut), column.level, cases, workers=self.workers, on_cases=count
         )
         self.on_run(title, cases, cases, "cases")
         return truth
@@ -171,7 +175,7 @@ class _Work:
         counter = iter(range(1, runs + 1))
         self.on_run(title, 0, runs, "runs")
         return search(
-            vut,
+            self.plan(vut),
             levels,
             samplers,
             seeds=self.scale.seeds,
@@ -179,7 +183,6 @@ class _Work:
             batch=batch,
             workers=self.workers,
             on_search=lambda *_: self.on_run(title, next(counter), runs, "runs"),
-            povs=self.povs,
         )
 
     def scatter(self, column: Column, truth: Truth, middle: Mapping[str, Search]) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.campaigns.conductor import workers_or_here
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for, runs_on
+from merge_sumo.campaigns.ground import road_for, runs_on
+from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
 from merge_sumo.errors import UserError
@@ -146,14 +147,7 @@ def rerun(
                 f"{run.folder} was run against another POV of level {level_name(level)} than "
                 "today's: give its --policies"
             )
-    plan = GroundPlan(
-        vut=settings.vut_factory,
-        corridors=min(MAX_CORRIDORS, len(before)),
-        net=road,
-        scenario=settings.scenario,
-        povs=settings.povs,
-        criterion=settings.criterion,
-    )
+    plan = plan_of(settings, road, cases=len(before))
     after: dict[int, Outcome] = {}
     with workers_or_here(workers) as there:
         for place, ran in runs_on(there, plan)([outcome.case for outcome in before]):
