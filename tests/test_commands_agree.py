@@ -1,0 +1,194 @@
+"""Every command that runs cases judges a case as every other one does, on every shipped scenario.
+
+The reference is `run RUN INDEX`, which runs one case alone. The criterion has a follow-up, so that
+a command that forgets the scenario or its follow-up cannot pass.
+"""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from conftest import some
+
+import merge_sumo as ms
+from merge_sumo.campaigns.run import OUTCOMES
+from merge_sumo.values.case import Case, Pool
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import Scenario
+
+CRITERION = "after_gap_m < 12 or ttc_s < 3"
+FOLLOW_UP_S = 3
+
+
+class Tried(NamedTuple):
+    """A VUT on a scenario, at a level where it fails in some cases and not in others."""
+
+    scenario: str
+    vut: str
+    level: int
+
+    @property
+    def asked(self) -> tuple[object, ...]:
+        """Return the options that each command takes."""
+        criterion = ("--fail-when", CRITERION, "--follow-up", FOLLOW_UP_S)
+        tried = ("--vut", self.vut, "--level", self.level, "--scenario", self.scenario)
+        return *tried, *criterion
+
+
+TRIED = {
+    "us23": Tried("us23", "design2", 0),
+    "roundabout": Tried("roundabout", "roundabout", 1),
+    "us23-traffic": Tried("us23-traffic", "design2", 0),
+}
+CASES, BATCH = 12, 6
+OF_A_CASE = ("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s")
+
+
+class World:
+    """The command line in a folder of its own, with a campaign in it."""
+
+    def __init__(self, tried: Tried, main: Any) -> None:
+        self.tried, self._main = tried, main
+        self.campaign = self("campaign", *tried.asked, *self.search(CASES), "--out", "run")[0]
+
+    def __call__(self, *arguments: object, codes: tuple[int, ...] = (0,)) -> Any:
+        """Return the objects that a command prints as lines of JSON."""
+        code, out, err = self._main(*arguments, "--json")
+        assert code in codes, err
+        return [json.loads(line) for line in out.splitlines() if line.startswith("{")]
+
+    @staticmethod
+    def search(cases: int) -> tuple[object, ...]:
+        return "--sampler", "uniform", "--cases", cases, "--batch", BATCH, "--seed", 0
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        return lines_of(Path("run") / OUTCOMES)
+
+    @property
+    def scenario(self) -> Scenario:
+        return ms.open_run("run").run.scenario
+
+    def judged(self, case: Case) -> bool:
+        """Return whether a case fails when it is run alone."""
+        given = {name: getattr(case, name) for name in OF_A_CASE}
+        found = ms.run_case(
+            self.tried.vut,
+            level=self.tried.level,
+            scenario=self.scenario,
+            **{name: value for name, value in given.items() if value is not None},
+        )
+        return Criterion(CRITERION).outcome(0, 0, found.trajectory).failed
+
+
+def lines_of(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def fails(record: dict[str, Any]) -> bool:
+    return record["margin"] < 0.0
+
+
+@pytest.fixture(params=some(TRIED, "us23-traffic"))
+def world(request, monkeypatch, tmp_path, command_line) -> World:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+    return World(TRIED[request.param], command_line)
+
+
+def test_every_command_judges_a_case_alike(world: World):
+    records = world.records
+    assert 0 < sum(map(fails, records)) < CASES, "else nothing is told apart"
+    assert world.campaign["levels"][str(world.tried.level)]["failures"] == sum(map(fails, records))
+    run_judges_as_the_campaign(world, records)
+    rerun_changes_nothing(world)
+    check_compare_and_truth(world, records)
+    probability_judges_as_run(world)
+    exports_and_replay_have_the_motion(world, records)
+    resume_goes_on_alike(world, records)
+
+
+def run_judges_as_the_campaign(world: World, records: list[dict[str, Any]]) -> None:
+    told = [next(r for r in records if fails(r) is failing) for failing in (True, False)]
+    for record in told:
+        (again,) = world("run", "--case", "run", record["index"], codes=(0, 1))
+        for name in ("motion", "index", "batch", "foretold"):
+            again.pop(name, None)
+        assert again == {k: v for k, v in record.items() if k in again}
+        assert again["margin"] == record["margin"]
+
+
+def rerun_changes_nothing(world: World) -> None:
+    (again,) = world("rerun", "run")
+    assert (again["cases"], again["changed"], again["worse"]) == (CASES, [], False)
+
+
+def check_compare_and_truth(world: World, records: list[dict[str, Any]]) -> None:
+    """Compare searches as a campaign with the same sampler, seed and batches; so does its truth."""
+    count, level = 10, world.tried.level
+    (truth,) = world("truth", *world.tried.asked, "--cases", count, "--workers", 1)
+    points = np.random.default_rng([0, level]).random(
+        (count, len(world.scenario.dimensions(level)))
+    )
+    cases = Pool(levels=(level,), scenario=world.scenario).cases(points, level)
+    failing = np.array([world.judged(case) for case in cases])
+    assert truth["failures"] == failing.sum()
+    sampler = ("--samplers", "uniform", "--seeds", 1, "--cases", CASES, "--batch", BATCH)
+    (compared,) = world(
+        "compare", *world.tried.asked, *sampler, "--truth-cases", count, "--workers", 1
+    )
+    assert compared["truth_fmc"] == truth["fmc"] == fmc(points[failing])
+    assert compared["uniform"]["failures_median"] == sum(map(fails, records))
+    of_campaign = world.campaign["levels"][str(level)]["fmc"]
+    assert compared["uniform"]["fmc_median"] == pytest.approx(of_campaign)
+
+
+def probability_judges_as_run(world: World) -> None:
+    (found,) = world("probability", "run", "--cases", 8)
+    fresh = lines_of(Path("run/probability.jsonl"))
+    assert found["failures"] == sum(map(fails, fresh))
+    for record in fresh[:3]:
+        given = {name: record.get(name) for name in OF_A_CASE}
+        fixed = record["v_vut0_mps"]
+        case = Case(level=record["level"], scenario=world.scenario, v_vut0_mps=fixed, **given)
+        assert world.judged(case) is fails(record)
+
+
+def exports_and_replay_have_the_motion(world: World, records: list[dict[str, Any]]) -> None:
+    failing = next(record["index"] for record in records if fails(record))
+    assert world._main("export", "run", failing, "--format", "csv", "--out", "table")[0] == 0
+    (table,) = Path("table").rglob("*.csv")
+    assert f"{failing}," in table.read_text(encoding="utf-8")
+    assert world._main("replay", "run", failing)[0] == 0
+    assert world._main("report", "run")[0] == 0
+    assert CRITERION.split(maxsplit=1)[0] in Path("run/report.html").read_text(encoding="utf-8")
+
+
+def resume_goes_on_alike(world: World, records: list[dict[str, Any]]) -> None:
+    world("campaign", "--resume", "run", "--cases", CASES + BATCH)
+    assert world.records[:CASES] == records
+    whole = World.search(CASES + BATCH)
+    world("campaign", *world.tried.asked, *whole, "--out", "whole")
+    assert Path("whole", OUTCOMES).read_bytes() == Path("run", OUTCOMES).read_bytes()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [name for name in TRIED if name != "us23-traffic"])
+def test_a_certificate_judges_a_case_alike(name, monkeypatch, tmp_path, command_line):
+    monkeypatch.chdir(tmp_path)
+    world = World(TRIED[name], command_line)
+    wanted = (*world.tried.asked, "--radius", 0.2, "--workers", 1, "--out", "certificate")
+    (found,) = world("certify", *wanted, codes=(0, 1))
+    (of_level,) = found["levels"].values()
+    assert 0 < of_level["failures"] < of_level["cases"]
+    for values in of_level["worst"][:3]:
+        case = {name: value for name, value in values.items() if name in OF_A_CASE}
+        case["v_vut0_mps"] = world.scenario.bounds("v_vut0_mps")[0]
+        assert world.judged(Case(level=world.tried.level, scenario=world.scenario, **case))
