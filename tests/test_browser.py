@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 import shutil
 from collections.abc import Iterator, Sequence
@@ -18,8 +20,9 @@ from handmade import write_run
 from merge_sumo.campaigns.avoidance import write_avoidance
 from merge_sumo.campaigns.driven_again import Avoidance
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
-from merge_sumo.reports import report, report_facts
+from merge_sumo.reports import diagnosis, report, report_facts
 from merge_sumo.reports.coordinates import WRITTEN
+from merge_sumo.reports.report_facts import Facts
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.values.scenario import POV
 
@@ -270,12 +273,12 @@ def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser
         filters.locator("[name=region]").select_option("1:0")
         assert sorted(rows(page)) == sorted(o.index for o in of_level if region[o.index] == 0)
         assert set(column(page, "region")) == {"1"}
-        filters.locator("button[type=reset]").click()
+        filters.locator(".reset").click()
         page.locator("#matching:text('180 of 180')").wait_for()
         kind = filters.locator("[name=kind] option").nth(1).get_attribute("value")
         filters.locator("[name=kind]").select_option(kind)
         assert set(column(page, "kind")) == {kind}
-        filters.locator("button[type=reset]").click()
+        filters.locator(".reset").click()
         page.locator("#matching:text('180 of 180')").wait_for()
         filters.locator("[name=measure]").select_option(label="gap at M m")
         filters.locator("[name=from]").fill("-8")
@@ -283,6 +286,133 @@ def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser
         inside = [o.index for o in made.outcomes if -8 <= round(o.measures.dx_m or 0, 2) <= -6]
         assert sorted(rows(page)) == inside
         assert inside
+
+
+def bright(page) -> list[int]:
+    """Return the cases that are drawn and not faint; maps with a slider show all values."""
+    for check in page.locator(".map input[type=checkbox]").all():
+        check.check()
+    found = page.locator(".map .mark:not(.faint)").evaluate_all(
+        "all => all.map((m) => m.dataset.case)"
+    )
+    return sorted(map(int, found))
+
+
+def all_rows(page) -> list[int]:
+    """Return the cases of the whole table."""
+    while page.locator("#more").is_visible():
+        page.locator("#more").click()
+    return sorted(rows(page))
+
+
+@WINDOWS
+def test_a_click_on_a_region_in_words_shows_its_cases_in_maps_and_table(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    found = failures(made.outcomes)
+    near = [o for o in made.outcomes if o.is_tested and not o.failed]
+    kinds = Facts(made).kinds
+    boxes = [b for n in (0, 1, 2) for b in diagnosis.failure_boxes(found + near, n, kinds)]
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        sentences = page.locator(".sentences button")
+        assert sentences.all_inner_texts() == [box.sentence for box in boxes]
+        for number in (0, len(boxes) - 1):
+            sentences.nth(number).click()
+            inside = sorted(boxes[number].indices)
+            assert len(inside) == boxes[number].cases
+            assert all_rows(page) == inside
+            assert bright(page) == inside
+            assert sentences.nth(number).get_attribute("aria-pressed") == "true"
+            assert page.inner_text("#filtered-number").startswith(f"{len(inside)} of 180 cases")
+        sentences.nth(len(boxes) - 1).click()
+        assert len(bright(page)) == 180
+        assert not page.locator("#filtered").is_visible()
+        kind = page.locator("[data-filter=kind]").first
+        kind.click()
+        assert set(column(page, "kind")) == {kind.get_attribute("data-value")}
+        page.locator("#filtered .reset").click()
+        assert len(all_rows(page)) == 180
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+
+
+def test_the_address_keeps_the_filters_through_reload_back_and_forward(browser, made):
+    found = failures(made.outcomes)
+    of_level = sorted(o.index for o in found if o.case.level == 1)
+    with shown(browser, made.folder / report.REPORT) as page:
+        filters = page.locator("#filters")
+        filters.locator("[name=verdict]").select_option("failure")
+        filters.locator("[name=level]").select_option("1")
+        page.evaluate(f"openCase(place.get({of_level[0]}))")
+        address = page.evaluate("location.hash")
+        assert address == f"#case-{of_level[0]}&level=1&verdict=failure"
+        assert page.get_attribute("#case-link", "href") == address
+        page.reload()
+        assert (all_rows(page), chosen(page)) == (of_level, of_level[0])
+        page.go_back()
+        page.locator("#matching:not(:text-is(''))").wait_for()
+        assert all_rows(page) == sorted(o.index for o in found)
+        page.go_back()
+        assert len(all_rows(page)) == 180
+        page.go_forward()
+        page.go_forward()
+        assert all_rows(page) == bright(page) == of_level
+        filters.locator("[name=measure]").select_option(label="score")
+        filters.locator("[name=to]").press_sequentially("-1000")
+        assert "measure=score&to=-1000" in page.evaluate("location.hash")
+        page.go_back()  # one step back is the whole number
+        assert all_rows(page) == of_level
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "#verdict=nothing&level=7&kind=%3Cscript%3E&region=9:9&box=99&avoided=me&from=x&to=1e999",
+        "#case-1e3&level=%E0%A4%A&__proto__=1&constructor=2&box=-1&measure=__proto__&from=",
+        "#&&&===&verdict&%00" + "&level=0" * 0 + "&x=" + "y" * 10_000,
+        "#case-0x1&verdict=failure%0A&kind=" + EVIL,
+    ],
+)
+def test_what_an_address_says_wrongly_is_left_out(browser, made, address):
+    with shown(browser, made.folder / report.REPORT) as page:
+        page.evaluate("(address) => { location.hash = address; }", address)
+        page.wait_for_timeout(100)
+        assert len(all_rows(page)) == 180
+        page.reload()
+        assert len(all_rows(page)) == 180
+        assert page.locator(".map .mark").count() == 180
+
+
+def test_the_table_is_downloaded_as_it_is_filtered_and_no_text_in_it_is_a_formula(
+    browser, tmp_path
+):
+    formulas = {4: "=1+1", 9: "@SUM(A1)\nnext;=2", 11: '-1,"x"', 13: "harmless, -3 m"}
+    run = write_run(tmp_path / "run", 20, errors=formulas)
+    with shown(browser, report.write_report(run)) as page:
+        with page.expect_download() as started:
+            page.locator("#download").click()
+        assert started.value.suggested_filename == "cases.csv"
+        text = started.value.path().read_text(encoding="utf-8")
+        table = list(csv.DictReader(io.StringIO(text, newline="")))
+        assert sorted(int(row["case"]) for row in table) == [o.index for o in run.outcomes]
+        by_case = {int(row["case"]): row for row in table}
+        for outcome in run.outcomes:
+            row = by_case[outcome.index]
+            score = outcome.score
+            assert row["score"] == ("" if score is None else f"{round(score, 1):g}") or (
+                float(row["score"]) == pytest.approx(score, abs=0.06)
+            )
+            assert float(row["x_POV0 m"]) == pytest.approx(outcome.case.x_pov0_m, abs=1e-3)
+        assert by_case[4]["verdict"] == "VUT_ERROR: =1+1"
+        cells = [cell for row in csv.reader(io.StringIO(text, newline="")) for cell in row]
+        # Where a list separator is another one, cells are split without a look at quotes.
+        cells += [cell for line in text.splitlines() for cell in re.split("[;\t]", line)]
+        for cell in cells:
+            plain = cell.strip('" ')
+            assert re.fullmatch(r"-?[0-9.]*", plain) or plain[:1] not in tuple("=+-@"), cell
+        page.locator("#filters [name=verdict]").select_option("failure")
+        with page.expect_download() as started:
+            page.locator("#download").click()
+        table = list(csv.DictReader(started.value.path().open(encoding="utf-8", newline="")))
+        assert [int(row["case"]) for row in table] == rows(page)
 
 
 def test_a_map_zooms_about_the_case_and_is_dragged(page, made):

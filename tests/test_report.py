@@ -27,6 +27,7 @@ from merge_sumo.reports.report_words import headline
 from merge_sumo.reports.summary import summarise
 from merge_sumo.reports.surface import Surface, learn_surface
 from merge_sumo.reports.verdict import judge
+from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import InProcess, Workers
 from merge_sumo.values.case import to_unit
@@ -143,6 +144,35 @@ class TestThePage:
                 f.score for f in found if (f.case.level, region[f.index]) == own[firsts.index(o)]
             ]
             assert o.score == min(same)
+
+    def test_a_bar_of_failures_is_their_share_of_the_levels_cases(self, made, page):
+        rows = root_of(page).xpath("(//table[@class='bars'])[1]//tr[td]")
+        for level, row in zip((0, 1, 2), rows, strict=True):
+            cases = [o for o in made.outcomes if o.case.level == level]
+            untested = 100 * sum(not o.is_tested for o in cases) / len(cases)
+            failed = 100 * sum(o.failed for o in cases) / len(cases)
+            widths = {
+                kind: float(row.xpath(f".//rect[@class='{kind}']/@width")[0])
+                for kind in ("untested", "fail", "track")
+            }
+            assert widths["track"] == 100.0
+            assert widths["untested"] == pytest.approx(untested, abs=0.06)
+            assert widths["fail"] == pytest.approx(failed, abs=0.06)
+
+    def test_bars_of_coverage_end_at_the_number_that_stands_above_them(self, page):
+        root = root_of(page)
+        (end,) = root.xpath("(//table[@class='bars'])[2]//*[@class='axis']/span[2]")
+        for row in root.xpath("(//table[@class='bars'])[2]//tr[td]"):
+            found = float(row.xpath("./td[1]")[0].text_content())
+            bar = float(row.xpath(".//rect[@class='fail']/@width")[0])
+            assert bar == pytest.approx(100 * found / float(end.text), abs=0.1)
+
+    @pytest.mark.parametrize("name", ["us23", "us23-traffic"])
+    def test_has_no_column_of_a_coordinate_that_no_level_of_it_has(self, tmp_path, name):
+        run = write_run(tmp_path / "run", 20, levels=(0, 1), scenario=named_scenario(name))
+        page = report_page(run)
+        assert "psi" not in [c["name"] for c in data_of(page)["coordinates"]]
+        assert "psi" not in root_of(page).xpath("//th/text()")
 
     def test_bars_of_all_levels_share_a_scale(self, page):
         root = root_of(page)

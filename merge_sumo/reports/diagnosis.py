@@ -182,6 +182,7 @@ class FailureBox:
         cases: cases of the run inside, by the bounds as written.
         failures: failures among them.
         kinds: kinds of these failures, the most frequent first.
+        indices: the cases.
     """
 
     level: int
@@ -189,6 +190,7 @@ class FailureBox:
     cases: int
     failures: int
     kinds: tuple[tuple[Kind, int], ...]
+    indices: tuple[int, ...]
 
     @property
     def where(self) -> str:
@@ -288,7 +290,8 @@ def _box(
     inside = [o for o in told if _inside(o, bounds)]
     failures = [o for o in inside if o.failed]
     found = Counter(kinds[o.index] for o in failures if o.index in kinds)
-    return FailureBox(level, bounds, len(inside), len(failures), tuple(found.most_common()))
+    kinds_found, indices = tuple(found.most_common()), tuple(o.index for o in inside)
+    return FailureBox(level, bounds, len(inside), len(failures), kinds_found, indices)
 
 
 def _inside(outcome: Outcome, bounds: Bounds) -> bool:

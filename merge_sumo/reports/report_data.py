@@ -49,6 +49,7 @@ def page_data(facts: Facts) -> dict[str, Any]:
         "ends": [end.value for end in End],
         "kinds": [kind.value for kind in Kind],
         "cases": _columns(facts, offsets),
+        "boxes": _boxes(facts),
         "errors": {
             o.index: shortened(o.measures.error, ERROR_CHARACTERS)
             for o in facts.shown
@@ -60,6 +61,15 @@ def page_data(facts: Facts) -> dict[str, Any]:
         "replay": f"merge-sumo replay {_quoted(facts.run.folder)}",
         **_road(facts.road),
     }
+
+
+def _boxes(facts: Facts) -> list[dict[str, Any]]:
+    """Return level and cases of the regions in words, of the cases that are shown."""
+    shown = {o.index for o in facts.shown}
+    return [
+        {"level": box.level, "cases": [index for index in box.indices if index in shown]}
+        for box in facts.boxes
+    ]
 
 
 def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:

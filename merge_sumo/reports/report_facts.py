@@ -19,6 +19,7 @@ from merge_sumo.reports.diagnosis import (
     Diagnosis,
     Kind,
     diagnose,
+    failure_boxes,
 )
 from merge_sumo.reports.foretelling import Expected, is_foretold, surprises
 from merge_sumo.reports.report_maps import GRID
@@ -28,7 +29,7 @@ from merge_sumo.reports.verdict import Trouble, judge
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, OWN
+from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, LEVELS, OWN
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -75,7 +76,7 @@ class Facts:
         self._surfaces = _meanwhile(
             partial(_surfaces, run, self.levels, workers, self.part_ended),
         )
-        self.coordinates = coordinates(run.scenario)
+        self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.worst = failures(run.outcomes)
         self.regions = regions_of(self.worst)
         self.spread = spread_failures(self.worst)[:LISTED]
@@ -100,6 +101,11 @@ class Facts:
         self.kinds: dict[int, Kind] = {
             index: found.kind for index, found in self.diagnoses.items() if found.kind is not None
         }
+        self.boxes = [
+            box
+            for level in self.levels
+            for box in failure_boxes(self.worst + self.near, level, self.kinds)
+        ]
         self.truths = {level: _truth(run, self.road, level) for level in self.levels}
         self.part_ended()
 

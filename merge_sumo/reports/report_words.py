@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.campaigns.avoidance import in_a_sentence
 from merge_sumo.campaigns.run import SETTINGS, TRAJECTORIES, Run
@@ -17,62 +16,19 @@ from merge_sumo.reports.diagnosis import (
     CEDED_MPS,
     MEANING,
     Kind,
-    failure_boxes,
 )
 from merge_sumo.reports.foretelling import foretold_in_words
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
-from merge_sumo.reports.report_maps import pairs_of
-from merge_sumo.reports.summary import LevelSummary, Summary
+from merge_sumo.reports.report_levels import Level, levels_of
+from merge_sumo.reports.summary import Summary
 from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.reports.verdict import Verdict, counted, in_words
-from merge_sumo.system.printable import printable, two_digits
+from merge_sumo.system.printable import printable
 from merge_sumo.values.criterion import COLLISION, Criterion
-from merge_sumo.values.empty_ball import EmptyBall
-from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.merge import HARSH_MPS2, AfterMerge
-from merge_sumo.values.scenario import OWN, level_name
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
-
-
-@dataclass(frozen=True, slots=True)
-class Third:
-    """A coordinate that the reader of a map moves through, and its bounds."""
-
-    name: str
-    low: float
-    high: float
-
-
-@dataclass(frozen=True, slots=True)
-class Level:
-    """What the page says of a level; bars are shares of 100."""
-
-    level: int
-    name: str
-    caption: str
-    about: str
-    cases: int
-    failures: int
-    untested: int
-    share_bar: float
-    untested_bar: float
-    fmc: float | None
-    fmc_bar: float | None
-    plausible: float | None
-    plausible_bar: float
-    truth: float | None
-    truth_bar: float
-    note: str
-    dims: int
-    third: Third | None
-    pairs: list[str]
-
-
-ABOUT: Final = {
-    0: "keeps its speed",
-    1: "makes room for a VUT that accelerates",
-    2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
-}
 
 
 def page_words(facts: Facts) -> dict[str, Any]:
@@ -80,17 +36,12 @@ def page_words(facts: Facts) -> dict[str, Any]:
     settings, summary = facts.run.settings, facts.summary
     criterion = facts.run.criterion
     wanted = settings.get("cases")
-    boxes = [
-        box
-        for level in facts.levels
-        for box in failure_boxes(facts.worst + facts.near, level, facts.kinds)
-    ]
-    described = Counter(box.level for box in boxes for _ in range(box.failures))
+    described = Counter(box.level for box in facts.boxes for _ in range(box.failures))
     lost = [str(o.index) for o in facts.shown if o.index not in facts.motion]
     if len(lost) > LISTED:
         lost = [*lost[:LISTED], counted(len(lost) - LISTED, "other")]
     left = {n: summary.levels[n].failures - described[n] for n in facts.levels}
-    levels = _levels(facts)
+    levels, fmc_axis = levels_of(facts)
     tables = [
         (f"{trouble.count} {trouble.end}: {trouble.message}", facts.examples_of(trouble))
         for trouble in facts.troubles()
@@ -100,7 +51,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         ("Ten nearest misses", facts.near[:LISTED]),
     ]
     if facts.surprises:
-        tables.append(("Ten that were foretold worst", facts.surprises))
+        tables.append(("Ten largest errors of the twin's predictions", facts.surprises))
     return {
         "vut": facts.run.vut,
         "headline": headline(facts.verdict, summary, facts.worst, facts.kinds, criterion),
@@ -116,6 +67,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "counted": summary.cases - len(facts.shown),
         "summary": summary,
         "levels": levels,
+        "fmc_axis": fmc_axis,
         "any_truth": any(level.truth is not None for level in levels),
         "truth_cases": " or ".join(
             f"{count:,}" for count in sorted({TRUTH_CASES[level] for level in facts.levels})
@@ -127,7 +79,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "batches": len({o.batch for o in facts.run.outcomes}),
         "recorded": _recorded(facts.run),
         "driven": _duration(sum(o.measures.t_end_s for o in facts.run.outcomes)),
-        "sentences": [box.sentence for box in boxes],
+        "sentences": [box.sentence for box in facts.boxes],
         "scattered": ", ".join(
             f"{counted(count, 'failure')} at level {level_name(level)}"
             for level, count in left.items()
@@ -149,80 +101,6 @@ def page_words(facts: Facts) -> dict[str, Any]:
     }
 
 
-def _levels(facts: Facts) -> list[Level]:
-    plausible = {
-        level: None if surface is None else surface.plausible_fmc()
-        for level, surface in facts.surfaces.items()
-    }
-    truth = {
-        level: None if found is None else fmc(found.failures)
-        for level, found in facts.truths.items()
-    }
-    most_share = max(
-        (
-            (s.failures + s.cases - s.tested) / s.cases
-            for s in facts.summary.levels.values()
-            if s.cases
-        ),
-        default=0.0,
-    )
-
-    # One scale for all levels: their bars are compared.
-    most = max(
-        (
-            max(found.fmc, plausible[level] or 0.0, truth[level] or 0.0)
-            for level, found in facts.summary.levels.items()
-        ),
-        default=0.0,
-    )
-
-    def row(level: int, found: LevelSummary) -> Level:
-        # Found against what there may be: a bar shows nothing where only one of them is known.
-        known = plausible[level] is not None or truth[level] is not None
-        scale = 90.0 / most if known and most > 0.0 else 0.0
-        share = 100.0 / (most_share * found.cases) if most_share > 0.0 and found.cases else 0.0
-        return Level(
-            level=level,
-            name=level_name(level),
-            caption=f"own: {facts.run.pov}" if level == OWN else str(level),
-            about=ABOUT.get(level, ""),
-            cases=found.cases,
-            failures=found.failures,
-            untested=found.cases - found.tested,
-            share_bar=round(share * found.failures, 1),
-            untested_bar=round(share * (found.cases - found.tested), 1),
-            fmc=found.fmc if found.tested else None,
-            fmc_bar=round(scale * found.fmc, 1) if scale else None,
-            plausible=plausible[level],
-            plausible_bar=round(scale * (plausible[level] or 0.0), 1),
-            truth=truth[level],
-            truth_bar=round(scale * (truth[level] or 0.0), 1),
-            note=_note(facts, level, found),
-            dims=len(facts.run.scenario.dimensions(level)),
-            third=_third(facts, level),
-            pairs=_pairs(facts, level),
-        )
-
-    return [row(level, found) for level, found in facts.summary.levels.items()]
-
-
-def _third(facts: Facts, level: int) -> Third | None:
-    if len(facts.run.scenario.dimensions(level)) != 3:
-        return None
-    found = facts.coordinates_of(level)[2]
-    return Third(found.name, round(found.dimension.low, 2), round(found.dimension.high, 2))
-
-
-def _pairs(facts: Facts, level: int) -> list[str]:
-    """Return the pairs of coordinates that a level's map may show, the first one first."""
-    found = facts.coordinates_of(level)
-    return [
-        " × ".join(found[axis].name for axis in pair.axes)
-        + ("" if pair.share is None else f": {pair.share:.0%}")
-        for pair in pairs_of(len(found), facts.surfaces[level])
-    ]
-
-
 def _radii(levels: Sequence[Level]) -> str:
     """Return what to know of the radius where there are more than three coordinates."""
     more = sorted({level.dims for level in levels if level.dims > 3})
@@ -232,37 +110,6 @@ def _radii(levels: Sequence[Level]) -> str:
     return (
         f"It is {in_words(parts)}: there a ball is as large as in three. Then the volume is "
         "integrated by quasi-Monte Carlo, to within some tenths of a percent."
-    )
-
-
-def _note(facts: Facts, level: int, found: LevelSummary) -> str:
-    if found.cases and not found.tested:
-        return f"Nothing was tested in {counted(found.cases, 'case')}."
-    text = f"{counted(found.failures, 'failure')} in {counted(found.cases, 'case')}"
-    if found.failures:
-        text += f", {counted(found.regions, 'region')}"
-    if found.tested < found.cases:
-        text += f"; {found.cases - found.tested} not tested"
-    if found.unseen is not None:
-        text += f". {_unseen(facts, level, found.unseen)}"
-    if facts.surfaces[level] is None:
-        text += f". No surrogate: it takes {FEWEST_FAILURES} failures to learn one"
-    return text + "."
-
-
-def _unseen(facts: Facts, level: int, ball: EmptyBall) -> str:
-    """Return the largest ball that no case has entered, in a clause."""
-    axes = facts.coordinates_of(level)
-    spans = [(c, c.dimension.high - c.dimension.low) for c in axes]
-    radii = ", ".join(f"{two_digits(ball.radius * span)} {c.unit}" for c, span in spans)
-    centre = ", ".join(
-        f"{c.name} {c.dimension.low + share * span:.{c.digits}f}"
-        for (c, span), share in zip(spans, ball.centre, strict=True)
-    )
-    more = ball.at_most > 1.01 * ball.radius
-    return (
-        f"The largest ball that no case has entered has {'at least ' if more else ''}a radius of "
-        f"{ball.radius:.0%} of the axes ({radii}), around {centre}"
     )
 
 

@@ -40,10 +40,10 @@ function motion(i) {
   return { rows, v, x, met: cases.nearest[i] };
 }
 const failed = (i) => cases.failed[i] === 1;
-const avoiders = document.getElementById("avoided-by"); // null where nobody was asked
-function wanted(i) { // whether the reader wants to see this failure
-  const who = avoiders?.value, by = who && failed(i) ? cases.avoided_by[i] : null;
-  if (!who || !failed(i)) return true;
+let matching = null; // the cases that the filters let through; null without a filter
+const wanted = (i) => matching === null || matching.has(i);
+function avoidedBy(i, who) { // a driver, "pov" or "none"
+  const by = failed(i) ? cases.avoided_by[i] : null;
   if (by === null) return false;
   return who === "pov" ? cases.pov_careful[i] === 1 : who === "none" ? by.length === 0 : by.includes(who);
 }
@@ -141,7 +141,6 @@ function shade(svg, values, nx, ny, box) {
 const BOX = [52, 8, 334, 286]; // x, y, width, height of the plot in a map
 const unit = (c, value) => (value - c.low) / (c.high - c.low);
 let chosen = -1;
-avoiders?.addEventListener("change", () => maps.forEach((map) => map.draw()));
 const maps = [...document.querySelectorAll(".map")].map((figure) => new FailureMap(figure));
 
 function FailureMap(figure) {
@@ -214,6 +213,7 @@ function FailureMap(figure) {
     figure.querySelector("output").textContent = all ? "all values" : valueText(third, value) + degrees;
     this.draw();
   };
+  this.showAll = () => (third ? this.move(at, true) : this.draw());
   this.begin = () => (third ? this.move(at, false) : this.draw());
   this.lookAt = (i) => { if (cases.level[i] === level && !near(i)) this.move(cases[third.field][i], false); };
   const counts = () => { // of a long campaign: the cases that are not listed one by one
@@ -378,7 +378,8 @@ function openCase(i, element = null) { // asked for by the reader: it is in sigh
   tip(null);
   const before = element?.getBoundingClientRect().top;
   show(i);
-  history.replaceState(null, "", `#case-${cases.index[i]}`);
+  opened = i;
+  history.replaceState(null, "", address());
   const { top, height } = panel.getBoundingClientRect();
   if (top < 0 || top + Math.min(height, 380) > innerHeight) dock(true);
   if (!element) return;
@@ -386,17 +387,39 @@ function openCase(i, element = null) { // asked for by the reader: it is in sigh
   const at = element.getBoundingClientRect(), room = panel.classList.contains("docked") ? panel.getBoundingClientRect().top - 12 - at.height : Infinity;
   scrollBy({ top: at.top - Math.min(before, room), behavior: "instant" });
 }
-function openLinked() { // #case-111
-  const index = Number(/^#case-(\d+)$/.exec(location.hash)?.[1] ?? NaN);
+
+/* ---------- the address: #case-111&verdict=failure ---------- */
+const form = byId("filters"), FILTERS = ["box", "level", "verdict", "region", "kind", "avoided", "measure", "from", "to"];
+let opened = -1; // the case that the reader asked for
+function filtersSet() { // [name, value] of what is not as it was
+  const bounded = form.elements.from.value !== "" || form.elements.to.value !== "";
+  return FILTERS.map((name) => [name, form.elements[name]?.value ?? ""]).filter(([name, value]) => value !== "" && (name !== "measure" || bounded));
+}
+function address(i = opened) {
+  const linked = i < 0 ? [] : [`case-${cases.index[i]}`];
+  return `#${[...linked, new URLSearchParams(filtersSet()).toString()].filter(Boolean).join("&")}`;
+}
+function openLinked() {
+  const index = Number(/^#case-(\d+)(&|$)/.exec(location.hash)?.[1] ?? NaN);
   if (!place.has(index)) return false;
-  openCase(place.get(index));
+  if (place.get(index) !== opened) openCase(place.get(index));
   return true;
+}
+function restore() { // an address is data: what it names that is not here is left out
+  const query = new URLSearchParams(location.hash.slice(1));
+  form.reset();
+  for (const name of FILTERS) {
+    const control = form.elements[name], value = query.get(name);
+    if (!control || value === null || (control.type === "number" && !/^-?\d{1,15}(\.\d{1,15})?$/.test(value))) continue;
+    control.value = value;
+    if (control.selectedIndex < 0) control.selectedIndex = 0;
+  }
 }
 byId("keep").addEventListener("click", () => {
   beside = beside < 0 ? chosen : -1;
   show(chosen);
 });
-addEventListener("hashchange", openLinked);
+addEventListener("hashchange", () => { restore(); filter(); openLinked(); });
 addEventListener("keydown", (event) => { if (event.key === "Escape") dock(false); });
 byId("close").addEventListener("click", () => dock(false));
 
@@ -407,7 +430,8 @@ function show(i) {
   byId("case-words").textContent = words(i);
   const link = byId("case-link");
   link.hidden = false;
-  link.href = link.textContent = `#case-${cases.index[i]}`;
+  link.href = address(i);
+  link.textContent = `#case-${cases.index[i]}`;
   const command = `${data.replay} ${cases.index[i]} --gui`;
   // Lines break between words only: a hyphen in a name is no place for it.
   byId("command").replaceChildren(...command.split(" ").flatMap((word, n) => {
@@ -597,12 +621,12 @@ for (const table of document.querySelectorAll(".list")) {
 
 /* ---------- all cases ---------- */
 const verdict = (i) => (failed(i) ? "failure" : tested(i) ? "no failure" : data.ends[cases.end[i]]);
-function allCases() {
-  const form = byId("filters"), head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
-  const { level, verdict: ended, region, kind, measure, from, to } = form.elements;
-  const number = (key, name, digits) => ({ name, value: (i) => cases[key][i], text: (value) => fixed(value, digits) });
+function allCases() { // gives what shows the cases that the filters let through
+  const head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
+  const { box, level, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where nobody was asked
+  const number = (key, name, digits) => ({ name, exact: true, value: (i) => cases[key][i], text: (value) => fixed(value, digits) });
   const columns = [
-    { name: "case", value: (i) => cases.index[i] },
+    { name: "case", exact: true, value: (i) => cases.index[i] },
     { name: "level", value: (i) => cases.level[i], text: (value) => data.level_names[value] },
     { name: "verdict", words: true, value: verdict, text: (value, i) => (tested(i) || !data.errors[cases.index[i]] ? value : `${value}: ${data.errors[cases.index[i]]}`) },
     { name: "kind", words: true, value: (i) => (cases.kind[i] === null ? null : data.kinds[cases.kind[i]]) },
@@ -630,7 +654,10 @@ function allCases() {
   ordered.sort(([a], [b]) => a[0] - b[0] || a[1] - b[1]);
   for (const [[l, r], value, n] of ordered) option(region, value, `level ${data.level_names[l]}, region ${r + 1} (${n})`);
   for (const [value, n] of count(columns[3].value)) option(kind, value, `${value} (${n})`);
-  for (const [n, c] of columns.entries()) if (n > 4) option(measure, n, c.name);
+  for (const [n, c] of columns.entries()) if (n > 4) option(measure, c.name);
+  for (const [n, { level: l, cases: inside }] of data.boxes.entries()) option(box, n, `level ${data.level_names[l]}, ${n + 1} (${inside.length})`);
+  box.parentElement.hidden = !data.boxes.length;
+  const boxes = data.boxes.map(({ cases: inside }) => new Set(inside));
 
   for (const c of columns) {
     const cell = head.appendChild(document.createElement("th")), button = cell.appendChild(document.createElement("button"));
@@ -656,13 +683,24 @@ function allCases() {
     more.hidden = rows >= found.length;
     more.textContent = `Show ${Math.min(PART, found.length - rows)} more`;
   };
-  const list = () => {
+  const filter = () => {
     const low = from.value === "" ? -Infinity : Number(from.value), high = to.value === "" ? Infinity : Number(to.value);
-    const measured = columns[measure.value].value, bounded = low > -Infinity || high < Infinity;
+    const measured = columns.find(({ name }) => name === measure.value)?.value, bounded = measured && (low > -Infinity || high < Infinity);
+    const inside = box.value === "" ? null : boxes[box.value];
     found = all.filter((i) => (!level.value || cases.level[i] === Number(level.value))
       && (!ended.value || verdict(i) === ended.value || `: ${message(i)}` === ended.value)
       && (!region.value || where(i) === region.value) && (!kind.value || columns[3].value(i) === kind.value)
+      && (!avoided?.value || avoidedBy(i, avoided.value)) && (!inside || inside.has(cases.index[i]))
       && (!bounded || (measured(i) !== null && measured(i) >= low && measured(i) <= high)));
+    matching = filtersSet().length ? new Set(found) : null;
+    list();
+    for (const map of maps) inside && map.level === data.boxes[box.value].level ? map.showAll() : map.draw();
+    for (const button of document.querySelectorAll("[data-filter]")) button.setAttribute("aria-pressed", form.elements[button.dataset.filter].value === button.dataset.value);
+    byId("filtered").hidden = matching === null;
+    byId("filtered-number").textContent = `${found.length} of ${all.length} cases are let through by the filters; the others are faint.`;
+    if (chosen >= 0) byId("case-link").href = address(chosen);
+  };
+  const list = () => {
     found.sort((a, b) => { // what has no value is last, whichever way
       const [x, y] = [by.value(a), by.value(b)];
       return (x === null) - (y === null) || (x < y ? -way : x > y ? way : a - b);
@@ -675,8 +713,34 @@ function allCases() {
     rows = 0;
     extend();
   };
-  form.addEventListener("input", list);
-  form.addEventListener("reset", () => setTimeout(list));
+  let typing = null; // one entry of the history for a number, not for each key
+  const changed = (control = null) => {
+    filter();
+    history[control && control === typing ? "replaceState" : "pushState"](null, "", address());
+    typing = control?.matches("input") ? control : null;
+  };
+  for (const control of form.elements) if (control.matches("select, input")) control.addEventListener("input", () => changed(control));
+  form.addEventListener("change", () => { typing = null; });
+  const reset = () => { form.reset(); changed(); };
+  for (const button of document.querySelectorAll(".reset")) button.addEventListener("click", reset);
+  for (const button of document.querySelectorAll("[data-filter]")) button.addEventListener("click", () => {
+    const control = form.elements[button.dataset.filter], { value } = button.dataset;
+    control.value = control.value === value ? "" : value;
+    changed();
+    document.querySelector(".map").scrollIntoView({ block: "nearest" });
+  });
+  byId("download").addEventListener("click", () => {
+    const cell = (c, i) => {
+      const value = c.value(i);
+      return value === null ? "" : c.exact ? String(value) : csvText(c.text ? c.text(value, i) : String(value));
+    };
+    const lines = [columns.map((c) => csvText(c.name)), ...found.map((i) => columns.map((c) => cell(c, i)))];
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([lines.map((line) => `${line.join(",")}\r\n`).join("")], { type: "text/csv" }));
+    link.download = "cases.csv";
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+  });
   form.addEventListener("submit", (event) => event.preventDefault());
   more.addEventListener("click", extend);
   body.addEventListener("click", (event) => {
@@ -691,7 +755,11 @@ function allCases() {
     openCase(found[to.sectionRowIndex], to);
   });
   byId("all").hidden = !all.length;
-  if (all.length) list();
+  return filter;
+}
+function csvText(text) { // a spreadsheet is to run nothing: not at the start, nor where it may split
+  const defused = text.replace(/(^|[;,\t\r\n])(\s*)(?=[=+\-@])/g, "$1$2'").replace(/[\t\r\n]+/g, " ");
+  return /[",;]/.test(defused) ? `"${defused.replaceAll('"', '""')}"` : defused;
 }
 
 /* ---------- the search ---------- */
@@ -719,9 +787,11 @@ function search() {
 }
 
 const worst = document.querySelector(".list button");
+const filter = allCases();
+restore();
 for (const map of maps) map.begin();
 search();
-allCases();
+if (cases.index.length) filter();
 if (!openLinked() && worst) show(place.get(Number(worst.dataset.case)));
 addEventListener("resize", () => at(step));
 addEventListener("beforeprint", () => at(step));
