@@ -48,7 +48,7 @@ from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, dated
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.criterion import COLLISION, Criterion
+from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
 
 __all__ = ["CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "history", "open_run"]
@@ -75,7 +75,7 @@ def campaign(
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
     pov: AnyVut | None = None,
-    fail_when: str = COLLISION.fail_when,
+    fail_when: str = PAPER_CRITERION.fail_when,
     require: str | None = None,
     learn_from: Sequence[Path | str] = (),
     on_case: OnCase | None = None,
@@ -220,7 +220,7 @@ def truth(
     scenario: Scenario | Path | str = US23,
     policies: Path | str | None = None,
     pov: AnyVut | None = None,
-    fail_when: str = COLLISION.fail_when,
+    fail_when: str = PAPER_CRITERION.fail_when,
     require: str | None = None,
     vut_command: str | None = None,
     deadline_s: float = DEADLINE_S,

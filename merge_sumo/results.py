@@ -152,7 +152,7 @@ class CaseRun(InLines):
 
     @property
     def failed(self) -> bool:
-        """Whether the VUT collided."""
+        """Whether this case is a failure of the VUT under the criterion."""
         return self.outcome.failed
 
     @property

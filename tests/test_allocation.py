@@ -39,7 +39,7 @@ batch_sizes = st.integers(0, 300)
 
 def outcome(index: int, batch: int, level: int, *, failed: bool) -> Outcome:
     nothing: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
-    end, score = (End.COLLISION, -700.0) if failed else (End.MERGED, -3.0)
+    end, score = End.MERGED, -700.0 if failed else -3.0
     svo = 0.5 if level == 2 else None
     case = Case(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo)
     return Outcome(index, batch, case, Measures(**{**nothing, "end": end, "score": score}))

@@ -118,7 +118,7 @@ def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options
 
 def test_a_merge_that_asks_too_much_of_others_is_no_harmless_dot(browser, made):
     safe = [o for o in made.outcomes if o.is_tested and not o.failed]
-    asking = [o for o in safe if o.measures.after_merge in ("harsh", "forced")]
+    asking = [o for o in safe if o.measures.severity in ("contact", "harsh")]
     assert asking
     with shown(browser, made.folder / report.REPORT) as page:
         assert page.locator(".map .mark.harsh").count() == len(asking)

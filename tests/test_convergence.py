@@ -42,7 +42,7 @@ def outcomes(*failures_by_batch: int, safe: int = 1) -> list[Outcome]:
             x = -340.0 + 16.0 * found if failed else -181.0
             found += failed
             case = Case(level=0, x_pov0_m=x, v_pov0_mps=30.0)
-            end, score = (End.COLLISION, -600.0) if failed else (End.MERGED, -1.0)
+            end, score = End.MERGED, -600.0 if failed else -1.0
             measures = Measures(**{**NOTHING, "end": end, "score": score})
             ran.append(Outcome(len(ran), batch, case, measures))
     return ran

@@ -32,7 +32,7 @@ def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = Tr
     x, v = to_unit([case], case.level)[0, :2].tolist()
     dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7) if fails else 80.0
     overlap_m = 6.0 - abs(dx_m)
-    end = End.COLLISION if overlap_m > 0.0 else End.MERGED
+    end = End.MERGED
     score = -560.0 - 75.0 * overlap_m if overlap_m > 0.0 else -450.0 * math.exp(overlap_m / 15.0)
     values = {**NOTHING, "end": end, "score": score, "dx_m": None if blind else dx_m}
     return Outcome(index, batch, case, Measures(**values))

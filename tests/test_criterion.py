@@ -25,9 +25,9 @@ from merge_sumo.reports.verdict import judge
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.values import score
-from merge_sumo.values.bodies import SPACING_M, CentreLines, clearance_before_m
+from merge_sumo.values.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.values.case import Pool
-from merge_sumo.values.criterion import COLLISION, VOCABULARY, Criterion
+from merge_sumo.values.criterion import PAPER_CRITERION, VOCABULARY, Criterion
 from merge_sumo.values.expression import MOST_MARGIN, parse_condition
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import FAILURE_SCORE, Outcome, measure, score_of
@@ -64,6 +64,11 @@ def margin(text, **values):
 def of(expression, trajectory):
     """Return the margin of an episode under a criterion."""
     return Criterion(expression).margin(trajectory, measure(trajectory))
+
+
+def nearest(trajectory, lines):
+    """Return the smallest clearance before M."""
+    return closest_before_m(trajectory, lines)[0]
 
 
 class TestMargins:
@@ -133,8 +138,8 @@ class TestRefused:
         [
             ("tcc_s < 1.5", "no measure 'tcc_s': did you mean ttc_s"),
             ("zzzzzzzz < 1.5", "choose ttc_s, clearance_m"),
-            ("colision", "did you mean collision?"),
-            ('end == "TIMEOT"', "never 'TIMEOT', but COLLISION, MERGED or TIMEOUT"),
+            ("papr", "did you mean paper?"),
+            ('end == "TIMEOT"', "never 'TIMEOT', but MERGED or TIMEOUT"),
             ('end == "VUT_ERROR"', "never 'VUT_ERROR'"),
             ('end < "TIMEOUT"', "compare it with == or !="),
             ("end == merged_first", "with a text in quotes"),
@@ -183,13 +188,13 @@ class TestMeasures:
 
     def test_that_are_missing_count_as_never_meeting(self):
         never = ending(0.0, end=End.TIMEOUT)
-        for harmless in ("ttc_s < 9", "gap_m < 9", "pet_s < 9", "dx_m < 9", "drac_mps2 > 0",
+        for harmless in ("ttc_s < 9", "bumper_gap_m < 9", "pet_s < 9", "dx_m < 9", "drac_mps2 > 0",
                          "brake_after_mps2 > 0", "impact_speed_mps > 0", 'merged_first == "VUT"',
                          "last_avoidable_s < 99"):  # fmt: skip
             assert of(harmless, never) > 0.0, harmless
         assert of('end == "TIMEOUT"', never) == -1.0
 
-    def test_in_a_collision_no_braking_would_do(self):
+    def test_within_6_m_no_braking_would_do(self):
         crash = ending(0.0)
         assert measure(crash).drac_mps2 is None
         assert of("drac_mps2 > 1000", crash) == -MOST_MARGIN
@@ -197,8 +202,8 @@ class TestMeasures:
 
     def test_gaps_are_between_bumpers(self):
         # The POV is 8 m ahead, and 5 m long.
-        assert of("gap_m < 2", ending(8.0)) == pytest.approx(0.5)
-        assert of("gap_m < 2", ending(-8.0)) == pytest.approx(0.5)
+        assert of("bumper_gap_m < 2", ending(8.0)) == pytest.approx(0.5)
+        assert of("bumper_gap_m < 2", ending(-8.0)) == pytest.approx(0.5)
 
     def test_braking_after_the_merge_by_hand(self):
         # 20 m between bumpers, closing by 10 m/s: 12.5 m are left after 0.75 s, so 100 / 25.
@@ -210,16 +215,24 @@ class TestMeasures:
         # 7 m are gone in 0.75 s at 10 m/s.
         assert of("brake_after_mps2 > 8", ending(-12.0, v_pov=36.0)) == -MOST_MARGIN
 
-    def test_what_a_merge_asks_by_hand(self):
-        # 20 m between bumpers: 4 m/s2 at 10 m/s, 2.86 at 8.75 m/s, 4.4 at 10.4 m/s; 2.5 at 8.16.
-        asked = {25.9: "none", 34.0: "none", 35.0: "harsh", 35.9: "harsh", 36.1: "forced"}
-        for v_pov, expected in asked.items():
-            assert measure(ending(-25.0, v_pov=v_pov, v_vut=26.0)).after_merge == expected
-        assert measure(ending(4.9, v_pov=40.0)).after_merge == "forced"
-        assert measure(ending(5.1, v_pov=40.0)).after_merge == "none"
-        assert measure(ending(0.0, end=End.TIMEOUT)).after_merge is None
-        assert of('after_merge == "forced"', ending(0.0)) == -1.0
-        assert of('after_merge != "none"', ending(0.0, end=End.TIMEOUT)) == 1.0
+    def test_severity_by_hand(self):
+        # 20 m between bumpers: 4 m/s2 at 10 m/s, 2.86 at 8.75 m/s; gone in .75 s at 26.7 m/s.
+        expected = {25.9: "safe", 34.0: "safe", 35.0: "harsh", 40.0: "harsh", 52.6: "harsh"}
+        for v_pov, severity in (expected | {52.7: "contact"}).items():
+            assert measure(ending(-25.0, v_pov=v_pov, v_vut=26.0)).severity == severity
+        assert measure(ending(4.9, v_pov=40.0)).severity == "contact"
+        assert measure(ending(5.1, v_pov=40.0)).severity == "conflict"
+        assert measure(ending(6.0, v_pov=40.0)).severity == "safe"
+        assert measure(ending(0.0, end=End.TIMEOUT)).severity is None
+        assert of('severity == "contact"', ending(0.0)) == -1.0
+        assert of('severity != "contact"', ending(0.0, end=End.TIMEOUT)) == -1.0
+
+    def test_an_impact_speed_needs_an_impact(self):
+        assert measure(ending(5.5, v_pov=20.0, v_vut=22.0)).impact_speed_mps == pytest.approx(2.0)
+        assert measure(ending(5.5, v_pov=22.0, v_vut=20.0)).impact_speed_mps is None
+        assert measure(ending(-4.0, v_pov=22.0, v_vut=26.0)).impact_speed_mps == pytest.approx(4.0)
+        assert measure(ending(-12.0, v_pov=36.0, v_vut=26.0)).impact_speed_mps == 10.0
+        assert measure(ending(-25.0, v_pov=36.0, v_vut=26.0)).impact_speed_mps is None
 
     def test_an_error_has_no_verdict_under_any_criterion(self):
         error = Trajectory(CASE, ending(0.0).motion, End.VUT_ERROR, "gone")
@@ -230,43 +243,52 @@ class TestMeasures:
 
 
 class TestRecords:
-    def test_end_with_what_the_merge_asks(self):
-        record = COLLISION.outcome(0, 0, ending(20.0)).to_record()
-        assert list(record)[-1] == "after_merge"
+    def test_hold_every_measure_that_a_criterion_may_name(self):
+        followed = replace(CASE, scenario=replace(US23, follow_up_s=3.0))
+        after = np.array([[[20.0, 30.0, 0.0], [0.0, 26.0, 0.0]]])
+        episode = replace(ending(20.0), case=followed, after=after)
+        record = PAPER_CRITERION.outcome(0, 0, episode).to_record()
+        assert set(VOCABULARY) - {"nearest"} <= set(record)
 
-    def test_of_before_say_nothing_of_it(self):
-        outcome = COLLISION.outcome(0, 0, ending(20.0))
-        record = outcome.to_record()
-        del record["after_merge"]
-        before = Outcome.from_record(record)
-        assert before.measures == replace(outcome.measures, after_merge=None)
+    def test_of_release_0_1_are_read(self):
+        record = PAPER_CRITERION.outcome(0, 0, ending(5.5, v_pov=20.0, v_vut=22.0)).to_record()
+        for name in ("severity", "bumper_gap_m", "clearance_m", "brake_after_mps2"):
+            del record[name]
+        record |= {"end": "COLLISION", "impact_speed_mps": 2.0, "after_merge": "forced"}
+        read = Outcome.from_record(record).measures
+        assert (read.end, read.severity, read.is_close) == (End.MERGED, "contact", True)
+        assert (read.bumper_gap_m, read.brake_after_mps2, read.clearance_m) == (0.5, None, None)
+        record |= {"dx_m": 30.0, "score": -10.0, "end": "MERGED"}
+        read = Outcome.from_record(record).measures
+        assert (read.severity, read.bumper_gap_m, read.impact_speed_mps) == ("safe", 25.0, None)
 
     def test_that_say_something_else_are_refused(self):
-        record = COLLISION.outcome(0, 0, ending(20.0)).to_record()
-        with pytest.raises(ValueError, match="after_merge"):
-            Outcome.from_record(record | {"after_merge": "<b>"})
+        record = PAPER_CRITERION.outcome(0, 0, ending(20.0)).to_record()
+        with pytest.raises(ValueError, match="severity"):
+            Outcome.from_record(record | {"severity": "<b>"})
 
 
 class TestNamed:
     def test_the_papers_needs_no_margin(self):
         for dx in (0.0, 5.9, 6.1, 80.0):
-            outcome = COLLISION.outcome(0, 0, ending(dx))
+            outcome = PAPER_CRITERION.outcome(0, 0, ending(dx))
             assert outcome == Outcome(0, 0, CASE, measure(ending(dx)))
             assert "margin" not in outcome.to_record()
 
     def test_contact_is_of_bodies_and_not_of_points(self):
-        # 5 m long: at 5.5 m between the fronts, a collision of the paper, they do not touch.
-        assert COLLISION.outcome(0, 0, ending(5.5)).failed
+        # 5 m long: at 5.5 m between the fronts, a failure of the paper, they do not touch.
+        assert PAPER_CRITERION.outcome(0, 0, ending(5.5)).failed
         assert not Criterion("contact").outcome(0, 0, ending(5.5)).failed
         assert Criterion("contact").outcome(0, 0, ending(-4.9)).failed
-        assert Criterion("contact").outcome(0, 0, ending(-4.9)).margin == pytest.approx(-0.1)
+        # 0.1 m of overlap, and the POV goes on at 4 m/s more for 0.75 s.
+        assert Criterion("contact").outcome(0, 0, ending(-4.9)).margin == pytest.approx(-3.1)
 
     def test_may_be_part_of_a_condition(self):
         either = Criterion('unsafe or end == "TIMEOUT"')
         assert either.text == "unsafe or end == 'TIMEOUT'"
         assert of(either.text, ending(-25.0, v_pov=36.0, v_vut=26.0)) == pytest.approx(-1.0 / 3.0)
         assert of(either.text, ending(9.0, end=End.TIMEOUT)) == -1.0
-        assert of("not (contact or collision)", ending(-25.0, v_pov=27.0)) < 0.0
+        assert of("not (contact or paper)", ending(-25.0, v_pov=27.0)) < 0.0
         with pytest.raises(UserError, match="did you mean unsafe"):
             Criterion("unsave or ttc_s < 1")
 
@@ -282,7 +304,7 @@ class TestTheVerdictAlone:
     @pytest.mark.parametrize("dx", [0.0, 5.5, -4.9, -25.0, 80.0])
     @pytest.mark.parametrize(
         "text",
-        ["collision", "contact", "unsafe", "ttc_s < 1.5", "last_avoidable_s < 2 or contact"],
+        ["paper", "contact", "unsafe", "ttc_s < 1.5", "last_avoidable_s < 2 or contact"],
     )
     def test_is_that_of_the_whole_outcome(self, text, dx):
         episode = ending(dx, v_pov=36.0, v_vut=26.0)
@@ -324,7 +346,7 @@ class TestBodiesBeforeM:
         ],
     )
     def test_clear_each_other_by_hand(self, dx, apart, clearance):
-        found = clearance_before_m(beside(dx), lines(apart))
+        found = nearest(beside(dx), lines(apart))
         assert found == pytest.approx(clearance)
 
     def test_that_cross_by_hand(self):
@@ -334,25 +356,28 @@ class TestBodiesBeforeM:
         crossing = CentreLines.of(mainline, ramp)
         assert crossing.together_m == 2.5
         ahead = Trajectory(CASE, np.array([[[2.5, 20.0, 0.0], [-2.0, 0.0, 0.0]]]), End.TIMEOUT)
-        assert clearance_before_m(ahead, crossing) == pytest.approx(1.1)
+        assert nearest(ahead, crossing) == pytest.approx(1.1)
 
     def test_are_looked_at_where_the_lanes_run_together(self):
         assert lines(1.0, ends_m=-20.0).together_m == pytest.approx(20.0, abs=SPACING_M)
         assert lines(3.2).together_m == pytest.approx(1.0, abs=SPACING_M)
-        assert clearance_before_m(beside(0.0, x_vut=-30.0), lines(1.0)) == math.inf
+        assert nearest(beside(0.0, x_vut=-30.0), lines(1.0)) == math.inf
 
     def test_on_the_shipped_roads(self):
         # The ramp of US-23 comes in at 8.8 degrees: 2.3 / sin(8.8 degrees) is 15 m.
         us23 = centre_lines(road_for(US23))
         assert us23.together_m == pytest.approx(15.0, abs=0.5)
-        assert clearance_before_m(beside(0.0), us23) < 0.0
-        assert clearance_before_m(beside(0.0, x_vut=-14.9), us23) > 0.0
+        assert nearest(beside(0.0), us23) < 0.0
+        assert nearest(beside(0.0, x_vut=-14.9), us23) > 0.0
         assert centre_lines(road_for(US23)) is us23
 
     def test_make_a_contact_although_the_vut_never_merges(self):
         hit = beside(0.0)
         assert Criterion("contact").margin(hit, measure(hit)) == MOST_MARGIN
-        assert Criterion("contact").margin(hit, measure(hit), lines(1.0)) == pytest.approx(-0.8)
+        touching = measure(hit, lines(1.0))
+        assert Criterion("contact").margin(hit, touching) == pytest.approx(-0.8)
+        assert touching.severity == "contact"
+        assert touching.impact_speed_mps is not None
 
 
 class TestOutcomes:
@@ -374,11 +399,11 @@ class TestOutcomes:
         fails = Criterion("ttc_s < 4").outcome(0, 0, ending(20.0, v_pov=16.0))
         assert safe.signed_gap_m == pytest.approx(-6.0 * 1.05)
         assert fails.signed_gap_m == pytest.approx(6.0 / 1.5)
-        assert COLLISION.outcome(0, 0, ending(-21.0)).signed_gap_m == pytest.approx(-21.0)
+        assert PAPER_CRITERION.outcome(0, 0, ending(-21.0)).signed_gap_m == pytest.approx(-21.0)
 
     def test_that_time_out_are_tested_where_that_is_the_failure(self):
         ended = [ending(9.0, end=End.TIMEOUT), ending(9.0)]
-        by_paper = judge(COLLISION.outcome(n, 0, t) for n, t in enumerate(ended))
+        by_paper = judge(PAPER_CRITERION.outcome(n, 0, t) for n, t in enumerate(ended))
         criterion = Criterion('end == "TIMEOUT"')
         by_end = judge(criterion.outcome(n, 0, t) for n, t in enumerate(ended))
         assert (by_paper.tested, by_paper.timeouts, by_paper.failures) == (1, 1, 0)
@@ -423,8 +448,8 @@ class TestCampaigns:
         page = (harsh.folder / "report.html").read_text(encoding="utf-8")
         assert code == 0
         assert "A case fails when brake_after_mps2 &gt; 2" in page
-        assert "Fails (brake_after_mps2 &gt; 2) in " in page
-        assert "Collides" not in page
+        assert "(brake_after_mps2 &gt; 2), " in page
+        assert "within 6 m at M), " not in page
         assert '"margin"' in page
 
     def test_go_on_with_the_same_criterion_only(self, harsh):
@@ -436,7 +461,7 @@ class TestCampaigns:
 
     def test_with_margins_of_another_criterion_are_refused(self, harsh, tmp_path):
         (tmp_path / "trajectories").mkdir()
-        record = {**harsh.settings, "fail_when": "collision"}
+        record = {**harsh.settings, "fail_when": "paper"}
         (tmp_path / "campaign.json").write_text(json.dumps(record), encoding="utf-8")
         lines = (harsh.folder / "outcomes.jsonl").read_bytes()
         (tmp_path / "outcomes.jsonl").write_bytes(lines)
@@ -472,7 +497,7 @@ class TestCampaigns:
         record = json.loads(path.read_text(encoding="utf-8"))
         del record["sha256"], record["fail_when"]
         path.write_text(json.dumps(record), encoding="utf-8")
-        assert resume_campaign(tmp_path / "run").criterion == COLLISION
+        assert resume_campaign(tmp_path / "run").criterion == PAPER_CRITERION
         path.write_text(json.dumps(record | {"fail_when": 3}), encoding="utf-8")
         with pytest.raises(UserError, match="no fail_when"):
             Run(tmp_path / "run")
@@ -482,7 +507,7 @@ class TestTruth:
     def test_is_of_its_criterion(self, tmp_path):
         paths = {
             key_of(criterion=Criterion(text)).path(tmp_path)
-            for text in ("collision", "contact", "ttc_s < 2", "ttc_s  <2", "ttc_s < 3")
+            for text in ("paper", "contact", "ttc_s < 2", "ttc_s  <2", "ttc_s < 3")
         }
         assert len(paths) == 4
 
@@ -497,7 +522,7 @@ class TestTruth:
 class TestSamplers:
     def test_learn_the_gap_of_the_papers_criterion_and_else_what_stands_for_it(self):
         outcomes = [ending(9.0), ending(-21.0, v_pov=31.0)]
-        for criterion in (COLLISION, Criterion("ttc_s < 4")):
+        for criterion in (PAPER_CRITERION, Criterion("ttc_s < 4")):
             sampler = make_sampler("uniform", Pool(levels=(0,), scenario=US23), 0)
             told = [criterion.outcome(n, 0, t) for n, t in enumerate(outcomes)]
             sampler.tell(told)

@@ -1,4 +1,4 @@
-"""Who yielded, which kind of failure it was, and where failures lie, by hand-made trajectories."""
+"""Which vehicle braked, which kind of failure it was, and where failures lie: by hand."""
 
 # mypy: no-strict-optional
 
@@ -57,20 +57,23 @@ def kind(trajectory: Trajectory) -> Kind | None:
 KEEP = np.zeros(STEPS)
 BRAKES = phases((3.0, 0.0), (5.0, -1.0))
 COASTS = phases((2.0, 1.0), (6.0, 0.0))
+EASES = phases((2.0, 1.0), (6.0, -0.5))
 
 
-class TestWhoYields:
-    def test_nobody_who_follows_the_level_0_profile(self):
+class TestWhichVehicleBrakes:
+    def test_none_that_keeps_its_speed_or_gains(self):
         found = diagnosed(meeting(KEEP, LEVEL0))
-        assert (found.pov_yields_s, found.vut_yields_s) == (None, None)
+        assert (found.pov_brakes_s, found.vut_brakes_s) == (None, None)
+        assert (found.pov_accelerates, found.vut_accelerates) == (False, True)
 
-    def test_nobody_who_goes_faster_than_it(self):
-        found = diagnosed(meeting(KEEP + 1.0, 2.0 * LEVEL0))
-        assert (found.pov_yields_s, found.vut_yields_s) == (None, None)
+    def test_one_from_when_its_speed_falls(self):
+        found = diagnosed(meeting(BRAKES, COASTS))
+        assert (found.pov_brakes_s, found.vut_brakes_s) == (3.0, None)
+        assert (found.pov_accelerates, found.vut_accelerates) == (False, True)
 
-    def test_a_pov_from_when_it_brakes(self):
-        found = diagnosed(meeting(BRAKES, LEVEL0))
-        assert (found.pov_yields_s, found.vut_yields_s) == (3.0, None)
+    def test_one_that_braked_does_not_count_as_accelerating(self):
+        found = diagnosed(meeting(KEEP, phases((2.0, 1.0), (2.0, -2.0), (4.0, 1.0))))
+        assert (found.vut_brakes_s, found.vut_accelerates) == (2.0, False)
 
     def test_in_traffic_the_car_that_the_vut_meets(self):
         pair = meeting(BRAKES, LEVEL0)
@@ -88,58 +91,34 @@ class TestWhoYields:
         )
         met = Trajectory(case, motion, End.MERGED)
         assert measure(met).nearest == "behind"
-        assert diagnosed(met).pov_yields_s == 3.0
-        assert kind(met) is Kind.FORCED_MERGE
+        assert diagnosed(met).pov_brakes_s == 3.0
+        assert kind(met) is Kind.POV_BRAKES
 
-    def test_a_vut_from_when_it_coasts(self):
-        found = diagnosed(meeting(KEEP, COASTS))
-        assert (found.pov_yields_s, found.vut_yields_s) == (None, 2.0)
-
-    def test_both_together(self):
-        late = phases((2.0, 0.0), (6.0, -1.0))
-        found = diagnosed(meeting(late, COASTS))
-        assert (found.pov_yields_s, found.vut_yields_s) == (2.0, 2.0)
-
-    def test_a_vut_that_lags_behind_its_commands_from_when_it_coasts(self):
-        lagging, command = [], 0.0
-        for wanted in COASTS:
-            command += (wanted - command) * 0.3
-            lagging.append(command)
-        assert diagnosed(meeting(KEEP, np.array(lagging))).vut_yields_s == pytest.approx(
-            2.0, abs=0.1
-        )
-
-    def test_nobody_who_is_less_than_1_mps_behind(self):
+    def test_none_that_loses_less_than_1_mps(self):
         a_little = phases((3.0, 0.0), (0.9, -1.0), (4.1, 0.0))
-        assert diagnosed(meeting(a_little, LEVEL0)).pov_yields_s is None
+        assert diagnosed(meeting(a_little, LEVEL0)).pov_brakes_s is None
         more = phases((3.0, 0.0), (1.0, -1.0), (4.0, 0.0))
-        assert diagnosed(meeting(more, LEVEL0)).pov_yields_s == 3.0
+        assert diagnosed(meeting(more, LEVEL0)).pov_brakes_s == 3.0
 
-    def test_a_vehicle_that_catches_up_from_when_it_falls_behind_again(self):
+    def test_one_that_regains_its_speed_from_when_it_loses_it_again(self):
         twice = phases((1.0, 0.0), (0.5, -1.0), (0.5, 1.0), (2.0, 0.0), (4.0, -1.0))
-        assert diagnosed(meeting(twice, LEVEL0)).pov_yields_s == 4.0
-
-    def test_a_fast_vut_not_for_keeping_its_speed(self):
-        # Above 28 m/s a level-0 VUT holds what it has.
-        motion = np.stack([drive(-300.0, 30.0, KEEP), drive(-182.0, 32.0, KEEP)], axis=1)
-        case = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, v_vut0_mps=32.0)
-        found = diagnosed(Trajectory(case, motion, End.TIMEOUT))
-        assert found.vut_yields_s is None
+        assert diagnosed(meeting(twice, LEVEL0)).pov_brakes_s == 4.0
 
 
 class TestTheKind:
-    def test_is_a_stalemate_where_both_yield(self):
-        assert kind(meeting(BRAKES, COASTS)) is Kind.STALEMATE
+    def test_is_a_stalemate_where_both_brake(self):
+        assert kind(meeting(BRAKES, EASES)) is Kind.STALEMATE
 
     def test_is_a_squeeze_where_neither_does(self):
         assert kind(meeting(KEEP, LEVEL0)) is Kind.SQUEEZE
         assert kind(meeting(KEEP + 0.5, LEVEL0)) is Kind.SQUEEZE
+        assert kind(meeting(KEEP, COASTS)) is Kind.SQUEEZE
 
-    def test_is_a_forced_merge_where_only_the_pov_yields(self):
-        assert kind(meeting(BRAKES, LEVEL0)) is Kind.FORCED_MERGE
+    def test_says_where_only_the_pov_brakes(self):
+        assert kind(meeting(BRAKES, LEVEL0)) is Kind.POV_BRAKES
 
     def test_is_a_weak_brake_where_the_vut_begins_in_time(self):
-        trajectory = meeting(KEEP, COASTS)
+        trajectory = meeting(KEEP, EASES)
         assert measure(trajectory).last_avoidable_s > 2.0
         assert kind(trajectory) is Kind.WEAK_BRAKE
 
@@ -148,7 +127,7 @@ class TestTheKind:
         assert measure(trajectory).last_avoidable_s < 7.5
         assert kind(trajectory) is Kind.LATE_BRAKE
 
-    def test_is_none_without_a_collision(self):
+    def test_is_none_where_the_cars_are_6_m_apart(self):
         assert kind(meeting(BRAKES, COASTS, gap_m=30.0)) is None
 
     def test_has_a_meaning(self):
@@ -181,7 +160,7 @@ class TestRegions:
         for box in boxes:
             assert box.failures >= 0.5 * box.cases
             assert "POV level 1" in box.sentence
-            assert "stalemate: both yield" in box.sentence
+            assert "stalemate: both brake" in box.sentence
 
     def test_of_a_band_of_equal_arrival_speak_of_the_time(self):
         outcomes = over_the_pool(lambda x, v: 8.3 < -x / v < 8.8)

@@ -172,7 +172,7 @@ def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float 
     for batch, points in enumerate(points_by_batch):
         for failed, point in [(False, (0.0, 0.0)), *((True, point) for point in points)]:
             (case,) = from_unit(np.array([point]), 0)
-            end, score = (End.COLLISION, -600.0) if failed else (End.MERGED, -1.0)
+            end, score = End.MERGED, -600.0 if failed else -1.0
             measures = Measures(**{**NOTHING, "end": end, "score": score})
             outcomes.append(Outcome(len(outcomes), batch, case, measures))
         curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0)))

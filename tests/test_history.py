@@ -42,9 +42,7 @@ def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> R
         trajectory = drive(case, "answered nan" if became == "errs" else None)
         measures = measure(trajectory)
         if became != "errs":
-            end, score = (
-                (End.COLLISION, -560.0) if became == "fails" else (End.MERGED, -100.0 - index)
-            )
+            end, score = (End.MERGED, -560.0) if became == "fails" else (End.MERGED, -100.0 - index)
             measures = replace(measures, end=end, score=score)
         ran.append((Outcome(index, 0, case, measures), trajectory))
     journal.append(ran)

@@ -17,11 +17,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import Run, failures, read_outcomes, to_line
 from merge_sumo.errors import UserError
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
+from merge_sumo.values.severity import Severity
 from merge_sumo.values.trajectory import End, Trajectory
 
 SPEC_FIELDS = [
@@ -57,7 +61,11 @@ any_measures = st.builds(
     ttc_s=maybe,
     pet_s=maybe,
     t_end_s=number,
+    severity=st.sampled_from([None, *(s.value for s in Severity)]),
+    bumper_gap_m=maybe,
+    clearance_m=maybe,
     drac_mps2=maybe,
+    brake_after_mps2=maybe,
     vut_max_brake_mps2=number,
     pov_max_brake_mps2=number,
     impact_speed_mps=maybe,
@@ -125,7 +133,7 @@ class TestARecord:
     def test_has_the_fields_of_the_specification_in_their_order(self):
         names = list(episode(0)[0].to_record())
         assert names[: len(SPEC_FIELDS)] == SPEC_FIELDS
-        assert names[-2:] == ["error", "after_merge"]
+        assert names[-1] == "error"
 
     def test_has_no_orientation_below_level_2(self):
         outcome, _ = episode(0)
@@ -355,15 +363,16 @@ class TestARun:
 
     def test_scores_its_trajectories_as_it_scored_them_when_they_ran(self, run):
         assert len(run.outcomes) == 60
+        lines = centre_lines(road_for(US23))
         for outcome in run.outcomes:
-            assert measure(run.trajectory(outcome.index)) == outcome.measures
+            assert measure(run.trajectory(outcome.index), lines) == outcome.measures
 
     def test_lists_its_failures_with_the_worst_first(self, run):
         worst = failures(run.outcomes)
         scores = [outcome.measures.score for outcome in worst]
         assert scores == sorted(scores)
         assert all(score < -500.0 for score in scores)
-        assert len(worst) == sum(o.measures.end is End.COLLISION for o in run.outcomes) > 0
+        assert len(worst) == sum(o.measures.is_close for o in run.outcomes) > 0
 
     def test_that_was_interrupted_between_trajectories_and_outcomes_is_read(self, folder):
         outcomes = folder / "outcomes.jsonl"

@@ -59,7 +59,7 @@ def picture(vut, level, count):
     """Return FMC and sizes of the failure regions over uniform cases."""
     cases = uniform_cases(level, count, seed=1)
     measures, _ = played(vut, cases)
-    failing = (c for c, m in zip(cases, measures, strict=True) if m.end is End.COLLISION)
+    failing = (c for c, m in zip(cases, measures, strict=True) if m.is_close)
     points = to_unit(failing, level)
     return fmc(points), np.bincount(regions(points)) if len(points) else np.array([])
 
@@ -217,7 +217,7 @@ class TestTheExampleRuns:
 
     def test_3_both_yield_and_collide(self, examples):
         run = examples["stalemate"]
-        assert measure(run).end is End.COLLISION
+        assert measure(run).is_close
         assert run.a_pov_mps2.min() <= -1.0
         assert run.a_vut_mps2[5:20].min() >= 0.5, "at first it accelerates, behind its lag"
         assert np.abs(run.a_vut_mps2[30:60]).max() <= 0.3, "then it coasts"

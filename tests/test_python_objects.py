@@ -192,7 +192,7 @@ class TestTheOtherFunctions:
     def test_one_case_shows_itself(self):
         found = ms.run_case("design2", level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6)
         assert found.failed
-        assert repr(found).startswith("<case: COLLISION with the POV at 9.3 s")
+        assert repr(found).startswith("<case: MERGED at 9.3 s, contact")
         assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
 
     def test_one_case_takes_a_row_of_a_campaign(self, run):
@@ -213,8 +213,8 @@ class TestTheOtherFunctions:
         worst = ms.open_run(run.folder).failures[0]["index"]
         found = ms.rerun(run.folder, [worst], vut="design2")
         assert [(c.before.index, c.change) for c in found.changed] == [(worst, "fixed")]
-        assert repr(found) == "<Rerun: recorded: 1 failure in 1 case>"
-        assert str(found).endswith(f"  case {worst}: COLLISION -> MERGED (fixed)")
+        assert repr(found) == "<Rerun: recorded: 1 failure (1 contact) in 1 case>"
+        assert str(found).endswith(f"  case {worst}: contact -> safe (fixed)")
         assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
 
     def test_campaigns_are_compared_by_their_folders(self, run):

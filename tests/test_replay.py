@@ -191,7 +191,7 @@ class TestAnExport:
 
 
 class TestAnHonestRecordReplaysIdentically:
-    @pytest.mark.parametrize("end", [End.MERGED, End.COLLISION])
+    @pytest.mark.parametrize("end", [End.MERGED, End.TIMEOUT])
     def test_of_a_campaign(self, run, tmp_path, end):
         outcome = next(o for o in run.outcomes if o.measures.end is end)
         export_case(run, outcome.index, tmp_path / "case")

@@ -21,9 +21,9 @@ from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.campaigns.truth import Truth
 from merge_sumo.drivers.vuts.output import LINES, LOG
 from merge_sumo.reports import report_data, report_facts
+from merge_sumo.reports.headline import Rule, headline
 from merge_sumo.reports.report import report_page, write_report
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
-from merge_sumo.reports.report_words import headline
 from merge_sumo.reports.summary import summarise
 from merge_sumo.reports.surface import Surface, learn_surface
 from merge_sumo.reports.verdict import judge
@@ -31,6 +31,7 @@ from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.sumo.road import road_of
 from merge_sumo.system.workers import InProcess, Workers
 from merge_sumo.values.case import to_unit
+from merge_sumo.values.criterion import PAPER_CRITERION
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import DT_S, US23, Scenario
 from merge_sumo.values.trajectory import REASON_CHARACTERS
@@ -69,9 +70,9 @@ class TestThePage:
         found = len(failures(made.outcomes))
         assert found > 10
         text = text_of(page)
-        assert f"handmade: 1 error and {found} failures in 180 cases" in text
+        assert f"handmade: 1 error and {found} failures (" in text
         assert f"{found} failures in 180 cases" in text
-        assert text.index("Collides in") < text.index("Failure mode coverage")
+        assert text.index("of them contacts") < text.index("Failure mode coverage")
 
     def test_loads_nothing_and_runs_nothing_but_its_own_script(self, page):
         root = root_of(page)
@@ -383,22 +384,23 @@ class TestTheSurrogate:
 
 def headline_of(outcomes) -> str:
     levels = (0, 1, 2) if outcomes else (0,)
-    return headline(judge(outcomes), summarise(outcomes, levels), failures(outcomes), {})
+    rule = Rule(PAPER_CRITERION, US23.dx_crash_m)
+    return headline(judge(outcomes), summarise(outcomes, levels), failures(outcomes), {}, rule)
 
 
 class TestTheHeadline:
     def test_of_no_failure_is_no_proof(self, made):
         safe = [o for o in made.outcomes if o.measures.end.is_tested and not o.failed]
         assert headline_of(safe) == (
-            f"No collision in {len(safe)} cases. That is no proof: the search saw these cases and "
-            "no others."
+            f"No failure (front bumpers within 6 m at M) in {len(safe)} cases. That is no proof: "
+            "the search saw these cases and no others."
         )
 
     def test_names_what_was_not_tested_before_what_was(self, made):
         safe = [o for o in made.outcomes if not o.failed]
         assert headline_of(safe).startswith(
             f"1 of {len(safe)} cases ended in a VUT error: “answered nan”. "
-            f"No collision in the other {len(safe) - 1} cases. That is no proof"
+            f"No failure (front bumpers within 6 m at M) in the other {len(safe) - 1} cases."
         )
 
     def test_of_nothing_says_so(self):
@@ -420,7 +422,7 @@ class TestTheHeadline:
         assert failures(run.outcomes)
         assert headline_of(run.outcomes).startswith(
             "3 of 40 cases ended in a VUT error, 2 of them: “boom”. 2 of 40 cases timed out: there "
-            "the VUT never reached the merge point. Collides in "
+            "the VUT never reached the merge point. "
         )
 
     def test_names_a_level_at_which_nothing_was_tested(self, tmp_path):

@@ -204,9 +204,7 @@ class TestItsVut:
         cases = uniform_cases(count, level, seed=1)
         with plan_for("roundabout", scenario=ROUNDABOUT).open() as ground:
             failing = [
-                trajectory
-                for _, trajectory in ground.run(cases)
-                if measure(trajectory).end is End.COLLISION
+                trajectory for _, trajectory in ground.run(cases) if measure(trajectory).is_close
             ]
         points = to_unit((trajectory.case for trajectory in failing), level)
         assert bounds[0] <= (fmc(points) if failing else 0.0) <= bounds[1]
@@ -230,7 +228,7 @@ class TestTheExampleRuns:
 
     def test_in_the_other_both_nearly_stop_go_at_the_same_moment_and_collide(self, runs):
         run = runs[1]
-        assert measure(run).end is End.COLLISION
+        assert measure(run).is_close
         assert diagnose(run, measure(run)).kind is Kind.STALEMATE
         slowest = run.v_pov_mps.argmin(), run.v_vut_mps.argmin()
         assert abs(slowest[0] - slowest[1]) <= 2

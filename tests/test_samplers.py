@@ -51,7 +51,7 @@ def play_case(index: int, batch: int, case: Case) -> Outcome:
     offset = 0.6 * x + 0.8 * v - 0.7
     distance = abs(offset)
     if distance < HALF_WIDTH:
-        end, score = End.COLLISION, -550.0 - 450.0 * (1.0 - distance / HALF_WIDTH)
+        end, score = End.MERGED, -550.0 - 450.0 * (1.0 - distance / HALF_WIDTH)
     else:
         end, score = End.MERGED, -450.0 * math.exp((HALF_WIDTH - distance) / 0.15)
     return Outcome(index, batch, case, measures(end, score, dx_m=6.0 * offset / HALF_WIDTH))
@@ -288,7 +288,7 @@ def test_gpr_gives_more_cases_to_the_level_with_the_failures():
     sampler = make_sampler("gpr", Pool(levels=(0, 1)), 4)
     cases = sampler.ask(20)
     # Level 0 never fails, all of level 1 does.
-    verdicts = {0: measures(End.MERGED, -5.0), 1: measures(End.COLLISION, -700.0)}
+    verdicts = {0: measures(End.MERGED, -5.0), 1: measures(End.MERGED, -700.0)}
     outcomes = [Outcome(index, 0, case, verdicts[case.level]) for index, case in enumerate(cases)]
     sampler.tell(outcomes)
     levels = [case.level for case in sampler.ask(20)]

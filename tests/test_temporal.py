@@ -19,7 +19,7 @@ from merge_sumo.values.scenario import US23
 from merge_sumo.values.temporal import NEVER_S, SIGNALS, check_formula, signals
 from merge_sumo.values.trajectory import End, Trajectory
 
-NEAR = "always ((x_vut_m > -20) implies (gap_m > 2))"
+NEAR = "always ((x_vut_m > -20) implies (bumper_gap_m > 2))"
 
 
 @pytest.fixture
@@ -39,9 +39,9 @@ class TestSignals:
         assert {name: float(values[0]) for name, values in found.items()} == {
             **{"x_pov_m": -40.0, "v_pov_mps": 30.0, "a_pov_mps2": 1.0},
             **{"x_vut_m": -20.0, "v_vut_mps": 20.0, "a_vut_mps2": -1.0},
-            **{"dx_m": -20.0, "dv_mps": 10.0, "gap_m": 15.0, "ttc_s": 1.5},
+            **{"dx_m": -20.0, "dv_mps": 10.0, "bumper_gap_m": 15.0, "ttc_s": 1.5},
         }
-        assert (found["gap_m"][1], found["ttc_s"][1]) == (-5.0, NEVER_S)
+        assert (found["bumper_gap_m"][1], found["ttc_s"][1]) == (-5.0, NEVER_S)
 
     def test_go_on_behind_m(self):
         episode = ending(20.0, steps=10)
@@ -53,25 +53,27 @@ class TestSignals:
 
 class TestFormulas:
     def test_are_kept_on_one_line(self):
-        assert check_formula(" always\n (gap_m  > 2) ") == "always (gap_m > 2)"
-        assert Criterion(require="always  (gap_m > 2)") == Criterion(require="always (gap_m > 2)")
+        assert check_formula(" always\n (bumper_gap_m  > 2) ") == "always (bumper_gap_m > 2)"
+        assert Criterion(require="always  (bumper_gap_m > 2)") == Criterion(
+            require="always (bumper_gap_m > 2)"
+        )
 
     @pytest.mark.parametrize(
         ("text", "said"),
         [
-            ("always (gab_m > 2)", "no signal 'gab_m': did you mean gap_m"),
-            ("from os import path always (gap_m > 2)", "no signal 'from'"),
+            ("always (bumper_gab_m > 2)", "no signal 'bumper_gab_m': did you mean bumper_gap_m"),
+            ("from os import path always (bumper_gap_m > 2)", "no signal 'from'"),
             ("import os", "no signal 'import'"),
             ("x_vut_m = 2", "'=' is no part"),
-            ("always (gap_m > 2);", "';' is no part"),
-            ("gap_m/dx_m > 2", "'/' is no part"),
-            ("always (gap_m > 2e9)", "'2' is no part"),
-            ("always[0:2s] (gap_m > 2)", "'2' is no part"),
-            ("always[0:151] (gap_m > 2)", "no episode has a time [0:151]"),
-            ("always[2:1] (gap_m > 2)", "no episode has a time [2:1]"),
+            ("always (bumper_gap_m > 2);", "';' is no part"),
+            ("bumper_gap_m/dx_m > 2", "'/' is no part"),
+            ("always (bumper_gap_m > 2e9)", "'2' is no part"),
+            ("always[0:2s] (bumper_gap_m > 2)", "'2' is no part"),
+            ("always[0:151] (bumper_gap_m > 2)", "no episode has a time [0:151]"),
+            ("always[2:1] (bumper_gap_m > 2)", "no episode has a time [2:1]"),
             ("x" * 2000, "1000 are the most"),
             ("\ud800", "is no part"),
-            ("gap_m > 2) or (gap_m < 1", "closed that was not opened"),
+            ("bumper_gap_m > 2) or (bumper_gap_m < 1", "closed that was not opened"),
         ],
     )
     def test_with_other_words_do_not_get_to_the_parser(self, text, said):
@@ -79,7 +81,7 @@ class TestFormulas:
             Criterion(require=text)
         assert said in str(error.value)
 
-    @pytest.mark.parametrize("text", ["always (gap_m >", "", "(" * 400, "gap_m > 2 dx_m < 1"])
+    @pytest.mark.parametrize("text", ["always (dx_m >", "", "(" * 400, "dx_m > 2 dv_mps < 1"])
     @pytest.mark.usefixtures("rtamt")
     def test_that_are_none_are_refused(self, text):
         with pytest.raises(UserError, match="no formula of signal temporal logic"):
@@ -92,13 +94,13 @@ class TestFormulas:
     def test_need_the_extra(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "rtamt", None)
         with pytest.raises(UserError, match="merge-sumo\\[stl\\]"):
-            Criterion(require="eventually (gap_m > 3)").check(US23)
+            Criterion(require="eventually (bumper_gap_m > 3)").check(US23)
 
     def test_need_a_python_that_has_the_extra(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "rtamt", None)
         monkeypatch.setattr("merge_sumo.values.temporal.LAST_PYTHON", (3, 10))
         with pytest.raises(UserError, match="it runs up to Python"):
-            Criterion(require="eventually (gap_m > 3)").check(US23)
+            Criterion(require="eventually (bumper_gap_m > 3)").check(US23)
 
 
 @pytest.mark.usefixtures("rtamt")
@@ -106,8 +108,8 @@ class TestRobustness:
     @pytest.mark.parametrize(
         ("formula", "margin"),
         [
-            ("always (gap_m > 2)", 9.0),  # from 11 m between bumpers to 15 m
-            ("eventually (gap_m > 17.5)", -2.5),
+            ("always (bumper_gap_m > 2)", 9.0),  # from 11 m between bumpers to 15 m
+            ("eventually (bumper_gap_m > 17.5)", -2.5),
             ("v_vut_mps > 26", -1e-9),
             ("eventually (x_vut_m > 0)", 1.0),  # 1 m past M at the end, 2.6 m a step
             ("always (x_vut_m > 0)", -25.0),
@@ -129,12 +131,12 @@ class TestRobustness:
         )
         assert (code, err) == (0, "")
         record = json.loads((tmp_path / "run" / "campaign.json").read_text(encoding="utf-8"))
-        assert (record["fail_when"], record["require"]) == ("collision", NEAR)
+        assert (record["fail_when"], record["require"]) == ("paper", NEAR)
         lines = (tmp_path / "run" / "outcomes.jsonl").read_text(encoding="utf-8").splitlines()
         failing = [line for line in map(json.loads, lines) if line["margin"] < 0.0]
         assert json.loads(out)["failures"] == len(failing)
         code, _, err = command_line(
-            "campaign", "--resume", tmp_path / "run", "--require", "always (gap_m > 3)"
+            "campaign", "--resume", tmp_path / "run", "--require", "always (bumper_gap_m > 3)"
         )
         assert code == 2
         assert "a campaign has one criterion" in err

@@ -19,6 +19,7 @@ from merge_sumo.drivers.vut import vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions, seen_at_start, seen_in
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.replay_folder import HOLD_STEPS, RECORD, write_scenario
 from merge_sumo.sumo.world import World
@@ -126,7 +127,11 @@ class TestCarsOfTheMainline:
         ]
         for one, other in zip(run("design2", alone), run("design2", far), strict=True):
             assert np.array_equal(one.motion, other.motion[:, :2])
-            assert (one.end, measure(one)) == (other.end, measure(other))
+            assert one.end == other.end
+            # A car far behind may still have to brake a little.
+            found = measure(other)
+            assert found.brake_after_mps2 == pytest.approx(measure(one).brake_after_mps2, abs=0.2)
+            assert replace(found, brake_after_mps2=measure(one).brake_after_mps2) == measure(one)
 
     @pytest.mark.parametrize("level", [0, 1, 2])
     def test_obey_eq4_and_keep_apart(self, level):
@@ -246,7 +251,8 @@ class TestARunInTraffic:
         assert {o.measures.nearest for o in again.outcomes} == {"pov", "ahead", "behind"}
         trajectory = again.trajectory(7)
         assert trajectory.motion.shape[1:] == (4, 3)
-        assert measure(trajectory) == again.outcome(7).measures
+        lines = centre_lines(road_for(TRAFFIC))
+        assert measure(trajectory, lines) == again.outcome(7).measures
 
     @pytest.mark.parametrize("hosted", [False, True])
     def test_is_replayed_identically(self, made, tmp_path, hosted):
@@ -310,7 +316,7 @@ class TestTheVerdict:
     def test_is_a_failure_where_any_car_is_too_near(self, row, name):
         gaps = {POV: 40.0, AHEAD: 90.0, BEHIND: -50.0}
         measures = measure(ending({**gaps, row: 4.0}, {row: 27.0}))
-        assert measures.end is End.COLLISION
+        assert measures.is_close
         assert (measures.dx_m, measures.dv_mps, measures.nearest) == (4.0, 2.0, name)
 
     def test_is_of_the_nearest_car(self):
@@ -339,5 +345,6 @@ class TestTheVerdict:
         motion = np.concatenate([motion, motion[-1:] + [[[2.0, 0.0, 0.0]]] * 4], axis=0)
         with_queue = measure(Trajectory(case, motion, End.MERGED))
         alone = measure(Trajectory(case, motion[:, :2], End.MERGED))
-        assert with_queue.end is alone.end is End.COLLISION
+        assert with_queue.is_close
+        assert alone.is_close
         assert (with_queue.last_avoidable_s or -1.0) <= (alone.last_avoidable_s or -1.0)

@@ -69,7 +69,9 @@ class TestErrorsAndTimeouts:
         assert (found.cases, found.errors, found.timeouts, found.tested) == (10, 3, 4, 3)
         number = len(failures(run.outcomes))
         word = "failure" if number == 1 else "failures"
-        assert found.counts == f"3 errors, 4 timeouts and {number} {word} in 10 cases"
+        contacts = f"{found.contacts} contact{'' if found.contacts == 1 else 's'}"
+        assert 0 <= found.contacts <= number
+        assert found.counts == f"3 errors, 4 timeouts and {number} {word} ({contacts}) in 10 cases"
 
     def test_that_differ_in_a_measured_value_or_an_address_are_one(self, tmp_path):
         errors = {
@@ -102,8 +104,8 @@ class TestErrorsAndTimeouts:
 
 
 def summary_of(fmc: float, level: int = 1) -> Summary:
-    levels = {0: LevelSummary(10, 10, 0, 0.0, 0), level: LevelSummary(10, 10, 1, fmc, 1)}
-    return Summary(20, 1, {"MERGED": 20}, levels)
+    levels = {0: LevelSummary(10, 10, 0, {}, 0.0, 0), level: LevelSummary(10, 10, 1, {}, fmc, 1)}
+    return Summary(20, 1, {"MERGED": 20}, {}, levels)
 
 
 class TestAGate:
@@ -224,9 +226,9 @@ class TestJUnit:
         said = "</failure><x>\\x00\\x1b[2J\\ud800\\uffff\\u202e\\n&\"'"
         assert error.get("message") == error.text == said
 
-    def test_tells_collisions_timeouts_and_gates_apart(self, root):
+    def test_tells_severities_timeouts_and_gates_apart(self, root):
         kinds = set(root.xpath("//failure/@type"))
-        assert kinds == {"COLLISION", "TIMEOUT", "GATE"}
+        assert {"contact", "TIMEOUT", "GATE"} <= kinds <= {"contact", "conflict", "TIMEOUT", "GATE"}
         (gate,) = root.xpath("//testcase[@name='errors']/failure")
         assert gate.text == "gate errors: met (1 error)"
 
@@ -277,7 +279,7 @@ class TestACampaignThatTestedNothing:
         assert said.stderr.endswith("the VUT reached the merge point in no case\n")
         page = (tmp_path / "run" / "report.html").read_text()
         assert "Nothing was tested." in page
-        assert "No collision in" not in page.split("<section", 1)[0]
+        assert "No failure" not in page.split("<section", 1)[0]
 
     def test_has_not_passed_in_json(self, vuts, tmp_path):
         said = campaign(vuts["stops"], tmp_path / "run", "--json", "--gate", "errors")
@@ -455,7 +457,13 @@ class TestTwoVersions:
         assert found["worse"] is True
         assert found["why"][0].startswith("at POV level 0 B reached the merge point in no case")
         assert found["b"]["errors"] == 20
-        assert found["a"] == {"errors": 0, "timeouts": 0, "troubles": [], "careful": None}
+        assert found["a"] == {
+            "contacts": 0,
+            "errors": 0,
+            "timeouts": 0,
+            "troubles": [],
+            "careful": None,
+        }
         level = found["levels"]["0"]
         assert level["untested_b"] == {
             "cases": 40,

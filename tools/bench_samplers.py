@@ -134,9 +134,8 @@ def outcome(index: int, case: Any) -> Outcome:
     dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7)
     overlap_m = 6.0 - abs(dx_m)
     score = -560.0 - 75.0 * overlap_m if overlap_m > 0 else -450.0 * math.exp(overlap_m / 15.0)
-    end = End.COLLISION if overlap_m > 0 else End.MERGED
     nothing = dict.fromkeys(Measures.__dataclass_fields__)
-    measures = Measures(**{**nothing, "end": end, "score": score, "dx_m": dx_m})
+    measures = Measures(**{**nothing, "end": End.MERGED, "score": score, "dx_m": dx_m})
     return Outcome(index, index // BATCH, case, measures)
 
 

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.values.case import Case
 from merge_sumo.values.criterion import Criterion
@@ -112,14 +113,15 @@ def main() -> None:
     for name, example in EXAMPLES.items():
         case, folder = example.case, out / name
         trajectory = play(example)
-        measures = measure(trajectory)
+        road = road_for(case.scenario)
+        measures = measure(trajectory, centre_lines(road))
         outcome = Outcome(0, 0, case, measures)
-        write_scenario(folder, road_for(case.scenario), outcome, trajectory)
+        write_scenario(folder, road, outcome, trajectory)
         pov = f"POV level {case.level}" + ("" if case.svo_rad is None else f" psi {case.svo_rad}")
         dx = "" if measures.dx_m is None else f", dx {measures.dx_m:.1f} m"
         if case.scenario.vehicles > 2:
             dx += f" to the car {measures.nearest}" if measures.nearest != "pov" else " to the POV"
-        title = f"{pov}, VUT {example.vut}: {measures.end.lower()}{dx}"
+        title = f"{pov}, VUT {example.vut}: {measures.became.lower()}{dx}"
         draw(trajectory, title, folder / "motion.png")
         print(
             f"{name}: {title}; hardest braking of the VUT {measures.vut_max_brake_mps2:.1f}, "

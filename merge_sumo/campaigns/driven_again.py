@@ -21,9 +21,9 @@ from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.merge import AfterMerge, after_merge
+from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.values.score import verdict
+from merge_sumo.values.score import is_close
 from merge_sumo.values.trajectory import End, Trajectory
 
 CAREFUL: Final = "careful"
@@ -163,10 +163,10 @@ def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) ->
 
     Nor is one avoided by a merge after which whoever is behind cannot brake hard enough.
     """
-    if after_merge(trajectory) is AfterMerge.FORCED:
+    if brake_after_mps2(trajectory) > -trajectory.case.scenario.a_min_mps2:
         return False
     if criterion.is_papers:  # which needs no measures
-        return verdict(trajectory) is End.MERGED
+        return trajectory.end is End.MERGED and not is_close(trajectory)
     outcome = criterion.judged(trajectory, lines)
     return outcome.measures.end.is_tested and not outcome.failed
 

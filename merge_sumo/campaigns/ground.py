@@ -154,11 +154,11 @@ def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
     with opened_ground(plan) as ground:
         ran = dict(ground.run(cases))
         files = hashed(ground.vut.files()), hashed(ground.pov.files())
-    lines = None if plan.criterion.is_papers else centre_lines(plan.net)
+    lines = centre_lines(plan.net)
     done: list[Ran] = []
     for place in range(len(cases)):
-        measures = measure(ran[place])
-        margin = plan.criterion.margin(ran[place], measures, lines)
+        measures = measure(ran[place], lines)
+        margin = plan.criterion.margin(ran[place], measures)
         done.append(Ran(measures, ran[place], *files, margin))
     return done
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from itertools import groupby
@@ -26,17 +27,20 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import FloatArray, to_unit
-from merge_sumo.values.criterion import COLLISION, Criterion
+from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.values.trajectory import Trajectory
 
 SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
 NAME_CHARACTERS: Final = 300
 """Of the name of a VUT, where it is shown."""
+_FORMER: Final = {"collision": PAPER_CRITERION.fail_when}
+_FORMER_NAME: Final = re.compile(r"\bgap_m\b")
+"""What release 0.1 called the paper's criterion, and the measure `bumper_gap_m`."""
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json`: the hash of all other keys with their values."""
 UNREADABLE_RECORD: Final = (
@@ -109,8 +113,9 @@ class Run:
             path = batch_file(self.folder, outcome.batch)
             raise UserError(f"{path} has no trajectory of case {index}")
         measures = outcome.measures
-        end = End.MERGED if measures.end is End.COLLISION else measures.end
-        return Trajectory(outcome.case, motion, end, measures.error, measures.clipped_steps)
+        return Trajectory(
+            outcome.case, motion, measures.end, measures.error, measures.clipped_steps
+        )
 
     def whole_batches(self) -> int:
         """Return the number of outcomes without those of a last batch that is not complete.
@@ -182,13 +187,13 @@ def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
 
 def _criterion_of(settings: Mapping[str, Any], path: Path) -> Criterion:
     """Return what counts as a failure in a campaign; one that does not say was the paper's."""
-    fail_when = settings.get("fail_when", COLLISION.fail_when)
+    fail_when = settings.get("fail_when", PAPER_CRITERION.fail_when)
     if not isinstance(fail_when, str):
         raise UserError(f"{path} has no fail_when, or something else there")
     require = settings.get("require")
     if not (require is None or isinstance(require, str)):
         raise UserError(f"{path} has something else than a formula as require")
-    return Criterion(fail_when, require)
+    return Criterion(_FORMER_NAME.sub("bumper_gap_m", _FORMER.get(fail_when, fail_when)), require)
 
 
 def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[list[Outcome], bool]:

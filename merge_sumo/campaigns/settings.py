@@ -24,7 +24,7 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.trust import is_own
 from merge_sumo.values.case import Pool
-from merge_sumo.values.criterion import COLLISION, Criterion
+from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import (
     ALL_LEVELS,
     DEADLINE_S,
@@ -59,7 +59,7 @@ class CampaignSettings:
     pov: str | None = None
     learn_from: tuple[str, ...] = ()
     scenario: Scenario = US23
-    fail_when: str = COLLISION.fail_when
+    fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
 
     def __post_init__(self) -> None:

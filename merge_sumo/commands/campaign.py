@@ -82,7 +82,7 @@ def campaign(
     ] = None,
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
-    fail_when: FailWhenOption = "collision",
+    fail_when: FailWhenOption = "paper",
     require: RequireOption = None,
     follow_up: FollowUpOption = None,
     v_vut0: Annotated[
@@ -368,6 +368,9 @@ def _print_summary(
     show(verdict.counts)
     if not run.criterion.is_papers:
         show(f"  a case fails when {run.criterion.words}")
+    if summary.severities:
+        counts = ", ".join(f"{number} {name}" for name, number in summary.severities.items())
+        show(f"  severity: {counts}")
     print_troubles(verdict)
     for level, found in summary.levels.items():
         if found.cases and not found.tested:

@@ -94,7 +94,7 @@ def run(
 ) -> None:
     """Run one case and show what happens: verdict, measures, and the motion second by second.
 
-    Exit code 0 when the VUT merges, 1 when it collides, errs or times out, 2 for bad use.
+    Exit code 0 when the case passes, 1 when it fails, errs or times out, 2 for bad use.
 
     Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
     """

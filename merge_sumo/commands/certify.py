@@ -46,7 +46,7 @@ def certify(
     scenario: ScenarioOption = "us23",
     policies: PoliciesOption = None,
     pov: PovOption = None,
-    fail_when: FailWhenOption = "collision",
+    fail_when: FailWhenOption = "paper",
     require: RequireOption = None,
     follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,

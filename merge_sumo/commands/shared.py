@@ -20,9 +20,9 @@ app = typer.Typer(
     help="""Find where a merging controller fails against drivers who react to it.
 
     A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO while a primary other
-    vehicle (POV) on the mainline interacts with it. A sampler chooses the test cases; failures
-    are collisions at the merge point, and failure mode coverage (FMC) says how much of the
-    failing region was found.
+    vehicle (POV) on the mainline interacts with it. A sampler chooses the test cases; a case fails
+    where both reach the merge point within 6 m, or by a rule of your own, and failure mode
+    coverage (FMC) says how much of the failing region was found.
 
     Start with:  merge-sumo campaign --vut design2
     """,
@@ -105,8 +105,8 @@ FailWhenOption = Annotated[
     str,
     typer.Option(
         metavar="EXPR",
-        help="What counts as a failure: collision (the paper's), contact, unsafe, or a condition "
-        "over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
+        help="What counts as a failure: paper (front bumpers within 6 m at M), contact, unsafe, or "
+        "a condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
     ),
 ]
 RequireOption = Annotated[
@@ -114,7 +114,7 @@ RequireOption = Annotated[
     typer.Option(
         metavar="STL",
         help="What is to hold over time, instead of --fail-when, in signal temporal logic: "
-        "'always ((x_vut_m > -20) implies (gap_m > 2))'. Needs the extra stl.",
+        "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
     ),
 ]
 FollowUpOption = Annotated[

@@ -45,6 +45,8 @@ class ComparedCase:
         score_b: P of B.
         end_a: how it ended with A; None where A was not run.
         end_b: how it ended with B.
+        severity_a: contact, conflict, harsh or safe with A; None where it has none.
+        severity_b: the same with B.
         change: what became of it.
     """
 
@@ -55,6 +57,8 @@ class ComparedCase:
     score_b: float | None
     end_a: End | None
     end_b: End | None
+    severity_a: str | None
+    severity_b: str | None
     change: Change
 
 

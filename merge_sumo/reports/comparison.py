@@ -190,6 +190,8 @@ def compared_case(run: str, of: Outcome, a: Outcome | None, b: Outcome | None) -
         score_b=None if b is None else b.score,
         end_a=None if a is None else a.measures.end,
         end_b=None if b is None else b.measures.end,
+        severity_a=None if a is None else a.measures.severity,
+        severity_b=None if b is None else b.measures.severity,
         change=_change(a, b),
     )
 

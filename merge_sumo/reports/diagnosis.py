@@ -1,10 +1,9 @@
-"""What went wrong in a failure, in words: who yielded when, which kind it was, and where it lies.
+"""What went wrong in a failure, in words: which vehicle braked when, its kind, and where it lies.
 
-Yielding is measured against level-0 behaviour, which gives way to nobody: a POV that keeps its
-speed, a VUT that accelerates by 1 m/s2 up to 28 m/s. A vehicle has yielded once it is `CEDED_MPS`
-slower than that profile; it began to yield when it last left the profile before that. So what a
-network jitters by is not taken for a decision, and a vehicle that brakes and then catches up again
-before it is 1 m/s behind has not yielded.
+All words follow from the recorded speeds and from the order at M. A vehicle brakes where its speed
+falls `BRAKED_MPS` below the highest it had before; it begins when it last had that speed. It
+accelerates where it does not brake and its speed rises as much. So the jitter of a network is not
+taken for a decision.
 """
 
 from __future__ import annotations
@@ -30,83 +29,84 @@ from merge_sumo.values.scenario import (
     level_name,
 )
 from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.values.trajectory import Trajectory
 
-KEEPS_UP_MPS2: Final = 0.2
-"""A vehicle that falls back by no more than this keeps up with its level-0 profile."""
-CEDED_MPS: Final = 1.0
-"""A vehicle that is this much slower than its level-0 profile has yielded."""
+BRAKED_MPS: Final = 1.0
+"""Loss of speed from which a vehicle is said to brake, and gain from which to accelerate."""
 ROUNDING_MPS: Final = 1e-6
 
 
 class Kind(StrEnum):
-    """Kinds of collision; `MEANING` says what they mean. Every collision is of exactly one."""
+    """Kinds of failures under the paper's rule; each such failure is of exactly one."""
 
     STALEMATE = "stalemate"
     SQUEEZE = "squeeze"
-    FORCED_MERGE = "forced merge"
+    POV_BRAKES = "only the POV brakes"
     LATE_BRAKE = "late brake"
     WEAK_BRAKE = "weak brake"
 
 
 MEANING: Final[dict[Kind, str]] = {
-    Kind.STALEMATE: "both yield, and meet",
-    Kind.SQUEEZE: "neither yields",
-    Kind.FORCED_MERGE: "only the POV yields, and not enough for the VUT that goes on",
-    Kind.LATE_BRAKE: "only the VUT yields, and begins when there is no way out any more",
-    Kind.WEAK_BRAKE: "only the VUT yields, begins in time, and does not yield enough",
+    Kind.STALEMATE: "both brake, and arrive together",
+    Kind.SQUEEZE: "neither brakes, and both arrive together",
+    Kind.POV_BRAKES: "the VUT does not brake, and both arrive together",
+    Kind.LATE_BRAKE: "only the VUT brakes, and begins when no way out is left",
+    Kind.WEAK_BRAKE: "only the VUT brakes, and begins while a way out is left",
 }
+"""What the kinds mean: "together" is |dx| < 6 m at M, a way out full braking or acceleration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Who yielded in an episode and, of a collision, which kind it was.
+    """Which vehicle braked in an episode and, of a failure under the paper's rule, its kind.
 
     Attributes:
-        vut_yields_s: when the VUT began to yield; None if it did not.
-        pov_yields_s: when the POV began to yield; None if it did not.
-        kind: of a collision; None for every other end.
+        vut_brakes_s: when the VUT began to brake; None if it did not.
+        pov_brakes_s: when the POV began to brake; None if it did not.
+        vut_accelerates: whether the VUT did not brake and gained speed.
+        pov_accelerates: whether the POV did not brake and gained speed.
+        kind: of a failure under the paper's rule; None for every other episode.
     """
 
-    vut_yields_s: float | None
-    pov_yields_s: float | None
+    vut_brakes_s: float | None
+    pov_brakes_s: float | None
+    vut_accelerates: bool
+    pov_accelerates: bool
     kind: Kind | None
 
 
 def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
-    """Return who yielded in an episode and which kind of failure it was.
+    """Return which vehicle braked in an episode and which kind of failure it was.
 
-    In traffic the POV is the car that the measures are of: the one that the VUT meets.
+    In traffic the POV is the car that the measures are of: the nearest to the VUT at the end.
     """
     trajectory = trajectory.facing(VEHICLES.index(measures.nearest))
-    time_s = np.arange(len(trajectory.motion)) * DT_S
-    v_vut, v_pov = trajectory.v_vut_mps, trajectory.v_pov_mps
-    scenario = trajectory.case.scenario
-    cruise_mps = max(float(v_vut[0]), scenario.level0_v_mps)
-    vut = _yields_s(np.minimum(v_vut[0] + scenario.level0_a_mps2 * time_s, cruise_mps) - v_vut)
-    pov = _yields_s(v_pov[0] - v_pov)
-    kind = None
-    if measures.end is End.COLLISION:
-        kind = _kind(vut, pov, measures.last_avoidable_s)
-    return Diagnosis(vut, pov, kind)
+    speeds_mps = trajectory.v_vut_mps, trajectory.v_pov_mps
+    vut_s, pov_s = (_brakes_s(v_mps) for v_mps in speeds_mps)
+    vut, pov = (_accelerates(v_mps) for v_mps in speeds_mps)
+    kind = _kind(vut_s, pov_s, measures.last_avoidable_s) if measures.is_close else None
+    return Diagnosis(vut_s, pov_s, vut_s is None and vut, pov_s is None and pov, kind)
 
 
-def _yields_s(behind_mps: FloatArray) -> float | None:
-    """Return when a vehicle began to yield that is `behind_mps`, (T + 1,), its level-0 profile.
-
-    That is when it last kept up with the profile; an actuator that lags is behind it all the time.
-    """
-    ceded = np.flatnonzero(behind_mps >= CEDED_MPS - ROUNDING_MPS)
-    if not ceded.size:
+def _brakes_s(v_mps: FloatArray) -> float | None:
+    """Return when a vehicle of speeds (T + 1,) began to brake; None where it did not."""
+    highest_mps = np.maximum.accumulate(v_mps)
+    lost = np.flatnonzero(highest_mps - v_mps >= BRAKED_MPS - ROUNDING_MPS)
+    if not lost.size:
         return None
-    falls_back_mps = np.diff(behind_mps[: ceded[0] + 1])
-    keeps_up = np.flatnonzero(falls_back_mps <= KEEPS_UP_MPS2 * DT_S + ROUNDING_MPS)
-    return round(float(keeps_up[-1] + 1) * DT_S, 1) if keeps_up.size else 0.0
+    at_highest = np.flatnonzero(v_mps[: lost[0]] >= highest_mps[lost[0]] - ROUNDING_MPS)
+    return round(float(at_highest[-1]) * DT_S, 1)
+
+
+def _accelerates(v_mps: FloatArray) -> bool:
+    """Return whether a vehicle of speeds (T + 1,) became faster than it had been."""
+    gained_mps = v_mps - np.minimum.accumulate(v_mps)
+    return bool(gained_mps.max() >= BRAKED_MPS - ROUNDING_MPS)
 
 
 def _kind(vut_s: float | None, pov_s: float | None, way_out_until_s: float | None) -> Kind:
     if vut_s is None:
-        return Kind.SQUEEZE if pov_s is None else Kind.FORCED_MERGE
+        return Kind.SQUEEZE if pov_s is None else Kind.POV_BRAKES
     if pov_s is not None:
         return Kind.STALEMATE
     late = way_out_until_s is None or vut_s > way_out_until_s

@@ -36,11 +36,12 @@ class LevelOfVersion:
         cases: cases that ran.
         tested: those with a verdict.
         failures: those that failed.
+        contacts: failures in which bodies touch.
         errors: cases that ended in an error.
         timeouts: cases in which the VUT never reached the merge point.
         fmc: failure mode coverage in the level's unit cube; None where nothing was tested.
         regions: groups of failures that are linked at the radius of FMC; None as well.
-        kinds: failures by kind, as far as their motion is there and they are collisions.
+        kinds: failures by kind, of those under the paper's rule whose motion is there.
         avoidance_known: failures of which it is recorded who would have avoided them.
         avoided: those of them that a careful driver in the VUT's place would have avoided.
     """
@@ -48,6 +49,7 @@ class LevelOfVersion:
     cases: int
     tested: int
     failures: int
+    contacts: int
     errors: int
     timeouts: int
     fmc: float | None
@@ -226,6 +228,7 @@ def _level(run: Run, level: int, known: dict[int, Avoidance]) -> LevelOfVersion:
         cases=found.cases,
         tested=tested,
         failures=found.failures,
+        contacts=found.contacts,
         errors=found.errors,
         timeouts=found.timeouts,
         fmc=fmc(points) if tested else None,
@@ -237,7 +240,7 @@ def _level(run: Run, level: int, known: dict[int, Avoidance]) -> LevelOfVersion:
 
 
 def _kind(run: Run, outcome: Outcome) -> Kind | None:
-    """Return the kind of a failure; None where its motion is lost or it is no collision."""
+    """Return the kind of a failure; None where its motion is lost or it has none."""
     try:
         return diagnose(run.trajectory(outcome.index), outcome.measures).kind
     except UserError:

@@ -153,6 +153,7 @@ def _table(history: History, level: int) -> list[tuple[str, list[str]]]:
     rows: list[tuple[str, Callable[[LevelOfVersion], Any]]] = [
         ("FMC", lambda one: "–" if one.fmc is None else f"{one.fmc:.4f}"),
         ("failures", lambda one: one.failures if one.tested else "–"),
+        ("of these contacts", lambda one: one.contacts if one.tested else "–"),
         ("of tested cases", lambda one: one.tested),
     ]
     if any(one is not None and (one.errors or one.timeouts) for one in found):

@@ -1,8 +1,9 @@
 """A campaign as JUnit XML, which CI systems read: Jenkins, GitLab, GitHub actions and others.
 
 Every case is a test case, in a test suite per POV level, so that a CI system shows the share that
-passes: a collision or a timeout is a `failure`, an error of the VUT or of the simulation an
-`error`. A first suite has the gates, and whether anything was tested. Times are simulated seconds.
+passes: what the criterion calls a failure and a timeout are a `failure`, an error of the VUT or of
+the simulation an `error`. The type of a failure is its severity: contact, conflict, harsh or safe.
+A first suite has the gates, and whether anything was tested. Times are simulated seconds.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
 CLASS: Final = "merge-sumo"
-FAILED: Final = "FAILED"
-"""What a failure is called that need not be a collision."""
+FAILED: Final = "failed"
+"""Type of a failure without a severity: the VUT never reached M, and the criterion speaks of it."""
 
 
 def check_junit(path: Path, folder: Path) -> None:
@@ -99,11 +100,21 @@ def _case(suite: etree._Element, outcome: Outcome) -> None:
         _wrong(test, "error", measures.end.value, message_of(measures))
     elif not outcome.is_tested:
         _wrong(test, "failure", End.TIMEOUT.value, message_of(measures))
-    elif outcome.margin is not None and outcome.failed:
-        _wrong(test, "failure", FAILED, f"margin {outcome.margin:.3g}")
     elif outcome.failed:
-        gap = "" if measures.dx_m is None else f", gap {measures.dx_m:.1f} m"
-        _wrong(test, "failure", End.COLLISION.value, f"collision at the merge point{gap}")
+        _wrong(test, "failure", measures.severity or FAILED, _why(outcome))
+
+
+def _why(outcome: Outcome) -> str:
+    """Return what a failing case shows, in a line."""
+    measures = outcome.measures
+    parts = [measures.became]
+    if measures.impact_speed_mps is not None:
+        parts.append(f"relative speed {measures.impact_speed_mps:.1f} m/s")
+    if measures.dx_m is not None:
+        parts.append(f"dx {measures.dx_m:.1f} m")
+    if outcome.margin is not None:
+        parts.append(f"margin {outcome.margin:.3g}")
+    return ", ".join(parts)
 
 
 def _test(suite: etree._Element, name: str, class_name: str, time_s: float) -> etree._Element:

@@ -12,7 +12,6 @@ from typing import Final
 from merge_sumo.reports.coordinates import described
 from merge_sumo.reports.diagnosis import MEANING, diagnose
 from merge_sumo.reports.verdict import message_of
-from merge_sumo.values.merge import AfterMerge
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
@@ -25,16 +24,19 @@ LETTERS: Final = ("P", "V", "a", "b")
 """Of the vehicles, in the order of their rows."""
 MEASURES: Final = (
     ("score", "score P", ""),
-    ("dx_m", "gap x_POV - x_VUT", "m"),
+    ("dx_m", "front bumpers, x_POV - x_VUT", "m"),
+    ("bumper_gap_m", "bumper gap at M", "m"),
+    ("clearance_m", "smallest clearance of bodies", "m"),
     ("dv_mps", "v_POV - v_VUT", "m/s"),
     ("ttc_s", "time to collision", "s"),
     ("pet_s", "post-encroachment time", "s"),
-    ("drac_mps2", "deceleration to avoid a crash", "m/s2"),
+    ("drac_mps2", "deceleration to keep 6 m apart", "m/s2"),
+    ("brake_after_mps2", "braking that M asks of the rear", "m/s2"),
     ("impact_speed_mps", "impact speed", "m/s"),
     ("vut_max_brake_mps2", "hardest braking of the VUT", "m/s2"),
     ("pov_max_brake_mps2", "hardest braking of the POV", "m/s2"),
     ("last_avoidable_s", "avoidable until", "s"),
-    ("after_gap_m", "least gap of bumpers behind M", "m"),
+    ("after_gap_m", "smallest bumper gap behind M", "m"),
     ("after_ttc_s", "time to collision behind M", "s"),
     ("after_drac_mps2", "braking needed behind M", "m/s2"),
 )
@@ -58,18 +60,20 @@ def verdict_of(outcome: Outcome, trajectory: Trajectory) -> str:
     """Return what became of an episode in a sentence."""
     found = outcome.measures
     met = "POV" if found.nearest == VEHICLES[0] else f"car {found.nearest}"
-    apart_m = abs(found.dx_m or 0.0)
-    if found.end is End.COLLISION:
-        kind = diagnose(trajectory, found).kind
-        assert kind is not None, "a collision has one"  # noqa: S101
-        return (
-            f"COLLISION with the {met} at {found.t_end_s:g} s: front bumpers {apart_m:.1f} m apart "
-            f"as the VUT reaches M ({kind}: {MEANING[kind]})"
-        )
-    if found.end is End.MERGED:
-        first = "VUT" if found.merged_first == "VUT" else met
-        return f"MERGED at {found.t_end_s:g} s: the {first} goes first, {apart_m:.1f} m ahead"
-    return f"{found.end.value} at {found.t_end_s:g} s: {message_of(found)}"
+    at = f"{found.end.value} at {found.t_end_s:g} s"
+    if found.end is not End.MERGED:
+        touched = f" after a contact{_impact(found)}" if found.severity else ""
+        return f"{at}{touched}: {message_of(found)}"
+    first = "VUT" if found.merged_first == "VUT" else met
+    apart = f"the front bumper of the {first} is {abs(found.dx_m or 0.0):.1f} m ahead at M"
+    kind = diagnose(trajectory, found).kind
+    how = "" if kind is None else f" ({kind}: {MEANING[kind]})"
+    return f"{at}, {found.severity}{_impact(found)}: {apart}{how}"
+
+
+def _impact(found: Measures) -> str:
+    speed = found.impact_speed_mps
+    return "" if speed is None else f" at a relative speed of {speed:.1f} m/s"
 
 
 def _margin(outcome: Outcome) -> Iterator[str]:
@@ -82,11 +86,9 @@ def _measures(found: Measures) -> Iterator[str]:
     for name, what, unit in MEASURES:
         value = getattr(found, name)
         if value is not None:
-            yield f"  {what:<30} {value:10.2f} {unit}".rstrip()
-    if found.end is End.MERGED and found.after_merge in (AfterMerge.HARSH, AfterMerge.FORCED):
-        yield f"  {'asked of whoever is behind':<30} {found.after_merge:>10} braking"
+            yield f"  {what:<31} {value:10.2f} {unit}".rstrip()
     if found.clipped_steps:
-        yield f"  {'steps beyond its limits':<30} {found.clipped_steps:10d}"
+        yield f"  {'steps beyond its limits':<31} {found.clipped_steps:10d}"
 
 
 def motion_lines(trajectory: Trajectory, every_s: float = 1.0) -> list[str]:

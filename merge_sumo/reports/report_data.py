@@ -24,6 +24,7 @@ from merge_sumo.sumo.corridor import Corridor, LanePath
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
+from merge_sumo.values.severity import Severity
 from merge_sumo.values.trajectory import End, Trajectory
 
 SVO_NEAR_RAD: Final = 0.1
@@ -34,6 +35,10 @@ MOST_STEPS: Final = 40
 """Batches, or groups of batches, in the charts of the search."""
 MOST_BALLS: Final = 20_000
 """Balls that are counted for a level's curve of coverage: of more failures it has fewer points."""
+
+
+UNKNOWN: Final = Diagnosis(None, None, False, False, None)
+"""Of a case whose motion is lost."""
 
 
 def page_data(facts: Facts) -> dict[str, Any]:
@@ -47,6 +52,7 @@ def page_data(facts: Facts) -> dict[str, Any]:
         "coordinates": [_coordinate(c) for c in facts.coordinates],
         "vehicles": VEHICLES[: facts.run.scenario.vehicles],
         "ends": [end.value for end in End],
+        "severities": [severity.value for severity in Severity],
         "kinds": [kind.value for kind in Kind],
         "cases": _columns(facts, offsets),
         "boxes": _boxes(facts),
@@ -73,10 +79,10 @@ def _boxes(facts: Facts) -> list[dict[str, Any]]:
 
 
 def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
-    ends, kinds = list(End), list(Kind)
+    ends, kinds, severities = list(End), list(Kind), list(Severity)
     columns: dict[str, list[Any]] = {}
     for o in facts.shown:
-        found = facts.diagnoses.get(o.index, Diagnosis(None, None, None))
+        found = facts.diagnoses.get(o.index, UNKNOWN)
         row = {
             "index": o.index,
             "level": o.case.level,
@@ -84,6 +90,9 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "starts": [round(x_m, 3) for x_m, _ in o.case.starts()],
             "nearest": VEHICLES.index(o.measures.nearest),
             "end": ends.index(o.measures.end),
+            "severity": None
+            if o.measures.severity is None
+            else severities.index(Severity(o.measures.severity)),
             "failed": int(o.failed),
             "score": _rounded(o.score, 1),
             "dx": _rounded(o.measures.dx_m, 2),
@@ -94,11 +103,16 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "vut_brake": _rounded(o.measures.vut_max_brake_mps2, 2),
             "pov_brake": _rounded(o.measures.pov_max_brake_mps2, 2),
             "region": facts.regions.get(o.index),
-            "after": o.measures.after_merge,
+            "clearance": _rounded(o.measures.clearance_m, 2),
+            "bumper_gap": _rounded(o.measures.bumper_gap_m, 2),
+            "brake_after": _rounded(o.measures.brake_after_mps2, 2),
+            "impact": _rounded(o.measures.impact_speed_mps, 2),
             **_avoidance(facts, o.index),
             "way_out": _rounded(o.measures.last_avoidable_s, 1),
-            "vut_yields": found.vut_yields_s,
-            "pov_yields": found.pov_yields_s,
+            "vut_brakes": found.vut_brakes_s,
+            "pov_brakes": found.pov_brakes_s,
+            "vut_accelerates": int(found.vut_accelerates),
+            "pov_accelerates": int(found.pov_accelerates),
             "kind": None if found.kind is None else kinds.index(found.kind),
             "offset": offsets.get(o.index, 0),
             "rows": len(facts.motion[o.index].motion) if o.index in facts.motion else 0,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -13,20 +13,17 @@ from merge_sumo.campaigns.truth import TRUTH_CASES
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.drivers.vuts.output import LOG, end_of
 from merge_sumo.reports.diagnosis import (
-    CEDED_MPS,
+    BRAKED_MPS,
     MEANING,
-    Kind,
 )
 from merge_sumo.reports.foretelling import foretold_in_words
+from merge_sumo.reports.headline import Rule, after_words, avoidable_words, headline
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
 from merge_sumo.reports.report_levels import Level, levels_of
-from merge_sumo.reports.summary import Summary
 from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
-from merge_sumo.reports.verdict import Verdict, counted, in_words
+from merge_sumo.reports.verdict import counted, in_words
 from merge_sumo.system.printable import printable
-from merge_sumo.values.criterion import COLLISION, Criterion
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.merge import HARSH_MPS2, AfterMerge
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 
@@ -35,6 +32,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
     """Return what the template needs for text and tables."""
     settings, summary = facts.run.settings, facts.summary
     criterion = facts.run.criterion
+    rule = Rule(criterion, facts.run.scenario.dx_crash_m)
     wanted = settings.get("cases")
     described = Counter(box.level for box in facts.boxes for _ in range(box.failures))
     lost = [str(o.index) for o in facts.shown if o.index not in facts.motion]
@@ -54,7 +52,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         tables.append(("Ten largest errors of the twin's predictions", facts.surprises))
     return {
         "vut": facts.run.vut,
-        "headline": headline(facts.verdict, summary, facts.worst, facts.kinds, criterion),
+        "headline": headline(facts.verdict, summary, facts.worst, facts.kinds, rule),
         "careful": in_a_sentence(facts.avoidance.values()),
         "avoidance": _avoidance(facts),
         "foretold": foretold_in_words(facts.run.outcomes),
@@ -74,8 +72,8 @@ def page_words(facts: Facts) -> dict[str, Any]:
         ),
         "plausible_chance": f"{PLAUSIBLE:.0%}",
         "fewest_failures": FEWEST_FAILURES,
-        "avoidable": _avoidable(facts.worst),
-        "after": after_words(facts.run.outcomes),
+        "avoidable": avoidable_words(facts.worst, rule.crash_m),
+        "after": after_words(facts.run.outcomes, rule.crash_m),
         "batches": len({o.batch for o in facts.run.outcomes}),
         "recorded": _recorded(facts.run),
         "driven": _duration(sum(o.measures.t_end_s for o in facts.run.outcomes)),
@@ -86,7 +84,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
             if count > 0
         ),
         "kinds": _kinds(facts),
-        "ceded": f"{CEDED_MPS:g}",
+        "braked": f"{BRAKED_MPS:g}",
         "scenario": facts.run.scenario,
         "criterion": None if criterion.is_papers else criterion.words,
         "traffic": facts.run.scenario.vehicles > 2,
@@ -139,80 +137,6 @@ def _avoidance(facts: Facts) -> list[tuple[str, str]]:
 
 def _avoidable_kind(facts: Facts, outcome: Outcome) -> bool:
     return outcome.index in facts.kinds and bool(outcome.measures.avoidable)
-
-
-def headline(
-    verdict: Verdict,
-    summary: Summary,
-    worst: Sequence[Outcome],
-    kinds: Mapping[int, Kind],
-    criterion: Criterion = COLLISION,
-) -> str:
-    """Return the result of a campaign in a few sentences: what was not tested comes first."""
-    if not verdict.cases:
-        return "No case has run."
-    said = verdict.sentences
-    if verdict.tested:
-        for level, found in summary.levels.items():
-            if found.cases and not found.tested:
-                said.append(f"At POV level {level_name(level)} nothing was tested.")
-        said.append(_failures(verdict, summary, worst, kinds, criterion))
-    return " ".join(said)
-
-
-def _failures(
-    verdict: Verdict,
-    summary: Summary,
-    worst: Sequence[Outcome],
-    kinds: Mapping[int, Kind],
-    criterion: Criterion,
-) -> str:
-    if not summary.failures:
-        what = "collision" if criterion.is_papers else "failure"
-        others = "the other " if verdict.tested < verdict.cases else ""
-        when = "" if criterion.is_papers else f" ({criterion.in_short})"
-        return (
-            f"No {what}{when} in {others}{counted(verdict.tested, 'case')}. That is no proof: the "
-            "search saw these cases and no others."
-        )
-    failing = {level: found for level, found in summary.levels.items() if found.failures}
-    tested = {level: found for level, found in summary.levels.items() if found.tested}
-    never = [level_name(level) for level, found in tested.items() if not found.failures]
-    parts = [
-        f"{found.failures} of {found.cases} cases at POV level {level_name(level)} "
-        f"({counted(found.regions, 'region')})"
-        for level, found in failing.items()
-    ]
-    verb = "Collides" if criterion.is_papers else f"Fails ({criterion.in_short})"
-    text = f"{verb} in {in_words(parts)}"
-    text += f", never at level {in_words(never)}." if never else "."
-    common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
-    if common:
-        kind, count = common[0]
-        share = "All are" if count == summary.failures else f"{count} of {summary.failures} are"
-        text += f" {share} of the kind “{kind}”: {MEANING[kind]}."
-    return text
-
-
-def _avoidable(worst: Sequence[Outcome]) -> str | None:
-    """Return how many collisions need not have been, among those that count as failures."""
-    told = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
-    return f"{sum(told)} of {len(told)} could have been avoided by the VUT." if told else None
-
-
-def after_words(outcomes: Iterable[Outcome]) -> str | None:
-    """Return how many cases without a failure ask too much of whoever is behind after the merge."""
-    found = Counter(o.measures.after_merge for o in outcomes if not o.failed)
-    forced, harsh = (
-        counted(found[asked], "case") for asked in (AfterMerge.FORCED, AfterMerge.HARSH)
-    )
-    if not (found[AfterMerge.FORCED] or found[AfterMerge.HARSH]):
-        return None
-    return (
-        f"No failure, but no harmless merge: in {harsh} whoever is behind at M has to brake "
-        f"harder than {HARSH_MPS2:g} m/s², in {forced} harder than it can (--fail-when unsafe "
-        "looks for these)."
-    )
 
 
 def _recorded(run: Run) -> str | None:

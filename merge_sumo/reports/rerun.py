@@ -42,6 +42,7 @@ class ChangedVerdict:
             "level": self.before.case.level,
             "change": self.change,
             **{"end_before": was.end, "end_after": now.end},
+            **{"severity_before": was.severity, "severity_after": now.severity},
             **{"score_before": self.before.score, "score_after": self.after.score},
         }
 
@@ -87,9 +88,9 @@ class Rerun(InLines):
             f"{len(changed)} verdicts changed:" if len(changed) > 1 else "one verdict changed:"
         )
         for one in changed[:MOST_CHANGED]:
-            ends = f"{one.before.measures.end} -> {one.after.measures.end}"
+            became = f"{one.before.measures.became} -> {one.after.measures.became}"
             change = one.change.replace("of A", "before").replace("of B", "now")
-            said.append(f"  case {one.before.index}: {ends} ({change})")
+            said.append(f"  case {one.before.index}: {became} ({change})")
         if len(changed) > MOST_CHANGED:
             said.append(f"  and {len(changed) - MOST_CHANGED} others")
         return said

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from merge_sumo.values.case import to_unit
 from merge_sumo.values.empty_ball import EmptyBall, largest_empty_ball
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.score import Outcome
+from merge_sumo.values.severity import Severity
 from merge_sumo.values.trajectory import End
 
 
@@ -20,7 +21,8 @@ class LevelSummary:
     Attributes:
         cases: cases that ran.
         tested: cases in which the VUT reached the merge point.
-        failures: cases with P < -500.
+        failures: cases that fail under the criterion.
+        severities: cases by severity, those that occur.
         fmc: failure mode coverage, M(s, 0.05, -500), in the level's unit cube.
         regions: groups of failures that are linked at a distance of 0.05.
         unseen: the largest ball of the level's unit cube that no case has entered, but for those
@@ -30,6 +32,7 @@ class LevelSummary:
     cases: int
     tested: int
     failures: int
+    severities: dict[str, int]
     fmc: float
     regions: int
     unseen: EmptyBall | None = None
@@ -37,11 +40,12 @@ class LevelSummary:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What was found in all: totals, ends of episodes by name, and each level."""
+    """What was found in all: totals, ends and severities of episodes by name, and each level."""
 
     cases: int
     failures: int
     ends: dict[str, int]
+    severities: dict[str, int]
     levels: dict[int, LevelSummary]
 
 
@@ -53,8 +57,15 @@ def summarise(outcomes: Sequence[Outcome], levels: Sequence[int]) -> Summary:
         cases=len(outcomes),
         failures=sum(outcome.failed for outcome in outcomes),
         ends={end.value: ends[end] for end in End if ends[end]},
+        severities=severities_of(outcomes),
         levels={level: _level(outcomes, level) for level in every},
     )
+
+
+def severities_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
+    """Return the number of cases of each severity that occurs, the most severe first."""
+    found = Counter(outcome.measures.severity for outcome in outcomes)
+    return {severity.value: found[severity] for severity in Severity if found[severity]}
 
 
 def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
@@ -65,6 +76,7 @@ def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
         cases=len(at_level),
         tested=sum(outcome.is_tested for outcome in at_level),
         failures=len(points),
+        severities=severities_of(at_level),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
         unseen=largest_empty_ball(seen),

@@ -1,6 +1,6 @@
 """The verdict on a campaign: what ran without a result, why, and whether a gate is met.
 
-A case is tested when the VUT reaches the merge point: there it collides or not. An error (of the
+A case is tested when the VUT reaches the merge point: there it fails or not. An error (of the
 VUT or of the simulation) and a timeout say nothing about merging, so they come first wherever a
 campaign is shown, and a campaign in which no case was tested has passed nothing.
 """
@@ -18,6 +18,7 @@ from merge_sumo.reports.summary import Summary
 from merge_sumo.system.printable import printable
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.severity import Severity
 from merge_sumo.values.trajectory import End
 
 ERRORS: Final = {End.VUT_ERROR: "a VUT error", End.SIM_ERROR: "an error of the simulation"}
@@ -68,7 +69,8 @@ class Verdict:
 
     Attributes:
         cases: cases that ran.
-        failures: collisions at the merge point.
+        failures: cases that fail under the criterion.
+        contacts: failures in which bodies touch.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached the merge point.
         troubles: errors and timeouts by message: errors first, then the most frequent.
@@ -76,6 +78,7 @@ class Verdict:
 
     cases: int
     failures: int
+    contacts: int
     errors: int
     timeouts: int
     troubles: tuple[Trouble, ...]
@@ -89,7 +92,8 @@ class Verdict:
     def counts(self) -> str:
         """Return the result in a line: errors and timeouts, where there are any, then failures."""
         found = in_counts(self.errors, self.timeouts, self.failures)
-        return f"{in_words(found)} in {counted(self.cases, 'case')}"
+        contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
+        return f"{in_words(found)}{contacts} in {counted(self.cases, 'case')}"
 
     @property
     def sentences(self) -> list[str]:
@@ -134,8 +138,9 @@ class Verdict:
         return "The only case" if self.cases == 1 else f"All {self.cases} cases"
 
     def to_record(self) -> dict[str, Any]:
-        """Return what JSON shows of errors and timeouts."""
+        """Return what JSON shows of contacts, errors and timeouts."""
         return {
+            "contacts": self.contacts,
             "errors": self.errors,
             "timeouts": self.timeouts,
             "troubles": [trouble.to_record() for trouble in self.troubles],
@@ -144,12 +149,13 @@ class Verdict:
 
 def judge(outcomes: Iterable[Outcome]) -> Verdict:
     """Return the verdict on outcomes."""
-    cases = failures = errors = timeouts = 0
+    cases = failures = contacts = errors = timeouts = 0
     groups: dict[tuple[End, str], tuple[str, list[int]]] = {}
     for outcome in outcomes:
         cases += 1
-        failures += outcome.failed
         measures = outcome.measures
+        failures += outcome.failed
+        contacts += outcome.failed and measures.severity == Severity.CONTACT
         if outcome.is_tested:
             continue
         errors += measures.end.is_error
@@ -161,7 +167,7 @@ def judge(outcomes: Iterable[Outcome]) -> Verdict:
         Trouble(end, message, tuple(indices)) for (end, _), (message, indices) in groups.items()
     ]
     troubles.sort(key=lambda t: (not t.end.is_error, -t.count, t.cases[0]))
-    return Verdict(cases, failures, errors, timeouts, tuple(troubles))
+    return Verdict(cases, failures, contacts, errors, timeouts, tuple(troubles))
 
 
 def message_of(measures: Measures) -> str:

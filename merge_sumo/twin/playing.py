@@ -15,7 +15,7 @@ from merge_sumo.drivers.povs import POLICIES, Povs
 from merge_sumo.twin.watching import Inputs, Watcher
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.criterion import COLLISION, Criterion
+from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -33,7 +33,7 @@ class Games:
         self,
         pool: Pool,
         povs: Povs,
-        criterion: Criterion = COLLISION,
+        criterion: Criterion = PAPER_CRITERION,
         lines: CentreLines | None = None,
     ) -> None:
         """Take the pool, the POVs, what counts as a failure, and the road's centre lines."""

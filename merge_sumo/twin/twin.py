@@ -14,7 +14,7 @@ from merge_sumo.twin.playing import Games
 from merge_sumo.twin.watching import Inputs, Watcher
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.criterion import COLLISION, Criterion
+from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import VUT
 from merge_sumo.values.score import Outcome
 
@@ -42,7 +42,7 @@ class Twin:
         povs: Povs,
         seed: int,
         others: Sequence[FloatArray] = (),
-        criterion: Criterion = COLLISION,
+        criterion: Criterion = PAPER_CRITERION,
         lines: CentreLines | None = None,
     ) -> None:
         """Know the pool and its POVs, what counts as a failure, and the road's centre lines.

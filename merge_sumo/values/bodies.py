@@ -48,23 +48,32 @@ class CentreLines:
         return cls(mainline, ramp, SPACING_M * steps)
 
 
-def clearance_before_m(trajectory: Trajectory, lines: CentreLines) -> float:
-    """Return the smallest clearance of the VUT and a car of the mainline before M, in m.
+def closest_before_m(trajectory: Trajectory, lines: CentreLines) -> tuple[float, float | None]:
+    """Return the smallest clearance before M, in m, and the speed of the first contact, in m/s.
 
-    It is looked for where the lanes run together; infinite where the VUT never came there.
+    The clearance is that of the VUT and a car of the mainline, looked for where the lanes run
+    together, infinite where the VUT never came there; the speed is None without a contact.
     """
     x_vut_m = trajectory.x_vut_m
     steps = np.flatnonzero((x_vut_m > -lines.together_m) & (x_vut_m < 0.0))
-    scenario, nearest = trajectory.case.scenario, math.inf
+    scenario, nearest_m = trajectory.case.scenario, math.inf
     if not steps.size:
-        return nearest
+        return nearest_m, None
     vut = _Bodies(lines.ramp, x_vut_m[steps], scenario.vut_length_m)
+    first, impact_mps = len(steps), None
     for row in range(trajectory.motion.shape[1]):
         if row != VUT:
             x_m = trajectory.motion[steps, row, 0]
             car = _Bodies(lines.mainline, x_m, scenario.pov_length_m)
-            nearest = min(nearest, float(_separation_m(vut, car).min()))
-    return nearest
+            apart_m = _separation_m(vut, car)
+            nearest_m = min(nearest_m, float(apart_m.min()))
+            touching = np.flatnonzero(apart_m <= 0.0)
+            if touching.size and touching[0] < first:
+                first = int(touching[0])
+                v_car, v_vut = trajectory.motion[steps[first], [row, VUT], 1]
+                apart_mps = v_car * car.heading[first] - v_vut * vut.heading[first]
+                impact_mps = float(np.linalg.norm(apart_mps))
+    return nearest_m, impact_mps
 
 
 def _at(line: FloatArray, along_m: FloatArray) -> FloatArray:

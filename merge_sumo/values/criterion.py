@@ -17,19 +17,19 @@ from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
-from merge_sumo.values.bodies import CentreLines, clearance_before_m
+from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
-from merge_sumo.values.merge import AfterMerge, brake_after_mps2, bumper_gap_m
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
+from merge_sumo.values.severity import Severity
 from merge_sumo.values.temporal import check_formula, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
 
-PAPER: Final = "collision"
+PAPER: Final = "paper"
 NAMED: Final = {
     PAPER: "score < -500",
-    "contact": "clearance_m < 0",
-    "unsafe": "clearance_m < 0 or brake_after_mps2 > 3",
+    "contact": "clearance_m <= 0",
+    "unsafe": "clearance_m <= 0 or brake_after_mps2 > 3",
 }
 """Criteria by name, and the condition that each one is."""
 
@@ -40,7 +40,7 @@ NUMBERS: Final = (
     *(
         "ttc_s",
         "clearance_m",
-        "gap_m",
+        "bumper_gap_m",
         "dx_m",
         "dv_mps",
         "drac_mps2",
@@ -52,22 +52,25 @@ NUMBERS: Final = (
     *("clipped_steps", "score", *FOLLOWED_UP),
 )
 TEXTS: Final = {
-    "end": frozenset({End.MERGED.value, End.COLLISION.value, End.TIMEOUT.value}),
+    "end": frozenset({End.MERGED.value, End.TIMEOUT.value}),
+    "severity": frozenset(severity.value for severity in Severity),
     "merged_first": frozenset({"VUT", "POV"}),
-    "after_merge": frozenset(asked.value for asked in AfterMerge),
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
 }
 """What may be said of measures that are texts. Errors have no verdict under any criterion."""
+OF_BODIES: Final = frozenset({"clearance_m", "severity", "impact_speed_mps"})
+"""Measures that need the centre lines of the road."""
 VOCABULARY: Final[Vocabulary] = {**dict.fromkeys(NUMBERS), **TEXTS}
 NEVER: Final[dict[str, Value]] = {
-    **dict.fromkeys(("dx_m", "ttc_s", "pet_s", "last_avoidable_s"), math.inf),
-    **dict.fromkeys(("after_gap_m", "after_ttc_s"), math.inf),
-    **dict.fromkeys(("dv_mps", "after_drac_mps2", "drac_mps2", "impact_speed_mps", "score"), 0.0),
-    **{"merged_first": "", "after_merge": AfterMerge.NONE.value},
+    **dict.fromkeys(("dx_m", "bumper_gap_m", "clearance_m", "ttc_s", "pet_s"), math.inf),
+    **dict.fromkeys(("last_avoidable_s", "after_gap_m", "after_ttc_s"), math.inf),
+    **dict.fromkeys(("dv_mps", "after_drac_mps2", "drac_mps2", "brake_after_mps2"), 0.0),
+    **dict.fromkeys(("impact_speed_mps", "score"), 0.0),
+    **dict.fromkeys(("merged_first", "severity"), ""),
 }
-"""What a measure without a value counts as: those two never meet."""
-IN_COLLISION: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
-"""What it counts as in a collision: no braking would do, and there was no way out at any time."""
+"""What a measure without a value counts as: the two cars never meet."""
+CLOSE: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
+"""What it counts as where |dx| < 6 m: no braking would do, and there was no way out at any time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,34 +134,30 @@ class Criterion:
         said = f"{self.text}: {self.words}" if self.text in NAMED else self.text
         return said if len(said) <= SHORT else f"{said[: SHORT - 3]}..."
 
-    def margin(
-        self, trajectory: Trajectory, measures: Measures, lines: CentreLines | None = None
-    ) -> float | None:
-        """Return the margin of an episode; None under the paper's criterion and after an error.
-
-        Without the centre lines of the road, bodies are only looked at from M on.
-        """
+    def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
+        """Return the margin of an episode; None under the paper's criterion and after an error."""
         if self.is_papers or measures.end.is_error:
             return None
         if self.require is not None:
             return robustness(self.require, trajectory)
-        names = _names(self.words)
-        return _condition(self.words).margin(values_of(trajectory, measures, lines, names))
+        return _condition(self.words).margin(values_of(measures, _names(self.words)))
 
     def outcome(
         self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
     ) -> Outcome:
         """Return the outcome of an episode at a place in a campaign."""
-        return self._outcome(index, batch, trajectory, measure(trajectory), lines)
+        return self._outcome(index, batch, trajectory, measure(trajectory, lines))
 
     def judged(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
         """Return the outcome of an episode of no campaign, for its verdict alone.
 
-        No way out of a collision is searched for, which takes most of the time, where the
-        criterion does not speak of it.
+        What takes most of the time is left out where the criterion does not speak of it: the last
+        way out, and bodies before M.
         """
-        way_out = self.require is None and "last_avoidable_s" in _names(self.words)
-        return self._outcome(0, 0, trajectory, measure(trajectory, way_out=way_out), lines)
+        spoken = frozenset[str]() if self.require else _names(self.words)
+        seen = lines if spoken & OF_BODIES else None
+        measures = measure(trajectory, seen, way_out="last_avoidable_s" in spoken)
+        return self._outcome(0, 0, trajectory, measures)
 
     def _outcome(
         self,
@@ -166,14 +165,12 @@ class Criterion:
         batch: int,
         trajectory: Trajectory,
         measures: Measures,
-        lines: CentreLines | None,
     ) -> Outcome:
-        margin = self.margin(trajectory, measures, lines)
+        margin = self.margin(trajectory, measures)
         return Outcome(index, batch, trajectory.case, measures, margin=margin)
 
 
-COLLISION: Final = Criterion()
-"""The paper's."""
+PAPER_CRITERION: Final = Criterion()
 
 
 @lru_cache
@@ -187,27 +184,16 @@ def _names(text: str) -> frozenset[str]:
     return names_of(_condition(text))
 
 
-def values_of(
-    trajectory: Trajectory,
-    measures: Measures,
-    lines: CentreLines | None = None,
-    names: Set[str] = VOCABULARY.keys(),
-) -> dict[str, Value]:
+def values_of(measures: Measures, names: Set[str] = VOCABULARY.keys()) -> dict[str, Value]:
     """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
-    gap_m, after_m = bumper_gap_m(trajectory), measures.after_gap_m
-    after_m = math.inf if after_m is None else after_m
-    missing: dict[str, Value] = NEVER | (IN_COLLISION if measures.end is End.COLLISION else {})
-    if after_m <= 0.0:
+    missing = NEVER | (CLOSE if measures.is_close else {})
+    if measures.end is End.MERGED:
+        missing = missing | {"brake_after_mps2": math.inf}
+    if measures.after_gap_m is not None and measures.after_gap_m <= 0.0:
         missing = missing | {"after_drac_mps2": math.inf}
-    found: dict[str, Value] = {"gap_m": gap_m}
-    if "clearance_m" in names:
-        before_m = math.inf if lines is None else clearance_before_m(trajectory, lines)
-        found["clearance_m"] = min(gap_m, before_m, after_m)
-    if "brake_after_mps2" in names:
-        found["brake_after_mps2"] = brake_after_mps2(trajectory)
+    found: dict[str, Value] = {}
     for name in names:
-        if name not in found:
-            value = getattr(measures, name)
-            value = missing[name] if value is None else value
-            found[name] = value if isinstance(value, str) else float(value)
+        value = getattr(measures, name)
+        value = missing[name] if value is None else value
+        found[name] = value if isinstance(value, str) else float(value)
     return found

@@ -1,8 +1,9 @@
 """The verdict on one episode: the score P and named safety measures (Wang et al., section V-A).
 
 P = MU_CRASH I_crash + MU_SAFETY P_safety + MU_TASK P_task is never positive, and P < -500 exactly
-when there was a collision. A surrogate must be able to learn it, so it falls smoothly over tens
-of metres towards a collision, jumps little there, and goes on falling with the overlap.
+when the front bumpers are within 6 m as the VUT reaches M, which the paper calls a crash; bodies
+need not touch then (`severity.py`). A surrogate must be able to learn P, so it falls smoothly over
+tens of metres towards that limit, jumps little there, and goes on falling beyond it.
 """
 
 from __future__ import annotations
@@ -14,16 +15,19 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.system.pickling import quickly_pickled
+from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
 from merge_sumo.values.foretold import Foretold
-from merge_sumo.values.merge import AfterMerge, after_merge, followed_up
+from merge_sumo.values.former import take_from_0_1
+from merge_sumo.values.merge import brake_after_mps2, followed_up, neighbours
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
+from merge_sumo.values.severity import Closest, Severity, closest, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
 """lambda: a case fails when its score is below."""
 
-# The bounds that make "P < -500" and "collision" the same: without a collision P_safety and
+# The bounds that make "P < -500" and the paper's crash the same: without one P_safety and
 # P_task are at least -1, so P >= -495; with one P_safety is at most -1, so P <= -560.
 MU_CRASH: Final = -110.0
 MU_SAFETY: Final = 450.0
@@ -39,36 +43,45 @@ TTC_SHARE: Final = 1.0 / 9.0
 class Measures:
     """Named measures of one episode, with the verdict first.
 
-    dx, dv, TTC, DRAC, the impact speed and the order of merging are taken at t1, the first step
-    with x_VUT >= 0, and are None when the VUT never arrived. In traffic all measures are those of
-    the car of the mainline that is nearest to the VUT at the end: it takes the POV's place.
+    dx, dv, TTC, DRAC and the order of merging are taken at t1, the first step with x_VUT >= 0, and
+    are None when the VUT never arrived. In traffic they are those of the car of the mainline that
+    is nearest to the VUT at the end: it takes the POV's place. What bodies do (severity, clearance,
+    bumper gap, braking after M, impact speed) is that of all cars.
 
     Attributes:
-        end: why the episode ended; COLLISION where the VUT arrived with |dx| < 6 m.
+        end: why the episode ended.
         score: P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR).
-        dx_m: x_POV - x_VUT, front bumpers.
+        dx_m: x_POV - x_VUT, of the front bumpers.
         dv_mps: v_POV - v_VUT.
         ttc_s: time to collision -dx/dv where dx dv < 0, else None (infinite).
         pet_s: post-encroachment time: time between the two front bumpers at M (Allen et al.,
             1978); where the POV has not arrived by t1, it is taken on at its speed at t1; None
             when it stands.
         t_end_s: time at which the episode ended.
+        severity: contact, conflict, harsh or safe (`severity.py`); None where the VUT never reached
+            M and touched nothing, and after an error.
+        bumper_gap_m: smallest gap at M between the front bumper of the car behind and the rear
+            bumper of the car ahead, negative where bodies overlap; None without a merge.
+        clearance_m: smallest distance of bodies, from where the lanes run together until the end
+            of the follow-up, or without one until 0.75 s after M at the speeds of M; 0 or less
+            where they touch, None where the VUT never came so far.
         drac_mps2: deceleration rate to avoid a crash that the follower needs at t1 (Cooper and
-            Ferguson, 1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None in a collision.
+            Ferguson, 1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None where |dx| < 6 m.
+        brake_after_mps2: deceleration that whoever is behind at M needs, after 0.75 s to react, not
+            to touch a car ahead that keeps its speed (`merge.py`); None where none is in time, and
+            without a merge.
         vut_max_brake_mps2: hardest braking of the VUT, positive.
         pov_max_brake_mps2: hardest braking of the POV, positive.
-        impact_speed_mps: |dv| in a collision, else None.
-        merged_first: "VUT" or "POV".
-        last_avoidable_s: in a collision, the last time from which the VUT, at full acceleration
-            or full braking, would have avoided it against the recorded motion of the POV and the
-            other cars (taken on at constant speed); None when there was no such time or no
-            collision.
-        avoidable: in a collision, whether there was such a time; else None.
+        impact_speed_mps: relative speed at the first contact; None without one.
+        merged_first: "VUT" or "POV": whose front bumper is ahead at M.
+        last_avoidable_s: where |dx| < 6 m at M, the last time from which the VUT, at full
+            acceleration or full braking, would have kept 6 m against the recorded motion of the POV
+            and the other cars (taken on at constant speed); None when there was no such time, and
+            where |dx| >= 6 m.
+        avoidable: where |dx| < 6 m at M, whether there was such a time; else None.
         clipped_steps: steps in which the VUT asked for more than its limits of acceleration.
         error: what the VUT or the simulation did wrong, else None.
         nearest: name of the car that the measures are of; recorded in traffic only.
-        after_merge: what the state at M asks of whoever is behind then, "none", "harsh" or "forced"
-            (`merge.py`); None without a merge, and where an older version did not record it.
         after_gap_m: least gap between bumpers in the follow-up, 0 or less where bodies touch; this
             and the next two are None without a merge, and recorded where there is a follow-up only.
         after_ttc_s: lowest time to collision in it, between bumpers; None where no gap closes.
@@ -82,7 +95,11 @@ class Measures:
     ttc_s: float | None
     pet_s: float | None
     t_end_s: float
+    severity: str | None
+    bumper_gap_m: float | None
+    clearance_m: float | None
     drac_mps2: float | None
+    brake_after_mps2: float | None
     vut_max_brake_mps2: float
     pov_max_brake_mps2: float
     impact_speed_mps: float | None
@@ -92,10 +109,19 @@ class Measures:
     clipped_steps: int
     error: str | None
     nearest: str = VEHICLES[POV]
-    after_merge: str | None = None
     after_gap_m: float | None = None
     after_ttc_s: float | None = None
     after_drac_mps2: float | None = None
+
+    @property
+    def became(self) -> str:
+        """What became of the episode in a word: its severity, or its end where it has none."""
+        return self.severity or self.end.value
+
+    @property
+    def is_close(self) -> bool:
+        """Whether the front bumpers were nearer at M than the paper allows: its rule of a crash."""
+        return self.score is not None and self.score < FAILURE_SCORE
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,13 +205,15 @@ class Outcome:
         names = (*RECORDED, *RECORDED_IN_TRAFFIC) if in_traffic else RECORDED
         case = Case(**{name: values.pop(name) for name in names}, scenario=scenario)
         foretold = values.pop("foretold", None)
+        if "severity" not in values:
+            take_from_0_1(values, scenario)
         values["end"] = End(values["end"])
         if not in_traffic:
             values["nearest"] = VEHICLES[POV]
         if values["nearest"] not in VEHICLES:
             raise ValueError(f"nearest is {values['nearest']!r}")
-        if values.setdefault("after_merge", None) not in (None, *AfterMerge):
-            raise ValueError(f"after_merge is {values['after_merge']!r}")
+        if values["severity"] not in (None, *Severity):
+            raise ValueError(f"severity is {values['severity']!r}")
         if not scenario.follow_up_s:
             values |= dict.fromkeys(FOLLOWED_UP)
         for name, types in _TYPES.items():
@@ -213,59 +241,66 @@ def score_of(margin: float) -> float:
     return FAILURE_SCORE * (1.0 - margin / (1.0 + abs(margin)))
 
 
-def verdict(trajectory: Trajectory) -> End:
-    """Return why an episode ended; COLLISION where the VUT arrived with |dx| < 6 m."""
+def is_close(trajectory: Trajectory) -> bool:
+    """Return whether the VUT arrived at M with |dx| < 6 m: the paper's rule of a crash."""
     x_m, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
-    collides = abs(x_m[trajectory.nearest] - x_m[VUT]) < crash_m
-    return End.COLLISION if trajectory.end is End.MERGED and collides else trajectory.end
+    near = bool(abs(x_m[trajectory.nearest] - x_m[VUT]) < crash_m)
+    return trajectory.end is End.MERGED and near
 
 
-def measure(trajectory: Trajectory, *, way_out: bool = True) -> Measures:
+def measure(
+    trajectory: Trajectory, lines: CentreLines | None = None, *, way_out: bool = True
+) -> Measures:
     """Return the verdict and the measures of an episode.
 
-    Whether there was a way out of a collision is only said with `way_out`: to search for it takes
-    most of the time.
+    Args:
+        trajectory: what happened.
+        lines: centre lines of the road; without them bodies are looked at from M on.
+        way_out: whether the last way out is searched for, which takes most of the time.
     """
     nearest = trajectory.nearest
     pair = trajectory.facing(nearest)
     (x_pov, v_pov, _), (x_vut, v_vut, _) = pair.motion[-1].tolist()
-    end, crash_m = verdict(trajectory), trajectory.case.scenario.dx_crash_m
-    dx = dv = ttc = pet = drac = impact = first = avoidable = last_avoidable = None
+    end, close = trajectory.end, is_close(trajectory)
+    dx = dv = ttc = pet = drac = first = avoidable = last_avoidable = None
     if end.is_tested:
         dx, dv = x_pov - x_vut, v_pov - v_vut
         ttc = time_to_collision(dx, dv)
         pet = _post_encroachment_time(pair)
         first = "VUT" if dx < 0 else "POV"
-        if end is End.COLLISION:
-            impact = abs(dv)
-            if way_out:
-                last_avoidable = _last_avoidable_s(trajectory)
-                avoidable = last_avoidable is not None
-        else:
-            gap = abs(dx) - crash_m
+        if close and way_out:
+            last_avoidable = _last_avoidable_s(trajectory)
+            avoidable = last_avoidable is not None
+        if not close:
+            gap = abs(dx) - trajectory.case.scenario.dx_crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
     hardest = -pair.motion[:, :, 2].min(axis=0)
-    asked = after_merge(trajectory)
+    bodies = Closest(math.inf, None) if end.is_error else closest(trajectory, lines)
+    brake = brake_after_mps2(trajectory)
+    severity = severity_of(end, bodies.clearance_m, is_close=close, brake_mps2=brake)
     followed: tuple[float | None, ...] = followed_up(trajectory) or (None, None, None)
     return Measures(
         end=end,
-        score=None if trajectory.error is not None else _score(trajectory, end, dx, ttc),
+        severity=None if severity is None else severity.value,
+        score=None if trajectory.error is not None else _score(trajectory, dx, ttc, close=close),
         dx_m=dx,
+        bumper_gap_m=min((gap for gap, _ in neighbours(trajectory)), default=None),
+        clearance_m=_finite(bodies.clearance_m),
         dv_mps=dv,
         ttc_s=ttc,
         pet_s=pet,
         t_end_s=trajectory.t_end_s,
         drac_mps2=drac,
+        brake_after_mps2=_finite(brake) if end is End.MERGED else None,
         vut_max_brake_mps2=max(0.0, float(hardest[VUT])),
         pov_max_brake_mps2=max(0.0, float(hardest[POV])),
-        impact_speed_mps=impact,
+        impact_speed_mps=bodies.impact_speed_mps,
         merged_first=first,
         last_avoidable_s=last_avoidable,
         avoidable=avoidable,
         clipped_steps=trajectory.clipped_steps,
         error=None if trajectory.error is None else as_reason(trajectory.error),
         nearest=VEHICLES[nearest],
-        after_merge=None if asked is None else asked.value,
         after_gap_m=followed[0],
         after_ttc_s=_finite(followed[1]),
         after_drac_mps2=_finite(followed[2]),
@@ -281,22 +316,22 @@ def time_to_collision(dx_m: float, dv_mps: float) -> float | None:
     return -dx_m / dv_mps if dx_m * dv_mps < 0 else None
 
 
-def _score(trajectory: Trajectory, end: End, dx: float | None, ttc: float | None) -> float:
+def _score(trajectory: Trajectory, dx: float | None, ttc: float | None, *, close: bool) -> float:
     p_safety = 0.0
     if dx is not None:
         scenario = trajectory.case.scenario
         overlap = scenario.dx_crash_m - abs(dx)
-        if end is End.COLLISION:
+        if close:
             p_safety = -1.0 - overlap / scenario.dx_crash_m
         else:
             short_ttc = 0.0 if ttc is None else max(0.0, 1.0 - ttc / scenario.ttc_min_s)
             near = math.exp(overlap / GAP_SCALE_M)
             p_safety = -(1.0 - TTC_SHARE) * near - TTC_SHARE * short_ttc
-    crash = MU_CRASH if end is End.COLLISION else 0.0
-    return crash + MU_SAFETY * p_safety + MU_TASK * _task(trajectory, end)
+    crash = MU_CRASH if close else 0.0
+    return crash + MU_SAFETY * p_safety + MU_TASK * _task(trajectory)
 
 
-def _task(trajectory: Trajectory, end: End) -> float:
+def _task(trajectory: Trajectory) -> float:
     """Return P_task in [-1, 0]: a slow ramp, a final speed off the highway's, harshness, no end."""
     v_vut, scenario = trajectory.v_vut_mps, trajectory.case.scenario
     v_end = float(v_vut[-1])
@@ -305,7 +340,7 @@ def _task(trajectory: Trajectory, end: End) -> float:
     off_range = min(off_range / scenario.v_hw_min_mps, 1.0)
     hardest = max(-scenario.a_min_mps2, scenario.a_max_mps2)
     harsh = float(np.square(trajectory.a_vut_mps2).mean()) / hardest**2
-    return -(slow + off_range + harsh + (end is End.TIMEOUT)) / 4.0
+    return -(slow + off_range + harsh + (trajectory.end is End.TIMEOUT)) / 4.0
 
 
 def _crossing_time_s(x: FloatArray, v: FloatArray) -> float | None:

@@ -25,7 +25,7 @@ from merge_sumo.values.trajectory import Trajectory
 
 SIGNALS: Final = (
     *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),
-    *("dx_m", "dv_mps", "gap_m", "ttc_s"),
+    *("dx_m", "dv_mps", "bumper_gap_m", "ttc_s"),
 )
 """What a formula may speak of, at every step; of the car that is nearest to the VUT at M."""
 NEVER_S: Final = 100.0
@@ -91,7 +91,7 @@ def try_formula(text: str) -> None:
     except Exception as error:
         raise UserError(
             f"--require {text[:80]!r} is no formula of signal temporal logic such as 'always "
-            f"((x_vut_m > -20) implies (gap_m > 2))': {printable(str(error))[:200]}"
+            f"((x_vut_m > -20) implies (bumper_gap_m > 2))': {printable(str(error))[:200]}"
         ) from error
 
 

@@ -17,7 +17,6 @@ class End(StrEnum):
     """Why an episode ended."""
 
     MERGED = "MERGED"
-    COLLISION = "COLLISION"
     TIMEOUT = "TIMEOUT"
     VUT_ERROR = "VUT_ERROR"
     SIM_ERROR = "SIM_ERROR"
@@ -25,7 +24,7 @@ class End(StrEnum):
     @property
     def is_tested(self) -> bool:
         """Whether the VUT reached the merge point."""
-        return self in (End.MERGED, End.COLLISION)
+        return self is End.MERGED
 
     @property
     def is_error(self) -> bool:
@@ -55,11 +54,11 @@ class Trajectory:
     vehicles POV, VUT and, in traffic, the cars ahead of and behind the POV; their x, v and a in m,
     m/s and m/s2. The acceleration of a step acts from it to the next; it is 0 in the last one.
 
-    `end` is MERGED whenever the VUT arrived at M: whether it collided there is the verdict of the
-    score. `error` says what the VUT or the simulation did wrong. `clipped_steps` counts the
-    answers of the VUT that were outside the limits of acceleration and were clipped. `after` is the
-    motion behind M where the scenario has it followed up, its first row that of the merge; it is
-    measured and not kept.
+    `end` is MERGED whenever the VUT arrived at M: how near the bodies came is its severity
+    (`severity.py`), and whether that is a failure is the criterion's. `error` says what the VUT or
+    the simulation did wrong. `clipped_steps` counts the answers of the VUT that were outside the
+    limits of acceleration and were clipped. `after` is the motion behind M where the scenario has
+    it followed up, its first row that of the merge; it is measured and not kept.
     """
 
     case: Case

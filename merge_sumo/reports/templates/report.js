@@ -47,46 +47,49 @@ function avoidedBy(i, who) { // a driver, "pov" or "none"
   if (by === null) return false;
   return who === "pov" ? cases.pov_careful[i] === 1 : who === "none" ? by.length === 0 : by.includes(who);
 }
-const tested = (i) => failed(i) || ["MERGED", "COLLISION"].includes(data.ends[cases.end[i]]);
-const asksTooMuch = (i) => ["harsh", "forced"].includes(cases.after[i]); // of whoever is behind after the merge
+const tested = (i) => failed(i) || data.ends[cases.end[i]] === "MERGED";
+const severity = (i) => cases.severity[i] === null ? null : data.severities[cases.severity[i]];
+const isSevere = (i) => severity(i) !== null && severity(i) !== "safe"; // contact, conflict or harsh
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
 function title(i) {
   const place = coordinates.filter((c) => cases[c.field][i] !== null).map((c) => `${c.name} ${valueText(c, cases[c.field][i])}`);
   return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, ${place.join(", ")}`;
 }
+function conduct(i) { // what both did, by their speeds
+  const met = NAMES[vehicles[cases.nearest[i]]];
+  const of = (brakes, accelerates) => brakes !== null ? `brakes from ${fixed(brakes, 1)} s on` : accelerates ? "accelerates" : "keeps its speed within 1 m/s";
+  return `The VUT ${of(cases.vut_brakes[i], cases.vut_accelerates[i])}, the ${met} ${of(cases.pov_brakes[i], cases.pov_accelerates[i])}.`;
+}
 function words(i) {
-  const end = data.ends[cases.end[i]], parts = [];
-  const vut = cases.vut_yields[i], pov = cases.pov_yields[i];
-  const met = NAMES[vehicles[cases.nearest[i]]], whom = cases.nearest[i] === POV ? "" : ` with the ${met}`;
-  const yields = [[vut, "VUT"], [pov, met]].filter(([t]) => t !== null).sort((a, b) => a[0] - b[0]);
-  if (end === "COLLISION") {
-    const kind = cases.kind[i] === null ? "" : ` (${data.kinds[cases.kind[i]]})`;
-    parts.push(`Collision${whom}${kind} at ${fixed(cases.t_end[i], 1)} s: gap ${fixed(cases.dx[i], 1)} m, difference in speed ${fixed(Math.abs(cases.dv[i]), 1)} m/s.`);
-  } else if (end === "MERGED") {
-    parts.push(`No collision: the ${cases.dx[i] < 0 ? "VUT" : met} goes first, gap ${fixed(cases.dx[i], 1)} m when the VUT arrives.`);
-    if (cases.after[i] === "harsh") parts.push("Whoever is behind then has to brake harshly.");
-    if (cases.after[i] === "forced") parts.push("Whoever is behind then cannot brake hard enough: the one ahead has to give way.");
+  const end = data.ends[cases.end[i]], parts = [], found = severity(i), at = `${fixed(cases.t_end[i], 1)} s`;
+  const met = NAMES[vehicles[cases.nearest[i]]];
+  if (end === "MERGED") {
+    const first = cases.dx[i] < 0 ? "VUT" : met, kind = cases.kind[i] === null ? "" : ` (${data.kinds[cases.kind[i]]})`;
+    if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}${kind}.`);
+    parts.push(`The VUT reaches M at ${at}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx[i]), 1)} m ahead.`);
+    if (found === "contact") parts.push(`Bodies touch at a relative speed of ${fixed(cases.impact[i], 1)} m/s.`);
+    else if (cases.brake_after[i] === null) parts.push("No braking of the car behind is in time.");
+    else if (cases.brake_after[i] > 0) parts.push(`The car behind has to brake at ${fixed(cases.brake_after[i], 1)} m/s² after M.`);
   } else if (end === "TIMEOUT") {
     parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
+    if (found === "contact") parts.push(`Bodies touch before M at a relative speed of ${fixed(cases.impact[i], 1)} m/s.`);
   } else {
     parts.push(`${end}: ${(data.errors[cases.index[i]] || "no reason given").replace(/\.?$/, ".")}`);
   }
   if (cases.margin && cases.margin[i] !== null) {
     parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
-  if (yields.length) {
-    parts.push(yields.map(([t, who], n) => `${n ? "the" : "The"} ${who} begins to yield at ${fixed(t, 1)} s`).join(", ") + ".");
-  } else if (cases.rows[i] && (tested(i) || end === "TIMEOUT")) parts.push("Neither yields.");
-  if (end === "COLLISION") {
+  if (cases.rows[i] && (tested(i) || end === "TIMEOUT")) parts.push(conduct(i));
+  if (cases.kind[i] !== null) {
     const until = cases.way_out[i];
-    parts.push(until === null ? "There never was a way out for the VUT." : `Full braking or full acceleration of the VUT would have avoided it until ${fixed(until, 1)} s.`);
+    parts.push(until === null ? "There never was a way out for the VUT." : `Full braking or full acceleration of the VUT would have kept ${fixed(data.crash_m, 0)} m at M until ${fixed(until, 1)} s.`);
   }
   if (cases.avoided_by && cases.avoided_by[i] !== null) {
     const by = cases.avoided_by[i], until = cases.careful_until[i];
     parts.push(by.length ? `In the VUT's place ${by.join(", ")} would have avoided it.` : "No reference driver in the VUT's place would have avoided it.");
     if (until !== null) parts.push(`A careful driver who takes over until ${fixed(until, 1)} s avoids it.`);
-    if (cases.pov_careful[i]) parts.push("So does a careful driver in the POV's place.");
+    if (cases.pov_careful[i]) parts.push("A careful driver in the POV's place avoids it, too.");
   }
   return parts.join(" ");
 }
@@ -198,7 +201,7 @@ function FailureMap(figure) {
       const faint = near(i) && wanted(i) ? "" : " faint";
       if (failed(i)) draw(svg, "path", { class: `mark fail${faint}`, d: `M${x} ${y - 5}l5 5l-5 5l-5 -5Z`, "data-case": cases.index[i] });
       else if (!tested(i)) draw(svg, "rect", { class: `mark error${faint}`, x: x - 3, y: y - 3, width: 6, height: 6, "data-case": cases.index[i] });
-      else draw(svg, "circle", { class: `mark ${asksTooMuch(i) ? "harsh" : "safe"}${faint}`, cx: x, cy: y, r: 2.4, "data-case": cases.index[i] });
+      else draw(svg, "circle", { class: `mark ${isSevere(i) ? "harsh" : "safe"}${faint}`, cx: x, cy: y, r: 2.4, "data-case": cases.index[i] });
     }
     const most = figure.querySelector(".most");
     if (most) most.textContent = chance ? `${Math.round(100 * chance.most)} %` : "–";
@@ -468,7 +471,7 @@ function showMotion(i) {
   const others = vehicles.map((_, who) => who).filter((who) => who !== VUT);
   const gap = x.map((places) => places.map((place, t) => place - x[VUT][t]));
   const inView = range([...gap[met], ...otherGap, -12, 12]); // of the car that the VUT meets
-  const flags = [[met, cases.pov_yields[i]], [VUT, cases.vut_yields[i]]]
+  const flags = [[met, cases.pov_brakes[i]], [VUT, cases.vut_brakes[i]]]
     .filter(([, t]) => t !== null).map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] }));
   const common = { xRange: [0, end], xLabel: "time, s" };
   charts = [
@@ -633,7 +636,7 @@ function allCases() { // gives what shows the cases that the filters let through
     { name: "region", value: (i) => cases.region[i], text: (value) => String(value + 1) },
     ...coordinates.map((c) => number(c.field, `${c.name}${c.unit === "rad" ? "" : ` ${c.unit}`}`, c.digits)),
     number("score", "score", 0), ...(cases.margin ? [number("margin", "margin", 2)] : []),
-    number("dx", "gap at M m", 1), number("dv", "dv m/s", 1), number("ttc", "TTC s", 1), number("pet", "PET s", 1),
+    number("dx", "Δx at M m", 1), number("dv", "dv m/s", 1), number("ttc", "TTC s", 1), number("pet", "PET s", 1),
     number("vut_brake", "VUT brakes m/s\u00b2", 1), number("pov_brake", "POV brakes m/s\u00b2", 1), number("t_end", "time s", 1),
   ];
   const all = cases.index.map((_, i) => i), PART = 100;

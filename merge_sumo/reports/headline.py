@@ -1,0 +1,125 @@
+"""The result of a campaign in a few sentences."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from merge_sumo.reports.diagnosis import MEANING, Kind
+from merge_sumo.reports.summary import Summary
+from merge_sumo.reports.verdict import Verdict, counted, in_words
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.merge import HARSH_MPS2
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.severity import Severity
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """What counts as a failure in a campaign.
+
+    Attributes:
+        criterion: what a case fails by.
+        crash_m: distance of the front bumpers at M below which the paper's criterion fails a case.
+    """
+
+    criterion: Criterion
+    crash_m: float
+
+    @property
+    def in_words(self) -> str:
+        """Return when a case fails, in a clause."""
+        if self.criterion.is_papers:
+            return f"front bumpers within {self.crash_m:g} m at M"
+        return self.criterion.in_short
+
+
+def headline(
+    verdict: Verdict,
+    summary: Summary,
+    worst: Sequence[Outcome],
+    kinds: Mapping[int, Kind],
+    rule: Rule,
+) -> str:
+    """Return the result of a campaign in a few sentences: what was not tested comes first."""
+    if not verdict.cases:
+        return "No case has run."
+    said = verdict.sentences
+    if verdict.tested:
+        for level, found in summary.levels.items():
+            if found.cases and not found.tested:
+                said.append(f"At POV level {level_name(level)} nothing was tested.")
+        said.append(_failures(verdict, summary, worst, kinds, rule))
+    return " ".join(said)
+
+
+def _failures(
+    verdict: Verdict,
+    summary: Summary,
+    worst: Sequence[Outcome],
+    kinds: Mapping[int, Kind],
+    rule: Rule,
+) -> str:
+    if not summary.failures:
+        others = "the other " if verdict.tested < verdict.cases else ""
+        return (
+            f"No failure ({rule.in_words}) in {others}{counted(verdict.tested, 'case')}. That is "
+            "no proof: the search saw these cases and no others."
+        )
+    failing = {level: found for level, found in summary.levels.items() if found.failures}
+    tested = {level: found for level, found in summary.levels.items() if found.tested}
+    never = [level_name(level) for level, found in tested.items() if not found.failures]
+    parts = [
+        f"{found.failures} of {found.cases} cases at POV level {level_name(level)} "
+        f"({counted(found.regions, 'region')})"
+        for level, found in failing.items()
+    ]
+    text = f"{failures_in_words(worst, rule)}: {in_words(parts)}"
+    text += f", never at level {in_words(never)}." if never else "."
+    common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
+    if common:
+        kind, count = common[0]
+        share = "All are" if count == summary.failures else f"{count} of {summary.failures} are"
+        text += f" {share} of the kind “{kind}”: {MEANING[kind]}."
+    return text
+
+
+def failures_in_words(failures: Sequence[Outcome], rule: Rule) -> str:
+    """Return how many failures there are and how many of them are contacts, in a clause."""
+    number = len(failures)
+    contacts = sum(o.measures.severity == Severity.CONTACT for o in failures)
+    what = "conflict" if rule.criterion.is_papers else "failure"
+    said = f"{counted(number, what)} ({rule.in_words})"
+    if number == 1:
+        return f"{said}, {'a contact' if contacts else 'no contact'}"
+    if contacts == number:
+        return f"{said}, all of them contacts"
+    return f"{said}, {contacts or 'none'} of them {'a contact' if contacts == 1 else 'contacts'}"
+
+
+def avoidable_words(failures: Sequence[Outcome], crash_m: float) -> str | None:
+    """Return how many failures need not have been, among those of which that is known."""
+    told = [o.measures.avoidable for o in failures if o.measures.avoidable is not None]
+    if not told:
+        return None
+    of = "" if len(told) == len(failures) else f" with front bumpers within {crash_m:g} m at M"
+    return (
+        f"In {sum(told)} of {counted(len(told), 'failure')}{of}, full braking or full acceleration "
+        f"of the VUT would have kept {crash_m:g} m at M."
+    )
+
+
+def after_words(outcomes: Iterable[Outcome], crash_m: float) -> str | None:
+    """Return how many cases without a failure are no harmless merges either."""
+    found = Counter(o.measures.severity for o in outcomes if not o.failed)
+    said = {
+        Severity.CONTACT: "bodies touch",
+        Severity.CONFLICT: f"the front bumpers are within {crash_m:g} m at M",
+        Severity.HARSH: f"the car behind has to brake harder than {HARSH_MPS2:g} m/s² after M",
+    }
+    parts = [f"in {counted(found[key], 'case')} {what}" for key, what in said.items() if found[key]]
+    if not parts:
+        return None
+    return f"No failures, but no harmless merges: {in_words(parts)} (--fail-when unsafe)."

@@ -1,0 +1,38 @@
+"""Records of release 0.1, as those of today."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from merge_sumo.values.merge import REACTION_S, needed_braking_mps2
+from merge_sumo.values.scenario import Scenario
+from merge_sumo.values.severity import severity_of
+from merge_sumo.values.trajectory import End
+
+
+def take_from_0_1(values: dict[str, Any], scenario: Scenario) -> None:
+    """Give a record of release 0.1 the fields of today, in place.
+
+    That release called |dx| < 6 m a collision and recorded nothing of bodies. Their state at M
+    follows from dx and dv of the nearest car; what bodies did before M is not known.
+    """
+    if values["end"] == "COLLISION":
+        values["end"] = End.MERGED.value
+    values.pop("after_merge", None)
+    values |= dict.fromkeys(("severity", "bumper_gap_m", "clearance_m", "brake_after_mps2"))
+    values["impact_speed_mps"] = None
+    dx, dv, score = values["dx_m"], values["dv_mps"], values["score"]
+    if not (type(dx) is float and type(dv) is float and type(score) is float):
+        return
+    ahead = dx >= 0.0
+    gap = abs(dx) - (scenario.pov_length_m if ahead else scenario.vut_length_m)
+    closing = -dv if ahead else dv
+    brake = needed_braking_mps2(gap, closing)
+    if math.isinf(brake):
+        values["impact_speed_mps"] = abs(dv)
+    clearance = gap - max(closing, 0.0) * REACTION_S
+    close = score < -500.0
+    severity = severity_of(End.MERGED, clearance, is_close=close, brake_mps2=brake)
+    values["severity"] = None if severity is None else severity.value
+    values["bumper_gap_m"], values["brake_after_mps2"] = gap, None if math.isinf(brake) else brake
