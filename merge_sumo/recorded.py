@@ -18,6 +18,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison, exports
 from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
 from merge_sumo.reports.changes import RunComparison
+from merge_sumo.reports.comparison_page import write_comparison
 from merge_sumo.reports.history import History, history_of
 from merge_sumo.reports.history_page import write_history
 from merge_sumo.reports.progress import is_watched
@@ -30,6 +31,7 @@ from merge_sumo.system.folders import check_new_file, link_latest
 from merge_sumo.system.workers import Workers, open_workers
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import Trajectory
 
 AnyRun = CampaignRun | Path | str
 """A campaign, or its folder."""
@@ -189,6 +191,8 @@ def compare_runs(
     net: Path | str | None = None,
     policies: Path | str | None = None,
     trust_vut: bool = False,
+    out: Path | str | None = None,
+    tolerance: float = 0.0,
 ) -> RunComparison:
     """Compare two campaigns: what got fixed, and what broke; as `merge-sumo compare-runs`.
 
@@ -201,13 +205,25 @@ def compare_runs(
         net: net for that; must be the one of the campaigns.
         policies: folder of the learned drivers, where they are elsewhere now.
         trust_vut: run the controllers that the folders name although they were not made here.
+        out: page to write; nothing may be there. None is written when left out.
+        tolerance: by how much B may be worse before the page says so.
     """
+    if out is not None:
+        check_new_file(Path(out))
     first, second = _opened(a).run, _opened(b).run
     given = {} if policies is None else {"policies": str(policies)}
     road = road_for(first.scenario, None if net is None else Path(net)) if rerun else None
-    return comparison.compare_runs(
-        first, second, rerun=rerun, net=road, given=given, trust=trust_vut
+    motions: dict[tuple[str, int], Trajectory] = {}
+
+    def keep(of: str, index: int, trajectory: Trajectory) -> None:
+        motions[of, index] = trajectory
+
+    compared = comparison.compare_runs(
+        first, second, rerun=rerun, net=road, given=given, trust=trust_vut, on_again=keep
     )
+    if out is not None:
+        write_comparison(compared, first, second, motions, tolerance, Path(out))
+    return compared
 
 
 def history(runs: Iterable[AnyRun], *, out: Path | str | None = None) -> History:

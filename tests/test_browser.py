@@ -20,9 +20,11 @@ from handmade import write_run
 from merge_sumo.campaigns.avoidance import write_avoidance
 from merge_sumo.campaigns.driven_again import Avoidance
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
-from merge_sumo.reports import diagnosis, report, report_facts
+from merge_sumo.reports import comparison, comparison_page, diagnosis, report, report_facts
+from merge_sumo.reports.campaign_progress import CampaignProgress
 from merge_sumo.reports.coordinates import WRITTEN
 from merge_sumo.reports.report_facts import Facts
+from merge_sumo.reports.running_page import running_page
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.values.scenario import POV
 
@@ -114,6 +116,37 @@ def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options
         assert page.locator(".map .mark.fail").count() == len(failures(made.outcomes))
         width = page.evaluate("document.documentElement.scrollWidth")
         assert width <= page.viewport_size["width"]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"viewport": {"width": 1280, "height": 900}},
+        {"viewport": {"width": 390, "height": 800}},
+        {"color_scheme": "dark"},
+    ],
+    ids=["wide", "narrow", "dark"],
+)
+def test_pages_without_a_script_open_without_a_complaint_and_fit_the_window(
+    browser, made, tmp_path, options
+):
+    other = write_run(tmp_path / "other", 20, vut=EVIL, error=EVIL)
+    compared = comparison.compare_runs(made, other, rerun=False)
+    file = tmp_path / "compared.html"
+    comparison_page.write_comparison(compared, made, other, {}, 0.0, file)
+    progress = CampaignProgress(EVIL, 400, (0, 1, 2))
+    for outcome in made.outcomes:
+        progress.case_ended(outcome)
+    running = tmp_path / "running.html"
+    running.write_text(running_page(progress, tmp_path, stopped=True), encoding="utf-8")
+    for page_file in (file, running):
+        with shown(browser, page_file, **options) as page:
+            assert EVIL in page.inner_text("h1")
+            for details in page.locator("details").all()[:3]:
+                details.locator("summary").click()
+                assert details.locator("svg").first.is_visible()
+            width = page.evaluate("document.documentElement.scrollWidth")
+            assert width <= page.viewport_size["width"]
 
 
 def test_a_merge_that_asks_too_much_of_others_is_no_harmless_dot(browser, made):

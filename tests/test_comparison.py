@@ -6,6 +6,7 @@ import json
 import math
 
 import pytest
+from lxml import html
 from typer.testing import CliRunner
 
 from merge_sumo import cli
@@ -13,6 +14,7 @@ from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
+from merge_sumo.reports import comparison_page
 from merge_sumo.reports.changes import Change, LevelChange, RunComparison, Untested
 from merge_sumo.reports.comparison import compare_runs
 
@@ -95,7 +97,7 @@ class TestTheSameVut:
 
 class TestRecordsOnly:
     def test_run_nothing_again(self, run, other_seed, monkeypatch):
-        monkeypatch.setattr("merge_sumo.reports.comparison.ProvingGround", None)
+        monkeypatch.setattr("merge_sumo.reports.comparison.plan_of", None)
         compared = compare_runs(run, other_seed, rerun=False)
         found = compared.levels[0]
         assert found.changes[Change.NOT_RUN_AGAIN] == len(compared.cases)
@@ -198,3 +200,75 @@ class TestTheCommand:
                 ["compare-runs", str(run.folder), str(fixed.folder), "--tolerance", str(tolerance)],
             )
             assert isinstance(said.exception, UserError)
+
+
+@pytest.fixture(scope="module")
+def page(run, fixed, tmp_path_factory):
+    """Return the page of the command, from the good VUT to the bad one, as a tree."""
+    file = tmp_path_factory.mktemp("page") / "page.html"
+    arguments = ["compare-runs", str(fixed.folder), str(run.folder), "--out", str(file)]
+    result = CliRunner().invoke(cli.app, arguments)
+    assert result.exit_code == 1
+    assert result.stdout.splitlines()[-1] == f"page: {file}"
+    return html.parse(file).getroot()
+
+
+class TestThePage:
+    def test_says_what_changed_and_lists_each_case(self, page, run):
+        count = len(failures(run.outcomes))
+        (verdict,) = page.xpath("//p[contains(@class, 'verdict')]")
+        assert verdict.text_content().startswith("B is worse than A, with a tolerance of 0.")
+        assert f"{count} broke" in verdict.text_content()
+        titles = page.xpath("//details/summary/b/text()")
+        assert sorted(titles) == sorted(f"case {o.index} of B" for o in failures(run.outcomes))
+        assert len(page.xpath("//*[@class='map']//*[@class='mark broke']")) == count
+
+    def test_draws_both_motions_over_the_same_axes(self, page, run):
+        for details in page.xpath("//details"):
+            left, right = details.xpath(".//div[@class='pair']")
+            assert left.xpath(".//text[@class='end']/text()") == right.xpath(
+                ".//text[@class='end']/text()"
+            )
+            ends = []
+            for pair in (left, right):
+                points = [line.get("points").split() for line in pair.xpath(".//polyline")]
+                assert len(points) == 4, "speeds and positions of two cars"
+                ends.append(max(float(p.split(",")[0]) for line in points for p in line))
+                for line in points:
+                    for x, y in (map(float, p.split(",")) for p in line):
+                        assert comparison_page.LEFT <= x <= comparison_page.RIGHT
+                        assert comparison_page.TOP <= y <= comparison_page.BOTTOM
+            assert max(ends) == comparison_page.RIGHT, "the longer one fills the axis"
+            index = int(details.xpath("./summary/b/text()")[0].split()[1])
+            rows = len(
+                details.xpath(".//div[@class='pair'][1]//polyline")[-1].get("points").split()
+            )
+            assert len(run.trajectory(index).motion) == rows
+
+    def test_loads_nothing_and_runs_nothing(self, page):
+        assert page.xpath("//script | //@src | //@href | //@style | //img") == []
+        (policy,) = page.xpath("//meta[@http-equiv='Content-Security-Policy']/@content")
+        assert policy.startswith("default-src 'none'; style-src 'sha256-")
+
+    def test_of_records_alone_draws_what_is_known(self, run, other_seed):
+        compared = compare_runs(run, other_seed, rerun=False)
+        page = comparison_page.comparison_page(compared, run, other_seed, {})
+        root = html.fromstring(page)
+        assert len(root.xpath("//details")) == len(compared.cases)
+        assert len(root.xpath("//div[@class='pair']")) == len(compared.cases)
+        assert page.count("Its motion is not known.") == len(compared.cases)
+
+    def test_draws_so_many_and_counts_the_others(self, run, fixed, monkeypatch):
+        compared = compare_runs(run, fixed, rerun=False)
+        monkeypatch.setattr(comparison_page, "SHOWN", 3)
+        page = comparison_page.comparison_page(compared, run, fixed, {})
+        assert len(html.fromstring(page).xpath("//details")) == 3
+        assert f"{len(compared.cases) - 3} further cases" in page
+
+    def test_is_written_nowhere_where_something_is(self, run, fixed, tmp_path):
+        file = tmp_path / "page.html"
+        file.write_text("mine")
+        arguments = ["compare-runs", str(run.folder), str(fixed.folder), "--out", str(file)]
+        result = CliRunner().invoke(cli.app, arguments)
+        assert isinstance(result.exception, UserError)
+        assert file.read_text() == "mine"

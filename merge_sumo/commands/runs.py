@@ -23,11 +23,12 @@ from merge_sumo.commands.shared import (
     show,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.system.folders import check_own
+from merge_sumo.system.folders import check_new_file, check_own
 from merge_sumo.system.printable import quoted
 
 if TYPE_CHECKING:
     from merge_sumo.reports.changes import RunComparison
+    from merge_sumo.values.trajectory import Trajectory
 
 EXPORTS: Final = "exports"
 
@@ -170,6 +171,13 @@ def compare_runs(
     net: NetOption = None,
     policies: PoliciesOption = None,
     trust_vut: TrustOption = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="New HTML page to write: what changed, in which cases, and both motions.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare two VUTs, or two versions of one: what got fixed, and what broke.
@@ -179,19 +187,31 @@ def compare_runs(
     share of cases with an error, the share of cases with an error or a timeout, or the failure
     mode coverage (FMC); and whenever B reached the merge point in no case of its campaign.
 
-    Example:  merge-sumo compare-runs runs/design1 runs/design2 --tolerance 0.005
+    Example:  merge-sumo compare-runs runs/design1 runs/design2 --out changes.html
     """
     from merge_sumo.campaigns.avoidance import in_a_sentence, read_avoidance
     from merge_sumo.campaigns.ground import road_for
     from merge_sumo.campaigns.run import Run
     from merge_sumo.reports import comparison
+    from merge_sumo.reports.comparison_page import write_comparison
     from merge_sumo.reports.verdict import judge
 
     check_tolerance(tolerance)
+    if out is not None:
+        check_new_file(out)
     runs = Run(a), Run(b)
     road = road_for(runs[0].scenario, net) if rerun else None
     given = {} if policies is None else {"policies": str(policies)}
-    compared = comparison.compare_runs(*runs, rerun=rerun, net=road, given=given, trust=trust_vut)
+    motions: dict[tuple[str, int], Trajectory] = {}
+
+    def keep(of: str, index: int, trajectory: Trajectory) -> None:
+        motions[of, index] = trajectory
+
+    compared = comparison.compare_runs(
+        *runs, rerun=rerun, net=road, given=given, trust=trust_vut, on_again=keep
+    )
+    if out is not None:
+        write_comparison(compared, *runs, motions, tolerance, out)
     why = compared.worse(tolerance)
     careful = {
         name: in_a_sentence(read_avoidance(loaded).values())
@@ -216,6 +236,8 @@ def compare_runs(
         show(f"B is {worse} than A, with a tolerance of {tolerance:g}")
         for sentence in why:
             show(f"  {sentence}")
+        if out is not None:
+            show(f"page: {out}")
     raise typer.Exit(1 if why else 0)
 
 

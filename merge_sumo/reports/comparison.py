@@ -9,8 +9,9 @@ checked first: it must give again the scores that were recorded.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from merge_sumo.campaigns.ground import road_for
@@ -26,11 +27,14 @@ from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.values.trajectory import End, Trajectory
 
 CHECKED: Final = 32
 """Cases of a campaign, the worst, that its VUT must reproduce."""
 SAME_SCORE: Final = 1e-6
+
+OnAgain = Callable[[str, int, Trajectory], None]
+"""Told of a motion with the campaign of its case, "A" or "B", and the index of that case there."""
 
 
 def compare_runs(
@@ -41,6 +45,7 @@ def compare_runs(
     net: Corridor | None = None,
     given: Mapping[str, object] | None = None,
     trust: bool = False,
+    on_again: OnAgain = lambda _run, _index, _trajectory: None,
 ) -> RunComparison:
     """Compare two campaigns level by level.
 
@@ -51,6 +56,7 @@ def compare_runs(
         net: net for that; must be the one of the campaigns.
         given: settings in the place of what the folders name: policies that are elsewhere.
         trust: run the controllers that the folders name although they may be a stranger's.
+        on_again: told of what a VUT did in a case of the other's campaign, "A" or "B".
 
     Raises `UserError` where the campaigns have no level in common or no case there, differ in
     the initial speed of the VUT or in the POV of a level, or were run on another net than the one
@@ -67,8 +73,8 @@ def compare_runs(
     again_a = again_b = _Again({}, "was not run again")
     if rerun:
         net = _common_net(a, b, net or road_for(a.scenario))
-        again_b = _run_again(b, telling_a, net, given, trust=trust)
-        again_a = _run_again(a, telling_b, net, given, trust=trust)
+        again_b = _run_again(b, telling_a, net, given, partial(on_again, "A"), trust=trust)
+        again_a = _run_again(a, telling_b, net, given, partial(on_again, "B"), trust=trust)
     cases = [
         *(compared_case("A", o, o, again_b.outcomes.get(o.index)) for o in telling_a),
         *(compared_case("B", o, again_a.outcomes.get(o.index), o) for o in telling_b),
@@ -153,6 +159,7 @@ def _run_again(
     failing: Sequence[Outcome],
     net: Corridor,
     given: Mapping[str, object] | None,
+    on_again: Callable[[int, Trajectory], None],
     *,
     trust: bool,
 ) -> _Again:
@@ -163,11 +170,13 @@ def _run_again(
     if not failing:
         return _Again({}, "had nothing to run")
     again: dict[int, Outcome] = {}
+    motions: dict[int, Trajectory] = {}
     settings = settings_of(run.folder, run.settings, given, trust=trust)
     lines = centre_lines(net)
     with plan_of(settings, net, cases=len(cases)).open() as ground:
         for place, trajectory in ground.run(cases):
             again[place] = settings.criterion.outcome(place, 0, trajectory, lines)
+            motions[place] = trajectory
     for place, outcome in enumerate(told):
         was, now = outcome.score, again[place].score
         if was is None or now is None or abs(was - now) > SAME_SCORE:
@@ -177,6 +186,8 @@ def _run_again(
                 f"{outcome.index} records",
             )
     first = len(told)
+    for n, o in enumerate(failing):
+        on_again(o.index, motions[first + n])
     return _Again({o.index: again[first + n] for n, o in enumerate(failing)}, "was run again")
 
 

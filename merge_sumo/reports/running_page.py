@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -16,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
-from merge_sumo.reports.coordinates import Coordinate, coordinates
 from merge_sumo.reports.report import REPORT, check_report, policy_hash
+from merge_sumo.reports.static_map import StaticMap, map_of
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import level_name
@@ -32,43 +31,6 @@ EVERY_S: Final = 5
 """Seconds between two pages."""
 MOST_SHARE: Final = 0.05
 """Of the time of a campaign that its page may take."""
-LEFT, RIGHT, TOP, BOTTOM = 52.0, 386.0, 8.0, 294.0
-"""Edges of the plot in a map of 400 by 340."""
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """A coordinate of a map, with what stands at its two ends."""
-
-    coordinate: Coordinate
-
-    @property
-    def name(self) -> str:
-        """Name and unit."""
-        return f"{self.coordinate.name}, {self.coordinate.unit}"
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """Lowest and highest value."""
-        at = self.coordinate.dimension
-        low, high = (f"{value:.4g}".replace("-", "−") for value in (at.low, at.high))
-        return low, high
-
-    def share(self, outcome: Outcome) -> float:
-        """Return where a case is, as a share of the axis."""
-        dimension = self.coordinate.dimension
-        value = self.coordinate.of(outcome.case)
-        # No coordinate of a level's map is missing in a case of that level.
-        return ((value or 0.0) - dimension.low) / (dimension.high - dimension.low)
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """A case in a map: its CSS class and its place."""
-
-    kind: str
-    x: float
-    y: float
 
 
 class RunningPage:
@@ -134,24 +96,18 @@ def running_page(progress: CampaignProgress, folder: Path, *, stopped: bool = Fa
     )
 
 
-def _maps(progress: CampaignProgress) -> dict[int, tuple[Axis, Axis, list[Mark]]]:
-    """Return by level the two axes and the marks of a map; failures lie on top."""
+def _maps(progress: CampaignProgress) -> dict[int, StaticMap]:
+    """Return a map by level; failures lie on top."""
     shown = [*(o for o in progress.newest if not o.failed), *progress.failures]
-    maps = {}
-    for level in progress.cases:
-        at_level = [o for o in shown if o.case.level == level]
-        if not at_level:
-            continue
-        across, up = map(Axis, coordinates(at_level[0].case.scenario, (level,))[:2])
-        maps[level] = across, up, [_mark(o, across, up) for o in at_level]
-    return maps
+    return {
+        level: map_of([(o.case, _mark(o)) for o in at_level])
+        for level in progress.cases
+        if (at_level := [o for o in shown if o.case.level == level])
+    }
 
 
-def _mark(outcome: Outcome, across: Axis, up: Axis) -> Mark:
-    kind = "fail" if outcome.failed else "safe" if outcome.is_tested else "error"
-    x = LEFT + across.share(outcome) * (RIGHT - LEFT)
-    y = BOTTOM - up.share(outcome) * (BOTTOM - TOP)
-    return Mark(kind, round(x, 1), round(y, 1))
+def _mark(outcome: Outcome) -> str:
+    return "fail" if outcome.failed else "safe" if outcome.is_tested else "error"
 
 
 @cache
