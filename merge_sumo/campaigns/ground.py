@@ -29,7 +29,7 @@ from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
 from merge_sumo.values.case import Case
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import Scenario
-from merge_sumo.values.score import Measures, Outcome, measure
+from merge_sumo.values.score import Measures, Outcome, measure, measure_all
 from merge_sumo.values.trajectory import End, Trajectory
 
 MAX_CORRIDORS: Final = 32
@@ -156,8 +156,8 @@ def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
         files = hashed(ground.vut.files()), hashed(ground.pov.files())
     lines = centre_lines(plan.net)
     done: list[Ran] = []
-    for place in range(len(cases)):
-        measures = measure(ran[place], lines)
+    measured = measure_all([ran[place] for place in range(len(cases))], lines)
+    for place, measures in enumerate(measured):
         margin = plan.criterion.margin(ran[place], measures)
         done.append(Ran(measures, ran[place], *files, margin))
     return done

@@ -9,6 +9,7 @@ Ericson, 2005, section 5.2.1). It is taken every 0.1 s.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -48,32 +49,48 @@ class CentreLines:
         return cls(mainline, ramp, SPACING_M * steps)
 
 
-def closest_before_m(trajectory: Trajectory, lines: CentreLines) -> tuple[float, float | None]:
+APART: Final = math.inf, None
+"""Clearance and speed of a contact where bodies never drive on lanes that run together."""
+
+
+def closest_before_m(
+    trajectories: Sequence[Trajectory], lines: CentreLines
+) -> list[tuple[float, float | None]]:
     """Return the smallest clearance before M, in m, and the speed of the first contact, in m/s.
 
     The clearance is that of the VUT and a car of the mainline, looked for where the lanes run
-    together, infinite where the VUT never came there; the speed is None without a contact.
+    together, infinite where the VUT never came there; the speed is None without a contact. Episodes
+    are looked at together: most of the time of one is the calls of numpy.
     """
-    x_vut_m = trajectory.x_vut_m
-    steps = np.flatnonzero((x_vut_m > -lines.together_m) & (x_vut_m < 0.0))
-    scenario, nearest_m = trajectory.case.scenario, math.inf
-    if not steps.size:
-        return nearest_m, None
-    vut = _Bodies(lines.ramp, x_vut_m[steps], scenario.vut_length_m)
-    first, impact_mps = len(steps), None
-    for row in range(trajectory.motion.shape[1]):
-        if row != VUT:
-            x_m = trajectory.motion[steps, row, 0]
-            car = _Bodies(lines.mainline, x_m, scenario.pov_length_m)
-            apart_m = _separation_m(vut, car)
-            nearest_m = min(nearest_m, float(apart_m.min()))
-            touching = np.flatnonzero(apart_m <= 0.0)
-            if touching.size and touching[0] < first:
-                first = int(touching[0])
-                v_car, v_vut = trajectory.motion[steps[first], [row, VUT], 1]
-                apart_mps = v_car * car.heading[first] - v_vut * vut.heading[first]
-                impact_mps = float(np.linalg.norm(apart_mps))
-    return nearest_m, impact_mps
+    found: list[tuple[float, float | None]] = [APART] * len(trajectories)
+    parts, places = [], []
+    for place, trajectory in enumerate(trajectories):
+        x_vut_m = trajectory.motion[:, VUT, 0]
+        steps = np.flatnonzero((x_vut_m > -lines.together_m) & (x_vut_m < 0.0))
+        if steps.size:
+            # One row for each step and car: x and v of the car, x and v of the VUT, both lengths.
+            cars = np.delete(trajectory.motion[steps, :, :2], VUT, axis=1)
+            own = np.broadcast_to(trajectory.motion[steps, VUT, None, :2], cars.shape)
+            scenario = trajectory.case.scenario
+            lengths = np.broadcast_to((scenario.pov_length_m, scenario.vut_length_m), cars.shape)
+            parts.append(np.concatenate((cars, own, lengths), axis=2).reshape(-1, 6))
+            places.append(place)
+    if not parts:
+        return found
+    x_car, v_car, x_vut, v_vut, car_length, vut_length = np.concatenate(parts).T
+    car = _Bodies(lines.mainline, x_car, car_length)
+    vut = _Bodies(lines.ramp, x_vut, vut_length)
+    apart_m = _separation_m(vut, car)
+    ends = np.cumsum([len(part) for part in parts])
+    nearest_m = np.minimum.reduceat(apart_m, np.concatenate(([0], ends[:-1]))).tolist()
+    for place, end, part, clearance_m in zip(places, ends.tolist(), parts, nearest_m, strict=True):
+        impact_mps = None
+        if clearance_m <= 0.0:
+            first = end - len(part) + int(np.argmax(apart_m[end - len(part) : end] <= 0.0))
+            apart_mps = v_car[first] * car.heading[first] - v_vut[first] * vut.heading[first]
+            impact_mps = float(np.linalg.norm(apart_mps))
+        found[place] = clearance_m, impact_mps
+    return found
 
 
 def _at(line: FloatArray, along_m: FloatArray) -> FloatArray:
@@ -84,12 +101,12 @@ def _at(line: FloatArray, along_m: FloatArray) -> FloatArray:
 class _Bodies:
     """A body at n moments: its centre and heading, (n, 2), and half its length and width."""
 
-    def __init__(self, line: FloatArray, front_m: FloatArray, length_m: float) -> None:
+    def __init__(self, line: FloatArray, front_m: FloatArray, length_m: FloatArray) -> None:
         front, rear = _at(line, front_m), _at(line, front_m - length_m)
         chord = front - rear
         self.heading = chord / np.maximum(np.linalg.norm(chord, axis=1), 1e-9)[:, None]
         self.aside = np.column_stack([-self.heading[:, 1], self.heading[:, 0]])
-        self.centre = front - 0.5 * length_m * self.heading
+        self.centre = front - 0.5 * length_m[:, None] * self.heading
         self._half_length_m = 0.5 * length_m
 
     def reach_m(self, axis: FloatArray) -> FloatArray:

@@ -7,13 +7,11 @@ counts as a failure is another question (`criterion.py`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from merge_sumo.values.bodies import CentreLines, closest_before_m
-from merge_sumo.values.merge import HARSH_MPS2, closest_after_m
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.values.merge import HARSH_MPS2
+from merge_sumo.values.trajectory import End
 
 
 class Severity(StrEnum):
@@ -32,32 +30,6 @@ MEANING: Final[dict[Severity, str]] = {
     Severity.SAFE: "none of these",
 }
 """What the words mean, at the paper's 6 m (`Scenario.dx_crash_m`)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Closest:
-    """How near the bodies of the VUT and the cars of the mainline come.
-
-    Attributes:
-        clearance_m: smallest clearance; 0 or less where bodies touch, infinite where they never
-            drive on lanes that run together.
-        impact_speed_mps: relative speed at the first contact; None without one.
-    """
-
-    clearance_m: float
-    impact_speed_mps: float | None
-
-
-def closest(trajectory: Trajectory, lines: CentreLines | None) -> Closest:
-    """Return how near bodies come, from where the lanes run together until after M.
-
-    Without the centre lines of the road, bodies are looked at from M on.
-    """
-    parts = [closest_after_m(trajectory)]
-    if lines is not None:
-        parts.insert(0, closest_before_m(trajectory, lines))
-    speeds = [speed for _, speed in parts if speed is not None]
-    return Closest(min(clearance for clearance, _ in parts), speeds[0] if speeds else None)
 
 
 def severity_of(
