@@ -109,14 +109,15 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
     )
     def test_for_its_settings(self, call, tmp_path, arguments, parts):
         before = contents(tmp_path)
-        assert_refused(call(*SMALL, "--out", "run", *arguments), *parts)
+        others = [option for option in (SMALL[1:3], SMALL[3:5]) if option[0] not in arguments]
+        assert_refused(call(SMALL[0], *sum(others, ()), "--out", "run", *arguments), *parts)
         assert contents(tmp_path) == before
 
     @pytest.mark.parametrize("level", ["1", "2"])
     def test_for_a_level_without_a_policy(self, call, tmp_path, monkeypatch, level):
         monkeypatch.setattr("merge_sumo.drivers.povs.policies_sha256", lambda _: {})
         before = contents(tmp_path)
-        said = call(*SMALL, "--level", level, "--out", "run")
+        said = call("campaign", "--vut", "design1", "--level", level, "--out", "run")
         assert_refused(said, f"level {level}", "merge-sumo train")
         assert contents(tmp_path) == before
 

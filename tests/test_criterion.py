@@ -139,7 +139,7 @@ class TestRefused:
             ("tcc_s < 1.5", "no measure 'tcc_s': did you mean ttc_s"),
             ("zzzzzzzz < 1.5", "choose ttc_s, clearance_m"),
             ("papr", "did you mean paper?"),
-            ('end == "TIMEOT"', "never 'TIMEOT', but MERGED or TIMEOUT"),
+            ('end == "TIMEOT"', "never 'TIMEOT': did you mean TIMEOUT? it is MERGED or TIMEOUT"),
             ('end == "VUT_ERROR"', "never 'VUT_ERROR'"),
             ('end < "TIMEOUT"', "compare it with == or !="),
             ("end == merged_first", "with a text in quotes"),
@@ -174,8 +174,8 @@ class TestRefused:
         code, out, err = command_line("campaign", "--vut", "design1", "--fail-when", "tcc_s < 1")
         assert (code, out) == (2, "")
         assert err == (
-            "merge-sumo: --fail-when 'tcc_s < 1': there is no measure 'tcc_s': did you mean ttc_s, "
-            "pet_s or t_end_s?\n"
+            "merge-sumo: --fail-when 'tcc_s < 1': at character 1, near 'tcc_s < 1': there is no "
+            "measure 'tcc_s': did you mean ttc_s, pet_s or t_end_s?\n"
         )
 
 

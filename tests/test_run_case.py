@@ -102,7 +102,7 @@ class TestTheCommand:
             (("--vut", "design2", *SAFE, "--headway-ahead", "2"), "--headway-ahead"),
             (("--vut", "design2", "--level", "2", "--x", "-300", "--v", "34"), "--psi"),
             (("--vut", "design9", *SAFE), "design9"),
-            (("--vut", "design2", *SAFE, "--level", "all"), "--level all"),
+            (("--vut", "design2", "--x", "-300", "--v", "34", "--level", "all"), "--level all"),
             (("--case", "nowhere", "3"), "not a campaign"),
         ],
     )

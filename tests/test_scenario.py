@@ -82,7 +82,9 @@ class TestAFile:
             named_scenario(str(tmp_path / "no.toml"))
 
     def test_that_nobody_knows_by_name_is_refused(self):
-        with pytest.raises(UserError, match=r"no scenario 'us24': choose us23, .*, or a file"):
+        with pytest.raises(
+            UserError, match=r"no scenario 'us24': did you mean us23.* choose us23, .*, or a file"
+        ):
             named_scenario("us24")
 
     def test_without_room_for_its_starts_is_refused(self):

@@ -7,10 +7,11 @@ from typing import Annotated
 
 import typer
 
+from merge_sumo.commands.once import Application
 from merge_sumo.commands.shared import PoliciesOption, app, show
 from merge_sumo.errors import UserError
 
-scenario = typer.Typer(help="The road and the numbers of a merge.", no_args_is_help=True)
+scenario = Application(help="The road and the numbers of a merge.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from merge_sumo.commands.once import Application
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from merge_sumo.values.scenario import Scenario
 
 
-app = typer.Typer(
+app = Application(
     help="""Find where a merging controller fails against drivers who react to it.
 
     A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO while a primary other

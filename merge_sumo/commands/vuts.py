@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from merge_sumo.commands.once import Application
 from merge_sumo.commands.shared import (
     DeadlineOption,
     InProcessOption,
@@ -21,7 +22,7 @@ from merge_sumo.commands.shared import (
 )
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23
 
-policies = typer.Typer(help="The learned drivers as files for others.", no_args_is_help=True)
+policies = Application(help="The learned drivers as files for others.", no_args_is_help=True)
 app.add_typer(policies, name="policies")
 
 

@@ -25,6 +25,7 @@ from merge_sumo.drivers.vuts.sumo_model import sumo_vut
 from merge_sumo.drivers.vuts.traci import traci_vut
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import workers_or_cores
 
 
@@ -191,10 +192,12 @@ def find_vut(spec: str, options: VutOptions) -> Vut:
         return _prepared(INSTALLED, spec, spec, options)
     if spec.endswith(".py"):
         raise UserError(f"{spec} is a file: name a class or a function of it, {spec}:NAME")
-    names = ", ".join([*built_in, *installed])
+    names = [*built_in, *installed]
+    choice = f"{', '.join(names)}, or bring your own (`merge-sumo vuts` lists the kinds)"
+    if not spec:
+        raise UserError(f"name the vehicle under test, as in --vut design2: {choice}")
     raise UserError(
-        f"there is no VUT {spec!r}: choose one of {names}, or bring your own "
-        "(`merge-sumo vuts` lists the kinds)"
+        f"there is no VUT {spec!r}: {meant(spec, (*names, *KINDS))}choose one of {choice}"
     )
 
 

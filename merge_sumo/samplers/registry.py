@@ -12,6 +12,7 @@ from merge_sumo.samplers.foresight import Foreteller
 from merge_sumo.samplers.gpr import GprSampler
 from merge_sumo.samplers.subset import SubsetSampler
 from merge_sumo.samplers.uniform import UniformSampler
+from merge_sumo.system.suggestions import meant
 from merge_sumo.values.case import Pool
 
 SAMPLERS: Final[dict[str, type[Sampler]]] = {
@@ -29,5 +30,8 @@ def make_sampler(name: str, pool: Pool, seed: int, games: Foreteller | None = No
     `games` plays cases out, for samplers that make something of that.
     """
     if name not in SAMPLERS:
-        raise UserError(f"there is no sampler {name!r}: choose one of {', '.join(SAMPLERS)}")
+        raise UserError(
+            f"there is no sampler {name!r}: {meant(name, SAMPLERS)}choose one of "
+            f"{', '.join(SAMPLERS)}"
+        )
     return SAMPLERS[name](pool, seed, games)

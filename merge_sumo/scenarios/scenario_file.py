@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.resources import resource
+from merge_sumo.system.suggestions import meant
 from merge_sumo.values.scenario import US23, Scenario
 
 SUFFIX: Final = ".toml"
@@ -40,8 +41,11 @@ def named_scenario(name: str) -> Scenario:
     if name in shipped_scenarios():
         return _read(resource("sumo_net") / f"{name}{SUFFIX}")
     if not name.endswith(SUFFIX):
-        known = ", ".join(shipped_scenarios())
-        raise UserError(f"there is no scenario {name!r}: choose {known}, or a file NAME{SUFFIX}")
+        known = shipped_scenarios()
+        raise UserError(
+            f"there is no scenario {name!r}: {meant(name, known)}choose {', '.join(known)}, or a "
+            f"file NAME{SUFFIX}"
+        )
     return read_scenario(Path(name))
 
 

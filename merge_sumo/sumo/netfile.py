@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import math
 from collections.abc import Iterator
@@ -15,8 +14,13 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.suggestions import meant
 
 VEHICLE_CLASS: Final = "passenger"
+ALIKE_EDGES: Final = 0.5
+"""Ratio of matching characters: ids of edges are short."""
+SHOWN_EDGES: Final = 12
+"""A net with at most as many edges names them all where one is unknown."""
 JUNCTION_TYPES: Final = (
     *("priority", "priority_stop", "allway_stop", "zipper", "unregulated", "dead_end", "district"),
     *("right_before_left", "left_before_right", "traffic_light", "traffic_light_unregulated"),
@@ -96,8 +100,9 @@ class NetFile:
         """Return the lanes of an edge on which cars may drive; `UserError` when there is none."""
         if edge not in self._edges or edge.startswith(":"):
             named = sorted(name for name in self._edges if not name.startswith(":"))
-            near = difflib.get_close_matches(edge, named, n=3, cutoff=0.4) or named[:3]
-            hint = f"; there are {', '.join(near)}" if near else ""
+            few = f"it has {', '.join(named)}" if named and len(named) <= SHOWN_EDGES else ""
+            hint = f"{meant(edge, named, ALIKE_EDGES)}{few}".strip()
+            hint = f": {hint}" if hint else ""
             raise self.broken(f"it has no edge {edge}{hint}")
         found = (self._lane(str(lane.get("id"))) for lane in self._edges[edge].iterfind("lane"))
         lanes = tuple(lane for lane in found if lane.open_to_cars)

@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Set
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import lru_cache
 from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
+from merge_sumo.system.suggestions import nearest
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
@@ -90,7 +90,7 @@ class Criterion:
         """Check the condition; however it is spaced, it is the same."""
         name = self.fail_when.strip()
         if name not in NAMED:
-            if name.isidentifier() and (near := get_close_matches(name, NAMED, n=1)):
+            if name.isidentifier() and (near := nearest(name, NAMED)):
                 raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
             _, name = parse_condition(self.fail_when, VOCABULARY, "--fail-when", NAMED)
         object.__setattr__(self, "fail_when", name)

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.suggestions import meant
 
 DT_S: Final = 0.1
 """Step of the equations of motion, eq. (4)."""
@@ -191,9 +191,8 @@ class Scenario:
         values: dict[str, Any] = {}
         for name, value in record.items():
             if name not in known:
-                near = get_close_matches(str(name), known, 1)
-                meant = f": did you mean {near[0]}?" if near else f": it has {', '.join(known)}"
-                raise UserError(f"a scenario has no {name!r}{meant}")
+                hint = meant(str(name), known) or f"it has {', '.join(known)}"
+                raise UserError(f"a scenario has no {name!r}: {hint.strip()}")
             values[name] = _read(name, value, known[name].type)
         return cls(**values)
 

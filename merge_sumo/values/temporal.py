@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 import sys
-from difflib import get_close_matches
 from functools import lru_cache
 from typing import Any, Final
 
@@ -18,8 +17,9 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
+from merge_sumo.system.suggestions import meant
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.expression import LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
+from merge_sumo.values.expression import ALIKE_MEASURES, LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S
 from merge_sumo.values.trajectory import Trajectory
 
@@ -54,10 +54,12 @@ def check_formula(text: str) -> str:
         found = _TOKEN.match(text, place)
         if found is None:
             sign = printable(text[place])
-            raise UserError(f"{what}: {sign!r} is no part of a formula over signals")
+            raise UserError(
+                f"{what}: at character {place + 1}: {sign!r} is no part of a formula over signals"
+            )
         word = found[0]
         if word[0].isalpha() or word[0] == "_":
-            _check_word(word, what)
+            _check_word(word, f"{what}: at character {place + 1}")
         depth += (word == "(") - (word == ")")
         if depth < 0:
             raise UserError(f"{what}: a bracket is closed that was not opened")
@@ -71,9 +73,8 @@ def check_formula(text: str) -> str:
 
 def _check_word(word: str, what: str) -> None:
     if word not in (*SIGNALS, *WORDS):
-        near = get_close_matches(word, (*SIGNALS, *WORDS), n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"choose {', '.join(SIGNALS)}"
-        raise UserError(f"{what}: there is no signal {word!r}: {hint}")
+        hint = meant(word, (*SIGNALS, *WORDS), ALIKE_MEASURES) or f"choose {', '.join(SIGNALS)}"
+        raise UserError(f"{what}: there is no signal {word!r}: {hint.strip()}")
 
 
 def try_formula(text: str) -> None:
