@@ -58,7 +58,7 @@ function title(i) {
 }
 function conduct(i) { // what both did, by their speeds
   const met = NAMES[vehicles[cases.nearest[i]]];
-  const of = (brakes, accelerates) => brakes !== null ? `brakes from ${fixed(brakes, 1)} s on` : accelerates ? "accelerates" : "keeps its speed within 1 m/s";
+  const of = (brakes, accelerates) => brakes !== null ? `begins to brake at ${fixed(brakes, 1)} s` : accelerates ? "accelerates" : "keeps its speed within 1 m/s";
   return `The VUT ${of(cases.vut_brakes[i], cases.vut_accelerates[i])}, the ${met} ${of(cases.pov_brakes[i], cases.pov_accelerates[i])}.`;
 }
 function words(i) {
@@ -70,7 +70,8 @@ function words(i) {
     parts.push(`The VUT reaches M at ${at}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx[i]), 1)} m ahead.`);
     if (found === "contact") parts.push(`Bodies touch at a relative speed of ${fixed(cases.impact[i], 1)} m/s.`);
     else if (cases.brake_after[i] === null) parts.push("No braking of the car behind is in time.");
-    else if (cases.brake_after[i] > 0) parts.push(`The car behind has to brake at ${fixed(cases.brake_after[i], 1)} m/s² after M.`);
+    else if (cases.brake_after[i] < 0.1) parts.push("The car behind has to brake at less than 0.1 m/s² after M.");
+    else parts.push(`The car behind has to brake at ${fixed(cases.brake_after[i], 1)} m/s² after M.`);
   } else if (end === "TIMEOUT") {
     parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
     if (found === "contact") parts.push(`Bodies touch before M at a relative speed of ${fixed(cases.impact[i], 1)} m/s.`);
@@ -88,7 +89,7 @@ function words(i) {
   if (cases.avoided_by && cases.avoided_by[i] !== null) {
     const by = cases.avoided_by[i], until = cases.careful_until[i];
     parts.push(by.length ? `In the VUT's place ${by.join(", ")} would have avoided it.` : "No reference driver in the VUT's place would have avoided it.");
-    if (until !== null) parts.push(`A careful driver who takes over until ${fixed(until, 1)} s avoids it.`);
+    if (until !== null) parts.push(`The last time at which a careful driver can take over and avoid it is ${fixed(until, 1)} s.`);
     if (cases.pov_careful[i]) parts.push("A careful driver in the POV's place avoids it, too.");
   }
   return parts.join(" ");
