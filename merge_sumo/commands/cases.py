@@ -5,48 +5,60 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from merge_sumo.commands import complete
 from merge_sumo.commands.shared import (
+    DaskOption,
     DeadlineOption,
+    FailWhenOption,
+    FollowUpOption,
     InProcessOption,
     JsonOption,
+    LevelOption,
     NetOption,
+    OneLevelOption,
     PoliciesOption,
     PovOption,
+    QuietOption,
+    RequireOption,
     RunArgument,
     ScenarioOption,
     ToleranceOption,
     TrustOption,
     VutCommandOption,
     VutMemoryOption,
+    WorkersOption,
     app,
     check_tolerance,
     say,
+    settings_in,
     show,
-    written,
     written_settings,
 )
-from merge_sumo.errors import UserError
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
-    from merge_sumo.campaigns.settings import CampaignSettings
-    from merge_sumo.campaigns.single import Ended
     from merge_sumo.reports.rerun import Rerun
-    from merge_sumo.values.case import Case
+    from merge_sumo.results import CaseRun
 
 
 @app.command()
 def run(
     context: typer.Context,
     vut: Annotated[
-        str, typer.Option(help="Vehicle under test.  [with --case default: the campaign's]")
+        str,
+        typer.Option(
+            metavar="SPEC",
+            help="Vehicle under test.",
+            show_default="with --case the campaign's",
+            autocompletion=complete.vuts,
+        ),
     ] = "",
-    level: Annotated[str, typer.Option(help="POV level: 0, 1, 2 or own.")] = "0",
+    level: OneLevelOption = "0",
     x: Annotated[
         float | None, typer.Option("--x", help="Where the POV starts, in m: M is 0.")
     ] = None,
@@ -56,7 +68,7 @@ def run(
     ] = None,
     v_vut0: Annotated[
         float | None,
-        typer.Option(help="Initial speed of the VUT in m/s.  [default: the scenario's]"),
+        typer.Option(help="Initial speed of the VUT in m/s.", show_default="the scenario's"),
     ] = None,
     headway_ahead: Annotated[
         float | None, typer.Option(help="Headway to the car ahead in s, in traffic.")
@@ -74,6 +86,9 @@ def run(
     pov: PovOption = None,
     policies: PoliciesOption = None,
     net: NetOption = None,
+    fail_when: FailWhenOption = "paper",
+    require: RequireOption = None,
+    follow_up: FollowUpOption = None,
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -98,52 +113,44 @@ def run(
 
     Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
     """
-    from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.plan import plan_of
-    from merge_sumo.campaigns.single import run_one
-    from merge_sumo.system.folders import check_new
+    from merge_sumo import api
+    from merge_sumo.campaigns.single import FIELDS
     from merge_sumo.values.trajectory import End
 
-    settings, one = _case_and_settings(context)
-    if out is not None:
-        check_new(out)
-    for outside in _outside(one):
-        say(f"note: {outside}")
-    road = road_for(settings.scenario, net)
-
-    def ended(found: Ended) -> None:
-        from merge_sumo.reports.motion import lines_of
-        from merge_sumo.sumo.replay_folder import write_scenario
-
-        if out is not None:
-            write_scenario(out, road, found.outcome, found.trajectory)
+    def ended(found: CaseRun) -> None:
         if as_json:
             kept = {} if out is None else {"out": str(out)}
             motion = {"motion": found.trajectory.motion.tolist()}
             typer.echo(json.dumps({**found.outcome.to_record(), **kept, **motion}))
             return
-        for line in lines_of(found.outcome, found.trajectory):
+        for line in found.lines():
             show(line)
         if out is not None:
             show(f"kept: merge-sumo replay {quoted(out)} --gui")
         if gui:
             say("close the window to go on")
 
-    plan = plan_of(settings, road, cases=1)
-    found = run_one(plan, one, live=gui, on_end=ended).outcome
-    raise typer.Exit(0 if found.measures.end is End.MERGED and not found.failed else 1)
-
-
-def _outside(case: Case) -> list[str]:
-    """Return in sentences which coordinates of a case are outside of the pool."""
-    from merge_sumo.reports.coordinates import coordinates
-
-    return [
-        f"{c.name} {c.text(case)} {c.unit} is outside of the pool, {c.dimension.low:g} to "
-        f"{c.dimension.high:g} {c.unit}: no campaign runs such a case"
-        for c in coordinates(case.scenario, (case.level,))
-        if (value := c.of(case)) is not None and not c.dimension.low <= value <= c.dimension.high
-    ]
+    given = settings_in(context) if case is None else written_settings(context)
+    given.pop("v_vut0_mps", None)
+    values = {
+        field: value
+        for field, option in FIELDS.items()
+        if (value := context.params[option[2:].replace("-", "_")]) is not None
+    }
+    who = given.pop("vut", None) or None
+    found = api.run_case(
+        who,
+        recorded=case,
+        net=net,
+        debug=debug,
+        gui=gui,
+        out=out,
+        trust_vut=trust_vut,
+        on_end=ended,
+        **{**given, **values},
+    )
+    merged = found.measures.end is End.MERGED
+    raise typer.Exit(0 if merged and not found.failed else 1)
 
 
 @app.command()
@@ -155,8 +162,15 @@ def rerun(
         typer.Argument(help="Indices of cases in outcomes.jsonl; all if left out."),
     ] = None,
     vut: Annotated[
-        str, typer.Option(help="The changed VUT.  [default: the campaign's, as its files are now]")
+        str,
+        typer.Option(
+            metavar="SPEC",
+            help="The changed VUT.",
+            show_default="the campaign's, as its files are now",
+            autocompletion=complete.vuts,
+        ),
     ] = "",
+    level: LevelOption = "all",
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -164,7 +178,9 @@ def rerun(
     policies: PoliciesOption = None,
     net: NetOption = None,
     tolerance: ToleranceOption = 0.0,
-    workers: Annotated[int, typer.Option(help="Processes that run cases.")] = 1,
+    workers: WorkersOption = 1,
+    dask: DaskOption = None,
+    quiet: QuietOption = False,
     trust_vut: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -176,32 +192,18 @@ def rerun(
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2
     """
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports import rerun as again
-    from merge_sumo.reports.progress import Counter
-    from merge_sumo.system.workers import open_workers
+    from merge_sumo import api
 
     check_tolerance(tolerance)
-    recorded = Run(run)
-    total = len(set(case or ()) or recorded.outcomes)
-    settings = again.settings_today(recorded, written_settings(context), trust=trust_vut)
-    with (
-        open_workers(settings.workers(workers)) as there,
-        Counter(f"{settings.vut} again", total, "cases") as counter,
-    ):
-        found = again.rerun(
-            recorded,
-            settings,
-            case or (),
-            net=net,
-            workers=there,
-            on_case=counter.ended,
-        )
+    where: dict[str, Any] = {"workers": workers, "dask": dask, "progress": not quiet}
+    where |= {"net": net, "trust_vut": trust_vut, **written_settings(context)}
+    found = api.rerun(run, case or (), **where)
     why = found.compared.worse(tolerance)
     if as_json:
         changed = [one.to_record() for one in found.changed]
         judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
-        compared = {"cases": total, "changed": changed, "levels": asdict(found.compared)["levels"]}
+        levels = asdict(found.compared)["levels"]
+        compared = {"cases": len(found.before), "changed": changed, "levels": levels}
         typer.echo(json.dumps({"vut": found.vut, **compared, **judged}))
     else:
         _print_rerun(found, run)
@@ -219,37 +221,3 @@ def _print_rerun(found: Rerun, folder: Path) -> None:
             f"look at one: merge-sumo run --case {quoted(folder)} {found.changed[0].before.index} "
             f"--vut {quoted(found.vut)} --gui"
         )
-
-
-def _case_and_settings(context: typer.Context) -> tuple[CampaignSettings, Case]:
-    """Return the case that is asked for, and how it is to be run."""
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.campaigns.settings import one_level, povs_of
-    from merge_sumo.campaigns.single import DEBUG_DEADLINE_S, FIELDS, settings_and_case
-    from merge_sumo.drivers.vuts.base import VutOptions
-    from merge_sumo.scenarios.scenario_file import named_scenario
-
-    options = context.params
-    given = written_settings(context)
-    if options["debug"]:
-        given |= {"in_process": True, "deadline_s": DEBUG_DEADLINE_S}
-    values = {
-        field: options[option[2:].replace("-", "_")]
-        for field, option in FIELDS.items()
-        if options[option[2:].replace("-", "_")] is not None
-    }
-    if options["case"] is None:
-        if not options["vut"]:
-            raise UserError("say with --vut who drives, or with --case which recorded case")
-        where = named_scenario(options["scenario"])
-        hosted = VutOptions(memory_gib=options["vut_memory"])
-        povs = povs_of(options["policies"], where, options["pov"], hosted)
-        given["scenario"] = where
-        return settings_and_case(None, one_level(options["level"], povs), values, given)
-    folder, index = options["case"]
-    recorded = Run(folder)
-    level = recorded.outcome(index).case.level
-    if "level" in written(context):
-        level = one_level(options["level"], povs_of(options["policies"], recorded.scenario))
-    of = recorded, index
-    return settings_and_case(of, level, values, given, trust=options["trust_vut"])

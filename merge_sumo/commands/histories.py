@@ -8,13 +8,18 @@ from typing import Annotated
 
 import typer
 
+from merge_sumo.commands import complete
 from merge_sumo.commands.shared import JsonOption, app, show
-from merge_sumo.system.folders import check_new_file
 
 
 @app.command()
 def history(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of campaigns, the oldest first.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Folders of campaigns, the oldest first.", autocompletion=complete.runs
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Page to write; nothing may be there.")] = Path(
         "history.html"
     ),
@@ -29,13 +34,9 @@ def history(
 
     Example:  merge-sumo history runs/design1 runs/design2 --out runs/history.html
     """
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports.history import history_of
-    from merge_sumo.reports.history_page import write_history
+    from merge_sumo import api
 
-    check_new_file(out)
-    found = history_of([Run(folder) for folder in runs])
-    write_history(found, out)
+    found = api.history(runs, out=out)
     if as_json:
         typer.echo(json.dumps({**found.to_record(), "page": str(out)}, allow_nan=False))
         return

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import typer
 from typer.core import TyperCommand
 
 from merge_sumo.errors import UserError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 class OnceCommand(TyperCommand):
@@ -28,11 +24,3 @@ class OnceCommand(TyperCommand):
                 name = max(option.opts, key=len)
                 raise UserError(f"{name} is given {times} times: give it once")
         return super().parse_args(ctx, args)
-
-
-class Application(typer.Typer):
-    """A Typer whose commands take each option once."""
-
-    def command(self, *arguments: Any, **named: Any) -> Callable[..., Any]:
-        """Register a command, as `typer.Typer.command` does."""
-        return super().command(*arguments, **{"cls": OnceCommand, **named})

@@ -6,10 +6,11 @@ import json
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from merge_sumo.commands import complete
 from merge_sumo.commands.shared import (
     JsonOption,
     NetOption,
@@ -22,15 +23,10 @@ from merge_sumo.commands.shared import (
     print_troubles,
     show,
 )
-from merge_sumo.errors import UserError
-from merge_sumo.system.folders import check_new_file, check_own
 from merge_sumo.system.printable import quoted
 
 if TYPE_CHECKING:
     from merge_sumo.reports.changes import RunComparison
-    from merge_sumo.values.trajectory import Trajectory
-
-EXPORTS: Final = "exports"
 
 
 class Format(StrEnum):
@@ -58,38 +54,34 @@ def export(
         ),
     ] = Format.SUMO,
     out: Annotated[
-        Path | None, typer.Option(help="Folder.  [default: RUN/scenarios, else RUN/exports]")
+        Path | None,
+        typer.Option(
+            help="Folder to write into.", show_default="RUN/scenarios for sumo, else RUN/exports"
+        ),
     ] = None,
     net: NetOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Write cases of a campaign for SUMO, for other simulators, or as a table.
 
     Example:  merge-sumo export runs/design2 17 42
     """
-    from merge_sumo.campaigns.conductor import SCENARIOS
-    from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports import exports
+    from merge_sumo import api
 
-    loaded = Run(run)
-    if out is None:
-        check_own(run / SCENARIOS, run / EXPORTS)
-    if file_format in (Format.CSV, Format.PARQUET):
-        indices = case or [outcome.index for outcome in loaded.outcomes]
-        show(exports.write_table(loaded, indices, out or run / EXPORTS, file_format.value))
+    paths = api.export(run, case or None, file_format=file_format.value, out=out, net=net)
+    if as_json:
+        typer.echo(json.dumps({"written": list(map(str, paths))}))
         return
-    if not case:
-        raise UserError(f"--format {file_format} needs the indices of cases")
-    to_sumo = file_format is Format.SUMO
-    target = out or run / (SCENARIOS if to_sumo else EXPORTS)
-    write = exports.write_sumo if to_sumo else exports.write_openscenario
-    for path in exports.write_folders(loaded, case, target, write, road_for(loaded.scenario, net)):
+    for path in paths:
         show(path)
 
 
 @app.command()
 def replay(
-    folder: Annotated[Path, typer.Argument(help="A scenario folder, or a campaign's.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(help="A scenario folder, or a campaign's.", autocompletion=complete.runs),
+    ],
     case: Annotated[
         int | None, typer.Argument(help="Index of the campaign's case in outcomes.jsonl.")
     ] = None,
@@ -104,16 +96,11 @@ def replay(
 
     Example:  merge-sumo replay scenarios/stalemate --gui
     """
-    from merge_sumo.campaigns.run import SETTINGS
-    from merge_sumo.sumo import replay as replayer
+    from merge_sumo import api
 
-    if (folder / SETTINGS).is_file():
-        folder = _exported(folder, case, net)
-    elif case is not None:
-        raise UserError(f"{folder} is no campaign, so it has no case {case}: leave that away")
     if gui:
-        raise typer.Exit(replayer.open_gui(folder))
-    result = replayer.replay(folder)
+        raise typer.Exit(api.open_in_gui(folder, case, net=net))
+    result = api.replay(folder, case, net=net)
     identical = result.diverged_at_s is None
     if as_json:
         typer.echo(json.dumps({"identical": identical, **asdict(result)}))
@@ -124,42 +111,27 @@ def replay(
     raise typer.Exit(0 if identical else 1)
 
 
-def _exported(run: Path, case: int | None, net: Path | None) -> Path:
-    """Return the folder of a campaign's case, which is written where it is not there yet."""
-    from merge_sumo.campaigns.conductor import SCENARIOS, case_name
-    from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports import exports
-
-    if case is None:
-        raise UserError(
-            f"{run} is a campaign: say which case, as in `merge-sumo replay {quoted(run)} 3`"
-        )
-    folder = run / SCENARIOS / case_name(case)
-    if not folder.is_dir():
-        check_own(run / SCENARIOS)
-        loaded = Run(run)
-        road = road_for(loaded.scenario, net)
-        list(exports.write_folders(loaded, [case], run / SCENARIOS, exports.write_sumo, road))
-    return folder
-
-
 @app.command()
-def report(run: RunArgument) -> None:
+def report(run: RunArgument, as_json: JsonOption = False) -> None:
     """Write the report of a campaign again and print its path.
 
     Example:  merge-sumo report runs/design2
     """
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports.report import write_report
+    from merge_sumo import api
 
-    show(write_report(Run(run)))
+    path = api.report(run)
+    show(json.dumps({"report": str(path)}) if as_json else path)
 
 
 @app.command("compare-runs")
 def compare_runs(
-    a: Annotated[Path, typer.Argument(help="Folder of the campaign before.")],
-    b: Annotated[Path, typer.Argument(help="Folder of the campaign after.")],
+    a: Annotated[
+        Path,
+        typer.Argument(help="Folder of the campaign before.", autocompletion=complete.runs),
+    ],
+    b: Annotated[
+        Path, typer.Argument(help="Folder of the campaign after.", autocompletion=complete.runs)
+    ],
     tolerance: ToleranceOption = 0.0,
     rerun: Annotated[
         bool,
@@ -189,48 +161,33 @@ def compare_runs(
 
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --out changes.html
     """
-    from merge_sumo.campaigns.avoidance import in_a_sentence, read_avoidance
-    from merge_sumo.campaigns.ground import road_for
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports import comparison
-    from merge_sumo.reports.comparison_page import write_comparison
-    from merge_sumo.reports.verdict import judge
+    from merge_sumo import api
 
     check_tolerance(tolerance)
-    if out is not None:
-        check_new_file(out)
-    runs = Run(a), Run(b)
-    road = road_for(runs[0].scenario, net) if rerun else None
-    given = {} if policies is None else {"policies": str(policies)}
-    motions: dict[tuple[str, int], Trajectory] = {}
-
-    def keep(of: str, index: int, trajectory: Trajectory) -> None:
-        motions[of, index] = trajectory
-
-    compared = comparison.compare_runs(
-        *runs, rerun=rerun, net=road, given=given, trust=trust_vut, on_again=keep
+    runs = {"A": api.open_run(a), "B": api.open_run(b)}
+    compared = api.compare_runs(
+        *runs.values(),
+        rerun=rerun,
+        net=net,
+        policies=policies,
+        trust_vut=trust_vut,
+        out=out,
+        tolerance=tolerance,
     )
-    if out is not None:
-        write_comparison(compared, *runs, motions, tolerance, out)
     why = compared.worse(tolerance)
-    careful = {
-        name: in_a_sentence(read_avoidance(loaded).values())
-        for name, loaded in zip("AB", runs, strict=True)
-    }
-    verdicts = {name: judge(loaded.outcomes) for name, loaded in zip("AB", runs, strict=True)}
     if as_json:
         own = {
-            name.lower(): verdict.to_record() | {"careful": careful[name]}
-            for name, verdict in verdicts.items()
+            name.lower(): one.verdict.to_record() | {"careful": one.careful}
+            for name, one in runs.items()
         }
         judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
         typer.echo(json.dumps({**own, **asdict(compared), **judged}))
     else:
-        for (name, verdict), loaded in zip(verdicts.items(), runs, strict=True):
-            show(f"{name}: {loaded.folder} ({loaded.vut}): {verdict.counts}")
-            if (said := careful[name]) is not None:
-                show(f"  {said}")
-            print_troubles(verdict)
+        for name, one in runs.items():
+            show(f"{name}: {one.folder} ({one.run.vut}): {one.verdict.counts}")
+            if one.careful is not None:
+                show(f"  {one.careful}")
+            print_troubles(one.verdict)
         _print_comparison(compared, {"A": a, "B": b})
         worse = "worse" if why else "not worse"
         show(f"B is {worse} than A, with a tolerance of {tolerance:g}")

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from merge_sumo.commands.once import Application
-from merge_sumo.commands.shared import PoliciesOption, app, show
+from merge_sumo.commands import complete
+from merge_sumo.commands.grouped import Commands
+from merge_sumo.commands.shared import JsonOption, PoliciesOption, app, show
 from merge_sumo.errors import UserError
 
-scenario = Application(help="The road and the numbers of a merge.", no_args_is_help=True)
+scenario = Commands(help="The road and the numbers of a merge.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")
 
 
 @scenario.command("list")
-def list_scenarios() -> None:
+def list_scenarios(as_json: JsonOption = False) -> None:
     """List the scenarios that the package brings.
 
     Example:  merge-sumo scenario list
     """
     from merge_sumo.scenarios.scenario_file import named_scenario, shipped_scenarios
 
-    for name in shipped_scenarios():
-        found = named_scenario(name)
+    scenarios = {name: named_scenario(name) for name in shipped_scenarios()}
+    if as_json:
+        typer.echo(json.dumps({name: asdict(found) for name, found in scenarios.items()}))
+        return
+    for name, found in scenarios.items():
         x, v = found.x_pov0_m, found.v_pov0_mps
         show(f"{name}: POV from {x[0]:g} to {x[1]:g} m at {v[0]:g} to {v[1]:g} m/s")
 
@@ -35,6 +41,7 @@ def new_scenario(
     net: Annotated[Path, typer.Option(help="SUMO net; netconvert makes one of OSM, OpenDRIVE.")],
     mainline: Annotated[str, typer.Option(help='Edges of the mainline, past M: "e1 e2".')],
     ramp: Annotated[str, typer.Option(help='Edges of the ramp, past M: "r1 e2".')],
+    as_json: JsonOption = False,
 ) -> None:
     """Write a scenario for a merge in a net of your own: what was found, and a suggested pool.
 
@@ -61,6 +68,9 @@ def new_scenario(
     beside = os.path.relpath(net.resolve(), file.parent.resolve())
     write_new(picture, road_svg(road, found), "FILE")
     write_new(file, to_toml(replace(found, net=beside), about(road)).encode(), "FILE")
+    if as_json:
+        typer.echo(json.dumps({"about": about(road), "written": [str(file), str(picture)]}))
+        return
     for line in about(road):
         show(line)
     show(f"written: {file}, and its picture {picture}")
@@ -68,8 +78,14 @@ def new_scenario(
 
 @scenario.command("check")
 def check_scenario(
-    name: Annotated[str, typer.Argument(metavar="NAME|FILE", help="Scenario to check.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME|FILE", help="Scenario to check.", autocompletion=complete.scenarios
+        ),
+    ],
     policies: PoliciesOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Say whether a scenario can be hosted, and whether the learned drivers know it.
 
@@ -84,9 +100,12 @@ def check_scenario(
     if policies is not None:
         policies = policies_in(policies)
     found = named_scenario(name)
-    for line in about(road_for(found)):
+    lines, outside = list(about(road_for(found))), unseen(found, policies)
+    if as_json:
+        typer.echo(json.dumps({"about": lines, "unseen": list(outside)}))
+        return
+    for line in lines:
         show(line)
-    outside = unseen(found, policies)
     if outside:
         show("the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:")
         for sentence in outside:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol
 
 import typer
 
-from merge_sumo.commands.once import Application
+from merge_sumo.commands import complete
+from merge_sumo.commands.grouped import Commands
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 
 if TYPE_CHECKING:
     from merge_sumo.reports.verdict import Verdict
-    from merge_sumo.values.scenario import Scenario
 
 
-app = Application(
+app = Commands(
     help="""Find where a merging controller fails against drivers who react to it.
 
     A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO while a primary other
@@ -28,11 +28,35 @@ app = Application(
     Start with:  merge-sumo campaign --vut design2
     """,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+VutOption = Annotated[
+    str,
+    typer.Option(
+        metavar="SPEC",
+        help="Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
+        "`merge-sumo vuts` lists the kinds.",
+        autocompletion=complete.vuts,
+    ),
+]
+LevelOption = Annotated[
+    str, typer.Option(help="POV level: 0, 1, 2, own or all.", autocompletion=complete.levels)
+]
+OneLevelOption = Annotated[
+    str, typer.Option(help="POV level: 0, 1, 2 or own.", autocompletion=complete.one_level)
+]
+WorkersOption = Annotated[
+    int, typer.Option(help="Processes that run cases; the outcomes are the same.")
+]
+CoresOption = Annotated[
+    int | None,
+    typer.Option(
+        help="Processes that run cases; the outcomes are the same.", show_default="one a core"
+    ),
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 NetOption = Annotated[
     Path | None, typer.Option(help="SUMO net to use instead of the shipped US-23 ramp.")
 ]
@@ -40,8 +64,8 @@ DenseOption = Annotated[
     bool | None,
     typer.Option(
         "--dense/--no-dense",
-        help="Make the dense truths, of 1,000,000 cases, or go without.  [default: those kept]",
-        show_default=False,
+        help="Make the dense truths, of 1,000,000 cases, or go without.",
+        show_default="those kept",
     ),
 ]
 
@@ -85,6 +109,7 @@ ScenarioOption = Annotated[
         metavar="NAME|FILE",
         help="Scenario that `merge-sumo scenario list` names, or a TOML file of your own: "
         "`merge-sumo scenario new` writes one.",
+        autocompletion=complete.scenarios,
     ),
 ]
 PoliciesOption = Annotated[
@@ -100,6 +125,7 @@ PovOption = Annotated[
     typer.Option(
         metavar="SPEC",
         help="A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
+        autocompletion=complete.vuts,
     ),
 ]
 FailWhenOption = Annotated[
@@ -122,8 +148,8 @@ FollowUpOption = Annotated[
     float | None,
     typer.Option(
         metavar="SECONDS",
-        help="How long both drive on behind M: what happens there is measured.  [default: the "
-        "scenario's, 0]",
+        help="How long both drive on behind M: what happens there is measured.",
+        show_default="the scenario's, 0",
     ),
 ]
 ToleranceOption = Annotated[
@@ -133,22 +159,24 @@ ToleranceOption = Annotated[
         "no regression."
     ),
 ]
-RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
+RunArgument = Annotated[
+    Path, typer.Argument(help="Folder of a campaign.", autocompletion=complete.runs)
+]
 
 
-SETTINGS: Final = {
-    **{
-        name: name
-        for name in (
-            *("vut", "sampler", "cases", "batch", "seed", "stop_after_converged", "vut_command"),
-            *("in_process", "policies", "pov", "learn_from", "scenario", "fail_when", "require"),
-        )
-    },
+KEYWORDS: Final = {
     "v_vut0": "v_vut0_mps",
     "deadline": "deadline_s",
     "vut_memory": "vut_memory_gib",
+    "follow_up": "follow_up_s",
 }
-"""Names in `CampaignSettings`, by the options for them."""
+"""Keywords of the API, by the options whose names are others."""
+SETTINGS: Final = (
+    *("vut", "level", "sampler", "cases", "batch", "seed", "stop_after_converged", "vut_command"),
+    *("in_process", "policies", "pov", "learn_from", "scenario", "fail_when", "require"),
+    *KEYWORDS,
+)
+"""Options that are settings of a campaign."""
 
 
 def written(context: typer.Context) -> set[str]:
@@ -157,27 +185,38 @@ def written(context: typer.Context) -> set[str]:
     return {name for name, source in found.items() if source and source.name == "COMMANDLINE"}
 
 
-def written_settings(context: typer.Context) -> dict[str, Any]:
-    """Return the settings that a person wrote, by their names in `CampaignSettings`.
+def settings_in(context: typer.Context, *others: str) -> dict[str, Any]:
+    """Return the settings of a command, written or by default, as keywords of the API.
 
-    Levels are not among them: which there are, the other settings say.
+    `others` are options of the command with which it is the same.
     """
-    from merge_sumo.scenarios.scenario_file import named_scenario
+    names = [name for name in context.params if name in (*SETTINGS, *others)]
+    return {KEYWORDS.get(name, name): context.params[name] for name in names}
 
-    given = {
-        SETTINGS[option]: context.params[option] for option in written(context) & SETTINGS.keys()
-    }
-    if "policies" in given:
-        given["policies"] = str(given["policies"])
-    if "learn_from" in given:
-        given["learn_from"] = tuple(map(str, given["learn_from"]))
-    if "scenario" in given:
-        given["scenario"] = followed_up(
-            named_scenario(given["scenario"]), context.params.get("follow_up")
-        )
-    elif "follow_up" in written(context):
-        raise UserError("--follow-up is of the scenario: name that, too, with --scenario")
-    return given
+
+def written_settings(context: typer.Context) -> dict[str, Any]:
+    """Return the settings that a person wrote, as keywords of the API."""
+    names = written(context) & {*SETTINGS}
+    return {KEYWORDS.get(name, name): context.params[name] for name in names}
+
+
+class Result(Protocol):
+    """What a verb of the API returns."""
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+
+    def lines(self) -> list[str]:
+        """Return it as a person reads it."""
+
+
+def print_result(result: Result, *, as_json: bool) -> None:
+    """Print what a verb of the API returned, in lines or as JSON."""
+    if as_json:
+        typer.echo(json.dumps(result.to_record(), allow_nan=False))
+        return
+    for line in result.lines():
+        show(line)
 
 
 def check_tolerance(tolerance: float) -> None:
@@ -190,11 +229,6 @@ def print_troubles(verdict: Verdict) -> None:
     """Print what ended in an error or a timeout, by message; nothing where nothing did."""
     for line in verdict.trouble_lines():
         show(line)
-
-
-def followed_up(scenario: Scenario, seconds: float | None) -> Scenario:
-    """Return a scenario in which both drive on behind M for so long, if that was said."""
-    return scenario if seconds is None else replace(scenario, follow_up_s=seconds)
 
 
 def show(line: object) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from merge_sumo.commands.once import Application
+from merge_sumo.commands import complete
+from merge_sumo.commands.grouped import Commands
 from merge_sumo.commands.shared import (
     DeadlineOption,
     InProcessOption,
@@ -18,11 +18,13 @@ from merge_sumo.commands.shared import (
     VutCommandOption,
     VutMemoryOption,
     app,
+    print_result,
+    settings_in,
     show,
 )
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23
 
-policies = Application(help="The learned drivers as files for others.", no_args_is_help=True)
+policies = Commands(help="The learned drivers as files for others.", no_args_is_help=True)
 app.add_typer(policies, name="policies")
 
 
@@ -54,7 +56,11 @@ def vuts(policies: PoliciesOption = None, as_json: JsonOption = False) -> None:
 
 @app.command("check-vut")
 def check_vut(
-    vut: Annotated[str, typer.Argument(help="What you would write after --vut.")],
+    context: typer.Context,
+    vut: Annotated[
+        str,
+        typer.Argument(help="What you would write after --vut.", autocompletion=complete.vuts),
+    ],
     vut_command: VutCommandOption = None,
     deadline: DeadlineOption = DEADLINE_S,
     vut_memory: VutMemoryOption = MEMORY_GIB,
@@ -68,45 +74,30 @@ def check_vut(
 
     Example:  merge-sumo check-vut design1
     """
-    from merge_sumo.campaigns import vut_check
-    from merge_sumo.drivers.policies import policies_in
-    from merge_sumo.drivers.vut import vut_factory
-    from merge_sumo.drivers.vuts.base import VutOptions
+    from merge_sumo import api
 
-    options = VutOptions(
-        command=vut_command,
-        deadline_s=deadline,
-        memory_gib=vut_memory,
-        in_process=in_process,
-        policies=None if policies is None else policies_in(policies),
-    )
-    found = vut_check.check_vut(vut_factory(vut, options))
-    if as_json:
-        typer.echo(json.dumps({"vut": vut, "ok": not found.problems, **asdict(found)}))
-    else:
-        for sentence in found.problems or ["nothing wrong"]:
-            show(sentence)
-        for sentence in found.notes:
-            show(f"note: {sentence}")
-        show(
-            f"a step costs {found.us_per_step_median:.0f} us (median), "
-            f"{found.us_per_step_worst:.0f} us at worst"
-        )
-    raise typer.Exit(1 if found.problems else 0)
+    found = api.check_vut(**settings_in(context))
+    print_result(found, as_json=as_json)
+    raise typer.Exit(0 if found.ok else 1)
 
 
 @policies.command("export")
 def export_policy(
-    name: Annotated[str, typer.Argument(help="pov1, vut1, pov2 or vut2.")],
+    name: Annotated[
+        str, typer.Argument(help="pov1, vut1, pov2 or vut2.", autocompletion=complete.networks)
+    ],
     out: Annotated[Path, typer.Option(help="ONNX file to write.")],
     policies: PoliciesOption = None,
     scenario: Annotated[
         str | None,
         typer.Option(
             metavar="NAME|FILE",
-            help="Scenario that it is to drive in.  [default: the one it was trained for]",
+            help="Scenario that it is to drive in.",
+            show_default="the one it was trained for",
+            autocompletion=complete.scenarios,
         ),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Write a learned driver as an ONNX network, from the state to the action values.
 
@@ -119,4 +110,4 @@ def export_policy(
     played = None if scenario is None else named_scenario(scenario)
     folder = policies_of(played or US23) if policies is None else policies_in(policies)
     export_onnx(name, out, folder, played)
-    show(out)
+    show(json.dumps({"written": [str(out)]}) if as_json else out)

@@ -83,9 +83,10 @@ class Bars:
     on, a line stands after every tenth of a bar.
     """
 
-    def __init__(self, console: Console | None = None) -> None:
-        """Show nothing yet."""
+    def __init__(self, console: Console | None = None, *, shown: bool | None = True) -> None:
+        """Show nothing yet, or never where it is not to be `shown`; None is where it is watched."""
         self._console = console or Console(stderr=True)
+        self._is_shown = is_watched() if shown is None else shown
         self._progress = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -104,6 +105,8 @@ class Bars:
         if title not in self._start_s:
             # What ends first began before: with the others, or when the bar before was full.
             self._start_s[title] = self._opened_s
+        if not self._is_shown:
+            return
         left = left_text(completed, total, self.elapsed_s(title)) if completed < total else ""
         said = "  ".join(filter(None, (note.strip(), left)))
         if not self._console.is_terminal:
@@ -127,7 +130,8 @@ class Bars:
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
-        self._console.print(text)
+        if self._is_shown:
+            self._console.print(text)
 
     def elapsed_s(self, title: str) -> float:
         """Return the seconds since the work of a bar began."""
@@ -146,9 +150,9 @@ class Bars:
 class Counter(Bars):
     """A bar that counts things called `unit`, with their rate."""
 
-    def __init__(self, title: str, total: int, unit: str) -> None:
+    def __init__(self, title: str, total: int, unit: str, *, shown: bool | None = True) -> None:
         """Count up to `total`."""
-        super().__init__()
+        super().__init__(shown=shown)
         self._title, self._total, self._unit = title, total, unit
         self._count = 0
 
@@ -162,9 +166,9 @@ class Counter(Bars):
 class TrainingBars(Bars):
     """A bar per network with return and share of crashes, and its regret when it is finished."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, shown: bool | None = True) -> None:
         """Show nothing yet."""
-        super().__init__()
+        super().__init__(shown=shown)
         self._regret: dict[str, str] = {}
 
     def progressed(self, now: TrainingProgress) -> None:

@@ -84,29 +84,31 @@ def travels(spec: str) -> bool:
     return not any(name.encode() in content for name in MAINS)
 
 
-def drivers_of(vut: Any, pov: Any, workers: int) -> tuple[str, str | None, int]:
-    """Return the specs of what drives, and how many workers can have it.
+def drivers_of(
+    vut: Any, pov: Any, workers: int | None, *, stacklevel: int = 3
+) -> tuple[str, str | None, int | None]:
+    """Return the specs of what drives, and how many workers can have it; None is one a core.
 
     Says in a sentence where something drives in this process that could do it harm.
     """
-    workers = workers_or_cores(workers)
+    count = workers_or_cores(workers)
     specs = spec_of(vut), None if pov is None else spec_of(pov)
     for spec in specs:
         if spec is None or object_of(spec) is None:
             continue
         name = spec.partition(":")[2]
         if travels(spec):
-            where = "the processes of the workers" if workers > 1 else "this process"
+            where = "the processes of the workers" if count > 1 else "this process"
             why = f"{name} is an object, so it drives in {where}, which what it does wrong may end"
         else:
-            alone = ", and without workers," if workers > 1 else ""
+            alone = ", and without workers," if count > 1 else ""
             workers = 1
             why = (
                 f"{name} is known to this process alone, so it drives here{alone} where what it "
                 "does wrong may end everything; put its class or function into a module for a "
                 "process of its own"
             )
-        warnings.warn(why, stacklevel=3)
+        warnings.warn(why, stacklevel=stacklevel)
     return *specs, workers
 
 

@@ -1,0 +1,134 @@
+"""Values that a shell completes: VUTs, levels, samplers, scenarios, criteria and run folders.
+
+A shell asks for them in a process of its own; nothing is imported before it asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+LEVELS: Final = (("0", "keeps its speed"), ("1", "learned"), ("2", "learned, with psi"))
+RUNS: Final = "runs"
+"""Folder in which campaigns are, unless a person says otherwise."""
+MOST_RUNS: Final = 50
+
+Completions = list[tuple[str, str]]
+"""Values with a help text each, which may be empty."""
+
+
+def _beginning(incomplete: str, values: Iterable[tuple[str, str]]) -> Completions:
+    return [(value, about) for value, about in values if value.startswith(incomplete)]
+
+
+def vuts(incomplete: str) -> Completions:
+    """Return the VUTs by name, the kinds of one's own, and Python files in the folder."""
+    from merge_sumo.drivers.vut import KINDS, built_in_vuts
+    from merge_sumo.drivers.vuts.python import installed_vuts
+
+    kinds = [(kind.form.partition(":")[0], kind.what) for kind in KINDS.values()]
+    if ":" in incomplete:
+        return _beginning(incomplete, _names_in(incomplete.rpartition(":")[0]))
+    named = [(name, "built in") for name in built_in_vuts()]
+    named += [(name, "installed") for name in installed_vuts()]
+    named += [(name if name == "traci" else f"{name}:", what) for name, what in kinds]
+    return _beginning(incomplete, [*named, *_files(incomplete, (".py",), ":")])
+
+
+def _names_in(source: str) -> Completions:
+    """Return the classes and functions of a Python file that may be a VUT; it is not run."""
+    import ast
+
+    path = Path(source)
+    if path.suffix != ".py" or not path.is_file():
+        return []
+    try:
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+    except (OSError, ValueError, SyntaxError):
+        return []
+    kinds = ast.ClassDef, ast.FunctionDef
+    names = [node.name for node in body if isinstance(node, kinds) and node.name[:1] != "_"]
+    return [(f"{source}:{name}", "") for name in names]
+
+
+def _files(incomplete: str, suffixes: tuple[str, ...], behind: str = "") -> Completions:
+    """Return the files of the folder that a text points into, and its folders."""
+    typed = Path(incomplete)
+    folder = typed if incomplete.endswith("/") else typed.parent
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError:
+        return []
+    shown = [entry for entry in entries if not entry.name.startswith(".")]
+    files = [(f"{e}{behind}", "") for e in shown if e.suffix in suffixes and e.is_file()]
+    return files + [(f"{e}/", "") for e in shown if e.is_dir() and str(e).startswith(incomplete)]
+
+
+def levels(incomplete: str) -> Completions:
+    """Return the POV levels, and all of them."""
+    return [*one_level(incomplete), *_beginning(incomplete, [("all", "every level")])]
+
+
+def one_level(incomplete: str) -> Completions:
+    """Return the POV levels."""
+    return _beginning(incomplete, [*LEVELS, ("own", "a POV of your own: --pov")])
+
+
+def samplers(incomplete: str) -> Completions:
+    """Return the samplers; after a comma those that are not named yet."""
+    from merge_sumo.samplers.registry import SAMPLERS
+
+    before = incomplete.rpartition(",")[0]
+    front, named = (f"{before},", before.split(",")) if before else ("", [])
+    return _beginning(
+        incomplete, [(f"{front}{name}", "") for name in SAMPLERS if name not in named]
+    )
+
+
+def scenarios(incomplete: str) -> Completions:
+    """Return the shipped scenarios, and TOML files."""
+    from merge_sumo.scenarios.scenario_file import shipped_scenarios
+
+    shipped = [(name, "shipped") for name in shipped_scenarios()]
+    return _beginning(incomplete, [*shipped, *_files(incomplete, (".toml",))])
+
+
+def criteria(incomplete: str) -> Completions:
+    """Return the names of criteria."""
+    from merge_sumo.values.criterion import NAMED
+
+    return _beginning(incomplete, [(name, "") for name in NAMED])
+
+
+def gates(incomplete: str) -> Completions:
+    """Return what a gate may be."""
+    known = (
+        ("failures", "a case fails"),
+        ("errors", "a case errs"),
+        ("timeouts", "a case never ends"),
+    )
+    return _beginning(incomplete, [*known, ("fmc>", "coverage of failures above a number")])
+
+
+def networks(incomplete: str) -> Completions:
+    """Return the learned networks."""
+    from merge_sumo.drivers.policies import NETWORKS
+
+    return _beginning(incomplete, [(name, "") for name in NETWORKS])
+
+
+def runs(incomplete: str) -> Completions:
+    """Return the folders of campaigns in `runs`, the newest first, and other folders."""
+    from merge_sumo.campaigns.run import SETTINGS
+
+    found = []
+    for settings in Path(RUNS).glob(f"*/{SETTINGS}"):
+        try:
+            found.append((settings.stat().st_mtime, str(settings.parent)))
+        except OSError:
+            continue
+    newest = [(folder, "campaign") for _, folder in sorted(found, reverse=True)[:MOST_RUNS]]
+    known = {f"{folder}/" for folder, _ in newest}
+    others = [entry for entry in _files(incomplete, ()) if entry[0] not in known]
+    return _beginning(incomplete, [*newest, *others])
