@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +23,8 @@ from merge_sumo.commands import (
 from merge_sumo.commands.shared import app, say
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.limits import check_limits, exhausted
+from merge_sumo.system.streams import prepare_streams
 
 __all__ = ["app", "campaign", "cases", "certify", "experiments", "main", "probability"]
 __all__ += ["histories", "runs", "scenarios", "training", "vuts"]
@@ -53,20 +54,25 @@ def _check_here() -> None:
 def main() -> None:
     """Run the command line; a `UserError` becomes one sentence and exit code 2.
 
-    What a signal stopped ends with 128 + its number.
+    So does an error of the system that has run out of something. What a signal stopped ends with
+    128 + its number.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            # No name of a file ends a command because a terminal has no such letter.
-            stream.reconfigure(errors="backslashreplace")
+    prepare_streams()
     try:
         _check_here()
+        check_limits()
         app()
     except UserError as error:
         say(f"merge-sumo: {error}")
         sys.exit(2)
     except Stopped as stopped:
         sys.exit(stopped.exit_code)
+    except (OSError, MemoryError, RuntimeError) as error:
+        sentence = exhausted(error)
+        if sentence is None:
+            raise
+        say(f"merge-sumo: {sentence}")
+        sys.exit(2)
 
 
 if __name__ == "__main__":

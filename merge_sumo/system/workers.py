@@ -32,6 +32,7 @@ from numbers import Integral
 from typing import Any, Final, Generic, Self, TypeVar
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.limits import check_threads
 from merge_sumo.system.spawning import forget_safe_path, without_cwd, without_main
 
 MAX_CHUNK: Final = 500
@@ -40,6 +41,10 @@ RECYCLE_AFTER: Final = 200
 """Chunks after which a worker process is replaced by a new one: a VUT may leak memory."""
 MAX_DEATHS: Final = 2
 """An item that ends so many workers on its own is not tried again."""
+POOL_THREADS: Final = 4
+"""Threads and processes that a pool takes, besides its workers."""
+WORKER_THREADS: Final = 4
+"""Those of a worker and of the process of a VUT, besides one for each core in NumPy."""
 DASK_TIMEOUT_S: Final = 30.0
 LOADED: Final = "merge_sumo.campaigns.ground"
 """What a local worker is there for: loaded before it is asked to, and by its name alone."""
@@ -222,6 +227,7 @@ def open_workers(workers: int | None = None, dask: str | None = None) -> Workers
     count = workers_or_cores(workers)
     if count == 1:
         return Workers(InProcess, 1)
+    check_threads(POOL_THREADS + count * ((os.cpu_count() or 1) + WORKER_THREADS))
     return Workers(lambda: LocalProcesses(count), count, recycle_after=RECYCLE_AFTER)
 
 

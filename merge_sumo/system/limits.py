@@ -1,0 +1,85 @@
+"""Limits of the system on which a command fails: found before it runs, or named when it does."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from typing import Final
+
+from merge_sumo.errors import UserError
+
+ADDRESS_SPACE_GIB: Final = 2.0
+"""Below this SUMO, or the libraries of linear algebra, end the process without a word."""
+OWN_THREADS: Final = 6
+"""Of the command itself: a bar that is drawn, what a program prints, the cases that run ahead."""
+MOST_TRIED: Final = 512
+"""More threads are not tried: that would take longer than a person may notice."""
+EXHAUSTED: Final = {
+    errno.EMFILE: "too many files are open: raise the limit (`ulimit -n`)",
+    errno.ENFILE: "too many files are open in the whole system: close some of its programs",
+    errno.EAGAIN: "the system starts no more processes or threads: raise the limit (`ulimit -u`)",
+    errno.ENOMEM: "the memory is full: take fewer --workers, or raise the limit (`ulimit -v`)",
+    errno.EFBIG: "a file would be larger than the limit allows: raise it (`ulimit -f`)",
+    errno.ENOSPC: "the disk is full: make room, or take another folder with --out and TMPDIR",
+    errno.EDQUOT: "the quota of the disk is used up: make room, or take another folder",
+    errno.EROFS: "the disk is read-only: take another folder with --out and TMPDIR",
+    errno.EIO: "a disk or a terminal failed: try it again",
+}
+"""What to do where the system refuses more, by its error."""
+
+
+def check_limits() -> None:
+    """Raise `UserError` where this process may not have the threads or the memory that it takes.
+
+    OpenBLAS starts a thread for each core when NumPy is imported, and ends the process where that
+    fails.
+    """
+    _check_address_space()
+    check_threads((os.cpu_count() or 1) + OWN_THREADS)
+
+
+def check_threads(count: int) -> None:
+    """Raise `UserError` where the system does not let this user have so many more threads.
+
+    Processes count as threads. What multiprocessing starts waits for ever where one of its threads
+    cannot be started, so that this has to be known before.
+    """
+    end = threading.Event()
+    started: list[threading.Thread] = []
+    try:
+        for _ in range(min(count, MOST_TRIED)):
+            thread = threading.Thread(target=end.wait, daemon=True)
+            thread.start()
+            started.append(thread)
+    except RuntimeError as error:
+        raise UserError(EXHAUSTED[errno.EAGAIN]) from error
+    finally:
+        end.set()
+        for thread in started:
+            thread.join()
+
+
+def _check_address_space() -> None:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if most != resource.RLIM_INFINITY and most < ADDRESS_SPACE_GIB * 2**30:
+        raise UserError(
+            f"the limit of address space (`ulimit -v`) is {most / 2**30:.2g} GiB: it takes "
+            f"{ADDRESS_SPACE_GIB:g} GiB or more"
+        )
+
+
+def exhausted(error: BaseException) -> str | None:
+    """Return what to do about an error of the system that is no fault of the program, or None."""
+    if isinstance(error, OSError) and error.errno in EXHAUSTED:
+        where = f"{error.filename}: " if isinstance(error.filename, str) else ""
+        return where + EXHAUSTED[error.errno]
+    if isinstance(error, MemoryError):
+        return EXHAUSTED[errno.ENOMEM]
+    if isinstance(error, RuntimeError) and str(error) == "can't start new thread":
+        return EXHAUSTED[errno.EAGAIN]
+    return None
