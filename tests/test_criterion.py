@@ -28,7 +28,7 @@ from merge_sumo.values import score
 from merge_sumo.values.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, VOCABULARY, Criterion
-from merge_sumo.values.expression import MOST_MARGIN, parse_condition
+from merge_sumo.values.expression import MOST_CHARACTERS, MOST_MARGIN, parse_condition
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import FAILURE_SCORE, Outcome, measure, score_of
 from merge_sumo.values.trajectory import End, Trajectory
@@ -166,6 +166,21 @@ class TestRefused:
         with pytest.raises(UserError, match=r"^--fail-when") as error:
             Criterion(text)
         assert said in str(error.value)
+
+    @pytest.mark.parametrize("name", ["paper", "contact", "unsafe"])
+    def test_a_named_criterion_has_no_value(self, name):
+        with pytest.raises(UserError, match=f": {name} is a criterion, which is met or not"):
+            Criterion(f"{name} < 1")
+
+    def test_the_length_is_that_of_what_a_person_typed(self):
+        longest = " or ".join(["ttc_s<1e9"] * 76) + " or ttc_s<1"
+        longest += " " * (MOST_CHARACTERS - len(longest))
+        read = Criterion(longest)
+        assert len(read.fail_when) > MOST_CHARACTERS
+        assert Criterion(read.fail_when) == read
+        assert of(read.fail_when, ending(10.0, 20.0)) is not None
+        with pytest.raises(UserError, match="--fail-when has 1001 characters: 1000 are the most"):
+            Criterion(f"{longest} ")
 
     def test_nesting_as_deep_as_it_may_be_is_read(self):
         assert of("not " * 240 + "ttc_s < 1", ending(20.0)) == MOST_MARGIN

@@ -56,8 +56,8 @@ class TestAFile:
             ("x_pov_m = [-340, -180]", "has no 'x_pov_m': did you mean x_pov0_m"),
             ("v_vut0_mps = 99", "v_vut0_mps is 99.0: choose between 0 and 45"),
             ("v_vut0_mps = nan", "v_vut0_mps is nan: it must be finite"),
-            ("a_min_mps2 = 3", "a_min_mps2 is 3.0: choose below 0"),
-            ("timeout_s = 1e9", "timeout_s is 1000000000.0: choose up to 120"),
+            ("a_min_mps2 = 3", "a_min_mps2 is 3.0: choose -20 to 0"),
+            ("timeout_s = 1e9", "timeout_s is 1000000000.0: choose 0.1 to 120"),
             ("dx_crash_m = 20", "dx_crash_m is 20.0: choose up to dx_critical_m"),
             ('mainline = "e1 e2"', "mainline is 'e1 e2': it must be edges"),
             ("name = 3", "name is 3: it must be a text"),
@@ -70,6 +70,14 @@ class TestAFile:
             read_scenario(path)
         assert said in str(refused.value)
         assert str(refused.value).startswith(f"{path}, line 3: ")
+
+    @pytest.mark.parametrize("field", [f for f in fields(Scenario) if "str" not in f.type])
+    @pytest.mark.parametrize("number", ["1e200", "-1e200", "1" + "0" * 400, "1e5"])
+    def test_beyond_a_road_and_its_cars_is_refused_with_a_range(self, tmp_path, field, number):
+        value = f"[{number}, {number}]" if field.type.startswith("Bounds") else number
+        (tmp_path / "far.toml").write_text(f"{field.name} = {value}\n")
+        with pytest.raises(UserError, match=rf"{field.name} is .*: (choose|it must be finite)"):
+            read_scenario(tmp_path / "far.toml")
 
     @pytest.mark.parametrize(
         ("content", "said"),

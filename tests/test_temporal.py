@@ -16,7 +16,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.expression import MOST_MARGIN
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.temporal import NEVER_S, SIGNALS, check_formula, signals
+from merge_sumo.values.temporal import NEVER_S, SIGNALS, check_formula, robustness, signals
 from merge_sumo.values.trajectory import End, Trajectory
 
 NEAR = "always ((x_vut_m > -20) implies (bumper_gap_m > 2))"
@@ -86,6 +86,41 @@ class TestFormulas:
     def test_that_are_none_are_refused(self, text):
         with pytest.raises(UserError, match="no formula of signal temporal logic"):
             Criterion(require=text).check(US23)
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "always (v_vut_mps - prev v_vut_mps > -5)",
+            "always (v_vut_mps - (prev v_vut_mps) > -5)",
+            "always ((prev v_vut_mps) - (prev v_vut_mps) > 0)",
+            "eventually ((prev v_vut_mps) - (prev v_vut_mps) > 0)",
+            "always (next v_vut_mps - next v_vut_mps > 0)",
+            f"always (x_vut_m * {'9' * 320} > 1)",
+            f"always ((x_vut_m - x_vut_m) * {'9' * 320} > 1)",
+        ],
+    )
+    def test_that_calculate_with_infinity_are_refused(self, rtamt, text):
+        with pytest.raises(UserError, match="calculates with infinity"):
+            Criterion(require=text).check(US23)
+
+    def test_that_overflow_in_an_episode_stop_it_with_a_sentence(self, rtamt):
+        many = " * ".join(["v_vut_mps", *["9" * 100] * 3])
+        text = f"always ({many} * {'9' * 7} > 1)"
+        Criterion(require=text).check(US23)
+        fast = np.array([[[-40.0, 30.0, 0.0], [-20.0, 45.0, 0.0]], [[8.0, 20.0, 0.0]] * 2])
+        with pytest.raises(UserError, match="calculates with infinity"):
+            robustness(text, Trajectory(CASE, fast, End.MERGED))
+
+    @pytest.mark.parametrize(
+        ("text", "margin"),
+        [
+            ("always[20:30] (v_vut_mps > 2)", MOST_MARGIN),
+            ("eventually[20:30] (v_vut_mps > 2)", -MOST_MARGIN),
+        ],
+    )
+    def test_over_a_time_behind_the_end_hold_for_no_step(self, rtamt, text, margin):
+        motion = np.array([[[-40.0, 30.0, 0.0], [-20.0, 20.0, 0.0]], [[8.0, 20.0, 0.0]] * 2])
+        assert robustness(text, Trajectory(CASE, motion, End.MERGED)) == margin
 
     def test_go_without_a_condition(self):
         with pytest.raises(UserError, match="choose one"):

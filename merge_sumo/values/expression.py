@@ -30,6 +30,8 @@ LEAST_MARGIN: Final = 1e-9
 """Margins are finite and never 0, so that their sign says whether a condition is met."""
 MOST_CHARACTERS: Final = 1000
 """Of an expression: what a parser that is not ours may be given."""
+MOST_WRITTEN: Final = 20 * MOST_CHARACTERS
+"""Of one as Python writes it, with its spaces, brackets and digits: records have it so."""
 
 Vocabulary = Mapping[str, Set[str] | None]
 """The values that there are by name: the texts that one may have, None for a number."""
@@ -143,13 +145,17 @@ def parse_condition(
     Raises `UserError` where it is none.
     """
     shown = printable(text[:80]) + ("..." if len(text) > 80 else "")
-    if len(text) > MOST_CHARACTERS:
-        raise UserError(f"{what} has {len(text)} characters: {MOST_CHARACTERS} are the most")
+    too_long = UserError(f"{what} has {len(text)} characters: {MOST_CHARACTERS} are the most")
+    if len(text) > MOST_WRITTEN:
+        raise too_long
     try:
         with warnings.catch_warnings(action="ignore"):  # "1.5or" is odd, and means what it says
             tree = ast.parse(text.lstrip(), mode="eval").body
+        written = ast.unparse(tree)
+        if len(text) > MOST_CHARACTERS and text != written:
+            raise too_long
         parser = _Parser(text, vocabulary, f"{what} {shown!r}", named)
-        return parser.condition(tree), ast.unparse(tree)
+        return parser.condition(tree), written
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         raise UserError(
             f"{what} {shown!r} is no expression over measures such as "
@@ -254,6 +260,12 @@ class _Parser:
         match node:
             case ast.Name(id=name) if name in self._vocabulary:
                 return name
+            case ast.Name(id=name) if name in self._named:
+                raise self._error(
+                    node,
+                    f"{name} is a criterion, which is met or not: write it alone, or compare a "
+                    "measure",
+                )
             case ast.Name(id=name):
                 raise self._unquoted(node, name, other) or self._unknown(node, name)
             case ast.Constant(value=str(text)):

@@ -8,6 +8,7 @@ only words and signs of our own get to it.
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from functools import lru_cache
@@ -36,6 +37,8 @@ WORDS: Final = (
     *("always", "eventually", "until", "historically", "once", "since", "not", "and", "or"),
     *("implies", "iff", "xor", "rise", "fall", "prev", "next", "abs"),
 )
+FINITE: Final = ("Addition", "Subtraction", "Multiplication", "Abs", "Constant", "Predicate")
+"""Parts of a formula that have numbers, by rtamt's names; infinite, they would decide by chance."""
 _TOKEN: Final = re.compile(r"\s+|[A-Za-z_]\w*|(?:\d+\.?\d*|\.\d+)(?!\w)|<=|>=|->|[-+*<>()\[\]:,]")
 _BOUNDS: Final = re.compile(r"\[([^\]]*)\]")
 _NUMBER: Final = re.compile(r"\d+\.?\d*|\.\d+")
@@ -88,6 +91,8 @@ def try_formula(text: str) -> None:
                 *LAST_PYTHON
             )
         raise UserError(f"--require needs rtamt: {how}") from error
+    except UserError:
+        raise
     # A parser that is not ours.
     except Exception as error:
         raise UserError(
@@ -125,7 +130,18 @@ def _robustness(text: str, values: dict[str, FloatArray]) -> float:
     steps = len(values[SIGNALS[0]])
     time_s = [round(step * DT_S, 1) for step in range(steps)]
     data = {"time": time_s, **{name: of.tolist() for name, of in values.items()}}
-    return float(_specification(text).evaluate(data)[0][1])
+    specification = _specification(text)
+    found = float(specification.evaluate(data)[0][1])
+    # A minimum or a maximum over time hides what is no number, so that every part is looked at; an
+    # operator with bounds in time appends infinities to its part.
+    for node, part in specification.ast.offline_results.items():
+        if type(node).__name__ in FINITE and not all(map(math.isfinite, part[:steps])):
+            raise UserError(
+                f"--require {printable(text[:80])!r} calculates with infinity: prev and next are "
+                "infinite where no step is, so put them around a comparison, not into it; and "
+                "write no number that large"
+            )
+    return found
 
 
 @lru_cache(maxsize=8)

@@ -19,7 +19,7 @@ import numpy as np
 
 from merge_sumo.drivers.base import Scene
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario import RANGES, US23, Scenario
 
 
 class About(IntEnum):
@@ -114,11 +114,6 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
     return b"".join(parts)
 
 
-ANYTHING: Final = 1e9
-TINY_M: Final = 1e-9
-"""Bounds that no start reaches: cases were checked where they were made."""
-
-
 @lru_cache(maxsize=8)
 def _any_scenario(
     x_vut0_m: float,
@@ -129,7 +124,10 @@ def _any_scenario(
     *,
     in_traffic: bool,
 ) -> Scenario:
-    """Return a scenario with what a VUT is told of its own; of the rest it is told nothing."""
+    """Return a scenario with what a VUT is told of its own; of the rest it is told nothing.
+
+    Its bounds are the widest: cases were checked where they were made.
+    """
     headways_s = (1.0, 2.0) if in_traffic else None
     return replace(
         US23,
@@ -140,9 +138,9 @@ def _any_scenario(
         a_max_mps2=a_max_mps2,
         headway_ahead_s=headways_s,
         headway_behind_s=headways_s,
-        pov_length_m=TINY_M,
-        reach_m=ANYTHING,
-        v_start_max_mps=ANYTHING,
+        pov_length_m=RANGES["pov_length_m"][0],
+        reach_m=RANGES["reach_m"][1],
+        v_start_max_mps=RANGES["v_start_max_mps"][1],
     )
 
 
