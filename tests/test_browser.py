@@ -149,19 +149,39 @@ def test_pages_without_a_script_open_without_a_complaint_and_fit_the_window(
             assert width <= page.viewport_size["width"]
 
 
-def test_a_merge_that_asks_too_much_of_others_is_no_harmless_dot(browser, made):
-    safe = [o for o in made.outcomes if o.is_tested and not o.failed]
-    asking = [o for o in safe if o.measures.severity in ("contact", "harsh")]
-    assert asking
+def test_marks_filters_and_table_know_the_four_words(browser, made):
+    classed = {
+        word: sorted(o.index for o in made.outcomes if o.measures.severity == word)
+        for word in ("contact", "conflict", "harsh", "safe")
+    }
+    assert sum(map(bool, classed.values())) >= 3
     with shown(browser, made.folder / report.REPORT) as page:
-        assert page.locator(".map .mark.harsh").count() == len(asking)
-        assert page.locator(".map .mark.safe").count() == len(safe) - len(asking)
-        assert page.locator(".legend .mark.harsh").count() == 1
+        for word, indices in classed.items():
+            marks = page.locator(f".map .mark.{word}")
+            drawn = marks.evaluate_all("all => all.map((m) => m.dataset.case)")
+            assert sorted(map(int, drawn)) == indices
+            chip = page.locator(f".legend [data-filter=severity][data-value={word}]")
+            assert chip.inner_text().split() == [word, str(len(indices))]
+            if indices:
+                chip.click()
+                assert page.evaluate("location.hash").endswith(f"severity={word}")
+                assert bright(page) == all_rows(page) == indices
+                assert set(column(page, "severity")) == {word}
+                chip.click()
+        fails = page.locator(".map .mark.fail").evaluate_all(
+            "all => all.map((m) => m.dataset.case)"
+        )
+        assert sorted(map(int, fails)) == sorted(o.index for o in failures(made.outcomes))
+        page.locator("#table th button", has_text="severity").click()
+        words = [word for word in column(page, "severity") if word]
+        order = list(classed)
+        assert words == sorted(words, key=order.index), "the most severe first"
 
 
 def test_it_starts_with_the_worst_case(page, made):
     assert chosen(page) == failures(made.outcomes)[0].index
-    assert "Collision" in page.inner_text("#case-words")
+    worst = failures(made.outcomes)[0].measures.severity
+    assert page.inner_text("#case-words").lower().startswith(worst)
 
 
 def test_the_slider_shows_the_cases_near_a_psi(page, made):
@@ -275,10 +295,10 @@ def test_all_cases_sort_and_open(browser, made, size):
         assert len(rows(page)) == 100
         page.locator("#more").click()
         assert sorted(rows(page)) == [o.index for o in made.outcomes]
-        by_gap = page.locator("#table th button", has_text="gap at M")
+        by_gap = page.locator("#table th button", has_text="Δx at M")
         for way, order in (("ascending", 1), ("descending", -1)):
             by_gap.click()
-            assert page.locator(f"#table th[aria-sort={way}]").inner_text().startswith("gap at M")
+            assert page.locator(f"#table th[aria-sort={way}]").inner_text().startswith("Δx at M")
             told = [o for o in made.outcomes if o.measures.dx_m is not None]
             told.sort(key=lambda o: (order * round(o.measures.dx_m, 2), o.index))
             assert rows(page) == [o.index for o in told[:100]]
@@ -313,7 +333,7 @@ def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser
         assert set(column(page, "kind")) == {kind}
         filters.locator(".reset").click()
         page.locator("#matching:text('180 of 180')").wait_for()
-        filters.locator("[name=measure]").select_option(label="gap at M m")
+        filters.locator("[name=measure]").select_option(label="Δx at M m")
         filters.locator("[name=from]").fill("-8")
         filters.locator("[name=to]").fill("-6")
         inside = [o.index for o in made.outcomes if -8 <= round(o.measures.dx_m or 0, 2) <= -6]
@@ -479,7 +499,8 @@ def test_two_cases_are_compared(browser, made, size):
         page.locator(f".list [data-case='{second}']").click()
         assert chosen(page) == second
         assert page.inner_text("#beside-title").startswith(f"Case {first} ")
-        assert "Collision" in page.inner_text("#beside-words")
+        word = made.outcome(first).measures.severity
+        assert page.inner_text("#beside-words").lower().startswith(word)
         if size[0] < 1000:
             assert page.locator("#case").evaluate("(panel) => panel.matches('.docked')")
         page.evaluate("dock(true)")

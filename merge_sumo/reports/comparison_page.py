@@ -155,11 +155,15 @@ def _maps(compared: RunComparison) -> dict[int, object]:
 def _shown(case: ComparedCase, runs: Mapping[str, Run], motions: Motions) -> Shown:
     known = {case.run: _recorded(runs[case.run], case.index)}
     known["B" if case.run == "A" else "A"] = motions.get((case.run, case.index))
-    ends = {"A": (case.end_a, case.score_a), "B": (case.end_b, case.score_b)}
+    ends = {
+        "A": (case.end_a, case.severity_a, case.score_a),
+        "B": (case.end_b, case.severity_b, case.score_b),
+    }
     both = [motion for motion in known.values() if motion is not None]
     sides = []
-    for name, (end, score) in ends.items():
-        how = "not run" if end is None else end.value.replace("_", " ")
+    for name, (end, severity, score) in ends.items():
+        how = "not run" if end is None else end.value.replace("_", " ").lower()
+        how += "" if severity is None else f", {severity}"
         how += "" if score is None else f", score {score:.0f}".replace("-", "−")
         motion = known[name]
         sides.append(Side(name, how, [] if motion is None else _charts(motion, both)))

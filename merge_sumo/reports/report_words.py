@@ -26,6 +26,7 @@ from merge_sumo.system.printable import printable
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
+from merge_sumo.values.severity import meanings
 
 
 def page_words(facts: Facts) -> dict[str, Any]:
@@ -85,6 +86,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         ),
         "kinds": _kinds(facts),
         "braked": f"{BRAKED_MPS:g}",
+        "severities": meanings(rule.crash_m),
         "scenario": facts.run.scenario,
         "criterion": None if criterion.is_papers else criterion.words,
         "traffic": facts.run.scenario.vehicles > 2,

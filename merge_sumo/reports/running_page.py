@@ -21,6 +21,7 @@ from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
+from merge_sumo.values.severity import Severity
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -92,6 +93,7 @@ def running_page(progress: CampaignProgress, folder: Path, *, stopped: bool = Fa
         phases=list(Phase),
         maps=_maps(progress),
         worst=progress.worst,
+        severities=list(Severity),
         level_name=level_name,
     )
 
@@ -107,7 +109,9 @@ def _maps(progress: CampaignProgress) -> dict[int, StaticMap]:
 
 
 def _mark(outcome: Outcome) -> str:
-    return "fail" if outcome.failed else "safe" if outcome.is_tested else "error"
+    """Return the CSS classes of a mark: the severity, and whether the case fails."""
+    kind = outcome.measures.severity or ("unclassed" if outcome.failed else "error")
+    return f"{kind} fail" if outcome.failed else kind
 
 
 @cache

@@ -8,7 +8,6 @@ counts as a failure is another question (`criterion.py`).
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Final
 
 from merge_sumo.values.merge import HARSH_MPS2
 from merge_sumo.values.trajectory import End
@@ -23,13 +22,14 @@ class Severity(StrEnum):
     SAFE = "safe"
 
 
-MEANING: Final[dict[Severity, str]] = {
-    Severity.CONTACT: "bodies touch before, at or right after M",
-    Severity.CONFLICT: "front bumpers within 6 m at M, no contact",
-    Severity.HARSH: f"the rear car must brake harder than {HARSH_MPS2:g} m/s² after M",
-    Severity.SAFE: "none of these",
-}
-"""What the words mean, at the paper's 6 m (`Scenario.dx_crash_m`)."""
+def meanings(crash_m: float) -> dict[Severity, str]:
+    """Return what the words mean, at a scenario's distance of a conflict (`dx_crash_m`)."""
+    return {
+        Severity.CONTACT: "bodies touch before, at or right after M",
+        Severity.CONFLICT: f"front bumpers within {crash_m:g} m at M, no contact",
+        Severity.HARSH: f"the rear car must brake harder than {HARSH_MPS2:g} m/s² after M",
+        Severity.SAFE: "none of these",
+    }
 
 
 def severity_of(

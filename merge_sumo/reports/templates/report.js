@@ -49,7 +49,15 @@ function avoidedBy(i, who) { // a driver, "pov" or "none"
 }
 const tested = (i) => failed(i) || data.ends[cases.end[i]] === "MERGED";
 const severity = (i) => cases.severity[i] === null ? null : data.severities[cases.severity[i]];
-const isSevere = (i) => severity(i) !== null && severity(i) !== "safe"; // contact, conflict or harsh
+function drawMark(parent, i, x, y, faint) { // shape and colour by severity; what fails is large
+  const found = severity(i), large = failed(i);
+  const look = { class: `mark ${found ?? (large ? "unclassed" : "error")}${large ? " fail" : ""}${faint}`, "data-case": cases.index[i] };
+  const r = large ? 5 : 3.4;
+  if (found === "contact" || found === "conflict" || (found === null && large)) return draw(parent, "path", { ...look, d: `M${x} ${y - r}l${r} ${r}l${-r} ${r}l${-r} ${-r}Z` });
+  if (found === null) return draw(parent, "rect", { ...look, x: x - 3, y: y - 3, width: 6, height: 6 });
+  return draw(parent, "circle", { ...look, cx: x, cy: y, r: large ? 4.2 : found === "safe" ? 2.4 : 3.2 });
+}
+const rank = (i) => cases.severity[i] ?? data.severities.length; // the most severe lie on top
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
 function title(i) {
@@ -165,7 +173,7 @@ function FailureMap(figure) {
     axes = of.pairs[pair].axes.map((k) => coordinates[k]);
     const [across, up] = axes;
     marks = own.map((i) => ({ i, x: X(unit(across, cases[across.field][i])), y: Y(unit(up, cases[up.field][i])) }))
-      .sort((a, b) => failed(a.i) - failed(b.i));
+      .sort((a, b) => failed(a.i) - failed(b.i) || rank(b.i) - rank(a.i));
   };
   this.level = level;
   this.draw = () => {
@@ -200,9 +208,7 @@ function FailureMap(figure) {
     for (const { i, x, y } of marks) {
       if (!framed(x, y)) continue;
       const faint = near(i) && wanted(i) ? "" : " faint";
-      if (failed(i)) draw(svg, "path", { class: `mark fail${faint}`, d: `M${x} ${y - 5}l5 5l-5 5l-5 -5Z`, "data-case": cases.index[i] });
-      else if (!tested(i)) draw(svg, "rect", { class: `mark error${faint}`, x: x - 3, y: y - 3, width: 6, height: 6, "data-case": cases.index[i] });
-      else draw(svg, "circle", { class: `mark ${isSevere(i) ? "harsh" : "safe"}${faint}`, cx: x, cy: y, r: 2.4, "data-case": cases.index[i] });
+      drawMark(svg, i, x, y, faint);
     }
     const most = figure.querySelector(".most");
     if (most) most.textContent = chance ? `${Math.round(100 * chance.most)} %` : "–";
@@ -393,7 +399,7 @@ function openCase(i, element = null) { // asked for by the reader: it is in sigh
 }
 
 /* ---------- the address: #case-111&verdict=failure ---------- */
-const form = byId("filters"), FILTERS = ["box", "level", "verdict", "region", "kind", "avoided", "measure", "from", "to"];
+const form = byId("filters"), FILTERS = ["box", "level", "verdict", "severity", "region", "kind", "avoided", "measure", "from", "to"];
 let opened = -1; // the case that the reader asked for
 function filtersSet() { // [name, value] of what is not as it was
   const bounded = form.elements.from.value !== "" || form.elements.to.value !== "";
@@ -627,18 +633,21 @@ for (const table of document.querySelectorAll(".list")) {
 const verdict = (i) => (failed(i) ? "failure" : tested(i) ? "no failure" : data.ends[cases.end[i]]);
 function allCases() { // gives what shows the cases that the filters let through
   const head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
-  const { box, level, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where nobody was asked
+  const { box, level, severity: severe, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where nobody was asked
   const number = (key, name, digits) => ({ name, exact: true, value: (i) => cases[key][i], text: (value) => fixed(value, digits) });
+  const kindOf = (i) => (cases.kind[i] === null ? null : data.kinds[cases.kind[i]]);
   const columns = [
     { name: "case", exact: true, value: (i) => cases.index[i] },
     { name: "level", value: (i) => cases.level[i], text: (value) => data.level_names[value] },
     { name: "verdict", words: true, value: verdict, text: (value, i) => (tested(i) || !data.errors[cases.index[i]] ? value : `${value}: ${data.errors[cases.index[i]]}`) },
-    { name: "kind", words: true, value: (i) => (cases.kind[i] === null ? null : data.kinds[cases.kind[i]]) },
+    { name: "severity", words: true, value: severity, order: rank },
+    { name: "kind", words: true, value: kindOf },
     { name: "region", value: (i) => cases.region[i], text: (value) => String(value + 1) },
     ...coordinates.map((c) => number(c.field, `${c.name}${c.unit === "rad" ? "" : ` ${c.unit}`}`, c.digits)),
     number("score", "score", 0), ...(cases.margin ? [number("margin", "margin", 2)] : []),
     number("dx", "Δx at M m", 1), number("dv", "dv m/s", 1), number("ttc", "TTC s", 1), number("pet", "PET s", 1),
     number("vut_brake", "VUT brakes m/s\u00b2", 1), number("pov_brake", "POV brakes m/s\u00b2", 1), number("t_end", "time s", 1),
+    number("clearance", "clearance m", 1), number("bumper_gap", "bumper gap at M m", 1), number("impact", "impact m/s", 1), number("brake_after", "braking asked after M m/s\u00b2", 1),
   ];
   const all = cases.index.map((_, i) => i), PART = 100;
   let by = columns.find(({ name }) => name === "score"), way = 1, found = all, rows = 0;
@@ -657,8 +666,10 @@ function allCases() { // gives what shows the cases that the filters let through
   const ordered = [...count(where)].map(([value, n]) => [value.split(":").map(Number), value, n]);
   ordered.sort(([a], [b]) => a[0] - b[0] || a[1] - b[1]);
   for (const [[l, r], value, n] of ordered) option(region, value, `level ${data.level_names[l]}, region ${r + 1} (${n})`);
-  for (const [value, n] of count(columns[3].value)) option(kind, value, `${value} (${n})`);
-  for (const [n, c] of columns.entries()) if (n > 4) option(measure, c.name);
+  for (const [value, n] of count(kindOf)) option(kind, value, `${value} (${n})`);
+  const severities = count(severity);
+  for (const value of data.severities) if (severities.has(value)) option(severe, value, `${value} (${severities.get(value)})`);
+  for (const c of columns) if (c.exact && c.name !== "case") option(measure, c.name);
   for (const [n, { level: l, cases: inside }] of data.boxes.entries()) option(box, n, `level ${data.level_names[l]}, ${n + 1} (${inside.length})`);
   box.parentElement.hidden = !data.boxes.length;
   const boxes = data.boxes.map(({ cases: inside }) => new Set(inside));
@@ -693,7 +704,7 @@ function allCases() { // gives what shows the cases that the filters let through
     const inside = box.value === "" ? null : boxes[box.value];
     found = all.filter((i) => (!level.value || cases.level[i] === Number(level.value))
       && (!ended.value || verdict(i) === ended.value || `: ${message(i)}` === ended.value)
-      && (!region.value || where(i) === region.value) && (!kind.value || columns[3].value(i) === kind.value)
+      && (!severe.value || severity(i) === severe.value) && (!region.value || where(i) === region.value) && (!kind.value || kindOf(i) === kind.value)
       && (!avoided?.value || avoidedBy(i, avoided.value)) && (!inside || inside.has(cases.index[i]))
       && (!bounded || (measured(i) !== null && measured(i) >= low && measured(i) <= high)));
     matching = filtersSet().length ? new Set(found) : null;
@@ -706,7 +717,7 @@ function allCases() { // gives what shows the cases that the filters let through
   };
   const list = () => {
     found.sort((a, b) => { // what has no value is last, whichever way
-      const [x, y] = [by.value(a), by.value(b)];
+      const [x, y] = [a, b].map((i) => (by.value(i) === null ? null : (by.order ?? by.value)(i)));
       return (x === null) - (y === null) || (x < y ? -way : x > y ? way : a - b);
     });
     for (const [n, cell] of [...head.cells].entries()) {
