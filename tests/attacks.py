@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,9 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-
-from merge_sumo.system.resources import cache_folder
-from merge_sumo.system.trust import KEY
 
 MARK = "MERGE_SUMO_ATTACK"
 """Environment variable by which the processes of a world are found."""
@@ -47,11 +43,6 @@ class World:
     @property
     def cache(self) -> Path:
         return self.root / "cache"
-
-    def take_key(self) -> None:
-        """Copy the key by which this user's campaigns are known, and no truth."""
-        self.cache.mkdir(exist_ok=True)
-        shutil.copy(cache_folder() / KEY, self.cache)
 
     def start(self, *arguments: object, script: str | None = None) -> subprocess.Popen[str]:
         """Start our command, or a script, as a session of its own."""

@@ -8,10 +8,14 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
+from accounts import Account, second_account
 from foreign_nets import corridor_of
 
 from merge_sumo import cli
@@ -101,6 +105,27 @@ def command_line(monkeypatch, capfd):
         return int(end.value.code or 0), *capfd.readouterr()
 
     return main
+
+
+@pytest.fixture(scope="session")
+def other_account() -> Iterator[Account]:
+    """Make a second account of this machine, and remove it in the end."""
+    if os.geteuid() != 0:
+        pytest.skip("a second account needs root")
+    with ExitStack() as made:
+        try:
+            account = made.enter_context(second_account())
+        except OSError as error:
+            require(available=False, reason=str(error))
+        yield account
+
+
+@pytest.fixture
+def common() -> Iterator[Path]:
+    """Return a folder that everybody on this machine can write."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o777)
+        yield Path(folder).resolve()
 
 
 @pytest.fixture

@@ -36,6 +36,7 @@ from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report import REPORT
+from merge_sumo.system.signature import signed, user_key
 from merge_sumo.values.scenario import US23
 
 FLIPS = 300
@@ -352,6 +353,10 @@ def true(tmp_path_factory) -> tuple[Truth, bytes]:
     return ground_truth(plan_for("design1"), 0, CASES, cache=folder), KEPT.path(folder).read_bytes()
 
 
+def of_this_user(content: bytes) -> bytes:
+    return signed(content, KEPT.path(Path()).stem, user_key())
+
+
 class TestACache:
     def assert_not_believed(self, content: bytes, folder: Path) -> None:
         path = KEPT.path(folder)
@@ -361,12 +366,26 @@ class TestACache:
 
     @pytest.mark.parametrize("name", SPOILT)
     def test_that_is_spoilt_is_not_believed(self, name, tmp_path):
-        self.assert_not_believed(SPOILT[name], tmp_path)
+        self.assert_not_believed(of_this_user(SPOILT[name]), tmp_path)
 
     def test_as_these_would_be_believed_is_what_the_test_spoils(self, tmp_path):
         path = KEPT.path(tmp_path)
-        path.write_bytes(saved())
+        path.write_bytes(of_this_user(saved()))
         assert read_truth(path, 0, CASES, US23) is not None
+
+    @pytest.mark.parametrize("by", ["nobody", "another user", "this user for another truth"])
+    def test_with_no_failures_that_somebody_planted_runs_again(self, by, true, tmp_path):
+        """As a shared cache was overwritten with "no failures"."""
+        content = saved(points=true[0].points, score=np.full(CASES, -1.0))
+        if by == "another user":
+            content = signed(content, KEPT.path(tmp_path).stem, b"k" * 32)
+        elif by != "nobody":
+            content = signed(content, "truth-0123456789abcdef01234567", user_key())
+        KEPT.path(tmp_path).write_bytes(content)
+        assert len(true[0].failures)
+        again = ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path)
+        assert np.array_equal(again.score, true[0].score)
+        assert KEPT.path(tmp_path).read_bytes() == true[1]
 
     @pytest.mark.parametrize("bits", [100, pytest.param(400, marks=pytest.mark.long)])
     def test_with_any_bit_flipped_or_cut_off_anywhere_is_not_believed(self, true, tmp_path, bits):

@@ -38,7 +38,6 @@ COMPARE = (
 def world_with(run, root: Path, **changes) -> World:
     world = World(root, **changes)
     shutil.copytree(run.folder, root / "run")
-    world.take_key()
     return world
 
 

@@ -54,7 +54,6 @@ def world(run, tmp_path):
     shutil.copytree(run.folder, tmp_path / "run")
     (tmp_path / "own.py").write_text("class Vut:\n    def act(self, seen):\n        return 0.5\n")
     world = World(tmp_path)
-    world.take_key()
     return world
 
 

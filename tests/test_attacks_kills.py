@@ -161,7 +161,6 @@ def prepared(run, root: Path) -> World:
     world = World(root)
     shutil.copytree(run.folder, root / "run")
     (root / "thesis.txt").write_text("mine")
-    world.take_key()
     return world
 
 

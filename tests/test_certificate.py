@@ -5,6 +5,7 @@ checks one trusts nothing.
 from __future__ import annotations
 
 import hashlib
+import io
 import itertools
 import json
 import math
@@ -22,6 +23,7 @@ from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.system.signature import signed, user_key, verified
 from merge_sumo.values.scenario import US23
 
 ROAD = road_for(US23)
@@ -265,6 +267,57 @@ class TestACertificate:
             certify(settings(0), 0.1, folder, ROAD, planted())
         with pytest.raises(UserError, match="no certificate to go on with"):
             certify(settings(0), 0.1, tmp_path, ROAD, planted(), resume=True)
+
+
+class TestBlocksThatSomebodyPlanted:
+    """When a certificate goes on, only blocks that this user has run count."""
+
+    @pytest.fixture
+    def begun(self, tmp_path):
+        certify(settings(0), 0.1, tmp_path / "c", ROAD, planted(np.zeros((1, 2)), 0.2))
+        return tmp_path / "c"
+
+    def go_on(self, folder) -> int:
+        """Go on with a certificate; return how many cases ran that are not run twice anyway."""
+        counted: list[int] = []
+        run = planted(np.zeros((1, 2)), 0.2)
+        certify(settings(0), 0.1, folder, ROAD, run, resume=True, on_cases=counted.append)
+        return sum(counted[1:])
+
+    def test_those_of_this_user_do_not_run_again(self, begun):
+        before = (begun / CERTIFICATE).read_bytes()
+        assert self.go_on(begun) == 0
+        assert (begun / CERTIFICATE).read_bytes() == before
+
+    @pytest.mark.parametrize("how", ["unsigned", "of another user", "of another level"])
+    def test_others_run_again(self, begun, how):
+        path = begun / "level-0" / "00000.npz"
+        honest = path.read_bytes()
+        with np.load(path) as data:
+            block = dict(data)
+        assert block["failed"].any()
+        block["failed"][:] = False
+        block["score"][:] = -1.0
+        content = io.BytesIO()
+        np.savez(content, **block)
+        forged = content.getvalue()
+        if how == "of another user":
+            record = json.loads((begun / CERTIFICATE).read_text())
+            asked = {k: v for k, v in record.items() if k not in ("files", "found", "sha256")}
+            of = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+            what = f"block 0 of level 0 of the certificate {of}"
+            assert verified(honest, what, user_key()) is not None
+            forged = signed(forged, what, b"k" * 32)
+        elif how == "of another level":
+            forged = signed(forged, "block 0 of level 1 of another certificate", user_key())
+        path.write_bytes(forged)
+        assert self.go_on(begun) == 52
+        assert path.read_bytes() == honest
+        assert certified_failures(begun) > 0
+
+
+def certified_failures(folder) -> int:
+    return json.loads((folder / CERTIFICATE).read_text())["found"]["levels"]["0"]["failures"]
 
 
 class TestWhoChecksOne:

@@ -17,7 +17,6 @@ lattice's code (`covering.py`).
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -26,8 +25,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from merge_sumo.campaigns.certificate_blocks import Blocks, block_key
 from merge_sumo.campaigns.certificate_runs import CaseResult, RunPoints
 from merge_sumo.campaigns.covering import Covering, covering
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
@@ -36,7 +35,7 @@ from merge_sumo.campaigns.truth import OnCases, sources_sha256
 from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
+from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
 from merge_sumo.system.printable import two_digits
 from merge_sumo.values.case import FloatArray
@@ -131,11 +130,12 @@ def certify(
         files = dict(settings.vut_factory.files or {})
         with new_folder(folder) as new:
             (new / CERTIFICATE).write_bytes(_text(asked | {"files": files, "found": None}))
+    places = _places(folder, asked, lattices)
     for level, lattice in lattices.items():
-        place = _place(folder, level)
-        check_own(place)
-        make_place(place)
-        missing = [n for n in range(_blocks(lattice)) if _read(place, n, lattice) is None]
+        place = places[level]
+        check_own(place.folder)
+        make_place(place.folder)
+        missing = [n for n in range(_count(lattice)) if place.read(n, _size(lattice, n)) is None]
         if on_cases is not None:
             on_cases(len(lattice) - sum(_size(lattice, n) for n in missing))
         known = len(files)
@@ -143,11 +143,11 @@ def certify(
             if len(files) > known:
                 known = len(files)
                 replace_own(folder / CERTIFICATE, _text(asked | {"files": files, "found": None}))
-            replace_own(_block_file(place, number), block)
+            place.write(number, block)
             check()
     found = {}
     for level, lattice in lattices.items():
-        place, dims = _place(folder, level), settings.scenario.dimensions(level)
+        place, dims = places[level], settings.scenario.dimensions(level)
         twice = _twice(place, lattice, partial(run, level))
         found[level] = _found(place, lattice, dims, twice)
         check()
@@ -224,8 +224,8 @@ def _tested(
     run: Callable[[FloatArray], Iterable[tuple[int, CaseResult]]],
     files: Files,
     on_cases: OnCases | None,
-) -> Iterable[tuple[int, bytes]]:
-    """Yield blocks, (number, file), as their last cases end; add to the files of the VUT."""
+) -> Iterable[tuple[int, list[CaseResult]]]:
+    """Yield blocks, (number, results), as their last cases end; add to the files of the VUT."""
     if not missing:
         return
     points = np.concatenate([_points(lattice, number) for number in missing])
@@ -241,36 +241,11 @@ def _tested(
             del open_blocks[nth]
             if on_cases is not None:
                 on_cases(len(block))
-            yield missing[nth], _packed([block[k] for k in range(len(block))])
-
-
-def _packed(block: Sequence[CaseResult]) -> bytes:
-    arrays = io.BytesIO()
-    np.savez(
-        arrays,
-        case=np.array([done.case for done in block], dtype="<f8"),
-        score=np.array([done.score for done in block], dtype="<f8"),
-        failed=np.array([done.failed for done in block], dtype=np.bool_),
-        told=np.array([done.told for done in block], dtype=np.bool_),
-    )
-    return arrays.getvalue()
-
-
-def _read(place: Path, number: int, lattice: Covering) -> dict[str, NDArray[Any]] | None:
-    """Return a block; None where it is not there, or is not what was written."""
-    try:
-        block = read_arrays(_block_file(place, number), "case", "score", "failed", "told")
-    except UNREADABLE_NPZ:
-        return None
-    size = _size(lattice, number)
-    shapes = {"case": (size, len(lattice.steps)), "score": (size,), "failed": (size,)}
-    types = {"case": "<f8", "score": "<f8", "failed": "|b1", "told": "|b1"}
-    fits = all(block[name].shape == shapes.get(name, (size,)) for name in types)
-    return block if fits and all(block[n].dtype == kind for n, kind in types.items()) else None
+            yield missing[nth], [block[k] for k in range(len(block))]
 
 
 def _twice(
-    place: Path, lattice: Covering, run: Callable[[FloatArray], Iterable[tuple[int, CaseResult]]]
+    place: Blocks, lattice: Covering, run: Callable[[FloatArray], Iterable[tuple[int, CaseResult]]]
 ) -> list[bool]:
     """Run some cases of a level once more, the last ones first; return which end as before."""
     count = min(TWICE, -(-len(lattice) // 4))
@@ -279,7 +254,7 @@ def _twice(
     same = [False] * count
     for nth, done in run(points):
         block, row = divmod(numbers[nth], BLOCK)
-        was = _read(place, block, lattice)
+        was = place.read(block, _size(lattice, block))
         verdict = np.array([*done.case, done.score, done.failed, done.told])
         same[nth] = was is not None and np.array_equal(
             verdict,
@@ -290,15 +265,15 @@ def _twice(
 
 
 def _found(
-    place: Path, lattice: Covering, dims: Sequence[Dimension], twice: Sequence[bool]
+    place: Blocks, lattice: Covering, dims: Sequence[Dimension], twice: Sequence[bool]
 ) -> Found:
     """Read the blocks of a level, one after the other."""
     sha256, failures, untold = hashlib.sha256(), 0, 0
     worst: list[tuple[float, list[float]]] = []
-    for number in range(_blocks(lattice)):
-        block = _read(place, number, lattice)
+    for number in range(_count(lattice)):
+        block = place.read(number, _size(lattice, number))
         if block is None:
-            raise UserError(f"{_block_file(place, number)} is not as it was written: resume")
+            raise UserError(f"{place.file(number)} is not as it was written: resume")
         for name in ("case", "score", "failed", "told"):
             sha256.update(block[name].tobytes())
         failed = block["failed"]
@@ -353,15 +328,24 @@ def _text(record: dict[str, Any]) -> bytes:
     return (json.dumps({**record, "sha256": sha256}, indent=2, allow_nan=False) + "\n").encode()
 
 
-def _place(folder: Path, level: int) -> Path:
-    return folder / f"level-{level_name(level)}"
+def _places(
+    folder: Path, asked: Mapping[str, Any], lattices: Mapping[int, Covering]
+) -> dict[int, Blocks]:
+    """Return where the blocks of each level are, and what they are signed as."""
+    of = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+    key = block_key()
+    return {
+        level: Blocks(
+            folder / f"level-{level_name(level)}",
+            len(lattice.steps),
+            f"level {level_name(level)} of the certificate {of}",
+            key,
+        )
+        for level, lattice in lattices.items()
+    }
 
 
-def _block_file(place: Path, number: int) -> Path:
-    return place / f"{number:05d}.npz"
-
-
-def _blocks(lattice: Covering) -> int:
+def _count(lattice: Covering) -> int:
     return -(-len(lattice) // BLOCK)
 
 

@@ -19,6 +19,7 @@ from merge_sumo.campaigns.ground import (
 )
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.learning import lessons
+from merge_sumo.campaigns.ownership import FILES
 from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.run import SETTINGS, Run, spread_failures
 from merge_sumo.campaigns.settings import (
@@ -28,7 +29,7 @@ from merge_sumo.campaigns.settings import (
     settings_of,
 )
 from merge_sumo.campaigns.software import differences
-from merge_sumo.drivers.vuts.files import Files, sha256_of
+from merge_sumo.drivers.vuts.files import Files
 from merge_sumo.drivers.vuts.output import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
@@ -37,7 +38,7 @@ from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
-from merge_sumo.system.trust import SEAL, seal
+from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.workers import Workers, open_workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, FloatArray
@@ -48,9 +49,8 @@ EXPORTED_FAILURES: Final = 10
 SCENARIOS: Final = "scenarios"
 FORCED: Final = "forced"
 """Key of `campaign.json`: what differed where a campaign went on with --force."""
-
-FILES: Final = ("vut_files", "pov_files")
-"""Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
+SEAL: Final = "seal"
+"""Key of `campaign.json` in folders of version 0.1; it means nothing any more."""
 
 OnCase = Callable[[Outcome], None]
 """Told of every case as it ends, in the order in which cases end."""
@@ -119,9 +119,8 @@ def run_campaign(
     with workers_or_here(workers) as there:
         run = runs_on(there, _plan(settings, net, folder))
         record = record_of(settings, net)
-        sealed = {**record, SEAL: seal(record)}
-        with Journal.create(folder, sealed) as journal:
-            return _go_on(settings, sealed, net, journal, run, None, on_case, check)
+        with Journal.create(folder, record) as journal:
+            return _go_on(settings, record, net, journal, run, None, on_case, check)
 
 
 def resume_campaign(
@@ -188,12 +187,13 @@ def resume_campaign(
         if dropped:
             warn(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
         run = runs_on(there, _plan(settings, net, folder))
-        record[SEAL] = seal(record)
         if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
             record[FORCED] = [*_forced(before), *([forced] if changes else [])]
         if changes or moved or grown:
             journal.rewrite_settings(record)
+        else:
+            journal.note_own(record)
         told = on_before or on_case
         if told is not None:
             for outcome in before.outcomes:

@@ -18,6 +18,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
+from merge_sumo.campaigns.ownership import note_run
 from merge_sumo.campaigns.run import (
     CHECKSUM,
     OUTCOMES,
@@ -31,6 +32,7 @@ from merge_sumo.campaigns.run import (
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_folder
 from merge_sumo.system.printable import quoted
+from merge_sumo.system.trust import begun_here
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -45,9 +47,13 @@ class Journal:
     The folder appears whole or not at all, and what was appended once stays.
     """
 
-    def __init__(self, folder: Path, outcomes: io.FileIO) -> None:
-        """Take the folder and its open outcomes; use `create` or `reopen`."""
+    def __init__(self, folder: Path, outcomes: io.FileIO, *, begun: bool) -> None:
+        """Take the folder and its open outcomes; use `create` or `reopen`.
+
+        `begun` is whether this user began the campaign there.
+        """
         self.folder = folder
+        self._begun = begun
         self._outcomes = outcomes
         self._threads = ThreadPoolExecutor(MOST_SYNCS)
         _lock(outcomes, folder)
@@ -58,7 +64,8 @@ class Journal:
         with new_folder(folder) as new:
             (new / TRAJECTORIES).mkdir()
             _write(new / SETTINGS, _settings_text(settings))
-            journal = cls(folder, (new / OUTCOMES).open("wb", buffering=0))
+            journal = cls(folder, (new / OUTCOMES).open("wb", buffering=0), begun=True)
+            note_run(new, folder, settings, begun=True)  # before a kill can leave the folder alone
             sync_folder(new)
         return journal
 
@@ -81,7 +88,7 @@ class Journal:
                 ) from error
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
         try:
-            journal = cls(folder, outcomes)
+            journal = cls(folder, outcomes, begun=begun_here(folder, SETTINGS))
             run = Run(folder)
             whole = run.outcomes[: run.whole_batches()]
             dropped = len(run.outcomes) - len(whole) + run.torn
@@ -126,6 +133,11 @@ class Journal:
     def rewrite_settings(self, settings: dict[str, Any]) -> None:
         """Put other settings in the place of those that were there, all or nothing."""
         replace_own(self.folder / SETTINGS, _settings_text(settings))
+        self.note_own(settings)
+
+    def note_own(self, settings: dict[str, Any]) -> None:
+        """Remember that this user runs the code that the settings name, from this folder."""
+        note_run(self.folder, self.folder, settings, begun=self._begun)
 
     def __enter__(self) -> Self:
         """Return the journal."""

@@ -12,17 +12,17 @@ import numpy as np
 
 from merge_sumo.campaigns.convergence import StoppingRule
 from merge_sumo.campaigns.learning import hashes, lessons
+from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.software import versions
 from merge_sumo.drivers.policies import how_to_train, policies_in, policies_of
 from merge_sumo.drivers.povs import POLICIES, Povs, own_pov
-from merge_sumo.drivers.vut import VutFactory, runs_code, vut_factory
+from merge_sumo.drivers.vut import VutFactory, vut_factory
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.system.trust import is_own
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import (
@@ -287,9 +287,9 @@ def settings_of(
     it.
     """
     record = {**recorded, **(given or {})}
-    if not (trust or is_own(recorded)):
-        _check_strangers(folder, record, given or {})
     _check_begun_here(folder, record, given or {})
+    if not trust:
+        check_own_code(folder, recorded, given or {})
     hints = get_type_hints(CampaignSettings)
     values: dict[str, Any] = {}
     for spec in fields(CampaignSettings):
@@ -305,18 +305,6 @@ def settings_of(
     if values["policies"] is not None and "policies" not in (given or {}):
         _check_still_there(folder, values["policies"])
     return CampaignSettings(**values)
-
-
-def _check_strangers(folder: Path, record: Mapping[str, Any], given: Mapping[str, object]) -> None:
-    """Raise `UserError` where a record has code run that nobody here has named."""
-    vut, command, pov = (record.get(name) for name in ("vut", "vut_command", "pov"))
-    vut_named = ("vut" if command is None else "vut_command") in given
-    for spec, started, named in ((vut, command, vut_named), (pov, None, "pov" in given)):
-        if spec is not None and not named and runs_code(str(spec), started):
-            raise UserError(
-                f"{folder} was not made here, and to go on is to run the controller that it names, "
-                f"{started or spec}: say --trust-vut if you trust it"
-            )
 
 
 def _check_begun_here(folder: Path, record: Mapping[str, Any], given: Mapping[str, object]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -21,9 +22,10 @@ from merge_sumo.campaigns.software import versions
 from merge_sumo.drivers.vut import runs_code
 from merge_sumo.drivers.vuts.files import Files, changed
 from merge_sumo.errors import UserError
-from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.system.resources import cache_folder
+from merge_sumo.system.signature import CACHE, signed, user_key, verified
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.criterion import Criterion
@@ -35,6 +37,8 @@ TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
 DENSE_CASES: Final = 1_000_000
 """Uniform cases of a dense truth: of what the paper's number of them has missed, it shows most."""
+MOST_FILES_BYTES: Final = 1 << 26
+"""Of a truth, besides its numbers: names and hashes of files."""
 PROGRESS_CASES: Final = 100
 """Cases after which a person is told."""
 REAL_REGION: Final = 0.03
@@ -114,7 +118,10 @@ def ground_truth(
     The cache's key is a hash of what was asked for and of what is ours to know: VUT, cases, seed,
     criterion, net, policies, versions, and the sources that decide outcomes. What the VUT itself
     loaded while it drove is kept with the truth, and a truth is only used while those files are the
-    same. Cases run on `workers`, by default in this process.
+    same. It is signed: what somebody else has put into the cache is not believed. Cases run on
+    `workers`, by default in this process.
+
+    Raises `UserError` where nothing can be kept in the cache, or others can write it.
     """
     count = TRUTH_CASES[level] if cases is None else cases
     for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
@@ -126,8 +133,9 @@ def ground_truth(
     found = read_truth(path, level, count, scenario)
     if found is not None:
         return found
-    check_place(path.parent, "MERGE_SUMO_CACHE")
+    check_place(path.parent, CACHE)
     check_own(path)
+    key = user_key()
     points = np.random.default_rng([seed, level]).random((count, len(scenario.dimensions(level))))
     scores = np.full(count, np.nan)
     files = (plan.vut.files or {}) | plan.povs.files
@@ -149,8 +157,8 @@ def ground_truth(
         files=json.dumps(files),
         of=path.stem,
     )
-    make_place(path.parent, "MERGE_SUMO_CACHE")
-    replace_own(path, arrays.getvalue())
+    make_place(path.parent, CACHE)
+    replace_own(path, signed(arrays.getvalue(), path.stem, key))
     return truth
 
 
@@ -224,23 +232,39 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
     """Return what a file of the cache holds.
 
     None where there is none, or it is torn or something else, such as another truth under this
-    name, or a file that the VUT loaded is not what it was.
+    name, it was not signed by this user, or a file that the VUT loaded is not what it was.
     """
+    dims = len(scenario.dimensions(level))
     try:
-        data = read_arrays(path, "points", "score", "files", "of")
+        content = _signed_content(path, most_bytes=8 * cases * (dims + 1) + MOST_FILES_BYTES)
+        if content is None:
+            return None
+        data = read_arrays(io.BytesIO(content), "points", "score", "files", "of")
         points, score, files = data["points"], data["score"], json.loads(str(data["files"]))
         if str(data["of"]) != path.stem or not isinstance(files, dict) or changed(files):
             return None
     except UNREADABLE_NPZ:
         return None
-    shape = cases, len(scenario.dimensions(level))
-    fits = points.shape == shape and score.shape == (cases,)
+    fits = points.shape == (cases, dims) and score.shape == (cases,)
     numbers = points.dtype == score.dtype == np.float64
     if not (fits and numbers):
         return None
     inside = bool(((points >= 0.0) & (points <= 1.0)).all())
     scores = not (np.isinf(score) | (score > 0.0)).any()
     return Truth(points, score) if inside and scores else None
+
+
+def _signed_content(path: Path, most_bytes: int) -> bytes | None:
+    """Return what a file of the cache holds; None where this user has not signed it.
+
+    Raises OSError where there is no file that can be read, or a giant one.
+    """
+    if regular(path).stat().st_size > most_bytes:
+        raise OSError(errno.EFBIG, "it is no truth, but a giant file", str(path))
+    try:
+        return verified(path.read_bytes(), path.stem, user_key())
+    except UserError:  # without a key of this user's nothing in a cache can be known
+        return None
 
 
 def _scores(

@@ -100,7 +100,7 @@ TrustOption = Annotated[
     bool,
     typer.Option(
         "--trust-vut",
-        help="Run the controller that a folder names although the folder was not made here.",
+        help="Run the controller that a folder names although it is not known to be yours.",
     ),
 ]
 ScenarioOption = Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import struct
 import tokenize
 import zipfile
@@ -21,13 +22,13 @@ UNREADABLE_NPZ: Final = (
 """What numpy raises when a file is not the archive of arrays that it should be."""
 
 
-def read_arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
+def read_arrays(file: Path | io.BytesIO, *names: str) -> dict[str, NDArray[Any]]:
     """Return the arrays of an .npz file of ours, or those that are named.
 
     Raises one of `UNREADABLE_NPZ` where there is none, or what is there is something else: ours are
     not compressed, so that no file is more than it looks.
     """
-    with np.load(regular(path), allow_pickle=False) as data:
+    with np.load(regular(file) if isinstance(file, Path) else file, allow_pickle=False) as data:
         if any(member.compress_type != zipfile.ZIP_STORED for member in data.zip.infolist()):
             raise ValueError("it is compressed")
         return {name: data[name] for name in names or data.files}

@@ -203,16 +203,29 @@ def new_file(path: Path, option: str = "--out", mode: int = 0o666) -> Iterator[B
         with _temporary(path, mode) as (new, file):
             yield file
             file.flush()
-            path.touch(mode, exist_ok=False)  # the name is ours: a rename replaces anything
-            try:
-                new.replace(path)
-            except BaseException:
-                path.unlink(missing_ok=True)
-                raise
+            _name_file(new, path, mode)
     except FileExistsError as error:
         raise _exists(path, option) from error
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+def _name_file(new: Path, path: Path, mode: int) -> None:
+    """Give a file a name that is free, in one step where the file system has hard links.
+
+    Raises FileExistsError where the name is taken.
+    """
+    try:
+        os.link(new, path, follow_symlinks=False)
+    except FileExistsError:
+        raise
+    except (OSError, NotImplementedError):
+        path.touch(mode, exist_ok=False)  # the name is ours: a rename replaces anything
+        try:
+            new.replace(path)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager

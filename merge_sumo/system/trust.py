@@ -1,55 +1,204 @@
-"""Whose folder a campaign is: one of this user's own, or one that somebody sent.
+"""Whose code the folder of a campaign names: this user's own, or that of who sent the folder.
 
 The folder of a campaign names its controller: a file, a module, a command. Going on with a campaign
 runs it. In a folder of the user's own that is what is wanted; in one that was received it would be
-code of a stranger. So a campaign is sealed with a key that never leaves the user's cache folder.
+code of a stranger. So the cache keeps, signed with a key that never leaves it, from which folder
+this user ran which code: the folder by path and inode, the code by name, path and hash. A copy of
+a folder has another path or inode, and code that somebody changed has another hash.
+
+Who changes a controller of their own wants to run the changed one. That is taken for such a change
+where the campaign was begun here, its `campaign.json` is the very file that was written here (a
+copy or an archive that is unpacked over it makes another one, with another time of change, which
+nobody can set), and the changed file is the user's own, outside of the folder.
 """
 
 from __future__ import annotations
 
 import hashlib
-import hmac
 import json
-import secrets
+import os
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.folders import make_place, write_new
+from merge_sumo.system.folders import make_place, replace_own
+from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.resources import cache_folder
+from merge_sumo.system.signature import CACHE, others_can_write, signed, user_key, verified
 
-SEAL: Final = "seal"
-"""Key of `campaign.json`."""
-KEY: Final = "key"
-KEY_BYTES: Final = 32
-
-
-def seal(settings: Mapping[str, Any]) -> str | None:
-    """Return the seal of whose code a campaign's settings run; None where no key can be kept."""
-    key = _key(cache_folder() / KEY)
-    if key is None:
-        return None
-    named = [settings.get(name) for name in ("vut", "vut_command")]
-    if settings.get("pov") is not None:  # a folder without is sealed as it was before there were
-        named.append(settings["pov"])
-    return hmac.new(key, json.dumps(named).encode(), hashlib.sha256).hexdigest()
+RUNS: Final = "runs"
+"""Folder of the cache with a file for each folder from which this user ran code of their own."""
+MOST_BYTES: Final = 1 << 24
+"""Of such a file."""
 
 
-def is_own(settings: Mapping[str, Any]) -> bool:
-    """Return whether the settings of a campaign, as read from its folder, have our seal."""
-    ours, theirs = seal(settings), json.dumps(settings.get(SEAL))
-    return ours is not None and hmac.compare_digest(json.dumps(ours), theirs)
+@dataclass(frozen=True, slots=True)
+class Code:
+    """What is run from a folder.
+
+    Attributes:
+        named: what names it: the VUT, its command, the POV; None where there is none.
+        files: the files that it is known to be made of, by absolute path, with their SHA-256.
+        here: the working folder, in which relative names of it are looked for; empty where it has
+            none.
+    """
+
+    named: tuple[str | None, ...]
+    files: Mapping[str, str | None]
+    here: str
 
 
-def _key(path: Path) -> bytes | None:
-    """Return the user's key, made where there is none yet; None where that cannot be."""
-    with suppress(UserError):  # it is there, or was made by another process in between
-        make_place(path.parent, "MERGE_SUMO_CACHE")
-        write_new(path, secrets.token_bytes(KEY_BYTES), mode=0o600)
+@dataclass(frozen=True, slots=True)
+class _OwnRun:
+    """What the cache keeps of a folder.
+
+    Attributes:
+        folder: its real path.
+        inode: its inode. The device is left out: its number may change when a disk is mounted
+            again.
+        record: inode and time of change, ns, of the file in it that names the code.
+        begun: whether the campaign was begun there by this user, and not only gone on with.
+        code: what was run.
+    """
+
+    folder: str
+    inode: int
+    record: tuple[int, int]
+    begun: bool
+    code: Code
+
+
+def note_own(folder: Path, at: Path, record: str, code: Code, *, begun: bool) -> None:
+    """Remember that this user runs code from a folder that is, or is about to be, `at` a path.
+
+    Args:
+        folder: where it is now.
+        at: where it will be.
+        record: name of the file in it that names the code.
+        code: what is run.
+        begun: whether the campaign was begun there by this user.
+
+    Where nothing can be kept, nothing is: then a person is asked later on.
+    """
+    with suppress(UserError, OSError):
+        key, path = user_key(), _path(at)
+        identity = _identity(folder, record)
+        before = _known(at)
+        if before is not None and (before.inode, before.code.named) == (identity[0], code.named):
+            # What was loaded before is of the code, too.
+            code = replace(code, files={**before.code.files, **code.files})
+        known = _OwnRun(os.path.realpath(at), *identity, begun, code)
+        make_place(path.parent, CACHE)
+        replace_own(path, signed(json.dumps(asdict(known)).encode(), _what(at), key))
+
+
+def begun_here(folder: Path, record: str) -> bool:
+    """Return whether this user began the campaign in a folder, and has written its record."""
     try:
-        key = path.read_bytes()
+        known = _known(folder)
+        inode, written = _identity(folder, record)
+    except (UserError, OSError):
+        return False
+    return known is not None and known.begun and (known.inode, known.record) == (inode, written)
+
+
+def doubt(folder: Path, record: str, code: Code) -> str | None:
+    """Return why code that a folder names may be a stranger's; None where it is this user's own.
+
+    The files of `code` do not count: what is known of them is what the cache says.
+    """
+    try:
+        known = _known(folder)
+        inode, written = _identity(folder, record)
+    except UserError as error:
+        return f"is not known to be yours ({error})"
+    except OSError as error:
+        return f"is not known to be yours ({error.strerror})"
+    if known is None:
+        return "was not made here, or was moved since"
+    return _doubt_of_place(known, inode, code) or _doubt_of_changes(known, written)
+
+
+def _doubt_of_place(known: _OwnRun, inode: int, code: Code) -> str | None:
+    if known.inode != inode:
+        return "is another folder than the one that you made under this name"
+    if known.code.named != code.named:
+        return "names another controller than when you made it"
+    if known.code.here != code.here:
+        return f"was begun in {known.code.here}, and here its controller may be another"
+    return None
+
+
+def _doubt_of_changes(known: _OwnRun, written: tuple[int, int]) -> str | None:
+    """Return why changed code may not be this user's own change; None where nothing has changed."""
+    changed = [name for name, sha256 in known.code.files.items() if _sha256(name) != sha256]
+    if not changed:
+        return None
+    if not known.begun:
+        return f"was not begun here, and {changed[0]} has changed since you ran it"
+    if known.record != written:
+        return f"was written by somebody else since you made it, and {changed[0]} has changed"
+    for name in changed:
+        if Path(name).is_relative_to(known.folder):
+            return f"holds {name}, which has changed since you ran it"
+        if not _is_ours(Path(name)):
+            return f"runs {name}, which has changed since you ran it, and others can write it"
+    return None
+
+
+def _known(folder: Path) -> _OwnRun | None:
+    """Return what the cache keeps of a folder; None where that is nothing of this user's."""
+    key, path = user_key(), _path(folder)
+    try:
+        if not path.is_file() or path.stat().st_size > MOST_BYTES:
+            return None
+        content = verified(path.read_bytes(), _what(folder), key)
     except OSError:
         return None
-    return key if len(key) == KEY_BYTES else None
+    if content is None:
+        return None
+    said = json.loads(content)  # our own words
+    code = said["code"]
+    return _OwnRun(
+        said["folder"],
+        said["inode"],
+        (said["record"][0], said["record"][1]),
+        said["begun"],
+        Code(tuple(code["named"]), code["files"], code["here"]),
+    )
+
+
+def _path(folder: Path) -> Path:
+    name = hashlib.sha256(os.fsencode(os.path.realpath(folder))).hexdigest()[:32]
+    return cache_folder() / RUNS / f"{name}.json"
+
+
+def _what(folder: Path) -> str:
+    return f"run {hashlib.sha256(os.fsencode(os.path.realpath(folder))).hexdigest()}"
+
+
+def _identity(folder: Path, record: str) -> tuple[int, tuple[int, int]]:
+    """Return the inode of a folder, and inode and time of change, ns, of a file in it."""
+    written = (folder / record).lstat()
+    return folder.stat().st_ino, (written.st_ino, written.st_ctime_ns)
+
+
+def _is_ours(path: Path) -> bool:
+    """Return whether nobody but this user, or root, can write a file; true where it is gone."""
+    try:
+        found = path.stat()
+    except OSError:
+        return True
+    if os.name != "posix":
+        return True
+    return found.st_uid in (0, os.geteuid()) and not others_can_write(found)
+
+
+def _sha256(name: str) -> str | None:
+    try:
+        return sha256_of(Path(name))
+    except ValueError:
+        return None

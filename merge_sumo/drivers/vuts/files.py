@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
-from functools import lru_cache
 from pathlib import Path
+
+from merge_sumo.system.hashing import sha256_of
 
 Files = dict[str, str | None]
 """SHA-256 by path, relative to the working folder where it lies below; None of a lost file."""
@@ -24,20 +24,3 @@ def hashed(paths: Iterable[Path]) -> Files:
 def changed(files: Files) -> list[str]:
     """Return the names of files that are not as they were when they were hashed."""
     return [name for name, sha256 in files.items() if sha256_of(Path(name)) != sha256]
-
-
-def sha256_of(path: Path) -> str | None:
-    """Return the SHA-256 of a regular file; None where there is none that can be read."""
-    try:
-        found = path.stat()
-        if not path.is_file():
-            return None
-        return _sha256(path.resolve(), found.st_mtime_ns, found.st_size)
-    except OSError:
-        return None
-
-
-@lru_cache(maxsize=4096)
-def _sha256(path: Path, _changed_ns: int, _size: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
