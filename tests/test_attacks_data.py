@@ -38,6 +38,7 @@ from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report import REPORT
 from merge_sumo.system.signature import signed, user_key
 from merge_sumo.values.scenario import US23
+from merge_sumo.values.severity import Severity
 
 FLIPS = 300
 SHOWN_SETTING = rb'<tr><th scope="row">[^\n]*</tr>\n'
@@ -547,7 +548,9 @@ class TestATextOfAStranger:
             header, *rows = csv.reader(file)
         assert all(name.replace("_", "").isalnum() for name in header)
         assert len(rows) > 40
-        assert all(math.isfinite(float(cell or 0)) for row in rows for cell in row), "numbers only"
+        assert header[-1] == "severity"
+        assert {row[-1] for row in rows} <= {"", *Severity}
+        assert all(math.isfinite(float(cell or 0)) for row in rows for cell in row[:-1])
         code, _, err = call(
             "export", folder, 7, "--format", "openscenario", "--out", tmp_path / "xosc"
         )

@@ -186,6 +186,7 @@ class TestATable:
         assert header == [
             *("case", "level", "time_s", "x_pov_m", "v_pov_mps", "a_pov_mps2"),
             *("x_vut_m", "v_vut_mps", "a_vut_mps2", "x_pov0_m", "v_pov0_mps", "svo_rad"),
+            "severity",
         ]
         motion = np.concatenate([made.trajectory(i).motion for i in (0, 3)])
         assert np.array_equal(
@@ -194,6 +195,7 @@ class TestATable:
         case = made.outcome(0).case
         assert [float(cell) for cell in rows[5][9:11]] == [case.x_pov0_m, case.v_pov0_mps]
         assert rows[5][11] == "", "level 0 has no psi"
+        assert {row[12] for row in rows} == {made.outcome(i).measures.severity for i in (0, 3)}
         assert {row[0] for row in rows} == {"0", "3"}
         assert float(rows[5][2]) == pytest.approx(5 * DT_S)
 

@@ -29,6 +29,8 @@ from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.values.trajectory import Trajectory
 
 TABLE: Final = "trajectories"
+SEVERITY: Final = "severity"
+"""Column with one of our words: no text of a stranger is in a table."""
 ROAD: Final = "road.xodr"
 _EPOCH: Final = datetime(2000, 1, 1)
 MINOR_VERSION: Final = 2
@@ -64,13 +66,13 @@ def write_sumo(run: Run, index: int, folder: Path, road: Corridor) -> Path:
 
 
 def columns_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the columns of a table: time and motion of all vehicles, then the case again."""
+    """Return the columns of a table: time and motion of all vehicles, the case, its severity."""
     motion = [
         f"{what}_{who}_{unit}"
         for who in VEHICLES[: scenario.vehicles]
         for what, unit in (("x", "m"), ("v", "mps"), ("a", "mps2"))
     ]
-    return ("case", "level", "time_s", *motion, *(c.field for c in coordinates(scenario)))
+    return ("case", "level", "time_s", *motion, *(c.field for c in coordinates(scenario)), SEVERITY)
 
 
 def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str) -> Path:
@@ -91,6 +93,7 @@ def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str
             content = io.BytesIO()
             numbers = dict.fromkeys(columns, polars.Float64)
             schema = numbers | dict.fromkeys(("case", "level"), polars.Int64)
+            schema[SEVERITY] = polars.String
             polars.DataFrame(rows, schema, orient="row").write_parquet(content)
             file.write(content.getbuffer())
         else:
@@ -103,15 +106,16 @@ def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str
     return path
 
 
-def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float | None, ...]]:
-    rows: list[tuple[float | None, ...]] = []
+def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float | str | None, ...]]:
+    rows: list[tuple[float | str | None, ...]] = []
     for index in indices:
         trajectory = run.trajectory(index)
         case = trajectory.case
         place = [c.of(case) for c in coordinates(run.scenario)]
+        severity = run.outcome(index).measures.severity
         motion = trajectory.motion.reshape(len(trajectory.motion), -1)
         for step, state in enumerate(motion.tolist()):
-            rows.append((index, case.level, round(step * DT_S, 1), *state, *place))
+            rows.append((index, case.level, round(step * DT_S, 1), *state, *place, severity))
     return rows
 
 
@@ -129,7 +133,8 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     """
     xosc = _need("scenariogeneration").xosc
     trajectory, name = run.trajectory(index), case_name(index)
-    recorded = _scenario(xosc, trajectory, road, name, f"{run.vut}, {name}", free=False)
+    title = f"{run.vut}, {name} ({run.outcome(index).measures.became})"
+    recorded = _scenario(xosc, trajectory, road, name, title, free=False)
     free = _scenario(xosc, trajectory, road, name, f"{run.vut}, {name}, free VUT", free=True)
     with new_folder(folder) as new:
         (new / ROAD).write_bytes(opendrive(road))

@@ -21,6 +21,7 @@ from merge_sumo.reports.comparison import check_comparable
 from merge_sumo.reports.diagnosis import Kind, diagnose
 from merge_sumo.reports.history_steps import Became, Step, step_between
 from merge_sumo.reports.in_lines import InLines
+from merge_sumo.reports.summary import severities_of
 from merge_sumo.reports.verdict import Verdict, in_words, judge
 from merge_sumo.values.case import to_unit
 from merge_sumo.values.fmc import fmc, regions
@@ -37,6 +38,7 @@ class LevelOfVersion:
         tested: those with a verdict.
         failures: those that failed.
         contacts: failures in which bodies touch.
+        severities: cases by severity, those that occur.
         errors: cases that ended in an error.
         timeouts: cases in which the VUT never reached the merge point.
         fmc: failure mode coverage in the level's unit cube; None where nothing was tested.
@@ -50,6 +52,7 @@ class LevelOfVersion:
     tested: int
     failures: int
     contacts: int
+    severities: dict[str, int]
     errors: int
     timeouts: int
     fmc: float | None
@@ -229,6 +232,7 @@ def _level(run: Run, level: int, known: dict[int, Avoidance]) -> LevelOfVersion:
         tested=tested,
         failures=found.failures,
         contacts=found.contacts,
+        severities=severities_of(outcomes),
         errors=found.errors,
         timeouts=found.timeouts,
         fmc=fmc(points) if tested else None,

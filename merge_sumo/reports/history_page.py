@@ -15,6 +15,7 @@ from merge_sumo.reports.history_steps import MEANING, Became
 from merge_sumo.reports.report import policy_hash
 from merge_sumo.system.folders import write_new
 from merge_sumo.values.scenario import level_name
+from merge_sumo.values.severity import Severity
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -154,6 +155,7 @@ def _table(history: History, level: int) -> list[tuple[str, list[str]]]:
         ("FMC", lambda one: "–" if one.fmc is None else f"{one.fmc:.4f}"),
         ("failures", lambda one: one.failures if one.tested else "–"),
         ("of these contacts", lambda one: one.contacts if one.tested else "–"),
+        *((f"{word} in all", partial(_of_severity, word)) for word in Severity),
         ("of tested cases", lambda one: one.tested),
     ]
     if any(one is not None and (one.errors or one.timeouts) for one in found):
@@ -168,6 +170,10 @@ def _table(history: History, level: int) -> list[tuple[str, list[str]]]:
     return [
         (name, ["" if one is None else str(value(one)) for one in found]) for name, value in rows
     ]
+
+
+def _of_severity(severity: Severity, one: LevelOfVersion) -> int | str:
+    return one.severities.get(severity, 0) if one.tested else "–"
 
 
 def _of_kind(kind: Kind, one: LevelOfVersion) -> int:
