@@ -1,328 +1,306 @@
-"""Reference drivers: published models of how a careful car avoids a collision, moved to a merge.
+"""Reference drivers: published models of a careful driver (`safety_models.py`), applied to a merge.
 
-The models are of rear-end conflicts: a car ahead cuts in, or brakes, and the one behind has to
-react. UN Regulation No. 157 covers cut-ins on a lane; the transposition to merging is ours, and no
-claim of compliance follows from it. It is the same for all of them:
+The models are of rear-end conflicts on one lane; UN Regulation No. 157 covers cut-ins there. The
+transposition to a merge is ours, and no claim of compliance follows from it.
 
-- The conflict is where the lanes meet. A driver foresees the two at M, the VUT on the scenario's
-  level-0 profile and the other at its speed. Whoever is ahead there has cut in, the other follows:
-  the gap is |dx| at M less `dx_crash_m`, the speeds are those at M.
-- A model says of gap and speeds how hard to brake; 0 is "no risk". It does so whether the VUT
-  would lead or follow: who merges must neither run into a car nor make one run into it.
-- Without risk the VUT drives the level-0 profile. A risk is perceived after the perception time;
-  then, for the reaction time, the VUT holds its speed; then it brakes as the model says, by its
-  jerk, and no harder than the scenario lets it. By eq. (4) a braking moves the vehicle one step
-  later: that step is the last of the reaction time. Who has reacted stays alert.
-- To give way is to fall behind. Where braking as hard as it can does not get the VUT behind the
-  other any more, it goes on.
+`RampDriver`, in the VUT's place, has to yield. It predicts the state at M in two ways, on the
+scenario's level-0 profile (P0) and at its present speed (P1; a standing VUT waits), and the other
+vehicle at its present speed. Whichever vehicle is behind at M is the rear one, the gap is |dx| less
+`dx_crash_m`, the speeds are those at M. A plan has a conflict where the gap is negative or unsafe
+under the model. The VUT can fall behind where braking at the limit, after what is left of its
+delay, stops it before M or brings it there at least `dx_crash_m` behind the other vehicle.
+
+1. Free: it takes the level-0 profile, until P0 has a conflict, the model says that it is time to
+   react (`is_due`), and the VUT is the rear vehicle or can fall behind.
+2. Delay: it goes on, or releases the pedal (the careful driver).
+3. From then on, in each step: it takes the level-0 profile where P0 has no conflict, holds its
+   speed where P1 has none, brakes as the model says for P1 where it is the rear vehicle in P1 or
+   can fall behind, and takes the level-0 profile where that is too late. The deceleration grows
+   from 0 by the model's jerk, and begins again at 0 after a step without braking.
+
+The drawn angle of the ramp means nothing, so the lateral conditions of the models became times to
+M. `tests/test_cut_in.py` compares the models with their published code, and the ramp driver with
+a table that was made by another implementation of the rules above.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
+from merge_sumo.drivers.safety_models import (
+    JERK_MPS3,
+    CarefulModel,
+    Flags,
+    FsmModel,
+    Reaction,
+    Reg157Model,
+    RssModel,
+    SafetyModel,
+    rss_distance_m,
+    ttc_s,
+)
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, US23
 
-JERK_MPS3: Final = 12.65
-"""UN R157, Annex 3, Appendix 3: the careful driver brakes harder by so much a second."""
-HARDEST_MPS2: Final = 0.774 * 9.81
-"""The same: as hard as this."""
+SLOWEST_MPS: Final = 1e-9
+"""A slower vehicle stands."""
 
 
-class ReferenceDriver(Level0Vut):
-    """Drives the level-0 profile, and gives way as a model says when it foresees a conflict at M.
+class Plan(NamedTuple):
+    """A prediction of the state at M, each array of shape (K,).
 
     Attributes:
-        perception_s: a risk is perceived after so long.
-        reaction_s: then the driver takes so long to brake.
-        jerk_mps3: braking grows by so much a second.
-        hardest_mps2: up to so much, positive, and never beyond the limit of the scenario.
+        t_s: time at which the VUT is at M; infinite where it never is.
+        gap_m: |dx| less `dx_crash_m`.
+        is_rear: whether the VUT is the rear vehicle.
+        v_rear_mps: speed of the rear vehicle.
+        v_front_mps: speed of the other one.
+        conflict: whether the gap is negative or unsafe under the model.
     """
 
-    perception_s: float = 0.0
-    reaction_s: float = 0.75
-    jerk_mps3: float = JERK_MPS3
-    hardest_mps2: float = HARDEST_MPS2
+    t_s: FloatArray
+    gap_m: FloatArray
+    is_rear: Flags
+    v_rear_mps: FloatArray
+    v_front_mps: FloatArray
+    conflict: Flags
+
+
+class RampDriver(Level0Vut):
+    """Takes the level-0 profile, and gives way when a model foresees a conflict at M.
+
+    Attributes:
+        model: the model.
+    """
+
+    model: SafetyModel
 
     def __init__(self, corridors: int) -> None:
         """Prepare for a number of corridors."""
         super().__init__(corridors)
-        self.limit_mps2 = np.full(corridors, min(-US23.a_min_mps2, self.hardest_mps2))
-        self.others_mps2 = np.full(corridors, -US23.a_min_mps2)
+        self.limit_mps2 = np.full(corridors, -US23.a_min_mps2)
         self.accel_mps2 = np.full(corridors, US23.a_max_mps2)
         self.crash_m = np.full(corridors, US23.dx_crash_m)
-        self._risk_steps = np.zeros(corridors, dtype=np.int64)
+        self._reacts = np.zeros(corridors, dtype=np.bool_)
+        """Whether the driver has left phase 1."""
+        self._delay_steps = np.zeros(corridors, dtype=np.int64)
+        """Steps of phase 2 that are left."""
+        self._conflict_steps = np.zeros(corridors, dtype=np.int64)
+        """Steps for which a conflict has been predicted without a break."""
         self._braking_mps2 = np.zeros(corridors)
 
     def begin(self, corridor: int, case: Case) -> None:
         """Forget; take the limits of the case's scenario."""
         super().begin(corridor, case)
-        self.limit_mps2[corridor] = min(-case.scenario.a_min_mps2, self.hardest_mps2)
-        self.others_mps2[corridor] = -case.scenario.a_min_mps2
+        hardest_mps2 = -case.scenario.a_min_mps2
+        self.limit_mps2[corridor] = min(hardest_mps2, self.model.hardest_mps2)
         self.accel_mps2[corridor] = case.scenario.a_max_mps2
         self.crash_m[corridor] = case.scenario.dx_crash_m
-        self._risk_steps[corridor] = 0
-        self._braking_mps2[corridor] = 0.0
+        self.forget(corridor)
+
+    def forget(self, corridors: int | Flags) -> None:
+        """Begin afresh in a corridor, or where a mask, (K,), says so."""
+        self._reacts[corridors] = False
+        self._delay_steps[corridors] = 0
+        self._conflict_steps[corridors] = 0
+        self._braking_mps2[corridors] = 0.0
 
     @abstractmethod
-    def braking_mps2(
-        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
-    ) -> FloatArray:
-        """Return how hard the model brakes, (K,), positive; 0 where there is no risk.
-
-        Args:
-            gap_m: between the two at M; negative where they overlap.
-            v_rear_mps: speed of the one behind at M.
-            v_front_mps: speed of the one ahead at M.
-        """
+    def is_due(self, scene: Scene, nominal: Plan) -> Flags:
+        """Return whether a conflict of P0, if any, is a reason to react now, (K,)."""
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration in each corridor, (K,)."""
-        return self._answer(self._foreseen(scene), super().act(scene))
+        calm = super().act(scene)
+        nominal, present = self._nominal(scene), self._present(scene)
+        self._start(scene, nominal)
+        waits = self._reacts & (self._delay_steps > 0)
+        self._delay_steps -= waits
+        acts = self._reacts & ~waits & nominal.conflict
+        behind = present.is_rear | self._can_fall_behind(scene, np.zeros(self.corridors))
+        brakes = acts & present.conflict & behind
+        harder = self._braking_mps2 + self.model.growth_mps2
+        most = np.minimum(self._demand_mps2(scene, present), self.limit_mps2)
+        released = np.where(waits, self.model.released_mps2, 0.0)
+        self._braking_mps2 = np.where(brakes, np.minimum(harder, most), released)
+        answer: FloatArray = np.where(acts & ~present.conflict, 0.0, calm)
+        if self.model.released_mps2 > 0.0:
+            answer = np.where(waits, -self.model.released_mps2, answer)
+        return np.where(brakes, -self._braking_mps2, answer)
 
-    def _foreseen(self, scene: Scene) -> FloatArray:
-        """Return how hard the model brakes for what is foreseen at M, (K,)."""
-        distance_m, v_mps = np.maximum(-scene.x_vut_m, 0.0), scene.v_vut_mps
+    def _start(self, scene: Scene, nominal: Plan) -> None:
+        """Begin the delay where it is time to react to the conflict that is predicted."""
+        conflict, model = nominal.conflict, self.model
+        self._conflict_steps = np.where(conflict, self._conflict_steps + 1, 0)
+        # The first prediction is 0 s old.
+        missing = np.maximum(model.perception_steps - (self._conflict_steps - 1), 0)
+        left_s = model.delay_s + missing * DT_S
+        due = conflict & ~self._reacts & self.is_due(scene, nominal)
+        if not due.any():
+            return
+        due &= nominal.is_rear | self._can_fall_behind(scene, left_s)
+        self._reacts |= due
+        self._delay_steps = np.where(due, model.delay_steps + missing, self._delay_steps)
+
+    def _nominal(self, scene: Scene) -> Plan:
+        """Return P0: the VUT takes the level-0 profile."""
+        v_mps = scene.v_vut_mps
+        distance_m = np.maximum(-scene.x_vut_m, 0.0)
         t_s = level0_time_to(distance_m, v_mps, self.a_mps2, self.v_cruise_mps)
-        v_at_m = np.sqrt(v_mps * v_mps + 2.0 * self.a_mps2 * distance_m)
-        v_at_m = np.minimum(v_at_m, np.maximum(v_mps, self.v_cruise_mps))
-        # Behind M, where an episode may go on, the two are as they are.
-        x_pov_m = scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
-        dx_m = x_pov_m + scene.v_pov_mps * t_s
-        follows = dx_m >= 0.0
-        demand = self.braking_mps2(
-            np.abs(dx_m) - self.crash_m,
-            np.where(follows, v_at_m, scene.v_pov_mps),
-            np.where(follows, scene.v_pov_mps, v_at_m),
+        most_mps = np.maximum(v_mps, self.v_cruise_mps)
+        return self._plan(scene, t_s, np.minimum(v_mps + self.a_mps2 * t_s, most_mps))
+
+    def _present(self, scene: Scene) -> Plan:
+        """Return P1: the VUT keeps its speed."""
+        v_mps = scene.v_vut_mps
+        distance_m = np.maximum(-scene.x_vut_m, 0.0)
+        moves = (v_mps > SLOWEST_MPS) | (distance_m == 0.0)
+        t_s = np.where(moves, distance_m / np.maximum(v_mps, SLOWEST_MPS), np.inf)
+        return self._plan(scene, t_s, v_mps)
+
+    def _plan(self, scene: Scene, t_s: FloatArray, v_vut_mps: FloatArray) -> Plan:
+        v_pov_mps = scene.v_pov_mps
+        arrives = np.isfinite(t_s)
+        dx_m = _x_pov_m(scene) + v_pov_mps * np.where(arrives, t_s, 0.0)
+        is_rear = dx_m >= 0.0
+        gap_m = np.where(arrives, np.abs(dx_m) - self.crash_m, np.inf)
+        v_rear = np.where(is_rear, v_vut_mps, v_pov_mps)
+        v_front = np.where(is_rear, v_pov_mps, v_vut_mps)
+        pair = gap_m, v_rear, v_front
+        unsafe = np.where(is_rear, self.model.is_unsafe(*pair), self.model.endangers(*pair))
+        conflict = arrives & ((gap_m < 0.0) | unsafe)
+        return Plan(t_s, gap_m, is_rear, v_rear, v_front, conflict)
+
+    def _can_fall_behind(
+        self, scene: Scene, delay_s: FloatArray, limit_mps2: FloatArray | None = None
+    ) -> Flags:
+        """Return whether the VUT can be behind the other vehicle at M, or stop before it, (K,).
+
+        It keeps its speed for `delay_s`, and then brakes by `limit_mps2`.
+        """
+        limit = self.limit_mps2 if limit_mps2 is None else limit_mps2
+        v_mps = scene.v_vut_mps
+        distance_m = np.maximum(-scene.x_vut_m, 0.0)
+        room_m = distance_m - v_mps * delay_s
+        left = v_mps * v_mps - 2.0 * limit * room_m
+        t_s = delay_s + (v_mps - np.sqrt(np.maximum(left, 0.0))) / limit
+        t_s = np.where(room_m > 0.0, t_s, distance_m / np.maximum(v_mps, SLOWEST_MPS))
+        stops = (room_m > 0.0) & (left <= 0.0)
+        return stops | (_x_pov_m(scene) + scene.v_pov_mps * t_s >= self.crash_m)
+
+    def _demand_mps2(self, scene: Scene, present: Plan) -> FloatArray:
+        """Return the deceleration that the model asks for in P1, (K,)."""
+        pair = present.gap_m, present.v_rear_mps, present.v_front_mps
+        return self.model.demand_mps2(*pair)
+
+
+class CarefulVut(RampDriver):
+    """The careful and competent human driver: reacts when a collision is less than 2 s away."""
+
+    model = CarefulModel()
+
+    def is_due(self, scene: Scene, nominal: Plan) -> Flags:
+        """Return whether the times to M and from there to the collision are below 2 s together."""
+        times_s = ttc_s(nominal.gap_m, nominal.v_rear_mps, nominal.v_front_mps)
+        return nominal.t_s + times_s < self.model.critical_ttc_s
+
+
+class FsmVut(RampDriver):
+    """The fuzzy safety model: reacts at once."""
+
+    model = FsmModel()
+
+    def is_due(self, scene: Scene, nominal: Plan) -> Flags:
+        """Return True everywhere."""
+        return np.ones(self.corridors, dtype=np.bool_)
+
+    def _demand_mps2(self, scene: Scene, present: Plan) -> FloatArray:
+        """Return the deceleration of the model; where bodies would overlap, what it takes."""
+        comfortable = np.minimum(self.model.comfortable_mps2, self.limit_mps2)
+        enough = self._can_fall_behind(scene, np.zeros(self.corridors), comfortable)
+        overlap = np.where(enough, self.model.comfortable_mps2, self.model.hardest_mps2)
+        demand = super()._demand_mps2(scene, present)
+        return np.where(present.gap_m < 0.0, overlap, demand)
+
+
+class Reg157Vut(RampDriver):
+    """The bound of UN R157: reacts when it would just stop before M."""
+
+    model = Reg157Model()
+
+    def is_due(self, scene: Scene, nominal: Plan) -> Flags:
+        """Return whether the delay and braking at the limit take all of the distance to M."""
+        v_mps = scene.v_vut_mps
+        stop_m = v_mps * v_mps / (2.0 * self.limit_mps2)
+        distance_m = np.maximum(-scene.x_vut_m, 0.0)
+        due: Flags = distance_m <= self.model.delay_s * v_mps + stop_m
+        return due
+
+
+class RssVut(RampDriver):
+    """Responsibility-sensitive safety: reacts when M is within the safe distance."""
+
+    model = RssModel()
+
+    def is_due(self, scene: Scene, nominal: Plan) -> Flags:
+        """Return whether a VUT that accelerates in its delay could only just stop before M.
+
+        Half of the time in which the deceleration grows counts as delay.
+        """
+        v_mps, limit_mps2 = scene.v_vut_mps, self.limit_mps2
+        delay_s = self.model.delay_s + 0.5 * limit_mps2 / JERK_MPS3
+        stops_m = rss_distance_m(
+            v_mps, np.zeros(self.corridors), delay_s, self.accel_mps2, limit_mps2, limit_mps2
         )
-        # Braking at the limit from here on it is at M later, or never.
-        left = v_mps * v_mps - 2.0 * self.limit_mps2 * distance_m
-        t_late_s = (v_mps - np.sqrt(np.maximum(left, 0.0))) / self.limit_mps2
-        helps = (left <= 0.0) | (x_pov_m + scene.v_pov_mps * t_late_s >= self.crash_m)
-        return np.where(helps, demand, 0.0)
-
-    def forget_risk(self, where: NDArray[np.bool_]) -> None:
-        """See and do as if nothing had been seen so far in some corridors, (K,)."""
-        self._risk_steps[where] = 0
-        self._braking_mps2[where] = 0.0
-
-    def _answer(self, demand: FloatArray, calm: FloatArray) -> FloatArray:
-        """Return accelerations, (K,): braking by perception, reaction and jerk, else calm ones."""
-        at_risk = demand > 0.0
-        self._risk_steps += at_risk
-        lasted_s = (self._risk_steps - 1) * DT_S + 1e-9
-        perceives = at_risk & (lasted_s >= self.perception_s)
-        brakes = at_risk & (lasted_s >= self.perception_s + self.reaction_s - DT_S)
-        most = np.minimum(demand, self.limit_mps2)
-        harder = np.minimum(self._braking_mps2 + self.jerk_mps3 * DT_S, most)
-        self._braking_mps2 = np.where(brakes, harder, 0.0)
-        answer: FloatArray = np.where(brakes, -self._braking_mps2, np.where(perceives, 0.0, calm))
-        return answer
+        due: Flags = np.maximum(-scene.x_vut_m, 0.0) < stops_m
+        return due
 
 
-def ttc_s(gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
-    """Return the time to collision, (K,): 0 where they overlap, infinite where the gap opens."""
-    closing = v_rear_mps - v_front_mps
-    times = np.where(closing > 0.0, gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
-    found: FloatArray = np.where(gap_m <= 0.0, 0.0, times)
-    return found
+class CarefulPov(Driver):
+    """The careful driver on the mainline: keeps its speed, and brakes for a VUT that cuts in.
 
-
-class CarefulVut(ReferenceDriver):
-    """A careful and competent human driver: UN R157, Annex 3, Appendix 3, performance model 1.
-
-    A risk is a time to collision of less than 2 s at the cut-in. The driver perceives it in 0.4 s,
-    reacts in 0.75 s, and brakes up to 0.774 g by 12.65 m/s3. Where R157's driver sees a car leave
-    the middle of its lane, ours has seen the lanes run together from the start.
+    The state at M is predicted with both at their present speeds. It reacts to a VUT that is ahead
+    of it, where it would not be ahead by `dx_crash_m` at M, and where the time to M and the time to
+    collision from there are less than 2 s together.
     """
 
-    perception_s = 0.4
-    ttc_s = 2.0
+    def __init__(self, corridors: int) -> None:
+        """Prepare for a number of corridors."""
+        super().__init__(corridors)
+        self._reaction = Reaction(corridors, CarefulModel())
+        self.limit_mps2 = np.full(corridors, -US23.a_min_mps2)
+        self.crash_m = np.full(corridors, US23.dx_crash_m)
 
-    def braking_mps2(
-        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
-    ) -> FloatArray:
-        """Return all there is below a time to collision of 2 s."""
-        return np.where(ttc_s(gap_m, v_rear_mps, v_front_mps) < self.ttc_s, self.hardest_mps2, 0.0)
-
-
-class Reg157Vut(ReferenceDriver):
-    """What R157 asks of lane-keeping systems in a cut-in (5.2.5.2), taken as a way to drive.
-
-    A system has to avoid a collision where TTC > v_rel / (2 * 6 m/s2) + 0.35 s when the other
-    intrudes into its lane. So this one brakes by 6 m/s2 at once, 0.35 s after TTC is down to that,
-    a step earlier: looking every 0.1 s, it would else be too late for what it has to avoid.
-    """
-
-    reaction_s = 0.35
-    jerk_mps3 = np.inf
-    hardest_mps2 = 6.0
-    late_s = DT_S
-    """TTC is down to the bound up to a step before it is seen to be."""
-
-    def braking_mps2(
-        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
-    ) -> FloatArray:
-        """Return 6 m/s2 where the time to collision is not above the bound of R157."""
-        bound_s = (v_rear_mps - v_front_mps) / (2.0 * self.hardest_mps2) + self.reaction_s
-        times_s = ttc_s(gap_m, v_rear_mps, v_front_mps)
-        late = times_s <= np.maximum(bound_s + self.late_s, 0.0)
-        return np.where(late, self.hardest_mps2, 0.0)
-
-
-class RssVut(ReferenceDriver):
-    """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua, arXiv:1708.06374, 2017).
-
-    It brakes as hard as it can while the gap is shorter than the safe distance of definition 1, of
-    which both limits of braking, and that of acceleration, are those of the scenario.
-    """
-
-    def braking_mps2(
-        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
-    ) -> FloatArray:
-        """Return all there is where the gap is shorter than the safe distance."""
-        limits = self.reaction_s, self.accel_mps2, self.limit_mps2, self.others_mps2
-        safe_m = rss_distance_m(v_rear_mps, v_front_mps, *limits)
-        return np.where(gap_m < np.maximum(safe_m, 1e-9), self.hardest_mps2, 0.0)
-
-
-def rss_distance_m(
-    v_rear_mps: FloatArray,
-    v_front_mps: FloatArray,
-    response_s: float,
-    accel_mps2: FloatArray | float,
-    brake_min_mps2: FloatArray | float,
-    brake_max_mps2: FloatArray | float,
-) -> FloatArray:
-    """Return the safe distance of RSS: the one behind accelerates for the response time at most.
-
-    [v_r rho + a rho^2 / 2 + (v_r + rho a)^2 / (2 b_min) - v_f^2 / (2 b_max)]+.
-    """
-    fastest = v_rear_mps + response_s * accel_mps2
-    stops_m = v_rear_mps * response_s + 0.5 * accel_mps2 * response_s**2
-    stops_m = stops_m + fastest * fastest / (2.0 * brake_min_mps2)
-    safe_m: FloatArray = np.maximum(
-        stops_m - v_front_mps * v_front_mps / (2.0 * brake_max_mps2), 0.0
-    )
-    return safe_m
-
-
-class FsmVut(ReferenceDriver):
-    """The fuzzy safety model: R157's performance model 2 (Mattas et al., 2020 and 2022).
-
-    Where the critical metric CFS is above 0 it brakes between comfortably and as hard as it can,
-    else, where the proactive metric PFS is, up to comfortably. Brakings are the published ones as
-    far as the scenario has them.
-    """
-
-    comfortable_mps2 = 4.0
-    hardest_mps2 = 6.0
-    leader_mps2 = 7.0
-    margin_m = 2.0
-
-    def braking_mps2(
-        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
-    ) -> FloatArray:
-        """Return CFS (b_max - b_comf) + b_comf where CFS > 0, else PFS b_comf."""
-        most = self.limit_mps2
-        comfortable = np.minimum(self.comfortable_mps2, most)
-        leader = np.minimum(self.leader_mps2, self.others_mps2)
-        speeds = v_rear_mps, v_front_mps
-        delay = self.reaction_s
-        critical = cfs(gap_m, *speeds, delay, comfortable, most)
-        ahead = pfs(gap_m, *speeds, delay, comfortable, most, leader, self.margin_m)
-        hard = critical * (most - comfortable) + comfortable
-        braking: FloatArray = np.where(critical > 0.0, hard, ahead * comfortable)
-        return braking
-
-
-def pfs(
-    gap_m: FloatArray,
-    v_rear_mps: FloatArray,
-    v_front_mps: FloatArray,
-    delay_s: float,
-    comfortable_mps2: FloatArray | float,
-    hardest_mps2: FloatArray | float,
-    leader_mps2: FloatArray | float,
-    margin_m: float,
-) -> FloatArray:
-    """Return the proactive fuzzy surrogate metric, (K,), 0 (safe) to 1: what if the leader brakes.
-
-    With d = gap - d1: 1 below d_unsafe = v_r tau + v_r^2 / (2 b_max) - v_f^2 / (2 b_l), 0 above
-    d_safe = v_r tau + v_r^2 / (2 b_comf) - v_f^2 / (2 b_l) + d1, linear between (R157, Annex 3).
-    """
-    leader_m = v_front_mps * v_front_mps / (2.0 * leader_mps2)
-    rear = v_rear_mps * v_rear_mps / 2.0
-    safe_m: FloatArray = v_rear_mps * delay_s + rear / comfortable_mps2 - leader_m + margin_m
-    unsafe_m: FloatArray = v_rear_mps * delay_s + rear / hardest_mps2 - leader_m
-    return _between(gap_m - margin_m, safe_m, unsafe_m)
-
-
-def cfs(
-    gap_m: FloatArray,
-    v_rear_mps: FloatArray,
-    v_front_mps: FloatArray,
-    delay_s: float,
-    comfortable_mps2: FloatArray | float,
-    hardest_mps2: FloatArray | float,
-) -> FloatArray:
-    """Return the critical fuzzy surrogate metric, (K,), 0 to 1: what if the leader goes on.
-
-    At M neither accelerates: with the closing speed u, the one behind comes nearer by u tau before
-    it brakes, then by u^2 / (2 b). 1 below that with b_max, 0 above that with b_comf, linear
-    between; 0 where the gap opens.
-    """
-    closing = np.maximum(v_rear_mps - v_front_mps, 0.0)
-    before_m, stop = closing * delay_s, closing * closing / 2.0
-    found = _between(gap_m, before_m + stop / comfortable_mps2, before_m + stop / hardest_mps2)
-    metric: FloatArray = np.where((closing > 0.0) | (gap_m <= 0.0), found, 0.0)
-    return metric
-
-
-def _between(gap_m: FloatArray, safe_m: FloatArray, unsafe_m: FloatArray) -> FloatArray:
-    """Return 1 up to the unsafe distance, 0 from the safe one on, and linear between."""
-    width = np.maximum(safe_m - unsafe_m, 1e-9)
-    found: FloatArray = np.clip((safe_m - gap_m) / width, 0.0, 1.0)
-    return found
-
-
-class CarefulPov(CarefulVut):
-    """The careful driver on the mainline: holds its speed, and brakes for the VUT that cuts in.
-
-    To give way is to fall behind the VUT, also here: it goes on where braking as hard as it can
-    would not get it there by the time at which the VUT is at M.
-    """
+    def begin(self, corridor: int, case: Case) -> None:
+        """Forget; take the limits of the case's scenario."""
+        self.limit_mps2[corridor] = min(-case.scenario.a_min_mps2, CarefulModel.hardest_mps2)
+        self.crash_m[corridor] = case.scenario.dx_crash_m
+        self._reaction.forget(corridor)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration of the POV in each corridor, (K,)."""
+        v_vut, v_pov = scene.v_vut_mps, scene.v_pov_mps
         distance_m = np.maximum(-scene.x_vut_m, 0.0)
-        v_vut = scene.v_vut_mps
-        t_s = level0_time_to(distance_m, v_vut, self.a_mps2, self.v_cruise_mps)
-        v_at_m = np.sqrt(v_vut * v_vut + 2.0 * self.a_mps2 * distance_m)
-        v_at_m = np.minimum(v_at_m, np.maximum(v_vut, self.v_cruise_mps))
-        v_pov = scene.v_pov_mps
-        x_pov_m = scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
-        dx_m = x_pov_m + v_pov * t_s
-        follows = dx_m < 0.0
-        demand = self.braking_mps2(
-            np.abs(dx_m) - self.crash_m,
-            np.where(follows, v_pov, v_at_m),
-            np.where(follows, v_at_m, v_pov),
-        )
-        t_brake = np.minimum(t_s, v_pov / self.limit_mps2)
-        dx_late = x_pov_m + (v_pov - 0.5 * self.limit_mps2 * t_brake) * t_brake
-        demand = np.where(dx_late <= -self.crash_m, demand, 0.0)
-        return self._answer(demand, np.zeros(self.corridors))
+        t_s = distance_m / np.maximum(v_vut, SLOWEST_MPS)
+        dx_m = _x_pov_m(scene) + v_pov * t_s
+        collides_s = t_s + ttc_s(-dx_m - self.crash_m, v_pov, v_vut)
+        ahead = (scene.x_vut_m > scene.x_pov_m) & (dx_m < self.crash_m)
+        unsafe: Flags = ahead & (collides_s < CarefulModel.critical_ttc_s)
+        return self._reaction.acceleration_mps2(unsafe, self.limit_mps2)
 
 
-REFERENCES: Final[dict[str, type[ReferenceDriver]]] = {
+def _x_pov_m(scene: Scene) -> FloatArray:
+    """Return the POV's position, (K,); relative to the VUT where an episode goes on behind M."""
+    x_m: FloatArray = scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
+    return x_m
+
+
+REFERENCES: Final[dict[str, type[RampDriver]]] = {
     "careful": CarefulVut,
     "fsm": FsmVut,
     "reg157": Reg157Vut,

@@ -1,0 +1,300 @@
+"""Published models of when a careful driver brakes for a vehicle ahead, and how hard.
+
+They are of rear-end conflicts on one lane, for two vehicles with a gap between them: the rear one
+has to react. Parameters are those of the JRC-FSM reference implementation (European Commission,
+Joint Research Centre: ec-jrc/JRC-FSM, commit 01b05c2), which compares the models on the cut-ins of
+UN Regulation No. 157. `tests/test_cut_in.py` compares these functions with tables made by it.
+
+`drivers/reference.py` applies the models to a merge.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import DT_S
+
+Flags = NDArray[np.bool_]
+
+JERK_MPS3: Final = 12.65
+"""Growth of the deceleration: UN R157, Annex 3, Appendix 3."""
+HARDEST_MPS2: Final = 0.774 * 9.81
+"""Hardest deceleration of the careful driver: the same."""
+
+
+class SafetyModel(ABC):
+    """When a driver brakes for a vehicle ahead, and how hard; arrays of shape (K,).
+
+    Attributes:
+        perception_steps: steps for which a risk is predicted before the delay begins.
+        delay_steps: steps from the first risk to the first braking.
+        delay_s: the same as the formulas have it.
+        released_mps2: deceleration in the delay: the pedal is released.
+        growth_mps2: growth of the deceleration in a step.
+        hardest_mps2: hardest deceleration.
+    """
+
+    perception_steps: int = 0
+    delay_steps: int = 8
+    delay_s: float = 0.75
+    released_mps2: float = 0.0
+    growth_mps2: float = JERK_MPS3 * DT_S
+    hardest_mps2: float = HARDEST_MPS2
+
+    @abstractmethod
+    def is_unsafe(
+        self,
+        gap_m: FloatArray,
+        v_rear_mps: FloatArray,
+        v_front_mps: FloatArray,
+        a_rear_mps2: FloatArray | float = 0.0,
+    ) -> Flags:
+        """Return whether the rear vehicle is too close."""
+
+    def endangers(
+        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
+    ) -> Flags:
+        """Return whether the front vehicle must not get in front of the rear one like this."""
+        return self.is_unsafe(gap_m, v_rear_mps, v_front_mps)
+
+    def demand_mps2(
+        self,
+        gap_m: FloatArray,
+        v_rear_mps: FloatArray,
+        v_front_mps: FloatArray,
+        a_rear_mps2: FloatArray | float = 0.0,
+    ) -> FloatArray:
+        """Return the deceleration that is asked for where it is unsafe."""
+        return np.full(np.shape(v_rear_mps), self.hardest_mps2)
+
+
+class CarefulModel(SafetyModel):
+    """The careful and competent human driver (CC): UN R157, Annex 3, performance model 1.
+
+    Unsafe is a time to collision of 2 s or less.
+    """
+
+    perception_steps = 4
+    released_mps2 = 0.4
+    critical_ttc_s: float = 2.0
+
+    def is_unsafe(
+        self,
+        gap_m: FloatArray,
+        v_rear_mps: FloatArray,
+        v_front_mps: FloatArray,
+        a_rear_mps2: FloatArray | float = 0.0,
+    ) -> Flags:
+        """Return whether the time to collision is at most 2 s."""
+        return ttc_s(gap_m, v_rear_mps, v_front_mps) <= self.critical_ttc_s
+
+
+class Reg157Model(SafetyModel):
+    """What UN R157 asks of lane-keeping systems in a cut-in (5.2.5.2), as a way to drive.
+
+    A system has to avoid a collision where TTC > (v_r - v_f) / (2 * 6 m/s2) + 0.35 s when the other
+    vehicle intrudes into its lane. The driver brakes at once by 6 m/s2, 0.35 s later.
+
+    Attributes:
+        bound_s: the 0.35 s. The published code adds a step, 0.1 s.
+    """
+
+    delay_steps = 4
+    delay_s = 0.35
+    growth_mps2 = np.inf
+    hardest_mps2 = 6.0
+
+    def __init__(self, bound_s: float = 0.35) -> None:
+        """Take the constant part of the bound."""
+        self.bound_s = bound_s
+
+    def is_unsafe(
+        self,
+        gap_m: FloatArray,
+        v_rear_mps: FloatArray,
+        v_front_mps: FloatArray,
+        a_rear_mps2: FloatArray | float = 0.0,
+    ) -> Flags:
+        """Return whether the time to collision is down to the bound."""
+        bound_s = (v_rear_mps - v_front_mps) / (2.0 * self.hardest_mps2) + self.bound_s
+        return ttc_s(gap_m, v_rear_mps, v_front_mps) <= bound_s
+
+
+class RssModel(SafetyModel):
+    """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua, arXiv:1708.06374, 2017).
+
+    Unsafe is a gap below the safe distance of definition 1.
+    """
+
+    accel_mps2: float = 3.0
+    brake_mps2: float = 6.0
+
+    def is_unsafe(
+        self,
+        gap_m: FloatArray,
+        v_rear_mps: FloatArray,
+        v_front_mps: FloatArray,
+        a_rear_mps2: FloatArray | float = 0.0,
+    ) -> Flags:
+        """Return whether the gap is shorter than the safe distance."""
+        limits = self.delay_s, self.accel_mps2, self.brake_mps2, self.brake_mps2
+        unsafe: Flags = gap_m < rss_distance_m(v_rear_mps, v_front_mps, *limits)
+        return unsafe
+
+
+class FsmModel(SafetyModel):
+    """The fuzzy safety model: performance model 2 of UN R157 (Mattas et al., 2020 and 2022).
+
+    Unsafe is PFS + CFS > 0. It brakes by 4 + 2 CFS where CFS > 0, else by 4 PFS.
+    """
+
+    hardest_mps2 = 6.0
+    comfortable_mps2: float = 4.0
+    leader_mps2: float = 7.0
+    margin_m: float = 2.0
+
+    def is_unsafe(
+        self,
+        gap_m: FloatArray,
+        v_rear_mps: FloatArray,
+        v_front_mps: FloatArray,
+        a_rear_mps2: FloatArray | float = 0.0,
+    ) -> Flags:
+        """Return whether one of the two metrics is above 0."""
+        critical = self.cfs(gap_m, v_rear_mps, v_front_mps, a_rear_mps2)
+        unsafe: Flags = critical + self.pfs(gap_m, v_rear_mps, v_front_mps) > 0.0
+        return unsafe
+
+    def endangers(
+        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
+    ) -> Flags:
+        """Return whether CFS is above 0: the precaution (PFS) is the rear vehicle's."""
+        unsafe: Flags = self.cfs(gap_m, v_rear_mps, v_front_mps) > 0.0
+        return unsafe
+
+    def demand_mps2(
+        self,
+        gap_m: FloatArray,
+        v_rear_mps: FloatArray,
+        v_front_mps: FloatArray,
+        a_rear_mps2: FloatArray | float = 0.0,
+    ) -> FloatArray:
+        """Return the deceleration that follows from the metrics."""
+        critical = self.cfs(gap_m, v_rear_mps, v_front_mps, a_rear_mps2)
+        proactive = self.pfs(gap_m, v_rear_mps, v_front_mps)
+        comfortable = self.comfortable_mps2
+        hard = comfortable + (self.hardest_mps2 - comfortable) * critical
+        demand: FloatArray = np.where(critical > 0.0, hard, comfortable * proactive)
+        return demand
+
+    def pfs(self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
+        """Return the proactive fuzzy metric, 0 (safe) to 1: the leader may brake by 7 m/s2.
+
+        With d = gap - margin: 0 from v_r tau + v_r^2 / (2 * 4) - v_f^2 / (2 * 7) + margin on, 1 up
+        to v_r tau + v_r^2 / (2 * 6) - v_f^2 / (2 * 7), linear between.
+        """
+        leader_m = v_front_mps * v_front_mps / (2.0 * self.leader_mps2)
+        stop = v_rear_mps * v_rear_mps / 2.0
+        reaction_m = v_rear_mps * self.delay_s - leader_m
+        safe_m = reaction_m + stop / self.comfortable_mps2 + self.margin_m
+        unsafe_m = reaction_m + stop / self.hardest_mps2
+        return _between(gap_m - self.margin_m, safe_m, unsafe_m)
+
+    def cfs(
+        self,
+        gap_m: FloatArray,
+        v_rear_mps: FloatArray,
+        v_front_mps: FloatArray,
+        a_rear_mps2: FloatArray | float = 0.0,
+    ) -> FloatArray:
+        """Return the critical fuzzy metric, 0 (safe) to 1: the leader keeps its speed.
+
+        The rear vehicle goes on with its acceleration a (not below -4 m/s2) for tau, and then
+        brakes. With u its speed by then, s(b) = (v_r + a tau / 2 - v_f) tau + (u - v_f)^2 / (2 b):
+        0 from s(4) on, 1 up to s(6), linear between. Where u < v_f, 1 if the gap closes before the
+        speeds are equal, else 0. Where v_r <= v_f, 0.
+        """
+        a = np.maximum(a_rear_mps2, -self.comfortable_mps2)
+        after = v_rear_mps + self.delay_s * a - v_front_mps
+        approach_m = (v_rear_mps + 0.5 * a * self.delay_s - v_front_mps) * self.delay_s
+        stop = after * after / 2.0
+        safe_m, unsafe_m = (
+            approach_m + stop / b for b in (self.comfortable_mps2, self.hardest_mps2)
+        )
+        found = _between(gap_m, safe_m, unsafe_m)
+        closing = v_rear_mps - v_front_mps
+        # Only a vehicle that brakes gets slower than the leader within the delay.
+        slowing = np.maximum(2.0 * np.abs(a_rear_mps2), 1e-12)
+        slower = np.where(gap_m < closing * closing / slowing, 1.0, 0.0)
+        metric: FloatArray = np.where(after < 0.0, slower, found)
+        return np.where(closing > 0.0, metric, 0.0)
+
+
+def ttc_s(gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
+    """Return the time to collision, (K,): 0 where they overlap, infinite where the gap opens."""
+    closing = v_rear_mps - v_front_mps
+    times = np.where(closing > 0.0, gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
+    found: FloatArray = np.where(gap_m <= 0.0, 0.0, times)
+    return found
+
+
+def rss_distance_m(
+    v_rear_mps: FloatArray,
+    v_front_mps: FloatArray,
+    response_s: FloatArray | float,
+    accel_mps2: FloatArray | float,
+    brake_min_mps2: FloatArray | float,
+    brake_max_mps2: FloatArray | float,
+) -> FloatArray:
+    """Return the safe distance of RSS, (K,): the rear one accelerates for the response time.
+
+    [v_r rho + a rho^2 / 2 + (v_r + rho a)^2 / (2 b_min) - v_f^2 / (2 b_max)]+.
+    """
+    fastest = v_rear_mps + response_s * accel_mps2
+    stops_m = v_rear_mps * response_s + 0.5 * accel_mps2 * response_s**2
+    stops_m = stops_m + fastest * fastest / (2.0 * brake_min_mps2)
+    safe_m: FloatArray = np.maximum(
+        stops_m - v_front_mps * v_front_mps / (2.0 * brake_max_mps2), 0.0
+    )
+    return safe_m
+
+
+def _between(gap_m: FloatArray, safe_m: FloatArray, unsafe_m: FloatArray) -> FloatArray:
+    """Return 1 up to the unsafe distance, 0 from the safe one on, and linear between."""
+    width = np.maximum(safe_m - unsafe_m, 1e-12)
+    found: FloatArray = np.clip((safe_m - gap_m) / width, 0.0, 1.0)
+    return found
+
+
+class Reaction:
+    """The reaction of the published models in K corridors: delay, growing deceleration, hold.
+
+    Steps of the delay are counted while it is unsafe. Then the deceleration grows. Safe again, the
+    driver holds the speed. Neither the delay nor the deceleration is reset.
+    """
+
+    def __init__(self, corridors: int, model: SafetyModel) -> None:
+        """Prepare for a number of corridors."""
+        self._model = model
+        self._waited = np.zeros(corridors, dtype=np.int64)
+        self._braking_mps2 = np.full(corridors, model.released_mps2)
+
+    def forget(self, corridors: int | Flags) -> None:
+        """Begin afresh in some corridors."""
+        self._waited[corridors] = 0
+        self._braking_mps2[corridors] = self._model.released_mps2
+
+    def acceleration_mps2(self, unsafe: Flags, demand_mps2: FloatArray) -> FloatArray:
+        """Return the accelerations of a step, (K,): 0 where it is safe, else 0 or less."""
+        waits = unsafe & (self._waited < self._model.delay_steps)
+        brakes = unsafe & ~waits
+        self._waited += waits
+        harder = np.minimum(self._braking_mps2 + self._model.growth_mps2, demand_mps2)
+        self._braking_mps2 = np.where(brakes, harder, self._braking_mps2)
+        answer: FloatArray = np.where(brakes, -self._braking_mps2, 0.0)
+        return np.where(waits, -self._model.released_mps2, answer)
