@@ -4,8 +4,8 @@ python tools/reference_table.py                         all of them, 1,000 unifo
 python tools/reference_table.py --cases 100 design2     fewer, of some
 
 Failures and timeouts at POV levels 0, 1 and 2, failure mode coverage of the failures that were
-found, the share of the failures that a careful and competent driver in the VUT's place avoids, and
-the median of the times until which one may take over.
+found, the numbers of failures that the careful driver and the fuzzy safety model avoid in the VUT's
+place, and the median of the times until which the latter may take over.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 
 from merge_sumo.campaigns.avoidance import avoidance
 from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.driven_again import CAREFUL, TAKES_OVER
 from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.reference import REFERENCES
@@ -32,14 +33,15 @@ VUTS = (
     *("level0", *REFERENCES),
 )
 HEAD = (
-    "| VUT | failures at levels 0, 1, 2 | timeouts | FMC at levels 0, 1, 2 | avoided by a careful "
-    "driver | who takes over until |\n|---|---|---|---|---|---|"
+    "| VUT | failures at levels 0, 1, 2 | timeouts | FMC at levels 0, 1, 2 | avoided by `careful` "
+    "| by `fsm` | `fsm` takes over until |\n|---|---|---|---|---|---|---|"
 )
 
 
 def row(vut: str, cases: int, workers: int | None) -> str:
     """Run uniform cases at each level and return the line of the table."""
-    failures, timeouts, coverage, avoided, known, times = [], 0, [], 0, 0, []
+    failures, timeouts, coverage, known, times = [], 0, [], 0, []
+    avoided = dict.fromkeys((CAREFUL, TAKES_OVER), 0)
     net = road_for(US23)
     with tempfile.TemporaryDirectory() as folder:
         for level in LEVELS:
@@ -55,13 +57,14 @@ def row(vut: str, cases: int, workers: int | None) -> str:
             timeouts += sum(o.measures.end is End.TIMEOUT for o in run.outcomes)
             for one in failing:
                 known += 1
-                avoided += one.by_careful
-                if one.careful_until_s is not None:
-                    times.append(one.careful_until_s)
-    share = f"{avoided} of {known}" if known else "–"
+                for name in avoided:
+                    avoided[name] += name in one.avoided_by
+                if one.latest_takeover_s is not None:
+                    times.append(one.latest_takeover_s)
+    shares = " | ".join(f"{count} of {known}" if known else "–" for count in avoided.values())
     until = f"{statistics.median(times):.1f} s" if times else "–"
     counts = ", ".join(map(str, failures))
-    return f"| `{vut}` | {counts} | {timeouts} | {', '.join(coverage)} | {share} | {until} |"
+    return f"| `{vut}` | {counts} | {timeouts} | {', '.join(coverage)} | {shares} | {until} |"
 
 
 def main() -> None:

@@ -1,13 +1,11 @@
 """Who would have avoided a failure: reference drivers in the very same case.
 
-Every failure of a campaign is driven again, in SUMO, without the VUT and without running any code
-of it:
+Every failure of a campaign is driven again, without the VUT and without running any code of it:
 
 - by each reference driver in the VUT's place, from the start;
-- by a careful driver who takes over: until some time the VUT does what it did, by its recorded
-  accelerations, and from then on the driver is at the wheel, who has to perceive and react first.
-  The last such time is sought from the end backwards, at every half second and then at every step
-  up to the next one;
+- by the FSM driver that takes over: until some time the VUT does what it did, by its recorded
+  accelerations, and from then on the driver is at the wheel, with its delay still to come. Every
+  step is tried from the last one back, up to the first success: success is not monotone in time;
 - with a careful driver on the mainline in the POV's place, against what the VUT did.
 
 avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases;
@@ -46,7 +44,7 @@ from merge_sumo.values.trajectory import Trajectory
 
 AVOIDANCE: Final = "avoidance.jsonl"
 MOST: Final = 500
-"""Failures that are driven again, the worst: each takes some fifteen episodes."""
+"""Failures that are driven again, the worst: each takes some thirty episodes."""
 CHUNK: Final = 64
 """Failures that a worker takes at a time: enough to keep all corridors busy."""
 
@@ -160,31 +158,35 @@ def read_avoidance(run: Run) -> dict[int, Avoidance]:
 
 
 def _of_record(record: Any) -> Avoidance:
+    if "careful_until_s" in record:  # until 0.1.0 that of the careful driver
+        record = dict(record)
+        record["latest_takeover_s"] = record.pop("careful_until_s")
     one = Avoidance(**record)
-    until, names = one.careful_until_s, record["avoided_by"]
+    until, names = one.latest_takeover_s, record["avoided_by"]
     if type(one.index) is not int or type(one.pov_careful) is not bool or type(names) is not list:
         raise TypeError("not as it is written")
     if not (until is None or (type(until) is float and 0.0 <= until <= MAX_EPISODE_S)):
-        raise ValueError("careful_until_s")
+        raise ValueError("latest_takeover_s")
     if [name for name in REFERENCES if name in names] != names:
         raise ValueError("avoided_by")
     return Avoidance(one.index, tuple(names), until, one.pov_careful)
 
 
 def in_a_sentence(found: Iterable[Avoidance]) -> str | None:
-    """Return how many failures a careful driver would have avoided; None where nothing is known."""
+    """Return how many failures careful drivers would have avoided; None where nothing is known."""
     known = list(found)
     if not known:
         return None
     count = sum(one.by_careful for one in known)
     pov = sum(one.pov_careful for one in known)
-    times = sorted(one.careful_until_s for one in known if one.careful_until_s is not None)
+    ahead = sum(one.by_who_takes_over for one in known)
+    times = sorted(one.latest_takeover_s for one in known if one.latest_takeover_s is not None)
     plural = "failure" if len(known) == 1 else "failures"
     said = (
         f"{count} of {len(known)} {plural} would have been avoided by a careful and competent "
-        "driver"
+        f"driver, {ahead} by the fuzzy safety model"
     )
     if times:
         middle = times[math.floor((len(times) - 1) / 2)]
-        said += f" (who takes over until {middle:.1f} s, in the median)"
-    return f"{said}, {pov} by a careful driver on the mainline."
+        said += f" (which may take over until {middle:.1f} s, in the median)"
+    return f"{said}, and {pov} by a careful driver on the mainline."

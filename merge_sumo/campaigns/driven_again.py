@@ -1,23 +1,27 @@
 """Failures that are driven again: a reference driver in the VUT's place, or on the mainline.
 
-What happens here happens in a worker process, in as many corridors at a time as there are.
+The drivers of the package need nothing of SUMO, so the episodes are those of eq. (4)
+(`equation_world.py`), many at a time. Where the POV is the tester's own they run in SUMO.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field, fields
-from itertools import islice
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.campaigns.equation_world import EquationWorld
 from merge_sumo.campaigns.ground import GroundPlan, opened_ground
 from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.levelk import DECISION_STEPS
+from merge_sumo.drivers.pov import PovLibrary
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.sumo.centre_lines import centre_lines
+from merge_sumo.sumo.world import World
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.criterion import Criterion
@@ -27,33 +31,43 @@ from merge_sumo.values.score import is_close
 from merge_sumo.values.trajectory import End, Trajectory
 
 CAREFUL: Final = "careful"
-"""The reference driver that takes over, and that the headline counts."""
-EVERY_STEPS: Final = 5
-"""A take-over is tried every half second first."""
+"""The reference driver that the headline counts."""
+TAKES_OVER: Final = "fsm"
+"""The reference driver that takes over. From the start it avoids what can be avoided; the careful
+driver brakes only 2 s before a collision, and would tell of itself more than of the VUT."""
+BLOCK_STEPS: Final = 10
+"""Take-overs that are tried at a time, from the last one back."""
+CORRIDORS: Final = 256
+"""Episodes that run at a time without SUMO."""
 
 
 @dataclass(frozen=True, slots=True)
 class Avoidance:
-    """Who would have avoided a failure.
+    """Which drivers would have avoided a failure.
 
     Attributes:
         index: of the case in its campaign.
         avoided_by: names of the reference drivers that pass the case in the VUT's place.
-        careful_until_s: the last time at which a careful driver who takes over still passes it;
-            None where that is too late from the start.
+        latest_takeover_s: the last time at which the FSM driver, taking over, passes it; None where
+            there is no such time.
         pov_careful: whether a careful driver on the mainline would have avoided it against what
             the VUT did.
     """
 
     index: int
     avoided_by: tuple[str, ...]
-    careful_until_s: float | None
+    latest_takeover_s: float | None
     pov_careful: bool
 
     @property
     def by_careful(self) -> bool:
         """Whether a careful and competent driver avoids it in the VUT's place."""
         return CAREFUL in self.avoided_by
+
+    @property
+    def by_who_takes_over(self) -> bool:
+        """Whether the driver of `latest_takeover_s` avoids it from the start."""
+        return TAKES_OVER in self.avoided_by
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -62,15 +76,33 @@ class _Again(Case):
 
     Attributes:
         by: reference driver in the VUT's place.
-        recorded: accelerations of the VUT in the failure, (T,).
-        until: steps for which the VUT does what it did.
+        failure: what happened.
+        first: step at which the episode begins, with the recorded state.
+        until: step up to which the VUT does what it did.
         careful_pov: whether a careful driver is in the POV's place.
     """
 
     by: str = CAREFUL
-    recorded: FloatArray = field(compare=False, repr=False)
+    failure: Trajectory = field(compare=False, repr=False)
+    first: int = 0
     until: int = 0
     careful_pov: bool = False
+
+    def starts(self) -> list[tuple[float, float]]:
+        """Return position and speed of every vehicle where the episode begins."""
+        return [(x, v) for x, v, _ in self.failure.motion[self.first].tolist()]
+
+    def recorded_mps2(self) -> FloatArray:
+        """Return the accelerations of the VUT in the failure from `first` to M."""
+        return self.failure.a_vut_mps2[self.first : self.scenario.max_steps + 1]
+
+    def from_the_start(self, trajectory: Trajectory) -> Trajectory:
+        """Return the trajectory of the episode with the steps before it."""
+        if not self.first:
+            return trajectory
+        motion = np.concatenate((self.failure.motion[: self.first], trajectory.motion))
+        late = len(motion) - 1 > self.scenario.max_steps
+        return replace(trajectory, motion=motion, end=End.TIMEOUT if late else trajectory.end)
 
 
 Failure = tuple[int, Trajectory]
@@ -78,84 +110,92 @@ Failure = tuple[int, Trajectory]
 
 
 def drive_again(plan: GroundPlan, failing: Sequence[Failure]) -> list[Avoidance | None]:
-    """Return who would have avoided failures, by driving them again in this process."""
-    found = [_Found(failure) for _, failure in failing]
-    searches = [one.take_over() for one in found]
-    searches += [one.on_the_mainline() for one in found]
-    # One driver after the other: who is in no corridor costs nothing.
-    searches += [one.in_its_place(by) for by in REFERENCES if by != CAREFUL for one in found]
-    lines = centre_lines(plan.net)
-    with opened_ground(plan) as ground:
-        world, povs = ground.world, _Mainline(ground.pov)
-        substitutes = _Substitutes(world.corridors, plan.scenario.max_steps)
-        waiting = deque((search, case) for search in searches for case in islice(search, 1))
+    """Return which drivers would have avoided failures, by driving them again in this process.
 
-        def cases(begun: list[_Search]) -> Iterator[Case]:
-            while waiting:
-                search, case = waiting.popleft()
-                begun.append(search)
-                yield case
-
-        while waiting:
-            begun: list[_Search] = []
-            for place, trajectory in rollout(world, povs, substitutes, cases(begun)):
-                try:
-                    case = begun[place].send(_passes(plan.criterion, trajectory, lines))
-                except StopIteration:
-                    continue
-                waiting.appendleft((begun[place], case))
-    return [one.avoidance(index) for (index, _), one in zip(failing, found, strict=True)]
+    Raises `UserError` where other software would give other outcomes.
+    """
+    if plan.povs.own is not None:
+        with opened_ground(plan) as ground:
+            return list(avoidances(Stage(plan, ground.world, ground.pov), failing))
+    plan.check_software()
+    world = EquationWorld(CORRIDORS, plan.net, plan.scenario)
+    with closing(PovLibrary(CORRIDORS * (world.vehicles - 1), plan.povs)) as povs:
+        return list(avoidances(Stage(plan, world, povs), failing))
 
 
-_Search = Generator[_Again, bool, None]
-"""Yields what is to be driven next, and is sent whether it was passed."""
+def avoidances(stage: Stage, failing: Sequence[Failure]) -> list[Avoidance]:
+    """Return which drivers would have avoided failures."""
+    failures = [failure for _, failure in failing]
+    # One driver after the other: a driver that is in no corridor costs nothing.
+    asked = [_again(f, by=name) for name in REFERENCES for f in failures]
+    asked += [_again(f, until=len(f.motion) - 1, careful_pov=True) for f in failures]
+    *by_name, pov_careful = np.reshape(stage.passed(asked), (-1, len(failures))).tolist()
+    latest = _latest_takeovers(stage, failures)
+    found: list[Avoidance] = []
+    for place, (index, _) in enumerate(failing):
+        names = [name for name, by in zip(REFERENCES, by_name, strict=True) if by[place]]
+        step = latest[place]
+        time_s = None if step is None else round(step * DT_S, 1)
+        found.append(Avoidance(index, tuple(names), time_s, pov_careful[place]))
+    return found
 
 
-class _Found:
-    """What is known of a failure that is driven again, and what is asked about it."""
+def _latest_takeovers(stage: Stage, failures: Sequence[Trajectory]) -> list[int | None]:
+    """Return the last steps at which a driver may take over, by trying all steps from the last.
 
-    def __init__(self, failure: Trajectory) -> None:
-        """Take the failure."""
-        case = failure.case
-        self._same = {f.name: getattr(case, f.name) for f in fields(Case)}
-        self._recorded = failure.a_vut_mps2[: case.scenario.max_steps + 1]
-        self._steps = len(self._recorded) - 1
-        self._avoided_by: set[str] = set()
-        self._until: int | None = None
-        self._pov_careful = False
+    Success is not monotone in time, so nothing before the last success matters, and no step after
+    it may be left out.
+    """
+    latest: list[int | None] = [None] * len(failures)
+    untried = {place: len(failure.motion) - 1 for place, failure in enumerate(failures)}
+    while untried:
+        asked = [
+            (place, until)
+            for place, end in untried.items()
+            for until in range(max(end - BLOCK_STEPS, 0), end)
+        ]
+        cases = [stage.takeover(failures[place], until) for place, until in asked]
+        for (place, until), passed in zip(asked, stage.passed(cases), strict=True):
+            if passed:
+                latest[place] = until  # in rising order
+        untried = {
+            place: end - BLOCK_STEPS
+            for place, end in untried.items()
+            if latest[place] is None and end > BLOCK_STEPS
+        }
+    return latest
 
-    def take_over(self) -> _Search:
-        """Search the last step at which a careful driver may take over, from the end backwards."""
-        for until in reversed(range(0, self._steps, EVERY_STEPS)):
-            if (yield self._again(until=until)):
-                break
-        else:
-            return
-        self._until = until
-        for later in reversed(range(until + 1, min(until + EVERY_STEPS, self._steps))):
-            if (yield self._again(until=later)):
-                self._until = later
-                break
-        if until == 0 or (yield self._again()):
-            self._avoided_by.add(CAREFUL)
 
-    def in_its_place(self, name: str) -> _Search:
-        """Ask whether a reference driver passes it in the VUT's place."""
-        if (yield self._again(by=name)):
-            self._avoided_by.add(name)
+def _again(failure: Trajectory, **other: Any) -> _Again:
+    same = {f.name: getattr(failure.case, f.name) for f in fields(Case)}
+    return _Again(**same, failure=failure, **other)
 
-    def on_the_mainline(self) -> _Search:
-        """Ask whether a careful driver on the mainline avoids it against what the VUT did."""
-        self._pov_careful = yield self._again(until=self._steps, careful_pov=True)
 
-    def avoidance(self, index: int) -> Avoidance:
-        """Return what was found."""
-        names = tuple(name for name in REFERENCES if name in self._avoided_by)
-        until_s = None if self._until is None else round(self._until * DT_S, 1)
-        return Avoidance(index, names, until_s, self._pov_careful)
+class Stage:
+    """Where failures are driven again, with the drivers of the mainline."""
 
-    def _again(self, **other: Any) -> _Again:
-        return _Again(**self._same, recorded=self._recorded, **other)
+    def __init__(self, plan: GroundPlan, world: World | EquationWorld, povs: Driver) -> None:
+        """Take the plan, the world, and the POVs."""
+        self._world, self._povs = world, _Mainline(povs)
+        self._substitutes = _Substitutes(world.corridors, plan.scenario.max_steps)
+        self._criterion, self._lines = plan.criterion, centre_lines(plan.net)
+
+    def takeover(self, failure: Trajectory, until: int) -> _Again:
+        """Return the case in which a driver takes over at a step.
+
+        Without SUMO it begins where the learned POVs, which remember nothing else, last decided.
+        """
+        in_sumo = isinstance(self._world, World)
+        first = 0 if in_sumo else until - until % DECISION_STEPS
+        return _again(failure, by=TAKES_OVER, first=first, until=until)
+
+    def passed(self, cases: Sequence[_Again]) -> list[bool]:
+        """Return whether each case is passed."""
+        passed = [False] * len(cases)
+        for place, trajectory in rollout(self._world, self._povs, self._substitutes, cases):
+            whole = cases[place].from_the_start(trajectory)
+            passed[place] = _passes(self._criterion, whole, self._lines)
+        return passed
 
 
 def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) -> bool:
@@ -185,8 +225,9 @@ class _Substitutes(Driver):
     def begin(self, corridor: int, case: Case) -> None:
         assert isinstance(case, _Again), "only failures are driven again"  # noqa: S101
         self._by[corridor] = list(self._drivers).index(case.by)
-        self._until[corridor] = case.until
-        self._recorded[: len(case.recorded), corridor] = case.recorded
+        self._until[corridor] = case.until - case.first
+        recorded_mps2 = case.recorded_mps2()
+        self._recorded[: len(recorded_mps2), corridor] = recorded_mps2
         self._drivers[case.by].begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
@@ -197,7 +238,7 @@ class _Substitutes(Driver):
             drives = scene.active & ~recorded & (self._by == number)
             if drives.any():
                 answer[drives] = driver.act(scene)[drives]
-                driver.forget_risk(recorded)
+                driver.forget(recorded)
         return answer
 
 

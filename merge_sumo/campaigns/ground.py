@@ -100,11 +100,8 @@ class GroundPlan:
         edges = self.net.sha256, self.net.mainline_edges, self.net.ramp_edges
         return *vut, self.corridors, *edges, self.scenario, self.povs, *self.software.items()
 
-    def open(self, binding: Any = None) -> ProvingGround:
-        """Open the proving ground; `UserError` where other software would give other outcomes.
-
-        `binding` takes the place of libsumo: see `World`.
-        """
+    def check_software(self) -> None:
+        """Raise `UserError` where other software would give other outcomes."""
         for name, (there, here) in differences(self.software, software(self.povs)).items():
             if name.startswith(POLICY):
                 raise UserError(
@@ -114,6 +111,13 @@ class GroundPlan:
             raise UserError(
                 f"a worker has {name} {here}, and this process {there}: install the same there"
             )
+
+    def open(self, binding: Any = None) -> ProvingGround:
+        """Open the proving ground; `UserError` where other software would give other outcomes.
+
+        `binding` takes the place of libsumo: see `World`.
+        """
+        self.check_software()
         drivers = self.vut, self.corridors, self.net, self.scenario, self.povs
         return ProvingGround(*drivers, binding)
 

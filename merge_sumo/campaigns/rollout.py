@@ -1,4 +1,4 @@
-"""From cases to trajectories: two drivers in the SUMO world."""
+"""From cases to trajectories: two drivers in the SUMO world, or by eq. (4) alone."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.campaigns.equation_world import EquationWorld
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import Following, keep_behind_vut
 from merge_sumo.sumo.world import SimulationError, World
@@ -54,7 +55,7 @@ class _Episode:
 
 
 def rollout(
-    world: World, pov: Driver, vut: Driver, cases: Iterable[Case]
+    world: World | EquationWorld, pov: Driver, vut: Driver, cases: Iterable[Case]
 ) -> Iterator[tuple[int, Trajectory]]:
     """Run cases in the world; yield (place in `cases`, trajectory) as the episodes end.
 
@@ -70,7 +71,9 @@ def rollout(
 
 
 class _Rollout:
-    def __init__(self, world: World, pov: Driver, vut: Driver, cases: Iterable[Case]) -> None:
+    def __init__(
+        self, world: World | EquationWorld, pov: Driver, vut: Driver, cases: Iterable[Case]
+    ) -> None:
         corridors, vehicles = world.corridors, len(world.x_m)
         self.world, self.pov, self.vut = world, pov, vut
         self.mainline = [row for row in range(vehicles) if row != VUT]

@@ -131,7 +131,7 @@ def _avoidance(facts: Facts, index: int) -> dict[str, Any]:
     found = facts.avoidance.get(index)
     return {
         "avoided_by": None if found is None else list(found.avoided_by),
-        "careful_until": None if found is None else found.careful_until_s,
+        "latest_takeover": None if found is None else found.latest_takeover_s,
         "pov_careful": None if found is None else int(found.pov_careful),
     }
 

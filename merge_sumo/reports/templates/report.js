@@ -95,9 +95,9 @@ function words(i) {
     parts.push(until === null ? "There never was a way out for the VUT." : `Full braking or full acceleration of the VUT would have kept ${fixed(data.crash_m, 0)} m at M until ${fixed(until, 1)} s.`);
   }
   if (cases.avoided_by && cases.avoided_by[i] !== null) {
-    const by = cases.avoided_by[i], until = cases.careful_until[i];
+    const by = cases.avoided_by[i], until = cases.latest_takeover[i];
     parts.push(by.length ? `In the VUT's place ${by.join(", ")} would have avoided it.` : "No reference driver in the VUT's place would have avoided it.");
-    if (until !== null) parts.push(`The last time at which a careful driver can take over and avoid it is ${fixed(until, 1)} s.`);
+    if (until !== null) parts.push(`The last time at which the fuzzy safety model (fsm) can take over and avoid it is ${fixed(until, 1)} s.`);
     if (cases.pov_careful[i]) parts.push("A careful driver in the POV's place avoids it, too.");
   }
   return parts.join(" ");
