@@ -209,7 +209,9 @@ class TestTheFile:
         write_avoidance(folder, found)
         path = folder / AVOIDANCE
         path.write_text(path.read_text().replace("latest_takeover_s", "careful_until_s"))
-        assert list(read_avoidance(Run(folder)).values()) == found
+        # In that version another driver took over.
+        without = [replace(one, latest_takeover_s=None) for one in found]
+        assert list(read_avoidance(Run(folder)).values()) == without
 
     def test_has_no_failure_twice(self, folder, found):
         write_avoidance(folder, [found[0], found[0]])

@@ -114,7 +114,7 @@ class CutIns:
             in_time = y / u <= (d + 2.0 * LENGTH_M) / (v - self.v_other) + 0.1
         near = (y <= 0.0) | ((u > 0.0) & in_time)
         sees = near & (d + LENGTH_M >= 0.0)
-        pfs, cfs = self.model.pfs(d, v, self.v_other), self.model.cfs(d, v, self.v_other, a)
+        pfs, cfs = FsmModel().pfs(d, v, self.v_other), FsmModel().cfs(d, v, self.v_other, a)
         self.most_pfs = np.maximum(self.most_pfs, np.where(sees, pfs, 0.0))
         self.most_cfs = np.maximum(self.most_cfs, np.where(sees, cfs, 0.0))
         return unsafe & near

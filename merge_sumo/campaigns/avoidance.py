@@ -158,9 +158,10 @@ def read_avoidance(run: Run) -> dict[int, Avoidance]:
 
 
 def _of_record(record: Any) -> Avoidance:
-    if "careful_until_s" in record:  # until 0.1.0 that of the careful driver
-        record = dict(record)
-        record["latest_takeover_s"] = record.pop("careful_until_s")
+    if isinstance(record, dict) and "careful_until_s" in record:
+        # Up to 0.1.0: another driver took over, so the time is none of this one's.
+        record = {**record, "latest_takeover_s": None}
+        del record["careful_until_s"]
     one = Avoidance(**record)
     until, names = one.latest_takeover_s, record["avoided_by"]
     if type(one.index) is not int or type(one.pov_careful) is not bool or type(names) is not list:

@@ -49,7 +49,7 @@ class Avoidance:
         index: of the case in its campaign.
         avoided_by: names of the reference drivers that pass the case in the VUT's place.
         latest_takeover_s: the last time at which the FSM driver, taking over, passes it; None where
-            there is no such time.
+            there is no such time, and where a version up to 0.1.0 made the record.
         pov_careful: whether a careful driver on the mainline would have avoided it against what
             the VUT did.
     """
