@@ -226,7 +226,7 @@ CHECKS: dict[str, Callable[..., None]] = {
     rf"Bodies touch at a relative speed of {NUMBER} m/s\.": of_another_test,
     r"In the VUT's place .+ would have avoided it\.": of_another_test,
     r"No reference driver in the VUT's place would have avoided it\.": of_another_test,
-    r"The last time at which a careful driver can take over .+ s\.": of_another_test,
+    r"The last time at which the fuzzy safety model \(fsm\) can take over .+ s\.": of_another_test,
     r"A careful driver in the POV's place avoids it, too\.": of_another_test,
 }  # fmt: skip
 """The sentences of the case view, and what checks their numbers and words."""
