@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, TypedDict
 from merge_sumo.campaigns.settings import CampaignSettings, parse_levels, povs_of
 from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.drivers.vuts.here import AnyVut, drivers_of
-from merge_sumo.errors import UserError
+from merge_sumo.errors import Notice, UserError
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario
 
@@ -142,7 +143,8 @@ def settings_for(
         workers: number that is asked for; None is one a core.
         search: settings of a search, by their names in `CampaignSettings`.
 
-    Raises `UserError` for values that make no settings.
+    Raises `UserError` for values that make no settings, and warns with a `Notice` of what is odd
+    about the criterion.
     """
     spec, pov_spec, workers = drivers_of(vut, setup.get("pov"), workers, stacklevel=4)
     named = recordable({"scenario": US23, **setup, **search, "pov": pov_spec})
@@ -152,4 +154,7 @@ def settings_for(
         in_process=named.get("in_process", False),
     )
     povs = povs_of(named.get("policies"), named["scenario"], pov_spec, options)
-    return CampaignSettings(vut=spec, levels=parse_levels(str(level), povs), **named), workers
+    settings = CampaignSettings(vut=spec, levels=parse_levels(str(level), povs), **named)
+    for note in settings.criterion.notes(settings.scenario):
+        warnings.warn(f"note: {note}", Notice, stacklevel=3)
+    return settings, workers

@@ -179,6 +179,7 @@ def campaign(
 
 def _conclude(found: CampaignRun, gates: list[Gate], junit: Path | None, *, as_json: bool) -> bool:
     """Print what a campaign found; return whether it passed."""
+    from merge_sumo.reports.doubts import notes_on
     from merge_sumo.reports.junit import write_junit
     from merge_sumo.reports.verdict import NOTHING_TESTED
 
@@ -195,6 +196,7 @@ def _conclude(found: CampaignRun, gates: list[Gate], junit: Path | None, *, as_j
             "stopped": "converged" if converged else "cases",
             "careful": careful,
             "fail_when": run.criterion.text,
+            "notes": notes_on(run.outcomes, run.criterion),
         }
         paths = {"run": str(run.folder), "report": str(found.report_file)}
         typer.echo(json.dumps({**judged, **paths}))
@@ -233,6 +235,7 @@ def _print_summary(
 ) -> None:
     from merge_sumo.campaigns.conductor import SCENARIOS, case_name
     from merge_sumo.campaigns.run import failures
+    from merge_sumo.reports.doubts import doubts
     from merge_sumo.reports.verdict import counted
 
     show(verdict.counts)
@@ -242,6 +245,8 @@ def _print_summary(
         counts = ", ".join(f"{number} {name}" for name, number in summary.severities.items())
         show(f"  severity: {counts}")
     print_troubles(verdict)
+    for note in doubts(run.outcomes, run.criterion):
+        show(f"  note: {note}")
     for level, found in summary.levels.items():
         if found.cases and not found.tested:
             show(f"  level {level_name(level)}: nothing was tested in {found.cases} cases")

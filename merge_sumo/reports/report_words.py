@@ -16,6 +16,7 @@ from merge_sumo.reports.diagnosis import (
     BRAKED_MPS,
     MEANING,
 )
+from merge_sumo.reports.doubts import notes_on
 from merge_sumo.reports.foretelling import foretold_in_words
 from merge_sumo.reports.headline import Rule, after_words, avoidable_words, headline
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
@@ -62,6 +63,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "troubles": facts.troubles(),
         "more_troubles": facts.verdict.troubles[LISTED:],
         "lost": in_words(lost) if lost else "",
+        "notes": notes_on(facts.run.outcomes, facts.run.criterion),
         "torn": facts.run.torn or (isinstance(wanted, int) and summary.cases < wanted),
         "counted": summary.cases - len(facts.shown),
         "summary": summary,

@@ -19,10 +19,12 @@ from merge_sumo.system.printable import printable
 from merge_sumo.system.suggestions import nearest
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
+from merge_sumo.values.ranges import Speeds
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
 from merge_sumo.values.severity import Severity
-from merge_sumo.values.temporal import check_formula, robustness, try_formula
+from merge_sumo.values.soundness import domain_of, emptiness, idle_parts
+from merge_sumo.values.temporal import check_formula, formula_range, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
 
 PAPER: Final = "paper"
@@ -102,16 +104,48 @@ class Criterion:
     def check(self, scenario: Scenario) -> None:
         """Raise `UserError` where it speaks of what an episode of a scenario does not have.
 
-        Also where it is no formula, or what evaluates one is missing.
+        Also where it is no formula, or what evaluates one is missing, and where no case could fail
+        or every case would (`soundness.py`).
         """
         if self.require is not None:
             try_formula(self.require)
-        spoken = frozenset[str]() if self.require else _names(self.words)
+            if (why := self._emptiness(Speeds.possible(scenario), scenario)) is not None:
+                raise UserError(f"--require {printable(self.require[:80])!r}: {why}")
+            return
+        spoken = _names(self.words)
         if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
             raise UserError(
                 f"--fail-when speaks of {min(named)}, which is measured behind M: say how long "
                 "with --follow-up SECONDS"
             )
+        if (why := self._emptiness(Speeds.possible(scenario), scenario)) is not None:
+            raise UserError(f"--fail-when {printable(self.words[:80])!r}: {why}")
+
+    def notes(self, scenario: Scenario) -> list[str]:
+        """Return in sentences what is odd about it in a scenario, although cases may meet it.
+
+        A part of a condition that is decided without any case, and a whole that no case meets, or
+        every one, at the speeds that the scenario names.
+        """
+        what = "--fail-when" if self.require is None else "--require"
+        found = []
+        if self.require is None and self.fail_when not in NAMED:
+            domain = domain_of(scenario, Speeds.possible(scenario), _texts())
+            found += [f"{what}: {part}" for part in idle_parts(condition_of(self.words), domain)]
+        usual = Speeds.usual(scenario)
+        if not found and (why := self._emptiness(usual, scenario)) is not None:
+            found.append(f"{what}: at speeds up to {usual.vut_mps:g} m/s {why}")
+        return found
+
+    def _emptiness(self, speeds: Speeds, scenario: Scenario) -> str | None:
+        """Return in words that no case fails, or that every case does; None where some may."""
+        if self.require is None:
+            domain = domain_of(scenario, speeds, _texts())
+            return emptiness(condition_of(self.words), domain)
+        limits = formula_range(self.require, scenario, speeds)
+        if limits.low > 0.0:
+            return "it holds in every case, so that none fails"
+        return "it holds in no case, so that every one fails" if limits.high <= 0.0 else None
 
     @property
     def is_papers(self) -> bool:
@@ -140,7 +174,7 @@ class Criterion:
             return None
         if self.require is not None:
             return robustness(self.require, trajectory)
-        return _condition(self.words).margin(values_of(measures, _names(self.words)))
+        return condition_of(self.words).margin(values_of(measures, _names(self.words)))
 
     def outcome(
         self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
@@ -174,14 +208,21 @@ PAPER_CRITERION: Final = Criterion()
 
 
 @lru_cache
-def _condition(text: str) -> Condition:
+def condition_of(text: str) -> Condition:
+    """Return the condition that a criterion states, by its words."""
     return parse_condition(text, VOCABULARY, "--fail-when", NAMED)[0]
+
+
+def _texts() -> dict[str, frozenset[str]]:
+    """Return all that a text can be, also where an episode has none."""
+    missing = {name: frozenset({value}) for name, value in NEVER.items() if isinstance(value, str)}
+    return {name: texts | missing.get(name, frozenset()) for name, texts in TEXTS.items()}
 
 
 @lru_cache
 def _names(text: str) -> frozenset[str]:
     """Return the measures that a condition speaks of, by their names or by those of others."""
-    return names_of(_condition(text))
+    return names_of(condition_of(text))
 
 
 def values_of(measures: Measures, names: Set[str] = VOCABULARY.keys()) -> dict[str, Value]:
