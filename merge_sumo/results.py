@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.campaigns.avoidance import in_a_sentence, read_avoidance
+from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.single import Ended
 from merge_sumo.errors import UserError
@@ -101,6 +102,11 @@ class CampaignRun:
         return Table(o for o in self._run.outcomes if o.measures.end is End.TIMEOUT)
 
     @cached_property
+    def repeats(self) -> list[Repeat]:
+        """The cases that ran a second time, and whether they went as before."""
+        return read_repeats(self._run)
+
+    @cached_property
     def verdict(self) -> Verdict:
         """How many cases failed, erred or timed out; errors and timeouts by message."""
         return judge(self._run.outcomes)
@@ -144,7 +150,9 @@ class CampaignRun:
             for level, found in self.summary.levels.items()
         )
         title = escape(f"{self._run.vut}: {self.verdict.counts}")
-        wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in self.verdict.sentences)
+        unsaid = unrepeatable(self.repeats)
+        said = [*([unsaid] if unsaid else []), *self.verdict.sentences]
+        wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in said)
         return (
             f"<p><b>{title}</b><br>{escape(str(self.folder))}</p>{wrong}"
             "<table><thead><tr><th>POV level</th><th>cases</th><th>failures</th><th>regions</th>"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import vector as vector_wrappers
 from merges import HALF, LIKE_A_ROUNDABOUT
 from typer.testing import CliRunner
 
@@ -102,20 +103,66 @@ class TestEnvironments:
         played = returns_of(play(cases, Level0Pov, Level0Vut), REWARD)
         assert returns == pytest.approx(played.safe + played.pov_ego, abs=1e-9)
 
-    def test_games_of_a_vector_environment_begin_anew_by_themselves(self):
+    def test_games_of_a_vector_environment_begin_anew_in_the_step_after_their_end(self):
         games = MergeVectorEnv(3, role="vut", opponent="level0")
         try:
             games.reset(seed=0)
-            ends = 0
+            ends, ended = 0, np.zeros(3, dtype=bool)
             for _ in range(45):
-                observation, _, terminated, _, info = games.step(np.full(3, 5))
-                if terminated.any():
-                    ends += int(terminated.sum())
-                    assert (info["final_obs"][terminated, 2] >= 0.0).all()
-                    assert (observation[terminated, 2] == -182.0).all()
+                observation, rewards, terminated, _, _ = games.step(np.full(3, 5))
+                assert (observation[ended, 2] == -182.0).all()
+                assert not rewards[ended].any()
+                assert not terminated[ended].any()
+                assert (observation[terminated, 2] >= 0.0).all()
+                ends, ended = ends + int(terminated.sum()), terminated
             assert ends >= 6
         finally:
             games.close()
+
+    def test_make_vec_plays_the_games_of_one_world_with_gymnasiums_wrappers(self):
+        games = gymnasium.make_vec(ENV_ID, num_envs=3, role="vut", opponent="level0")
+        try:
+            wrapped = vector_wrappers.RecordEpisodeStatistics(
+                vector_wrappers.NormalizeObservation(games)
+            )
+            wrapped.reset(seed=0)
+            lengths, returns = [], np.zeros(3)
+            for _ in range(45):
+                _, rewards, terminated, truncated, info = wrapped.step(np.full(3, 5))
+                returns += rewards
+                for k in np.flatnonzero(terminated | truncated):
+                    assert info["episode"]["r"][k] == pytest.approx(returns[k])
+                    lengths.append(int(info["episode"]["l"][k]))
+                    returns[k] = 0.0
+            assert len(lengths) >= 6
+            # +1 m/s2 from 18 m/s: at M, 182 m on, in the 17th decision.
+            assert set(lengths) == {17}
+        finally:
+            games.close()
+
+    @pytest.mark.parametrize("timeout_s", [30.0, 40.0])
+    def test_a_game_is_truncated_by_the_timeout_of_its_own_scenario(self, timeout_s):
+        scenario = dataclasses.replace(US23, timeout_s=timeout_s)
+        one = gymnasium.make(ENV_ID, role="vut", scenario=scenario)
+        several = gymnasium.make_vec(ENV_ID, num_envs=2, role="vut", scenario=scenario)
+        for games, brake in ((one, 0), (several, np.zeros(2, dtype=np.int64))):
+            try:
+                games.reset(seed=0)
+                truncated = [np.any(games.step(brake)[3]) for _ in range(round(2 * timeout_s))]
+                assert [bool(t) for t in truncated] == [False] * (len(truncated) - 1) + [True]
+            finally:
+                games.close()
+
+    def test_a_shorter_game_is_truncated_alike_by_make_and_make_vec(self):
+        one = gymnasium.make(ENV_ID, role="vut", max_episode_steps=3)
+        several = gymnasium.make_vec(ENV_ID, num_envs=2, role="vut", max_episode_steps=3)
+        for games, keep in ((one, 4), (several, np.full(2, 4))):
+            try:
+                games.reset(seed=0)
+                truncated = [np.all(games.step(keep)[3]) for _ in range(3)]
+                assert [bool(t) for t in truncated] == [False, False, True]
+            finally:
+                games.close()
 
     def test_same_seed_same_starts(self):
         for starts in (pool_starts, exploring_starts):
@@ -158,6 +205,7 @@ class TestEnvironments:
             ({"role": "bus"}, "no role 'bus'"),
             ({"role": "vut", "svo": 0.5}, "svo is the orientation of a POV"),
             ({"role": "pov", "opponent": "pov1"}, "cannot play against 'pov1'"),
+            ({"max_episode_steps": 0}, "max_episode_steps is 0"),
         ],
     )
     def test_settings_that_make_no_game_are_refused_in_a_sentence(self, settings, sentence):

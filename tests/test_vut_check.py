@@ -50,12 +50,15 @@ def test_of_a_good_vut_it_says_nothing_wrong_and_what_a_step_costs(check):
 @pytest.mark.parametrize(
     ("source", "problem"),
     [
-        ("import random\ndef Vut(seen):\n    return random.random()\n", "the same cases again"),
+        (
+            "import random\ndef Vut(seen):\n    return random.random()\n",
+            "the same cases in another order",
+        ),
         (
             CLASS.format(reset="pass", act="self.shared[0] += 1; return self.shared[0] % 7 * 0.1"),
             "differently",
         ),
-        ("def Vut(seen):\n    return None\n", "5 of 5 ordinary cases end as VUT_ERROR"),
+        ("def Vut(seen):\n    return None\n", "16 of 16 ordinary cases end as VUT_ERROR"),
         ("def Vut(seen):\n    return 1.0 / seen.v_vut_mps\n", "From a stand (v = 0) it ends as"),
         ("def Vut(seen):\n    return 0.1 * (seen.v_vut_mps > 1)\n", "it never starts"),
         (

@@ -29,6 +29,7 @@ import numpy as np
 from merge_sumo.campaigns.certificate_blocks import Blocks, block_key
 from merge_sumo.campaigns.certificate_runs import CaseResult, RunPoints
 from merge_sumo.campaigns.covering import Covering, covering
+from merge_sumo.campaigns.repeats import spread_places
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.campaigns.software import differences
 from merge_sumo.campaigns.truth import OnCases, sources_sha256
@@ -247,9 +248,12 @@ def _tested(
 def _twice(
     place: Blocks, lattice: Covering, run: Callable[[FloatArray], Iterable[tuple[int, CaseResult]]]
 ) -> list[bool]:
-    """Run some cases of a level once more, the last ones first; return which end as before."""
+    """Run some cases of a level once more, in reverse order; return which end as before.
+
+    The first ones, which ran when the VUT was new, are among them.
+    """
     count = min(TWICE, -(-len(lattice) // 4))
-    numbers = np.linspace(len(lattice) - 1, 0, count).astype(np.int64).tolist()
+    numbers = spread_places(len(lattice), count)
     points = np.concatenate([lattice.points(number, number + 1) for number in numbers])
     same = [False] * count
     for nth, done in run(points):

@@ -21,6 +21,7 @@ from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.learning import lessons
 from merge_sumo.campaigns.ownership import FILES
 from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.repeats import repeat, write_repeats
 from merge_sumo.campaigns.run import SETTINGS, Run, spread_failures
 from merge_sumo.campaigns.settings import (
     RECORDED_BY_DEFAULT,
@@ -277,6 +278,9 @@ def _go_on(
                 journal.rewrite_settings(record)
             check()
     done = Run(journal.folder, [*history, *ended])
+    repeats = repeat(done, settings, run)
+    if repeats:
+        write_repeats(done, repeats)
     for outcome in spread_failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
         if not os.path.lexists(folder):  # written whole, before the campaign was stopped

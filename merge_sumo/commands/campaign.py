@@ -31,6 +31,7 @@ from merge_sumo.commands.shared import (
     WorkersOption,
     app,
     print_troubles,
+    print_unrepeatable,
     say,
     settings_in,
     show,
@@ -197,6 +198,7 @@ def _conclude(found: CampaignRun, gates: list[Gate], junit: Path | None, *, as_j
             "careful": careful,
             "fail_when": run.criterion.text,
             "notes": notes_on(run.outcomes, run.criterion),
+            "repeats": [one.to_record() for one in found.repeats],
         }
         paths = {"run": str(run.folder), "report": str(found.report_file)}
         typer.echo(json.dumps({**judged, **paths}))
@@ -238,6 +240,7 @@ def _print_summary(
     from merge_sumo.reports.doubts import doubts
     from merge_sumo.reports.verdict import counted
 
+    print_unrepeatable(run)
     show(verdict.counts)
     if not run.criterion.is_papers:
         show(f"  a case fails when {run.criterion.words}")

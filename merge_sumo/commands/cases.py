@@ -204,7 +204,8 @@ def rerun(
         judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
         levels = asdict(found.compared)["levels"]
         compared = {"cases": len(found.before), "changed": changed, "levels": levels}
-        typer.echo(json.dumps({"vut": found.vut, **compared, **judged}))
+        again = {"unrepeated": found.unrepeated}
+        typer.echo(json.dumps({"vut": found.vut, **compared, **judged, **again}))
     else:
         _print_rerun(found, run)
         show(f"it is {'worse' if why else 'not worse'}, with a tolerance of {tolerance:g}")

@@ -14,6 +14,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 
 if TYPE_CHECKING:
+    from merge_sumo.campaigns.run import Run
     from merge_sumo.reports.verdict import Verdict
 
 
@@ -229,6 +230,15 @@ def print_troubles(verdict: Verdict) -> None:
     """Print what ended in an error or a timeout, by message; nothing where nothing did."""
     for line in verdict.trouble_lines():
         show(line)
+
+
+def print_unrepeatable(run: Run) -> None:
+    """Print that cases went differently when they ran again; nothing where none did."""
+    from merge_sumo.campaigns.repeats import read_repeats, unrepeatable
+
+    said = unrepeatable(read_repeats(run))
+    if said is not None:
+        show(said)
 
 
 def show(line: object) -> None:

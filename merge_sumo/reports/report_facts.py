@@ -10,6 +10,7 @@ from typing import Final, TypeVar
 
 from merge_sumo.campaigns.avoidance import read_avoidance
 from merge_sumo.campaigns.ground import road_for
+from merge_sumo.campaigns.repeats import read_repeats
 from merge_sumo.campaigns.run import SETTINGS, Run, failures, regions_of, spread_failures
 from merge_sumo.campaigns.software import versions
 from merge_sumo.campaigns.truth import TRUTH_CASES, Kept, Truth, read_truth
@@ -81,6 +82,7 @@ class Facts:
         self.regions = regions_of(self.worst)
         self.spread = spread_failures(self.worst)[:LISTED]
         self.avoidance = read_avoidance(run)
+        self.repeats = read_repeats(run)
         self.near = sorted(
             (o for o in run.outcomes if _is_told(o) and not o.failed),
             key=lambda o: (o.score, o.index),

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from merge_sumo.campaigns import repeats
 from merge_sumo.campaigns.avoidance import in_a_sentence
 from merge_sumo.campaigns.run import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.truth import TRUTH_CASES
@@ -55,6 +56,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
     return {
         "vut": facts.run.vut,
         "headline": headline(facts.verdict, summary, facts.worst, facts.kinds, rule),
+        "unrepeatable": repeats.unrepeatable(facts.repeats),
         "careful": in_a_sentence(facts.avoidance.values()),
         "avoidance": _avoidance(facts),
         "foretold": foretold_in_words(facts.run.outcomes),

@@ -10,8 +10,12 @@ from typing import Any, Final
 from merge_sumo.campaigns.conductor import workers_or_here
 from merge_sumo.campaigns.ground import road_for, runs_on
 from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.repeats import cause
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
+from merge_sumo.campaigns.software import versions
+from merge_sumo.drivers.vut import built_in_vuts
+from merge_sumo.drivers.vuts.files import changed
 from merge_sumo.errors import UserError
 from merge_sumo.reports.changes import Change, RunComparison
 from merge_sumo.reports.comparison import compared_case, level_change, telling
@@ -60,12 +64,15 @@ class Rerun(InLines):
         before: the recorded outcomes.
         after: those of today, in the same order, with the same indices.
         compared: what changed, as in `compare_runs`: A is what was recorded, B is today's.
+        unrepeated: indices of the cases that did not go as before although the VUT is the same, by
+            its name, its command and its files; empty where it is another one.
     """
 
     vut: str
     before: list[Outcome]
     after: list[Outcome]
     compared: RunComparison
+    unrepeated: tuple[int, ...] = ()
 
     @property
     def changed(self) -> list[ChangedVerdict]:
@@ -82,6 +89,12 @@ class Rerun(InLines):
         now, changed = judge(self.after), self.changed
         said = [f"recorded:  {judge(self.before).counts}", f"now:       {now.counts} ({self.vut})"]
         said += now.trouble_lines()
+        if self.unrepeated:
+            said.append(
+                f"{len(self.unrepeated)} of {counted(len(self.after), 'case')} went differently, "
+                f"and no file of the VUT has changed (the first is case {self.unrepeated[0]}). "
+                f"{cause()}."
+            )
         if not changed:
             return [*said, "no verdict changed"]
         said.append(
@@ -149,14 +162,44 @@ def rerun(
                 "today's: give its --policies"
             )
     plan = plan_of(settings, road, cases=len(before))
-    after: dict[int, Outcome] = {}
+    # In another order than the campaign's, which a VUT that remembers would repeat.
+    order, after = before[::-1], dict[int, Outcome]()
     with workers_or_here(workers) as there:
-        for place, ran in runs_on(there, plan)([outcome.case for outcome in before]):
-            was = before[place]
-            after[place] = Outcome(was.index, was.batch, was.case, ran.measures, margin=ran.margin)
+        for place, ran in runs_on(there, plan)([outcome.case for outcome in order]):
+            was = order[place]
+            now = Outcome(was.index, was.batch, was.case, ran.measures, margin=ran.margin)
+            after[was.index] = now
             on_case(1)
-    again = [after[place] for place in range(len(before))]
-    return Rerun(settings.vut, before, again, _compared(levels, before, again))
+    again = [after[outcome.index] for outcome in before]
+    unrepeated = _unrepeated(before, again) if _same_vut(run, settings) else ()
+    return Rerun(settings.vut, before, again, _compared(levels, before, again), unrepeated)
+
+
+def _same_vut(run: Run, settings: CampaignSettings) -> bool:
+    """Return whether a VUT that is not of the package is the one that was recorded."""
+    recorded, files = run.settings, run.settings.get("vut_files")
+    return (
+        settings.vut not in built_in_vuts()
+        and (settings.vut, settings.vut_command)
+        == (recorded.get("vut"), recorded.get("vut_command"))
+        and recorded.get("versions") == versions()
+        and isinstance(files, dict)
+        and not changed(files)
+    )
+
+
+def _unrepeated(before: Sequence[Outcome], after: Sequence[Outcome]) -> tuple[int, ...]:
+    """Return the indices of the cases that did not go as before, but for those with an error."""
+
+    def motion(outcome: Outcome) -> tuple[object, ...]:
+        found = outcome.measures
+        return found.end, found.t_end_s, found.dx_m, found.dv_mps, found.clipped_steps
+
+    return tuple(
+        a.index
+        for a, b in zip(before, after, strict=True)
+        if not (a.measures.end.is_error or b.measures.end.is_error) and motion(a) != motion(b)
+    )
 
 
 def _compared(

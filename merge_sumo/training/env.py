@@ -2,6 +2,7 @@
 
     import merge_sumo.training.registration
     env = gymnasium.make("merge_sumo/Merge-v0", role="pov", opponent="level0", svo=None)
+    games = gymnasium.make_vec("merge_sumo/Merge-v0", num_envs=32, role="vut")
 
 The agent plays the POV or the VUT; its opponent is a driver of this package. Observations are
 [x_POV, v_POV, x_VUT, v_VUT] in m and m/s, and psi for a POV with a social value orientation;
@@ -94,15 +95,19 @@ class MergeGame:
         x, v = self.world.x_m, self.world.v_mps
         return np.stack([x[POV], v[POV], x[VUT], v[VUT]], axis=1)
 
-    def decide(self, a_mps2: FloatArray) -> tuple[FloatArray, RewardParts, NDArray[np.bool_]]:
+    def decide(
+        self, a_mps2: FloatArray, ended: NDArray[np.bool_] | None = None
+    ) -> tuple[FloatArray, RewardParts, NDArray[np.bool_]]:
         """Hold the agent's accelerations, (K,), for one decision.
+
+        Games that have `ended`, (K,), stand still and earn nothing.
 
         Returns the states at its end (or at t1, where that came first), the reward in parts, and
         which games are over because the VUT is at M. Those stand until they begin anew.
         """
         world, reward = self.world, self.reward
         parts = RewardParts(*np.zeros((3, self.corridors)))
-        over = np.zeros(self.corridors, dtype=bool)
+        over = np.zeros(self.corridors, dtype=bool) if ended is None else ended.copy()
         state = self.state()
         agent, other = (POV, VUT) if self.role == "pov" else (VUT, POV)
         a = np.empty((2, self.corridors))
@@ -182,9 +187,13 @@ def exploring_starts(
 
 
 class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
-    """K merging games as one gymnasium vector environment; games begin anew by themselves."""
+    """K merging games as one gymnasium vector environment.
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    A game that has ended begins anew in the next step, which ignores its action and has reward 0:
+    `AutoresetMode.NEXT_STEP`, which the wrappers of gymnasium expect.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -194,17 +203,26 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         svo: float | Literal["random"] | None = None,
         weights: RewardWeights | None = None,
         scenario: Scenario = US23,
+        max_episode_steps: int | None = None,
     ) -> None:
         """Play `role` against `opponent`: "level0", or a policy such as "vut1" or "pov1".
 
         `svo` is psi of a POV of level 2, or "random" for one drawn anew for every game; psi is
         then part of the observation. The weights are those of the scenario unless they are given.
+        A game is truncated by the scenario's timeout, or after `max_episode_steps` decisions where
+        that is earlier.
         """
         if role == "vut" and svo is not None:
             raise UserError("svo is the orientation of a POV: leave it out for role='vut'")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise UserError(f"max_episode_steps is {max_episode_steps}: it must be 1 or more")
         self.num_envs, self.role, self.svo = num_envs, role, svo
         self._opponent = make_opponent(role, opponent, num_envs)
         self._scenario = of_two(scenario)
+        self._max_steps = min(
+            self._scenario.max_steps,
+            DECISION_STEPS * (max_episode_steps or self._scenario.max_steps),
+        )
         self._reward = Reward(weights or RewardWeights.of(scenario), self._scenario)
         self._game: MergeGame | None = None
         unit = Units.of(scenario)
@@ -220,6 +238,7 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         self._rng = np.random.default_rng()
         self._svo_rad = np.zeros(num_envs)
         self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._ended = np.zeros(num_envs, dtype=bool)
 
     @property
     def game(self) -> MergeGame:
@@ -239,24 +258,25 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         if seed is not None:
             self._rng = np.random.default_rng([s or 0 for s in np.atleast_1d(np.array(seed))])
         self._begin(np.arange(self.num_envs))
+        self._ended = np.zeros(self.num_envs, dtype=bool)
         return self._observe(self.game.state()), {}
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Take one decision in every game; `info` has the last observation of those that ended."""
-        state, parts, terminated = self.game.decide(self.game.actions_mps2[np.asarray(actions)])
+        """Take one decision in every game that has not ended; begin the others anew."""
+        began = self._ended
+        a_mps2 = self.game.actions_mps2[np.asarray(actions)]
+        state, parts, over = self.game.decide(a_mps2, began)
         self._steps += DECISION_STEPS
-        truncated = ~terminated & (self._steps >= self._scenario.max_steps)
-        reward = parts.of(self.role, self._svo_rad)
-        observation = self._observe(state)
-        info: dict[str, Any] = {}
-        ended = terminated | truncated
-        if ended.any():
-            info = {"final_obs": observation.copy(), "_final_obs": ended}
-            self._begin(np.flatnonzero(ended))
-            observation = np.where(ended[:, None], self._observe(self.game.state()), observation)
-        return observation, reward, terminated, truncated, info
+        terminated = over & ~began
+        truncated = ~over & (self._steps >= self._max_steps)
+        reward = np.where(began, 0.0, parts.of(self.role, self._svo_rad))
+        self._ended = terminated | truncated
+        if began.any():
+            self._begin(np.flatnonzero(began))
+            state = np.where(began[:, None], self.game.state(), state)
+        return self._observe(state), reward, terminated, truncated, {}
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close SUMO."""
@@ -309,9 +329,8 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
 
     def step(self, action: np.int64) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Take one decision."""
-        observations, reward, terminated, truncated, info = self._games.step(np.array([action]))
-        last = info["final_obs"] if info else observations
-        return last[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+        observations, reward, terminated, truncated, _ = self._games.step(np.array([action]))
+        return observations[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
 
     def close(self) -> None:
         """Close SUMO."""

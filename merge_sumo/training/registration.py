@@ -1,4 +1,4 @@
-"""Importing this module makes `gymnasium.make("merge_sumo/Merge-v0")` work."""
+"""Importing this module makes `gymnasium.make("merge_sumo/Merge-v0")` and `make_vec` work."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from typing import Final
 from gymnasium.envs import registration
 
 from merge_sumo.drivers.levelk import DECISION_STEPS
-from merge_sumo.values.scenario import US23
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
 
 ENV_ID: Final = "merge_sumo/Merge-v0"
 
-# The environments themselves are imported when one is made.
+# The environments themselves are imported when one is made. They truncate a game by the timeout of
+# its scenario: here stands what no scenario exceeds, for the wrappers that ask for a limit.
 registration.register(
     ENV_ID,
     entry_point="merge_sumo.training.env:MergeEnv",
     vector_entry_point="merge_sumo.training.env:MergeVectorEnv",
-    max_episode_steps=US23.max_steps // DECISION_STEPS,
+    max_episode_steps=round(MAX_EPISODE_S / DT_S) // DECISION_STEPS,
 )

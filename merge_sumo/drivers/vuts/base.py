@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import signal
-import struct
 import sys
 import threading
 from abc import abstractmethod
@@ -21,6 +20,7 @@ import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.following import car_met
+from merge_sumo.drivers.vuts.asked import NOBODY, asked
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.interrupt import Stopped
@@ -167,46 +167,6 @@ class TooLate(BaseException):
     """A call ran into its deadline. Not an Exception, so that a VUT does not catch it by habit."""
 
 
-NOBODY: Final = -1
-EVERYBODY: Final = -2
-"""Whom a batched VUT is asked for."""
-
-
-class Asked:
-    """Which corridor's controller is being asked, in memory that outlives the process.
-
-    Whoever watches the process reads from it whose doing it was that the process died or hangs.
-    """
-
-    FORMAT: Final = struct.Struct("<Qq")
-
-    def __init__(self) -> None:
-        """Note it where nobody else reads it."""
-        self.shared = False
-        """Whether somebody does: then this process is there for a VUT alone."""
-        self._memory: Any = bytearray(self.FORMAT.size)
-        self._count = 0
-
-    def share(self, memory: Any) -> None:
-        """Note it from now on in a buffer that another process reads, too."""
-        self.shared, self._memory = True, memory
-
-    @classmethod
-    def read(cls, memory: Any) -> tuple[int, int]:
-        """Return from such a buffer how often something was noted, and what was last."""
-        count, corridor = cls.FORMAT.unpack_from(memory)
-        return count, corridor
-
-    def note(self, corridor: int) -> None:
-        """Note a corridor, `NOBODY` or `EVERYBODY`."""
-        self._count += 1
-        self.FORMAT.pack_into(self._memory, 0, self._count, corridor)
-
-
-asked: Final = Asked()
-"""Of this process."""
-
-
 RING_AFTER: Final = 1.02
 """Of the deadline: when a timer rings for a call, that is too late beyond doubt."""
 
@@ -319,6 +279,9 @@ class PerCorridor(Driver):
     What a controller does wrong is the reason of its corridor alone; it is then made anew.
     """
 
+    renewal = "made anew"
+    """Begins the reason where that fails."""
+
     def __init__(self, corridors: int, deadline_s: float) -> None:
         """Prepare for a number of corridors; a subclass makes the controllers."""
         super().__init__(corridors)
@@ -341,14 +304,16 @@ class PerCorridor(Driver):
     def begin(self, corridor: int, case: Case) -> None:
         """Reset the controller of a corridor; an error is kept as the reason of its answer."""
         self._reasons[corridor] = None
+        doing = self.renewal
         try:
             with self._watch as watch:
                 if self._renew_first[corridor]:
                     watch.call(corridor, self.renew, corridor)
                     self._renew_first[corridor] = False
+                doing = "reset"
                 watch.call(corridor, self.reset, corridor, seen_at_start(case))
         except BaseException as error:
-            self._fault(corridor, f"reset: {self._watch.reason(error)}")
+            self._fault(corridor, f"{doing}: {self._watch.reason(error)}")
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
@@ -378,9 +343,13 @@ class PerCorridor(Driver):
     def _number(self, corridor: int, seen: Seen) -> float:
         return as_number(self.answer(corridor, seen))
 
+    def renew_next(self, corridor: int) -> None:
+        """Have the controller of a corridor made anew before the next episode."""
+        self._renew_first[corridor] = True
+
     def _fault(self, corridor: int, reason: str) -> None:
         self._reasons[corridor] = reason
-        self._renew_first[corridor] = True
+        self.renew_next(corridor)
 
 
 class WrongAnswerError(Exception):

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.vuts.base import PerCorridor, Seen, Vut, VutOptions, asked
+from merge_sumo.drivers.vuts.asked import asked
+from merge_sumo.drivers.vuts.base import PerCorridor, Seen, Vut, VutOptions
 from merge_sumo.drivers.vuts.options import split_options
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.vuts.base import Vut, VutOptions, text_of
-from merge_sumo.drivers.vuts.python import BatchedVut, FunctionVut, PythonVut, takes_one, vut_of
+from merge_sumo.drivers.vuts.python import BatchedVut, CallableVut, PythonVut, takes_one, vut_of
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.workers import workers_or_cores
@@ -133,18 +133,13 @@ def vut_of_object(vut: Any, name: str, options: VutOptions) -> Vut:
             return BatchedVut(corridors, lambda: vut, options.deadline_s)
 
         made = Vut(make=make_batched)
-    elif callable(getattr(vut, "act", None)):
+    elif callable(getattr(vut, "act", None)) or (callable(vut) and takes_one(vut)):
+        kind = PythonVut if callable(getattr(vut, "act", None)) else CallableVut
 
         def make(corridors: int, _world: World | None) -> Driver:
-            return PythonVut(corridors, lambda: _copy(vut, name), options.deadline_s)
+            return kind(corridors, lambda: _copy(vut, name), options.deadline_s)
 
         made = Vut(make=make)
-    elif callable(vut) and takes_one(vut):
-
-        def make_function(corridors: int, _world: World | None) -> Driver:
-            return FunctionVut(corridors, vut, options.deadline_s)
-
-        made = Vut(make=make_function)
     else:
         raise UserError(
             f"{text_of(vut, repr)[:80]} is no VUT: give a spec as after --vut, a class or an "
@@ -154,7 +149,7 @@ def vut_of_object(vut: Any, name: str, options: VutOptions) -> Vut:
 
 
 def _copy(vut: Any, name: str) -> Any:
-    """Return a copy: each corridor has an object of its own."""
+    """Return a copy of an object as it was given: none that drives is what another episode left."""
     try:
         return copy.deepcopy(vut)
     except Exception as error:

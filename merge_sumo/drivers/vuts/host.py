@@ -18,7 +18,8 @@ import numpy as np
 
 from merge_sumo.drivers.base import Driver, VutLostError
 from merge_sumo.drivers.vuts import wire
-from merge_sumo.drivers.vuts.base import Asked, Vut, VutOptions, asked, text_of
+from merge_sumo.drivers.vuts.asked import Asked, asked
+from merge_sumo.drivers.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.drivers.vuts.loaded import LoadedFiles
 from merge_sumo.drivers.vuts.wire import About, Frame
 from merge_sumo.errors import UserError

@@ -27,7 +27,8 @@ import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.drivers.vuts import wire
-from merge_sumo.drivers.vuts.base import Asked, Vut, VutOptions, Watch
+from merge_sumo.drivers.vuts.asked import Asked
+from merge_sumo.drivers.vuts.base import Vut, VutOptions, Watch
 from merge_sumo.drivers.vuts.host import BOOT
 from merge_sumo.drivers.vuts.output import Output
 from merge_sumo.drivers.vuts.wire import About, Frame, WireError

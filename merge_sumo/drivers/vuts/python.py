@@ -18,16 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.drivers.vuts.asked import EVERYBODY, NOBODY, asked
 from merge_sumo.drivers.vuts.base import (
-    EVERYBODY,
-    NOBODY,
     PerCorridor,
     Seen,
     Vut,
     VutOptions,
     Watch,
     WrongAnswerError,
-    asked,
     seen_at_start,
     text_of,
 )
@@ -95,7 +93,11 @@ def vut_of(target: Any, spec: str, options: VutOptions) -> Vut:
 
 
 class PythonVut(PerCorridor):
-    """Drives by objects with `act(seen)`, and `reset(seen)` and `close()` where they have them."""
+    """Drives by objects with `act(seen)`, and `reset(seen)` and `close()` where they have them.
+
+    An object with `reset` drives one episode after the other in its corridor. One without is never
+    told that an episode begins, so each episode has a new one.
+    """
 
     def __init__(self, corridors: int, make: Callable[[], Any], deadline_s: float) -> None:
         """Make an object for each corridor."""
@@ -107,13 +109,17 @@ class PythonVut(PerCorridor):
 
     def renew(self, corridor: int) -> None:
         """Replace the object of a corridor."""
+        _close(self._objects[corridor], self._watch.deadline_s)
         self._objects[corridor] = self._make()
 
     def reset(self, corridor: int, seen: Seen) -> None:
-        """Call `reset`, if there is one."""
-        reset = getattr(self._objects[corridor], "reset", None)
-        if reset is not None:
-            reset(seen)
+        """Call `reset`; where there is none, have the next episode begin with a new object."""
+        vut = self._objects[corridor]
+        if _has(vut, "reset"):
+            vut.reset(seen)
+        else:
+            self.renewal = "made anew for this episode, as it has no `reset`"
+            self.renew_next(corridor)
 
     def answer(self, corridor: int, seen: Seen) -> Any:
         """Call `act`."""
@@ -122,11 +128,19 @@ class PythonVut(PerCorridor):
     def close(self) -> None:
         """Call `close`, if there is one; what it raises comes too late to matter."""
         for vut in self._objects:
-            _close(vut, self._watch)
+            _close(vut, self._watch.deadline_s)
+
+
+class CallableVut(PythonVut):
+    """Drives by objects that are called with what is seen."""
+
+    def answer(self, corridor: int, seen: Seen) -> Any:
+        """Call the object."""
+        return self._objects[corridor](seen)
 
 
 class FunctionVut(PerCorridor):
-    """Drives by a function of what is seen, which remembers nothing."""
+    """Drives by a function of what is seen, which has nothing to begin anew with an episode."""
 
     def __init__(self, corridors: int, function: Callable[[Seen], Any], deadline_s: float) -> None:
         """Take the function."""
@@ -208,7 +222,7 @@ class BatchedVut(Driver):
 
     def close(self) -> None:
         """Call `close`, if there is one."""
-        _close(self._object, self._watch)
+        _close(self._object, self._watch.deadline_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,14 +262,21 @@ def _made(target: type, spec: str, *arguments: int) -> Any:
         raise UserError(f"{spec} cannot be made{given}: {what}") from error
 
 
-def _close(vut: Any, watch: Watch) -> None:
-    close = getattr(vut, "close", None)
-    if close is not None:
-        try:
-            with watch:
-                watch.call(NOBODY, close)
-        except BaseException as error:
-            sys.stderr.write(f"closing the VUT: {watch.reason(error)}\n")
+def _has(vut: Any, name: str) -> bool:
+    return getattr(vut, name, None) is not None
+
+
+def _close(vut: Any, deadline_s: float) -> None:
+    """Call `close`, if there is one; what it raises comes too late to matter, and is printed."""
+    if vut is None:
+        return
+    watch = Watch(deadline_s)  # of its own: this may be part of another call
+    try:
+        with watch:
+            if _has(vut, "close"):
+                watch.call(NOBODY, vut.close)
+    except BaseException as error:
+        sys.stderr.write(f"closing the VUT: {watch.reason(error)}\n")
 
 
 _VARIABLE: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)

@@ -1,0 +1,217 @@
+"""Cases of a campaign that run a second time: does a result depend on what ran before it?
+
+An episode is to depend on its case alone. A controller that draws random numbers, reads a clock,
+or keeps something from one episode to the next breaks that, and then a result depends on the number
+of workers, on the sampler, and on chance. So a few cases run again at the end of a campaign: the
+first ones, when the controller was new, and others, in reverse order. Their motion must be the same
+to the last bit. The VUTs of this package need no such check.
+
+repeats.jsonl           in the folder of the campaign: one line per case that ran twice
+
+The file of a folder that somebody sent is data as everything in it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.campaigns.ground import Ran, RunCases
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.vut import built_in_vuts
+from merge_sumo.errors import UserError
+from merge_sumo.system.arrays import regular
+from merge_sumo.system.folders import replace_own
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VEHICLES
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import End, Trajectory
+
+REPEATS: Final = "repeats.jsonl"
+MOST: Final = 20
+"""Cases that run twice at the end of a campaign, at most,"""
+ONE_IN: Final = 8
+"""and one in so many."""
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """A case that ran a second time.
+
+    Attributes:
+        index: of the case.
+        differs_from_s: time of the first step with another motion; None where all is the same.
+        first: the vehicle that differs first; None where none does, or not one alone.
+        end: how the case ended the second time.
+        failed: whether it failed the second time.
+        other_verdict: whether it ended or failed otherwise than the first time.
+    """
+
+    index: int
+    differs_from_s: float | None
+    first: str | None
+    end: End
+    failed: bool
+    other_verdict: bool
+
+    @property
+    def same(self) -> bool:
+        """Whether both times are the same."""
+        return self.differs_from_s is None and not self.other_verdict
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        return asdict(self)
+
+
+def repeat(run: Run, settings: CampaignSettings, run_cases: RunCases) -> list[Repeat]:
+    """Run some cases of a campaign again; return what became of them, in the order of the cases.
+
+    None run again where the package brings all that drives. Cases whose trajectory is lost are left
+    out.
+    """
+    chosen = chosen_again(run.outcomes, settings)
+    recorded = {o.index: motion for o in chosen if (motion := _trajectory(run, o)) is not None}
+    again = [outcome for outcome in chosen if outcome.index in recorded]
+    found = []
+    for place, ran in run_cases([outcome.case for outcome in again]) if again else ():
+        found.append(compared(again[place], recorded[again[place].index], ran))
+    return sorted(found, key=lambda one: one.index)
+
+
+def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
+    """Return the outcomes of the cases that are to run again, in that order.
+
+    Half of them are the first ones, which ran when the controller was new; the others are spread
+    over the campaign, and run before those. What ended in an error is left out: that may have been
+    a slow machine's doing.
+    """
+    built_in, own = built_in_vuts(), settings.povs.own
+    tested = [
+        outcome
+        for outcome in outcomes
+        if not outcome.measures.end.is_error
+        and (
+            settings.vut not in built_in
+            or (outcome.case.level == OWN and own is not None and own.spec not in built_in)
+        )
+    ]
+    places = spread_places(len(tested), min(MOST, -(-len(tested) // ONE_IN)))
+    return [tested[place] for place in places]
+
+
+def spread_places(cases: int, count: int) -> list[int]:
+    """Return the places of `count` of so many cases: the first ones and others, descending."""
+    first = (count + 1) // 2
+    others = np.linspace(cases - 1, first, count - first).astype(np.int64).tolist()
+    return [*others, *reversed(range(first))]
+
+
+def compared(outcome: Outcome, recorded: Trajectory, ran: Ran) -> Repeat:
+    """Return how the second run of a case compares with the recorded one."""
+    differs_from_s, first = _difference(recorded, ran.trajectory)
+    now = Outcome(outcome.index, outcome.batch, outcome.case, ran.measures, margin=ran.margin)
+    end = now.measures.end
+    other = (end, now.failed) != (outcome.measures.end, outcome.failed)
+    return Repeat(outcome.index, differs_from_s, first, end, now.failed, other)
+
+
+def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, str | None]:
+    """Return from when on two motions differ, and which vehicle differs first."""
+    rows = min(len(one.motion), len(other.motion))
+    pairs = [trajectory.motion[:rows].copy() for trajectory in (one, other)]
+    for pair in pairs:
+        pair[-1, :, 2] = 0.0  # a last acceleration is 0 by definition
+    differs = pairs[0] != pairs[1]
+    steps = np.flatnonzero(differs.any(axis=(1, 2)))
+    if not steps.size:
+        same = len(one.motion) == len(other.motion)
+        return (None, None) if same else (round((rows - 1) * DT_S, 1), None)
+    step = int(steps[0])
+    # The acceleration of a step is the answer to its state, which was the same.
+    vehicles = np.flatnonzero(differs[step, :, 2]).tolist()
+    return round(step * DT_S, 1), VEHICLES[vehicles[0]] if len(vehicles) == 1 else None
+
+
+def _trajectory(run: Run, outcome: Outcome) -> Trajectory | None:
+    try:
+        return run.trajectory(outcome.index)
+    except UserError:
+        return None
+
+
+def write_repeats(run: Run, found: Iterable[Repeat]) -> None:
+    """Write what became of the cases that ran twice into the folder of their campaign."""
+    lines = "".join(json.dumps(one.to_record(), allow_nan=False) + "\n" for one in found)
+    replace_own(run.folder / REPEATS, lines.encode())
+
+
+def read_repeats(run: Run) -> list[Repeat]:
+    """Return what the folder of a campaign says of cases that ran twice; empty where it is silent.
+
+    Raises `UserError` for a line that is of no case of the campaign.
+    """
+    path = run.folder / REPEATS
+    try:
+        lines = regular(path).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+    found: dict[int, Repeat] = {}
+    for number, line in enumerate(lines, start=1):
+        try:
+            one = _of_record(json.loads(line))
+            if not 0 <= one.index < len(run.outcomes) or one.index in found:
+                raise ValueError(f"case {one.index}")
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            raise UserError(f"line {number} of {path} is of no case of the campaign") from error
+        found[one.index] = one
+    return list(found.values())
+
+
+def _of_record(record: Mapping[str, Any]) -> Repeat:
+    one = Repeat(**{**record, "end": End(record["end"])})
+    from_s = one.differs_from_s
+    if type(one.index) is not int or {type(one.failed), type(one.other_verdict)} != {bool}:
+        raise TypeError("not as it is written")
+    if not (from_s is None or (type(from_s) is float and 0.0 <= from_s <= MAX_EPISODE_S)):
+        raise ValueError("differs_from_s")
+    if one.first not in (None, *VEHICLES):
+        raise ValueError("first")
+    return one
+
+
+def unrepeatable(found: Iterable[Repeat]) -> str | None:
+    """Return how many cases did not repeat, and what that means; None where all did, or none ran.
+
+    Which of the reasons it is, two runs of a case cannot tell.
+    """
+    known = list(found)
+    differing = [one for one in known if not one.same]
+    if not differing:
+        return None
+    verdicts = sum(one.other_verdict for one in differing)
+    example = next((one for one in differing if one.other_verdict), differing[0])
+    by = {one.first for one in differing}
+    who = {"vut": "VUT", "pov": "POV"}.get(next(iter(by)) or "", "") if len(by) == 1 else ""
+    since = "" if example.differs_from_s is None else f" from {example.differs_from_s:g} s on"
+    cases = "case that ran" if len(known) == 1 else "cases that ran"
+    return (
+        f"Not repeatable: {len(differing)} of {len(known)} {cases} twice went differently the "
+        f"second time, {verdicts or 'none'} of them with another verdict (case {example.index}"
+        f"{since}). {cause(who or 'VUT or the POV')}: a result depends on more than its case, and "
+        "other workers or another order may give others."
+    )
+
+
+def cause(who: str = "VUT") -> str:
+    """Return in a clause why a case may go differently when it runs again."""
+    return (
+        f"Either the {who} draws random numbers or reads a clock, or it keeps something from "
+        "earlier episodes"
+    )
