@@ -68,7 +68,7 @@ def of(expression, trajectory):
 
 def nearest(trajectory, lines):
     """Return the smallest clearance before M."""
-    return closest_before_m([trajectory], lines)[0][0]
+    return closest_before_m([trajectory], lines)[0]
 
 
 class TestMargins:
@@ -267,12 +267,18 @@ class TestRecords:
 
     def test_of_release_0_1_are_read(self):
         record = PAPER_CRITERION.outcome(0, 0, ending(5.5, v_pov=20.0, v_vut=22.0)).to_record()
-        for name in ("severity", "bumper_gap_m", "clearance_m", "brake_after_mps2"):
+        for name in (
+            "severity",
+            "bumper_gap_m",
+            "clearance_m",
+            "before_clearance_m",
+            "brake_after_mps2",
+        ):
             del record[name]
         record |= {"end": "COLLISION", "impact_speed_mps": 2.0, "after_merge": "forced"}
         read = Outcome.from_record(record).measures
         assert (read.end, read.severity, read.is_close) == (End.MERGED, "contact", True)
-        assert (read.bumper_gap_m, read.brake_after_mps2, read.clearance_m) == (0.5, None, None)
+        assert (read.bumper_gap_m, read.brake_after_mps2) == (0.5, None)
         record |= {"dx_m": 30.0, "score": -10.0, "end": "MERGED"}
         read = Outcome.from_record(record).measures
         assert (read.severity, read.bumper_gap_m, read.impact_speed_mps) == ("safe", 25.0, None)
@@ -386,13 +392,14 @@ class TestBodiesBeforeM:
         assert nearest(beside(0.0, x_vut=-14.9), us23) > 0.0
         assert centre_lines(road_for(US23)) is us23
 
-    def test_make_a_contact_although_the_vut_never_merges(self):
+    def test_before_m_are_a_measure_of_their_own(self):
         hit = beside(0.0)
         assert Criterion("contact").margin(hit, measure(hit)) == MOST_MARGIN
         touching = measure(hit, lines(1.0))
-        assert Criterion("contact").margin(hit, touching) == pytest.approx(-0.8)
-        assert touching.severity == "contact"
-        assert touching.impact_speed_mps is not None
+        assert Criterion("contact").margin(hit, touching) == MOST_MARGIN
+        overlap = Criterion("before_clearance_m < 0")
+        assert overlap.margin(hit, touching) == pytest.approx(-0.8)
+        assert (touching.severity, touching.impact_speed_mps) == (None, None)
 
 
 class TestOutcomes:

@@ -64,6 +64,7 @@ any_measures = st.builds(
     severity=st.sampled_from([None, *(s.value for s in Severity)]),
     bumper_gap_m=maybe,
     clearance_m=maybe,
+    before_clearance_m=maybe,
     drac_mps2=maybe,
     brake_after_mps2=maybe,
     vut_max_brake_mps2=number,

@@ -163,11 +163,10 @@ def check_severity(told: Told, word: str, kind: str | None) -> None:
     needed = (
         max(told.closing, 0.0) ** 2 / (2.0 * drives_on_m) if drives_on_m > 0.0 else float("inf")
     )
-    if word == "Contact":  # bodies before M are the matter of test_severity.py
-        return
-    assert drives_on_m > 0.0
-    assert (word == "Conflict") == (abs(told.dx) < NEAR_M)
-    if word != "Conflict":
+    assert (word == "Contact") == (drives_on_m <= 0.0)
+    if word != "Contact":
+        assert (word == "Conflict") == (abs(told.dx) < NEAR_M)
+    if word in ("Harsh", "Safe"):
         assert (word == "Harsh") == (needed > 3.0)
 
 
@@ -208,8 +207,12 @@ def check_timeout(told: Told, after: str) -> None:
     near(after, told.end_s, 0)
 
 
+def check_impact(told: Told, mps: str) -> None:
+    near(mps, abs(told.closing))
+
+
 def of_another_test(*_: object) -> None:
-    """Accept what test_severity.py (impact) and test_avoidance.py (other drivers) check."""
+    """Accept what test_severity.py (before M) and test_avoidance.py (other drivers) check."""
 
 
 CHECKS: dict[str, Callable[..., None]] = {
@@ -223,7 +226,8 @@ CHECKS: dict[str, Callable[..., None]] = {
         check_way_out,
     r"There never was a way out for the VUT\.": check_no_way_out,
     rf"Timeout: the VUT did not arrive in {NUMBER} s\.": check_timeout,
-    rf"Bodies touch at a relative speed of {NUMBER} m/s\.": of_another_test,
+    rf"Bodies touch at a relative speed of {NUMBER} m/s\.": check_impact,
+    r"Bodies overlap before M, where the lanes run together\.": of_another_test,
     r"In the VUT's place .+ would have avoided it\.": of_another_test,
     r"No reference driver in the VUT's place would have avoided it\.": of_another_test,
     r"The last time at which the fuzzy safety model \(fsm\) can take over .+ s\.": of_another_test,

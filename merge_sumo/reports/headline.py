@@ -123,3 +123,17 @@ def after_words(outcomes: Iterable[Outcome], crash_m: float) -> str | None:
     if not parts:
         return None
     return f"No failures, but no harmless merges: {in_words(parts)} (--fail-when unsafe)."
+
+
+def before_words(outcomes: Iterable[Outcome]) -> str | None:
+    """Return in how many cases bodies overlap before M and nowhere else."""
+    before = sum(
+        (o.measures.before_clearance_m or 0.0) < 0.0 and o.measures.severity != Severity.CONTACT
+        for o in outcomes
+    )
+    if not before:
+        return None
+    return (
+        f"In {counted(before, 'case')} bodies overlap before M, where the lanes run together, "
+        "and not from M on: that is no contact (measure before_clearance_m)."
+    )

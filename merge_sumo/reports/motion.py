@@ -26,7 +26,8 @@ MEASURES: Final = (
     ("score", "score P", ""),
     ("dx_m", "front bumpers, x_POV - x_VUT", "m"),
     ("bumper_gap_m", "bumper gap at M", "m"),
-    ("clearance_m", "smallest clearance of bodies", "m"),
+    ("clearance_m", "smallest gap from M on", "m"),
+    ("before_clearance_m", "smallest clearance before M", "m"),
     ("dv_mps", "v_POV - v_VUT", "m/s"),
     ("ttc_s", "time to collision", "s"),
     ("pet_s", "post-encroachment time", "s"),
@@ -62,8 +63,7 @@ def verdict_of(outcome: Outcome, trajectory: Trajectory) -> str:
     met = "POV" if found.nearest == VEHICLES[0] else f"car {found.nearest}"
     at = f"{found.end.value} at {found.t_end_s:g} s"
     if found.end is not End.MERGED:
-        touched = f" after a contact{_impact(found)}" if found.severity else ""
-        return f"{at}{touched}: {message_of(found)}"
+        return f"{at}: {message_of(found)}"
     first = "VUT" if found.merged_first == "VUT" else met
     apart = f"the front bumper of the {first} is {abs(found.dx_m or 0.0):.1f} m ahead at M"
     kind = diagnose(trajectory, found).kind

@@ -104,6 +104,7 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
             "pov_brake": _rounded(o.measures.pov_max_brake_mps2, 4),
             "region": facts.regions.get(o.index),
             "clearance": _rounded(o.measures.clearance_m, 4),
+            "before_clearance": _rounded(o.measures.before_clearance_m, 4),
             "bumper_gap": _rounded(o.measures.bumper_gap_m, 4),
             "brake_after": _rounded(o.measures.brake_after_mps2, 4),
             "impact": _rounded(o.measures.impact_speed_mps, 4),

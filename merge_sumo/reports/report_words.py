@@ -19,7 +19,7 @@ from merge_sumo.reports.diagnosis import (
 )
 from merge_sumo.reports.doubts import notes_on
 from merge_sumo.reports.foretelling import foretold_in_words
-from merge_sumo.reports.headline import Rule, after_words, avoidable_words, headline
+from merge_sumo.reports.headline import Rule, after_words, avoidable_words, before_words, headline
 from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
 from merge_sumo.reports.report_levels import Level, levels_of
 from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
@@ -79,6 +79,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
         "fewest_failures": FEWEST_FAILURES,
         "avoidable": avoidable_words(facts.worst, rule.crash_m),
         "after": after_words(facts.run.outcomes, rule.crash_m),
+        "before": before_words(facts.run.outcomes),
         "batches": len({o.batch for o in facts.run.outcomes}),
         "recorded": _recorded(facts.run),
         "driven": _duration(sum(o.measures.t_end_s for o in facts.run.outcomes)),

@@ -49,47 +49,37 @@ class CentreLines:
         return cls(mainline, ramp, SPACING_M * steps)
 
 
-APART: Final = math.inf, None
-"""Clearance and speed of a contact where bodies never drive on lanes that run together."""
+def closest_before_m(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[float]:
+    """Return the smallest clearance of the VUT and a car of the mainline before M, in m.
 
-
-def closest_before_m(
-    trajectories: Sequence[Trajectory], lines: CentreLines
-) -> list[tuple[float, float | None]]:
-    """Return the smallest clearance before M, in m, and the speed of the first contact, in m/s.
-
-    The clearance is that of the VUT and a car of the mainline, looked for where the lanes run
-    together, infinite where the VUT never came there; the speed is None without a contact. Episodes
-    are looked at together: most of the time of one is the calls of numpy.
+    It is looked for where the lanes run together, and infinite where the VUT never came there.
+    Episodes are looked at together: most of the time of one is the calls of numpy.
     """
-    found: list[tuple[float, float | None]] = [APART] * len(trajectories)
-    parts, places = [], []
+    found, parts, places = [math.inf] * len(trajectories), [], []
     for place, trajectory in enumerate(trajectories):
         x_vut_m = trajectory.motion[:, VUT, 0]
         steps = np.flatnonzero((x_vut_m > -lines.together_m) & (x_vut_m < 0.0))
         if steps.size:
-            # One row for each step and car: x and v of the car, x and v of the VUT, both lengths.
-            cars = np.delete(trajectory.motion[steps, :, :2], VUT, axis=1)
-            own = np.broadcast_to(trajectory.motion[steps, VUT, None, :2], cars.shape)
+            # One row for each step and car: x of the car, x of the VUT, and both lengths.
+            cars = np.delete(trajectory.motion[steps, :, 0], VUT, axis=1)[..., None]
+            own = np.broadcast_to(trajectory.motion[steps, VUT, None, :1], cars.shape)
             scenario = trajectory.case.scenario
-            lengths = np.broadcast_to((scenario.pov_length_m, scenario.vut_length_m), cars.shape)
-            parts.append(np.concatenate((cars, own, lengths), axis=2).reshape(-1, 6))
+            lengths = scenario.pov_length_m, scenario.vut_length_m
+            rows = np.concatenate(
+                (cars, own, np.broadcast_to(lengths, (*cars.shape[:2], 2))), axis=2
+            )
+            parts.append(rows.reshape(-1, 4))
             places.append(place)
     if not parts:
         return found
-    x_car, v_car, x_vut, v_vut, car_length, vut_length = np.concatenate(parts).T
-    car = _Bodies(lines.mainline, x_car, car_length)
+    x_car, x_vut, car_length, vut_length = np.concatenate(parts).T
     vut = _Bodies(lines.ramp, x_vut, vut_length)
-    apart_m = _separation_m(vut, car)
-    ends = np.cumsum([len(part) for part in parts])
-    nearest_m = np.minimum.reduceat(apart_m, np.concatenate(([0], ends[:-1]))).tolist()
-    for place, end, part, clearance_m in zip(places, ends.tolist(), parts, nearest_m, strict=True):
-        impact_mps = None
-        if clearance_m <= 0.0:
-            first = end - len(part) + int(np.argmax(apart_m[end - len(part) : end] <= 0.0))
-            apart_mps = v_car[first] * car.heading[first] - v_vut[first] * vut.heading[first]
-            impact_mps = float(np.linalg.norm(apart_mps))
-        found[place] = clearance_m, impact_mps
+    apart_m = _separation_m(vut, _Bodies(lines.mainline, x_car, car_length))
+    firsts = np.cumsum([0, *(len(part) for part in parts[:-1])])
+    for place, clearance_m in zip(
+        places, np.minimum.reduceat(apart_m, firsts).tolist(), strict=True
+    ):
+        found[place] = clearance_m
     return found
 
 

@@ -42,6 +42,7 @@ NUMBERS: Final = (
     *(
         "ttc_s",
         "clearance_m",
+        "before_clearance_m",
         "bumper_gap_m",
         "dx_m",
         "dv_mps",
@@ -60,11 +61,12 @@ TEXTS: Final = {
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
 }
 """What may be said of measures that are texts. Errors have no verdict under any criterion."""
-OF_BODIES: Final = frozenset({"clearance_m", "severity", "impact_speed_mps"})
+OF_BODIES: Final = frozenset({"before_clearance_m"})
 """Measures that need the centre lines of the road."""
 VOCABULARY: Final[Vocabulary] = {**dict.fromkeys(NUMBERS), **TEXTS}
 NEVER: Final[dict[str, Value]] = {
-    **dict.fromkeys(("dx_m", "bumper_gap_m", "clearance_m", "ttc_s", "pet_s"), math.inf),
+    **dict.fromkeys(("dx_m", "bumper_gap_m", "clearance_m", "before_clearance_m"), math.inf),
+    **dict.fromkeys(("ttc_s", "pet_s"), math.inf),
     **dict.fromkeys(("last_avoidable_s", "after_gap_m", "after_ttc_s"), math.inf),
     **dict.fromkeys(("dv_mps", "after_drac_mps2", "drac_mps2", "brake_after_mps2"), 0.0),
     **dict.fromkeys(("impact_speed_mps", "score"), 0.0),

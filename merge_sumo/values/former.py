@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
 from merge_sumo.values.merge import REACTION_S, needed_braking_mps2
 from merge_sumo.values.scenario import Scenario
 from merge_sumo.values.severity import severity_of
 from merge_sumo.values.trajectory import End
+
+NEW: Final = (
+    *("severity", "bumper_gap_m", "clearance_m", "before_clearance_m", "brake_after_mps2"),
+)
+"""Fields that release 0.1 did not record."""
 
 
 def take_from_0_1(values: dict[str, Any], scenario: Scenario) -> None:
@@ -20,7 +25,9 @@ def take_from_0_1(values: dict[str, Any], scenario: Scenario) -> None:
     if values["end"] == "COLLISION":
         values["end"] = End.MERGED.value
     values.pop("after_merge", None)
-    values |= dict.fromkeys(("severity", "bumper_gap_m", "clearance_m", "brake_after_mps2"))
+    values |= dict.fromkeys(
+        ("severity", "bumper_gap_m", "clearance_m", "before_clearance_m", "brake_after_mps2")
+    )
     values["impact_speed_mps"] = None
     dx, dv, score = values["dx_m"], values["dv_mps"], values["score"]
     if not (type(dx) is float and type(dv) is float and type(score) is float):
@@ -35,4 +42,8 @@ def take_from_0_1(values: dict[str, Any], scenario: Scenario) -> None:
     close = score < -500.0
     severity = severity_of(End.MERGED, clearance, is_close=close, brake_mps2=brake)
     values["severity"] = None if severity is None else severity.value
-    values["bumper_gap_m"], values["brake_after_mps2"] = gap, None if math.isinf(brake) else brake
+    values["bumper_gap_m"], values["clearance_m"], values["brake_after_mps2"] = (
+        gap,
+        clearance,
+        None if math.isinf(brake) else brake,
+    )

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.system.pickling import quickly_pickled
-from merge_sumo.values.bodies import APART, CentreLines, closest_before_m
+from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
 from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.former import take_from_0_1
@@ -61,12 +61,13 @@ class Measures:
             when it stands.
         t_end_s: time at which the episode ended.
         severity: contact, conflict, harsh or safe (`severity.py`); None where the VUT never reached
-            M and touched nothing, and after an error.
+            M, and after an error.
         bumper_gap_m: smallest gap at M between the front bumper of the car behind and the rear
             bumper of the car ahead, negative where bodies overlap; None without a merge.
-        clearance_m: smallest distance of bodies, from where the lanes run together until the end
-            of the follow-up, or without one until 0.75 s after M at the speeds of M; 0 or less
-            where they touch, None where the VUT never came so far.
+        clearance_m: smallest gap between bumpers from M on, to the end of the follow-up, or without
+            one for 0.75 s at the speeds of M; 0 or less where bodies touch, None without a merge.
+        before_clearance_m: smallest distance of bodies before M, where the lanes run together; 0 or
+            less where they overlap, None where the VUT never came there.
         drac_mps2: deceleration rate to avoid a crash that the follower needs at t1 (Cooper and
             Ferguson, 1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None where |dx| < 6 m.
         brake_after_mps2: deceleration that whoever is behind at M needs, after 0.75 s to react, not
@@ -100,6 +101,7 @@ class Measures:
     severity: str | None
     bumper_gap_m: float | None
     clearance_m: float | None
+    before_clearance_m: float | None
     drac_mps2: float | None
     brake_after_mps2: float | None
     vut_max_brake_mps2: float
@@ -260,8 +262,8 @@ def measure(
         lines: centre lines of the road; without them bodies are looked at from M on.
         way_out: whether the last way out is searched for, which takes most of the time.
     """
-    before = APART if lines is None else closest_before_m([trajectory], lines)[0]
-    return _measure(trajectory, before, way_out=way_out)
+    before_m = math.inf if lines is None else closest_before_m([trajectory], lines)[0]
+    return _measure(trajectory, before_m, way_out=way_out)
 
 
 def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[Measures]:
@@ -270,9 +272,7 @@ def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[
     return [_measure(*pair, way_out=True) for pair in zip(trajectories, before, strict=True)]
 
 
-def _measure(
-    trajectory: Trajectory, before: tuple[float, float | None], *, way_out: bool
-) -> Measures:
+def _measure(trajectory: Trajectory, before_m: float, *, way_out: bool) -> Measures:
     nearest = trajectory.nearest
     pair = trajectory.facing(nearest)
     (x_pov, v_pov, _), (x_vut, v_vut, _) = pair.motion[-1].tolist()
@@ -290,8 +290,7 @@ def _measure(
             gap = abs(dx) - trajectory.case.scenario.dx_crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
     hardest = -pair.motion[:, :, 2].min(axis=0)
-    contacts = [APART] if end.is_error else [before, closest_after_m(trajectory)]
-    clearance = min(nearest for nearest, _ in contacts)
+    clearance, impact = closest_after_m(trajectory)
     brake = brake_after_mps2(trajectory)
     severity = severity_of(end, clearance, is_close=close, brake_mps2=brake)
     followed: tuple[float | None, ...] = followed_up(trajectory) or (None, None, None)
@@ -302,6 +301,7 @@ def _measure(
         dx_m=dx,
         bumper_gap_m=min((gap for gap, _ in neighbours(trajectory)), default=None),
         clearance_m=_finite(clearance),
+        before_clearance_m=None if end.is_error else _finite(before_m),
         dv_mps=dv,
         ttc_s=ttc,
         pet_s=pet,
@@ -310,7 +310,7 @@ def _measure(
         brake_after_mps2=_finite(brake) if end is End.MERGED else None,
         vut_max_brake_mps2=max(0.0, float(hardest[VUT])),
         pov_max_brake_mps2=max(0.0, float(hardest[POV])),
-        impact_speed_mps=next((v for _, v in contacts if v is not None), None),
+        impact_speed_mps=impact,
         merged_first=first,
         last_avoidable_s=last_avoidable,
         avoidable=avoidable,

@@ -25,7 +25,7 @@ class Severity(StrEnum):
 def meanings(crash_m: float) -> dict[Severity, str]:
     """Return what the words mean, at a scenario's distance of a conflict (`dx_crash_m`)."""
     return {
-        Severity.CONTACT: "bodies touch before, at or right after M",
+        Severity.CONTACT: "bodies touch at M or right after it",
         Severity.CONFLICT: f"front bumpers within {crash_m:g} m at M, no contact",
         Severity.HARSH: f"the rear car must brake harder than {HARSH_MPS2:g} m/s² after M",
         Severity.SAFE: "none of these",
@@ -35,20 +35,18 @@ def meanings(crash_m: float) -> dict[Severity, str]:
 def severity_of(
     end: End, clearance_m: float, *, is_close: bool, brake_mps2: float
 ) -> Severity | None:
-    """Return the class of an encounter; None where the VUT never reached M and touched nothing.
+    """Return the class of an encounter; None where the VUT never reached M.
 
     Args:
         end: why the episode ended.
-        clearance_m: smallest clearance of bodies.
+        clearance_m: smallest clearance of bodies from M on.
         is_close: whether the front bumpers were nearer at M than the paper allows.
         brake_mps2: deceleration that whoever is behind at M needs.
     """
-    if end.is_error:
+    if end is not End.MERGED:
         return None
     if clearance_m <= 0.0:
         return Severity.CONTACT
-    if end is not End.MERGED:
-        return None
     if is_close:
         return Severity.CONFLICT
     return Severity.HARSH if brake_mps2 > HARSH_MPS2 else Severity.SAFE

@@ -82,10 +82,10 @@ function words(i) {
     else parts.push(`The car behind has to brake at ${fixed(cases.brake_after[i], 1)} m/s² after M.`);
   } else if (end === "TIMEOUT") {
     parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
-    if (found === "contact") parts.push(`Bodies touch before M at a relative speed of ${fixed(cases.impact[i], 1)} m/s.`);
   } else {
     parts.push(`${end}: ${(data.errors[cases.index[i]] || "no reason given").replace(/\.?$/, ".")}`);
   }
+  if (cases.before_clearance[i] !== null && cases.before_clearance[i] < 0) parts.push("Bodies overlap before M, where the lanes run together.");
   if (cases.margin && cases.margin[i] !== null) {
     parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
