@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import inspect
+import math
 import struct
 import warnings
 
 import pytest
 import traci
-from traci_pair import Drive, ToSession
+from traci_pair import Drive
 
-from merge_sumo.drivers.vuts.base import Seen
-from merge_sumo.drivers.vuts.traci_commands import Kind, kind_of
-from merge_sumo.drivers.vuts.traci_session import ASKS, Session
-from merge_sumo.sumo.road import road_of
+from merge_sumo.drivers.vuts.traci_calls import Kind, NotFiniteError, kind_of
+from merge_sumo.drivers.vuts.traci_session import ASKS
 from merge_sumo.sumo.traci_names import DUMMIES, named
+from merge_sumo.values.scenario import US23
 
 V, T = "vehicle", "vehicletype"
 SCRIPTS: dict[str, list[tuple]] = {
@@ -176,8 +176,7 @@ class TestWhatWasSet:
 
     def test_of_the_gap_counts_in_the_distance_to_the_leader_as_in_sumo(self, drive):
         drive.begin()
-        drive.x_m, drive.v_mps = [60.0, 20.0], [20.0, 18.0]
-        drive._show()
+        drive.place([60.0, 20.0], [20.0, 18.0])
         assert drive.ours.vehicle.getLeader("vut", 100.0) == ("pov", pytest.approx(35.0))
         drive.ours.vehicle.setMinGap("vut", 1.5)
         assert drive.ours.vehicle.getLeader("vut", 100.0) == ("pov", pytest.approx(33.5))
@@ -196,45 +195,88 @@ class TestWhatWasSet:
         assert c.vehicle.getLaneChangeMode("vut") == 512
 
 
-class TestNotes:
-    @pytest.mark.parametrize(
-        ("function", "values", "note"),
-        [
-            ("setTau", (0.5,), "vehicle.setTau is kept for what SUMO answers and moves nothing"),
-            ("setSpeedMode", (31,), "SUMO's checks of safe speed, right of way and red lights"),
-            ("setSpeed", (-1.0,), "it keeps its speed"),
-            ("changeLane", (0, 1.0), "vehicle.changeLane"),
-        ],
-    )
-    def test_say_once_what_does_less_than_in_sumo(self, drive, function, values, note):
-        drive.begin()
-        for _ in range(2):
-            getattr(drive.ours.vehicle, function)("vut", *values)
-        (said,) = drive.notes
-        assert note in said
+class TestWhatSumoDecides:
+    """What the emulation of commands could not do: SUMO's own models drive the VUT."""
 
-    def test_are_not_taken_of_what_acts_as_in_sumo(self, drive):
+    FOLLOWS = (
+        ("car-following in mode 31", ("setSpeedMode", 31), ("setSpeed", -1.0)),
+        ("a headway", ("setSpeedMode", 31), ("setTau", 3.0), ("setSpeed", -1.0)),
+        ("a gap that is opened", ("openGap", 3.0, 30.0, 5.0, 1.0), ("setSpeed", -1.0)),
+        ("a stop", ("setStop", "main_out", 60.0, 0, 2.0), ("setSpeed", -1.0)),
+        ("an acceleration that runs out", ("setAcceleration", 1.0, 0.3)),
+        ("slowing down that runs out", ("slowDown", 17.0, 0.5)),
+    )
+
+    @pytest.mark.parametrize(("name", "commands"), [(n, c) for n, *c in FOLLOWS])
+    def test_moves_the_vut_as_the_same_commands_move_a_car_of_sumo(self, drive, name, commands):
+        """What differs is eq. (4), which moves by the speed before the step."""
+        drive.begin((-900.0, 1.0))
+        for function, *values in commands:
+            drive.both(lambda c, f=function, v=values: getattr(c.vehicle, f)("vut", *v))
+        apart = []
+        for _ in range(60):
+            drive.step()
+            ours, real = drive.speeds()
+            apart.append(abs(ours - real))
+        # A stop ends a step sooner or later.
+        assert max(apart) < (2.0 if name == "a stop" else 0.4)
+        assert ours != pytest.approx(18.0, abs=1e-3)
+
+    def test_is_said_in_no_note(self, drive):
         drive.begin()
-        drive.ours.vehicle.setSpeedMode("vut", 0)
-        drive.ours.vehicle.setMaxSpeed("vut", 20.0)
-        drive.ours.vehicle.setSpeed("vut", 18.0)
-        assert drive.notes == []
+        drive.ours.vehicle.setSpeedMode("vut", 31)
+        drive.ours.vehicle.setTau("vut", 2.0)
+        drive.ours.vehicle.setSpeed("vut", -1.0)
+        assert drive.session.notes == []
+
+    def test_stops_before_a_car_that_stands(self, drive):
+        drive.begin()
+        drive.place([100.0, 10.0], [0.0, 18.0])
+        drive.ours.vehicle.setSpeedMode("vut", 31)
+        drive.ours.vehicle.setSpeed("vut", -1.0)
+        for _ in range(120):
+            drive.step()
+        assert drive.v_mps[1] == pytest.approx(0.0, abs=0.1)
+        assert 0.0 < drive.x_m[0] - US23.pov_length_m - drive.x_m[1] < 5.0
+
+
+def test_what_can_change_nothing_here_is_noted_once(drive):
+    drive.begin()
+    for _ in range(2):
+        drive.ours.vehicle.changeLane("vut", 0, 1.0)
+    assert drive.session.notes == [
+        "vehicle.changeLane or vehicle.changeLaneRelative is accepted and changes nothing here"
+    ]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("function", ["setSpeed", "slowDown", "setAcceleration"])
+def test_a_speed_that_is_no_number_is_a_fault(drive, function, value):
+    drive.begin()
+    values = (value,) if function == "setSpeed" else (value, 1.0)
+    with pytest.raises(NotFiniteError, match=rf"vehicle\.{function}\("):
+        getattr(drive.ours.vehicle, function)("vut", *values)
 
 
 @pytest.mark.parametrize(
     ("domain", "function", "arguments", "reason"),
     [
-        ("vehicle", "openGap", ("vut", 3.0, 20.0, 5.0, 1.0), "car-following model, which does not"),
         ("vehicle", "setPreviousSpeed", ("vut", 10.0), "as the scenario says"),
         ("vehicle", "add", ("new", "route.vut"), "as the scenario says"),
-        ("vehicle", "setStop", ("vut", "ramp"), "nothing stops here but by a speed of 0"),
+        ("vehicle", "moveTo", ("vut", "main_out_0", 5.0), "as the scenario says"),
+        ("vehicle", "remove", ("vut",), "as the scenario says"),
+        ("vehicle", "setRoute", ("vut", ["ramp"]), "the route is the scenario's"),
         ("vehicle", "setActionStepLength", ("vut", 1.0), "the VUT acts in every step of 0.1 s"),
         ("vehicle", "setLength", ("vut", 1.0), "what the vehicles are is the scenario's"),
         ("vehicle", "setTau", ("pov", 1.0), "the vehicle 'pov' is not the controller's to command"),
+        ("vehicle", "openGap", ("pov", 1.0, 1.0, 1.0, 1.0), "the vehicle 'pov' is not the"),
+        ("vehicle", "setStop", ("pov", "main_out"), "the vehicle 'pov' is not the controller's"),
         ("vehicletype", "setTau", ("pov", 1.0), "the type 'pov' is not the controller's"),
         ("vehicletype", "copy", ("vut", "other"), "what the vehicles are is the scenario's"),
         ("edge", "setMaxSpeed", ("ramp", 5.0), "the road is the scenario's"),
         ("simulation", "saveState", ("x.xml",), "the campaign runs the simulation"),
+        ("simulation", "loadState", ("x.xml",), "the campaign runs the simulation"),
+        ("simulation", "writeMessage", ("x",), "the campaign runs the simulation"),
         ("calibrator", "setFlow", ("c", 0.0, 1.0, 1.0, 1.0, "t", "r"), "none of that kind here"),
     ],
 )
@@ -245,6 +287,15 @@ def test_what_is_refused_is_named_with_its_reason(drive, domain, function, argum
     assert reason in str(error.value)
     assert "'" in reason or f"{domain}." in str(error.value)
     assert drive.ours.vehicle.getSpeed("vut") == 18.0
+
+
+@pytest.mark.parametrize("key", ["has.ssm.device", "device.ssm.file", "device.toc.file"])
+@pytest.mark.parametrize("domain", ["vehicle", "vehicletype"])
+def test_devices_that_would_write_files_are_refused(drive, domain, key, tmp_path):
+    drive.begin()
+    with pytest.raises(traci.TraCIException, match="gives vehicles no devices"):
+        getattr(drive.ours, domain).setParameter("vut", key, str(tmp_path / "written"))
+    assert list(tmp_path.iterdir()) == []
 
 
 def commanded(connection, function: str) -> str | None:
@@ -266,24 +317,34 @@ def commanded(connection, function: str) -> str | None:
     return None
 
 
-def test_every_command_that_the_client_has_acts_or_moves_nothing_or_is_refused_by_name():
+def test_every_command_that_the_client_has_goes_to_sumo_or_changes_nothing_or_is_refused(drive):
+    """No command but those on the VUT and its type reaches SUMO, and none moves the VUT away."""
     kinds = {f: kind_of(n.functions) for n in named().values() for f in n.functions}
     functions = [f for n in named().values() if n.command not in ASKS for f in n.functions]
-    tried = 0
+    tried, called = 0, []
     for function in functions:
-        session = Session(road_of())
-        session.show(Seen(0.1, -250.0, 30.0, -182.0, 18.0))
-        with warnings.catch_warnings():
+        drive.begin()
+        sumo = drive.session.sumo
+        call = sumo.call
+
+        def noted(name, *arguments, call=call):
+            called.append((name, arguments[0]))
+            return call(name, *arguments)
+
+        with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
             warnings.simplefilter("ignore")
-            said = commanded(ToSession(session), function)
+            patch.setattr(sumo, "call", noted)
+            said = commanded(drive.ours, function)
         if said is None:
             continue
         tried += 1
         if kinds[function] is Kind.REFUSED:
             assert said.startswith("merge-sumo does not carry out ")
             assert function in said
-        else:
+        elif kinds[function] is Kind.NOTHING:
             assert said == "", function
-        if kinds[function] is not Kind.DRIVES:
-            assert session.acceleration_mps2() == 0.0, function
+        assert drive.ours.vehicle.getLanePosition("vut") == pytest.approx(425.0 - 182.0)
     assert tried > 200
+    assert {name.partition(".")[0] for name, _ in called} <= {"vehicle", "vehicletype"}
+    assert {object_id for _, object_id in called} == {"vut"}
+    assert not any(kinds[name] is not Kind.CARRIED_OUT for name, _ in called)

@@ -284,7 +284,7 @@ class TestARunInTraffic:
             "    traci.simulationStep()\n"
             "    if 'vut' in (names := traci.vehicle.getIDList()):\n"
             "        assert sorted(names) == ['ahead', 'behind', 'pov', 'vut'], names\n"
-            "        assert traci.vehicle.getLeader('behind')[0] == 'pov'\n"
+            "        assert traci.vehicle.getLeader('behind', 500.0)[0] == 'pov'\n"
             "        assert traci.vehicle.getLength('vut') == 4.0\n"
             "        gap = traci.vehicle.getLeader('pov', 500.0)[1]\n"
             "        at = [traci.vehicle.getPosition(n)[0] for n in ('ahead', 'pov')]\n"

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
+import socket
 import struct
+import subprocess
 import warnings
 from collections.abc import Iterator
+from contextlib import redirect_stdout
+from pathlib import Path
 from typing import Any
 
 import traci
@@ -14,13 +19,23 @@ from traci.connection import Connection
 from traci.storage import Storage
 
 from merge_sumo.drivers.vuts import traci_protocol as tp
-from merge_sumo.drivers.vuts.base import seen_in
-from merge_sumo.drivers.vuts.traci_commands import SPEED_MODE_AT_FIRST
 from merge_sumo.drivers.vuts.traci_session import Session
-from merge_sumo.sumo.beside import COLOURS, OPTIONS, TYPES, _edges, _types
-from merge_sumo.sumo.client import end_program, open_program
+from merge_sumo.sumo.binding import sumo_environment, sumo_program
+from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
-from merge_sumo.values.scenario import DT_S, POV, US23
+from merge_sumo.sumo.shadow_sumo import (
+    COLOURS,
+    COMMANDED_VUT,
+    NET,
+    OPTIONS,
+    TYPES,
+    ShadowRoad,
+    ShadowSumo,
+    _edges,
+    write_files,
+)
+from merge_sumo.system.landlock import lock_in
+from merge_sumo.values.scenario import DT_S, US23, VEHICLES, Scenario
 
 STEPS = 30
 IDS = {
@@ -100,16 +115,64 @@ class ToSession(Connection):
         return result
 
 
+def open_program(folder: Path) -> tuple[subprocess.Popen[bytes], Any]:
+    """Start a real SUMO behind its own TraCI server; return it and a client's connection.
+
+    Its port is open to all of this machine and beyond, so it may touch no file but in its folder.
+    """
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
+    program = sumo_program("sumo")
+    read = [Path(program).parents[2], Path("/usr"), Path("/lib"), Path("/lib64"), Path("/etc")]
+    process = subprocess.Popen(
+        [program, *files, *OPTIONS, "--remote-port", str(port)],
+        env=sumo_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: lock_in([folder], read, ports=True),  # noqa: PLW1509
+    )
+    try:
+        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+            return process, traci.connect(port, 240, proc=process, waitBetweenRetries=0.05)
+    except BaseException:
+        end_program(process)
+        raise
+
+
+def end_program(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+
+
+_shadows: list[ShadowSumo] = []
+"""libsumo holds one simulation per process."""
+
+
+def shadow(folder: Path, scenario: Scenario = US23, road: Corridor | None = None) -> ShadowSumo:
+    """Return the shadow SUMO of this process, with an empty road at time 0."""
+    road = road or road_of()
+    write_files(folder, road, scenario)
+    sumo = ShadowSumo(folder, ShadowRoad.of(road), VEHICLES[: scenario.vehicles])
+    sumo._started = bool(_shadows)
+    sumo.load()
+    _shadows[:] = [sumo]
+    return sumo
+
+
+def close_shadow() -> None:
+    if _shadows:
+        _shadows.pop()._libsumo.close()
+
+
 class Pair:
     """A session and a SUMO program in the same state: both cars on their way to M."""
 
-    def __init__(self, folder) -> None:
+    def __init__(self, folder: Path) -> None:
         road = road_of()
-        (folder / TYPES).write_bytes(_types(road, US23, 2))
-        files = ("--net-file", str(road.path), "--additional-files", str(folder / TYPES))
-        self.process, self.real = open_program("sumo", [*files, *OPTIONS])
-        self.notes: list[str] = []
-        self.session = Session(road, US23, note=self.notes.append)
+        self.session = Session(shadow(folder))
+        self.process, self.real = open_program(folder)
         vehicle = self.real.vehicle
         starts = {"pov": (road.mainline, -300.0, 30.0), "vut": (road.ramp, -182.0, 18.0)}
         for name, (path, x_m, v_mps) in starts.items():
@@ -123,24 +186,29 @@ class Pair:
             name: {piece.lane: piece.start_m for piece in path.pieces}
             for name, (path, _, _) in starts.items()
         }
-        for _ in range(STEPS):
+        before = {name: v_mps for name, (_, _, v_mps) in starts.items()}
+        for step in range(STEPS):
             self.session.answered()
             self.real.simulationStep()
-            places_m: list[float] = []
-            speeds_mps: list[float] = []
+            states = {}
             for name in starts:
-                vehicle.setSpeedMode(name, SPEED_MODE_AT_FIRST if name == "vut" else 32)
+                vehicle.setSpeedMode(name, COMMANDED_VUT if name == "vut" else 32)
                 vehicle.setLaneChangeMode(name, 0)
                 vehicle.setSpeed(name, vehicle.getSpeed(name) + (0.05 if name == "vut" else -0.05))
-                places_m.append(
-                    begin[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
-                )
-                speeds_mps.append(vehicle.getSpeed(name))
-            self.session.show(seen_in(self.session.steps * DT_S, POV, places_m, speeds_mps))
+                v_mps = vehicle.getSpeed(name)
+                x_m = begin[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
+                states[name] = x_m, v_mps, (v_mps - before[name]) / DT_S
+                before[name] = v_mps
+            if step:
+                self.session.sumo.call("vehicle.setSpeed", "vut", states["vut"][1])
+                self.session.step()
+                self.session.put(states)
+            else:
+                self.session.enter(states)
         self.ours = ToSession(self.session)
 
     def close(self) -> None:
-        self.session.close()
+        close_shadow()
         end_program(self.process)
 
 
@@ -151,30 +219,23 @@ class Drive:
     for the programs.
     """
 
-    def __init__(self, folder) -> None:
-        self.road = road_of()
-        (folder / TYPES).write_bytes(_types(self.road, US23, 2))
-        files = ("--net-file", str(self.road.path), "--additional-files", str(folder / TYPES))
-        self.process, self.real = open_program("sumo", [*files, *OPTIONS])
+    def __init__(self, folder: Path) -> None:
+        self.road, self.folder = road_of(), folder
+        write_files(folder, self.road, US23)
+        self.process, self.real = open_program(folder)
         self.real.route.add("route.vut", _edges(self.road.ramp))
-        self.notes: list[str] = []
-        self.session = Session(self.road, US23, note=self.notes.append)
 
-    def begin(self) -> None:
-        before = self.session.beside
-        if before is not None:
-            before.show({})
-            _as_at_first(before._connection)
-        self.session = Session(self.road, US23, note=self.notes.append)
-        self.session.beside = before
-        self.notes.clear()
+    def begin(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
+        """Let the vehicles depart; `pov` is (x in m, v in m/s) of the session's POV."""
+        self.pov = pov
+        self.session = Session(shadow(self.folder))
         self.ours = ToSession(self.session)
         _as_at_first(self.real)
         if "vut" in self.real.vehicle.getIDList():
             self.real.vehicle.remove("vut")
         self.real.vehicle.add("vut", "route.vut", typeID="vut", departSpeed="18")
         self.real.simulationStep()
-        self.real.vehicle.setSpeedMode("vut", SPEED_MODE_AT_FIRST)
+        self.real.vehicle.setSpeedMode("vut", COMMANDED_VUT)
         self.real.vehicle.setLaneChangeMode("vut", 0)
         self.real.vehicle.setColor("vut", COLOURS[1])
         self.real.vehicle.setSpeed("vut", 18.0)
@@ -182,31 +243,44 @@ class Drive:
 
     def again(self) -> None:
         """Let the vehicles of the session depart, after they have arrived."""
-        if self.session.vehicles:
-            self.session.clear(more=True)
-        self.x_m, self.v_mps = [-250.0, -182.0], [30.0, 18.0]
-        self._show()
+        if self.session.driving:
+            self.session.step()
+            self.session.clear()
+        (x_m, v_mps) = self.pov
+        self.x_m, self.v_mps = [x_m, -182.0], [v_mps, 18.0]
+        self.session.enter(self._states(0.0))
 
     def both(self, ask):
         return ask(self.ours), ask(self.real)
 
     def step(self) -> None:
-        a_mps2 = self.session.acceleration_mps2()
+        wanted_mps = self.session.step()
+        assert wanted_mps is not None
+        a_mps2 = (wanted_mps - self.v_mps[1]) / DT_S
         a_mps2 = min(max(a_mps2, US23.a_min_mps2), US23.a_max_mps2)
         self.x_m = [x + v * DT_S for x, v in zip(self.x_m, self.v_mps, strict=True)]
         self.v_mps[1] = max(self.v_mps[1] + a_mps2 * DT_S, 0.0)
-        self._show()
+        self.session.put(self._states(a_mps2))
         self.real.simulationStep()
+
+    def place(self, x_m: list[float], v_mps: list[float]) -> None:
+        """Put the vehicles of the session somewhere else."""
+        self.x_m, self.v_mps = x_m, v_mps
+        self.session.step()
+        self.session.put(self._states(0.0))
 
     def speeds(self) -> tuple[float, float]:
         ours, real = self.both(lambda c: c.vehicle.getSpeed("vut"))
         return ours, real
 
-    def _show(self) -> None:
-        self.session.show(seen_in(self.session.steps * DT_S, POV, self.x_m, self.v_mps))
+    def _states(self, a_mps2: float) -> dict[str, tuple[float, float, float]]:
+        return {
+            name: (x_m, v_mps, a_mps2 if name == "vut" else 0.0)
+            for name, x_m, v_mps in zip(VEHICLES, self.x_m, self.v_mps, strict=False)
+        }
 
     def close(self) -> None:
-        self.session.close()
+        close_shadow()
         end_program(self.process)
 
 

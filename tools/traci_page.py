@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from merge_sumo.drivers.vuts.traci_commands import Kind, kind_of, reason_against
-from merge_sumo.drivers.vuts.traci_session import ASKS
-from merge_sumo.drivers.vuts.traci_variables import GETTERS
+from merge_sumo.drivers.vuts.traci_calls import NOT_ANSWERED, Kind, kind_of, reason_against
+from merge_sumo.drivers.vuts.traci_session import ASKS, OWN_ANSWERS
 from merge_sumo.sumo.traci_names import Named, named
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
@@ -18,18 +17,22 @@ HEAD = """# What a TraCI controller can do
 
 Made by `python tools/traci_page.py` from SUMO's own client: do not edit.
 
-Questions are answered as SUMO answers them, about the net as it is in its file and the vehicles \
-`pov` and `vut` (in traffic also `ahead` and `behind`). What is needed in every step, merge-sumo \
-answers itself. The rest is passed on to a SUMO beside it, which is started for the first such \
-question and has the same vehicles in the same state; it holds up the first answer by a fraction \
-of a second. A question about an object that there is not is refused as by SUMO. Subscriptions \
-and context subscriptions take all of it, too, but no filters of contexts.
+Questions are answered by SUMO, about the net as it is in its file and the vehicles `pov` and \
+`vut` (in traffic also `ahead` and `behind`), by a shadow SUMO that has the same vehicles in the \
+same state. It runs as a library in a process of its own and opens no port. What it cannot know, \
+merge-sumo answers: where a vehicle was put after the step, and who came and went while several \
+steps were made. A question about an object that there is not is refused as by SUMO. \
+Subscriptions and context subscriptions take all of it, too, but no filters of contexts.
 
-Commands drive the VUT, which moves as a car that is commanded in SUMO in speed mode 38: limits of \
-acceleration and speed that a controller sets act, SUMO's checks of safe speed, right of way and \
-red lights do not. Or they are kept for what SUMO answers, or accepted because they can change \
-nothing here (all of which is noted once in `controller.log`), or they are refused by name and \
-with a reason, as an error of that command: the connection stays.
+Commands on `vut` and its type are carried out by the same SUMO, and the speed that its step gives \
+the VUT is what the controller commanded; the rollout then moves the VUT by eq. (4), within the \
+scenario's limits. `vut` departs in speed mode 38 with its speed set, so a controller that \
+commands nothing keeps its speed: limits of acceleration act, SUMO's checks of safe speed, right \
+of way and red lights do not. Speed mode 31, `setSpeed(-1)`, `setTau`, `openGap` and `setStop` \
+mean what they mean in SUMO, whose car-following model then drives the VUT (without chance: \
+`sigma` is 0, unless `setImperfection` sets another). The rest is accepted because it can change \
+nothing here (which is noted once in `controller.log`), or it is refused by name and with a \
+reason, as an error of that command: the connection stays.
 """
 
 
@@ -42,7 +45,10 @@ def sections() -> Iterator[str]:
     for domain, mine in sorted(domains.items(), key=lambda item: (item[0] != "vehicle", item[0])):
         asks = [f for f in mine if f.command in ASKS]
         sets = [f for f in mine if f.command not in ASKS]
-        own = [f for f in asks if f.variable in GETTERS.get(f.command, {})]
+        own = [f for f in asks if (f.command, f.variable) in OWN_ANSWERS]
+        unanswered = [
+            f for f in asks if domain == "gui" or not NOT_ANSWERED.isdisjoint(f.functions)
+        ]
         yield f"\n## {domain}\n"
         refused: dict[str, list[Named]] = {}
         for found in sets:
@@ -50,10 +56,11 @@ def sections() -> Iterator[str]:
                 refused.setdefault(reason_against(found.functions), []).append(found)
         for what, those in (
             ("Answered here", own),
-            ("Answered by SUMO", [f for f in asks if f not in own]),
+            ("Answered by SUMO", [f for f in asks if f not in own and f not in unanswered]),
+            ("Not answered", unanswered),
             *(
                 (kind.value, [f for f in sets if kind_of(f.functions) is kind])
-                for kind in (Kind.DRIVES, Kind.KEPT, Kind.NOTHING)
+                for kind in (Kind.CARRIED_OUT, Kind.NOTHING)
             ),
             *((f"Refused ({reason})", those) for reason, those in refused.items()),
         ):

@@ -23,6 +23,7 @@ from merge_sumo.drivers.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.drivers.vuts.loaded import LoadedFiles
 from merge_sumo.drivers.vuts.wire import About, Frame
 from merge_sumo.errors import UserError
+from merge_sumo.system.lifeline import end_with
 
 BOOT: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1])['path']; "
@@ -38,7 +39,7 @@ def main() -> None:
     channel = _Channel()
     _hear_signals()
     _limit(settings["memory_gib"])
-    _end_with(settings["lifeline"])
+    end_with(settings["lifeline"])
     asked.share(mmap.mmap(settings["asked"], Asked.FORMAT.size))
     _Hosting(channel).serve()
 
@@ -166,18 +167,3 @@ def _limit(memory_gib: float) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     with suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def _end_with(lifeline: int) -> None:
-    """Have the system end this process when the other end of a pipe is closed.
-
-    By a signal and not by a thread: native code that never returns would hold a thread up.
-    """
-    import fcntl
-
-    asynchronous = getattr(os, "O_ASYNC", 0o20000)
-    signal.signal(signal.SIGIO, signal.SIG_DFL)
-    if hasattr(fcntl, "F_SETSIG"):  # a signal that the VUT can neither block nor ignore
-        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
-    fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | asynchronous)

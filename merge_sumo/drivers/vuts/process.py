@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shlex
 import shutil
 import signal
@@ -16,6 +17,7 @@ from merge_sumo.errors import UserError
 
 PORT_FIELD: Final = "{port}"
 PORT_VARIABLE: Final = "MERGE_SUMO_PORT"
+TOKEN_VARIABLE: Final = "MERGE_SUMO_TOKEN"  # noqa: S105 (its name)
 GRACE_S: Final = 2.0
 """Time that a program has to end by itself before it is killed."""
 
@@ -38,20 +40,29 @@ class Program:
     """A running program in a process group of its own; what it prints goes to a log."""
 
     def __init__(self, arguments: list[str], port: int, log: Path | None = None) -> None:
-        """Start it, told the port as `{port}` in its arguments and by the environment."""
+        """Start it, told the port as `{port}` in its arguments and by the environment.
+
+        The environment has a token, too, by which a client can show that it is this program's.
+        """
+        self.token = os.environ.get(TOKEN_VARIABLE) or secrets.token_hex(16)
         try:
             self._process = subprocess.Popen(
                 [argument.replace(PORT_FIELD, str(port)) for argument in arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, PORT_VARIABLE: str(port)},
+                env={**os.environ, PORT_VARIABLE: str(port), TOKEN_VARIABLE: self.token},
                 start_new_session=True,
             )
         except OSError as error:
             raise UserError(f"--vut-command cannot be started: {error.strerror}") from error
         assert self._process.stdout is not None, "piped"  # noqa: S101
         self._output = Output(self._process.stdout, log)
+
+    @property
+    def process(self) -> int:
+        """Id of its process, which is that of its session."""
+        return self._process.pid
 
     @property
     def running(self) -> bool:

@@ -15,7 +15,10 @@ from typing import Any, Final
 MAX_MESSAGE_BYTES: Final = 1 << 20
 """A controller of one vehicle never says more at a time; garbage read as a length mostly does."""
 
+POSITION_LON_LAT: Final = 0x00
 POSITION_2D: Final = 0x01
+POSITION_LON_LAT_ALT: Final = 0x02
+POSITION_ROADMAP: Final = 0x04
 POSITION_3D: Final = 0x03
 TYPE_POLYGON: Final = 0x06
 TYPE_UBYTE: Final = 0x07
@@ -33,7 +36,9 @@ NOT_IMPLEMENTED: Final = 0x01
 ERROR: Final = 0xFF
 
 _FIXED: Final = {
+    POSITION_LON_LAT: struct.Struct("!dd"),
     POSITION_2D: struct.Struct("!dd"),
+    POSITION_LON_LAT_ALT: struct.Struct("!ddd"),
     POSITION_3D: struct.Struct("!ddd"),
     TYPE_UBYTE: struct.Struct("!B"),
     TYPE_BYTE: struct.Struct("!b"),
@@ -41,16 +46,13 @@ _FIXED: Final = {
     TYPE_DOUBLE: struct.Struct("!d"),
     TYPE_COLOR: struct.Struct("!BBBB"),
 }
+POSITIONS: Final = frozenset({POSITION_LON_LAT, POSITION_2D, POSITION_LON_LAT_ALT, POSITION_3D})
 _UBYTE, _INT, _DOUBLE = (_FIXED[t] for t in (TYPE_UBYTE, TYPE_INTEGER, TYPE_DOUBLE))
 _MAX_NESTING: Final = 4
 
 
 class ProtocolError(Exception):
     """Bytes that are not TraCI; the text says what is wrong with them."""
-
-
-class AnsweredError(Exception):
-    """A server's answer that it does not carry a command out; the text is its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,41 @@ class Reader:
 
     def typed(self, nesting: int = 0) -> Any:
         """Return the next value with a type before it; compounds and lists as tuples."""
+        return self._of_type(self.ubyte(), nesting)
+
+    def arguments(self, nesting: int = 0) -> list[Any]:
+        """Return the values that are left, in order.
+
+        Those of compounds and positions stand one by one, lists and colours are one value each.
+        """
+        found: list[Any] = []
+        while self.left:
+            kind = self.ubyte()
+            if kind == TYPE_COMPOUND:
+                if nesting >= _MAX_NESTING:
+                    raise ProtocolError("compounds are nested too deeply")
+                self._count(1)
+                nesting += 1
+            elif kind == POSITION_ROADMAP or kind in POSITIONS:
+                found += self._place(kind)
+            else:
+                found.append(self._of_type(kind, nesting))
+        return found
+
+    def place(self) -> tuple[int, list[Any]]:
+        """Return the type of the next value, a position, and what it is made of."""
         kind = self.ubyte()
+        return kind, self._place(kind)
+
+    def _place(self, kind: int) -> list[Any]:
+        if kind == POSITION_ROADMAP:
+            return [self.string(), self.double(), self.ubyte()]
+        if kind not in POSITIONS:
+            raise ProtocolError(f"a position was expected, not type 0x{kind:02x}")
+        return list(_FIXED[kind].unpack(self.raw(_FIXED[kind].size)))
+
+    def _of_type(self, kind: int, nesting: int) -> Any:
+        """Return the next value, whose type has been read."""
         if kind in _FIXED:
             form = _FIXED[kind]
             values = form.unpack(self.raw(form.size))
@@ -160,48 +196,6 @@ def commands_of(body: bytes) -> list[Command]:
     return commands
 
 
-def accepted(body: bytes) -> Reader:
-    """Return what follows the status in an answer, without the message's length.
-
-    Raises `AnsweredError` where the server does not do it, and `ProtocolError` for no answer.
-    """
-    reader = Reader(body)
-    _length(reader)
-    reader.ubyte()
-    result, said = reader.ubyte(), reader.string()
-    if result != OK:
-        raise AnsweredError(said)
-    return reader
-
-
-def value_in(answer: Reader) -> bytes:
-    """Return the typed value in the answer to a question, behind its status."""
-    _length(answer)
-    answer.raw(2)
-    answer.string()
-    return answer.raw(answer.left)
-
-
-def objects_in(answer: Reader) -> list[str]:
-    """Return whom the answer to a context subscription of one plain variable is about."""
-    _length(answer)
-    answer.raw(1)
-    answer.string()
-    answer.raw(2)
-    found = []
-    for _ in range(answer.integer()):
-        found.append(answer.string())
-        answer.raw(2)
-        answer.typed()
-    return found
-
-
-def _length(reader: Reader) -> None:
-    """Read past the length of a command."""
-    if reader.ubyte() == 0:
-        reader.integer()
-
-
 def message(content: bytes) -> bytes:
     """Return what is sent: the content behind its length."""
     return _INT.pack(len(content) + 4) + content
@@ -226,6 +220,11 @@ def command(content: bytes) -> bytes:
 def raw_integer(value: int) -> bytes:
     """Return an integer without its type."""
     return _INT.pack(value)
+
+
+def raw_double(value: float) -> bytes:
+    """Return a double without its type."""
+    return _DOUBLE.pack(value)
 
 
 def raw_string(value: str) -> bytes:
@@ -274,11 +273,33 @@ def polygon(points: Sequence[tuple[float, float]]) -> bytes:
     return bytes((TYPE_POLYGON,)) + count + items
 
 
-def colour(red: int, green: int, blue: int) -> bytes:
-    """Return a typed opaque colour."""
-    return bytes((TYPE_COLOR, red, green, blue, 255))
+def byte(value: int) -> bytes:
+    """Return a typed signed byte."""
+    return bytes((TYPE_BYTE, value & 0xFF))
+
+
+def doubles(values: Sequence[float]) -> bytes:
+    """Return a typed list of doubles."""
+    items = struct.pack(f"!{len(values)}d", *values)
+    return bytes((TYPE_DOUBLELIST,)) + _INT.pack(len(values)) + items
+
+
+def road_position(edge: str, position_m: float, lane: int) -> bytes:
+    """Return a typed position on a lane of an edge."""
+    place = raw_string(edge) + _DOUBLE.pack(position_m) + bytes((lane,))
+    return bytes((POSITION_ROADMAP,)) + place
+
+
+def colour(*channels: int) -> bytes:
+    """Return a typed colour of four channels."""
+    return bytes((TYPE_COLOR, *channels))
 
 
 def compound(*typed: bytes) -> bytes:
     """Return typed values as one."""
     return bytes((TYPE_COMPOUND,)) + _INT.pack(len(typed)) + b"".join(typed)
+
+
+def compound_list(items: Sequence[Sequence[bytes]]) -> bytes:
+    """Return items of typed values as one: their number, and the values of all."""
+    return compound(integer(len(items)), *(value for item in items for value in item))

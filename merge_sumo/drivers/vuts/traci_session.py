@@ -1,48 +1,32 @@
-"""What a TraCI client may do: it asks, commands the VUT and subscribes, and gets answers.
+"""What a TraCI client sees and may do: questions and commands go to the shadow SUMO.
 
-The session has no socket and does not decide when a step is made. What there is to see is in
-`traci_simulation.py`, what can be asked of it in `traci_variables.py`.
+The session has no socket and does not decide when a step is made. Time runs on over the episodes:
+in each the vehicles depart, and when it ends they arrive.
 """
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
 from typing import Final, TypeVar
 
 from merge_sumo.drivers.vuts import traci_protocol as tp
-from merge_sumo.drivers.vuts.base import Seen
-from merge_sumo.drivers.vuts.traci_commands import (
-    LIMITS,
-    MODES,
-    OF_MODEL,
-    OWN_TYPE,
-    SET_VEHICLE,
-    SET_VEHICLETYPE,
-    SPEED_MODE,
-    SPEEDS,
+from merge_sumo.drivers.vuts.traci_answers import packed
+from merge_sumo.drivers.vuts.traci_calls import (
+    OF_OTHERS,
     Kind,
-    Orders,
+    asked_of,
     kind_of,
-    note_on,
     reason_against,
+    told_by,
 )
 from merge_sumo.drivers.vuts.traci_protocol import Command, ProtocolError, Reader
-from merge_sumo.drivers.vuts.traci_simulation import VUT, RefusedError, Simulation
-from merge_sumo.drivers.vuts.traci_variables import (
-    GET_EDGE,
-    GET_LANE,
-    GET_VEHICLE,
-    GETTERS,
-    ID_COUNT,
-)
-from merge_sumo.errors import UserError
-from merge_sumo.sumo.beside import Beside, GoneError, State
+from merge_sumo.sumo.binding import SUMO_VERSION
+from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, RefusedError, ShadowSumo, State
 from merge_sumo.sumo.traci_names import name_of, named
-from merge_sumo.values.scenario import DT_S, VEHICLES
+from merge_sumo.values.scenario import VEHICLES
 
 T = TypeVar("T")
 
@@ -62,6 +46,9 @@ GETTERS_TO_CONTEXTS: Final = -0x20
 TO_RESPONSE: Final = 0x10
 """Identifiers of the kinds of command lie these distances apart, for every domain."""
 
+GET_VEHICLE, GET_SIMULATION, SET_VEHICLE, SET_VEHICLETYPE = 0xA4, 0xAB, 0xC4, 0xC5
+LANE_CHANGE_MODE: Final = 0xB6
+LANE_CHANGE_BITS: Final = 0xFFF
 PARAMETER: Final = 0x7E
 LOAD, ADD_FILTER = 0x01, 0x7E
 REASONS: Final = {
@@ -69,7 +56,11 @@ REASONS: Final = {
     ADD_FILTER: "subscribe to all that is around, and choose from it",
 }
 """Why a command on no variable is refused."""
+OWN_TYPE: Final = f"{NAME_OF_VUT}@{NAME_OF_VUT}"
+"""What SUMO calls the type of a vehicle that has numbers of its own."""
 FOR_EVER: Final = -1073741824.0
+EXPECTED: Final = 2
+"""Vehicles that are expected between two episodes."""
 
 
 @dataclass(slots=True)
@@ -95,55 +86,62 @@ class Subscription:
 
 
 @dataclass
-class Session(Simulation):
-    """The simulation as one client sees it, and what it has asked for."""
+class Session:
+    """The simulation as one client sees it, and what it has subscribed to."""
 
-    orders: Orders = field(init=False)
+    sumo: ShadowSumo
     subscriptions: list[Subscription] = field(default_factory=list)
-    note: Callable[[str], None] = lambda _: None
-    """Told in a sentence, once each, what a command does less than in SUMO."""
-    noted: set[str] = field(default_factory=set)
-    history: list[dict[str, State]] = field(default_factory=list)
-    """The states of the episode so far, for a SUMO that is asked for the first time."""
-    beside: Beside | None = None
-    no_beside: str = ""
-    """Why there is no such SUMO."""
+    notes: list[str] = field(default_factory=list)
+    """Sentences on what a command does less than in SUMO, once each."""
+    expected: bool = True
+    """Whether more vehicles may come."""
+    departed: list[str] = field(default_factory=list)
+    arrived: list[str] = field(default_factory=list)
+    lane_change_mode: int = 0
 
-    def __post_init__(self) -> None:
-        """Begin without orders."""
-        self.orders = Orders(self.scenario)
+    @property
+    def time_s(self) -> float:
+        """Simulation time."""
+        return self.sumo.time_s
 
-    def show(self, seen: Seen) -> None:
-        """Advance by a step, to a state with all vehicles."""
-        super().show(seen)
-        state = {name: (v.x_m, v.v_mps, v.a_mps2) for name, v in self.vehicles.items()}
-        self.history.append(state)
-        if self.beside is not None:
-            self.beside.show(state)
+    @property
+    def driving(self) -> bool:
+        """Whether the vehicles of an episode are on the road."""
+        return bool(self.sumo.at_m)
 
-    def close(self) -> None:
-        """End the SUMO beside."""
-        if self.beside is not None:
-            self.beside.close()
-            self.beside = None
+    def answered(self) -> None:
+        """Forget who departed and arrived: the client has been told."""
+        self.departed.clear()
+        self.arrived.clear()
 
-    def clear(self, *, more: bool) -> None:
-        """Advance by a step, to an empty road; `more` vehicles may come."""
-        super().clear(more=more)
-        self.orders.forget_vehicle()
-        self.history.clear()
-        if self.beside is not None:
-            self.beside.show({})
+    def enter(self, states: Mapping[str, State]) -> None:
+        """Make a step in which the vehicles depart."""
+        self.sumo.enter(states)
+        self.departed += states
+        self.lane_change_mode = 0
+
+    def step(self) -> float | None:
+        """Make a step; return the speed that SUMO gives the VUT by what was commanded."""
+        return self._noting_arrivals(self.sumo.step)
+
+    def put(self, states: Mapping[str, State]) -> None:
+        """Put the vehicles where they are after the step."""
+        self._noting_arrivals(lambda: self.sumo.put(states))
+
+    def clear(self) -> None:
+        """End the episode: all vehicles arrive, and what was subscribed of them ends."""
+        self._noting_arrivals(self.sumo.clear)
         self.subscriptions = [
             subscription
             for subscription in self.subscriptions
             if subscription.getter != GET_VEHICLE or subscription.object_id not in VEHICLES
         ]
 
-    def acceleration_mps2(self) -> float:
-        """Return what the last commands on the VUT ask for in the coming step."""
-        v_mps = self.vehicles[VUT].v_mps
-        return (self.orders.next_mps(v_mps) - v_mps) / DT_S
+    def _noting_arrivals(self, change: Callable[[], T]) -> T:
+        before = list(self.sumo.at_m)
+        result = change()
+        self.arrived += [name for name in before if name not in self.sumo.at_m]
+        return result
 
     def handle(self, command: Command) -> bytes:
         """Return the answer to any command but a step or a close; raises `ProtocolError`."""
@@ -151,7 +149,8 @@ class Session(Simulation):
         try:
             return self._handle(identifier, reader)
         except RefusedError as refused:
-            return tp.status(identifier, refused.result, str(refused))
+            code = tp.NOT_IMPLEMENTED if identifier in REASONS else tp.ERROR
+            return tp.status(identifier, code, str(refused))
 
     def _handle(self, identifier: int, reader: Reader) -> bytes:
         if identifier in ASKS:
@@ -164,16 +163,12 @@ class Session(Simulation):
         if identifier - GETTERS_TO_CONTEXTS in ASKS:
             return self._subscribe_context(identifier, reader)
         if identifier == GET_VERSION:
-            text = tp.raw_string(f"SUMO {version('libsumo')}, hosted by merge-sumo")
-            content = bytes((identifier,)) + tp.raw_integer(API_VERSION) + text
-            return tp.status(identifier) + tp.command(content)
+            return tp.status(identifier) + version_answer()
         if identifier == SET_ORDER:
             reader.integer()
             return tp.status(identifier)
         reason = REASONS.get(identifier, "it is made for SUMO as a program")
-        raise RefusedError(
-            f"merge-sumo does not carry out {name_of(identifier)}: {reason}", tp.NOT_IMPLEMENTED
-        )
+        raise RefusedError(f"merge-sumo does not carry out {name_of(identifier)}: {reason}")
 
     def _get(self, identifier: int, reader: Reader) -> bytes:
         variable, object_id = reader.ubyte(), reader.string()
@@ -183,100 +178,44 @@ class Session(Simulation):
 
     def _value(self, getter: int, variable: int, object_id: str, reader: Reader) -> bytes:
         """Return the typed value of a variable; raises `RefusedError` where there is none."""
-        if getter == GET_VEHICLE and object_id == VUT and VUT in self.vehicles:
-            if variable in MODES:
-                return tp.integer(self.orders.mode(variable))
-            if self.orders.changed(variable):
-                return self._from_sumo(getter, variable, object_id, reader.raw(reader.left))
-        answer = GETTERS.get(getter, {}).get(variable)
-        if answer is not None and self.knows(getter, object_id):
-            return answer(self, object_id, reader)
-        return self._from_sumo(getter, variable, object_id, reader.raw(reader.left))
-
-    def knows(self, getter: int, object_id: str) -> bool:
-        """Return whether an object is one that is answered for here, besides those of the net."""
-        if getter == GET_LANE:
-            return object_id in self.lanes()
-        return getter != GET_EDGE or object_id in self.edges()
-
-    def _from_sumo(self, getter: int, variable: int, object_id: str, parameter: bytes) -> bytes:
-        """Return what the SUMO beside answers; raises `RefusedError`."""
-        asked = bytes((getter, variable)) + tp.raw_string(object_id) + parameter
-        return self._ask_sumo(name_of(getter, variable), asked, tp.value_in)
-
-    def _ask_sumo(self, name: str, command: bytes, read: Callable[[Reader], T]) -> T:
-        """Return what is read in SUMO's answer; it is started for the first such question.
-
-        Raises `RefusedError` where it refuses, or where there is none.
-        """
-        if self.no_beside:
-            raise RefusedError(f"{name} is not answered here: {self.no_beside}")
-        try:
-            if self.beside is None:
-                self.beside = Beside(self.road, self.scenario, self.scenario.vehicles)
-                for state in self.history:
-                    self.beside.show(state)
-                for kept in self.orders.all_kept():
-                    with suppress(RefusedError):
-                        self._tell(kept)
-            if self.beside is None:
-                raise GoneError  # it was told something that ended it
-            return read(tp.accepted(self.beside.ask(tp.command(command))))
-        except UserError as error:
-            self.no_beside = str(error)
-        except (GoneError, ProtocolError):
-            self.no_beside = f"SUMO ended when it was asked for {name}"
-        except tp.AnsweredError as error:
-            raise RefusedError(str(error)) from error
-        self.close()
-        raise RefusedError(f"{name} is not answered here: {self.no_beside}")
+        own = OWN_ANSWERS.get((getter, variable))
+        if own is not None and (getter == GET_SIMULATION or object_id in self.sumo.at_m):
+            return own(self, object_id)
+        found = named().get((getter, variable))
+        if found is None:
+            raise RefusedError(f"merge-sumo does not answer {name_of(getter, variable)}")
+        function, arguments = asked_of(found.functions, object_id, reader)
+        return packed(function, self.sumo.call(function, *arguments))
 
     def _set(self, command: int, reader: Reader) -> None:
-        """Carry a command out, or keep it, or note that it changes nothing, or refuse it."""
-        variable = reader.ubyte()
-        functions: tuple[str, ...]
-        if command == SET_VEHICLE and variable in SPEEDS:
-            # What comes in every step needs no look at the tables of SUMO's client.
-            name, functions = SPEEDS[variable], (SPEEDS[variable],)
-        else:
-            name, found = name_of(command, variable), named().get((command, variable))
-            functions = () if found is None else found.functions
-        kind = kind_of(functions)
+        """Have a command carried out, or note that it changes nothing, or refuse it."""
+        variable, object_id = reader.ubyte(), reader.string()
+        found = named().get((command, variable))
+        functions: tuple[str, ...] = () if found is None else found.functions
+        name, kind = name_of(command, variable), kind_of(functions)
         if kind is Kind.REFUSED:
             reason = reason_against(functions)
             raise RefusedError(f"merge-sumo does not carry out {name}: {reason}")
-        object_id, typed = reader.string(), reader.raw(reader.left)
-        if command == SET_VEHICLE:
-            self.vehicle(object_id)
-        if command in (SET_VEHICLE, SET_VEHICLETYPE):
-            mine = object_id in (VUT, OWN_TYPE)
-            if mine and (kind is not Kind.NOTHING or variable in MODES):
-                v_mps = self.vehicles[VUT].v_mps if VUT in self.vehicles else 0.0
-                self.orders.carry_out(command, variable, object_id, typed, v_mps)
-                if kind is Kind.KEPT or variable in LIMITS:
-                    self._tell(bytes((command, variable)) + tp.raw_string(object_id) + typed)
-            moves = kind is Kind.DRIVES or variable in OF_MODEL
-            if moves and not mine and variable != SPEED_MODE:
-                what = "vehicle" if command == SET_VEHICLE else "type"
-                raise RefusedError(f"the {what} '{object_id}' is not the controller's to command")
-        self._note_once(note_on(name, variable, kind, typed))
-
-    def _tell(self, command: bytes) -> None:
-        """Pass a command on to the SUMO beside, if there is one; raises `RefusedError`."""
-        if self.beside is None:
+        if command == SET_VEHICLE and object_id not in self.sumo.at_m:
+            raise RefusedError(f"Vehicle '{object_id}' is not known.")
+        mine = object_id in (NAME_OF_VUT, OWN_TYPE)
+        if kind is Kind.CARRIED_OUT and mine:
+            function, arguments = told_by(functions, object_id, reader)
+            self.sumo.call(function, *arguments)
             return
-        try:
-            tp.accepted(self.beside.ask(tp.command(command)))
-        except tp.AnsweredError as error:
-            raise RefusedError(str(error)) from error
-        except (GoneError, ProtocolError):
-            self.no_beside = f"SUMO ended when it was told {name_of(command[0], command[1])}"
-            self.close()
+        if kind is Kind.CARRIED_OUT and OF_OTHERS.isdisjoint(functions):
+            what = "vehicle" if command == SET_VEHICLE else "type"
+            raise RefusedError(f"the {what} '{object_id}' is not the controller's to command")
+        if command == SET_VEHICLE and mine and variable == LANE_CHANGE_MODE:
+            mode = reader.typed()
+            if not isinstance(mode, int):
+                raise RefusedError("a mode is an integer")
+            self.lane_change_mode = mode & LANE_CHANGE_BITS
+        self._note_once(f"{name} is accepted and changes nothing here")
 
-    def _note_once(self, said: str) -> None:
-        if said and said not in self.noted:
-            self.noted.add(said)
-            self.note(said)
+    def _note_once(self, sentence: str) -> None:
+        if sentence not in self.notes:
+            self.notes.append(sentence)
 
     def _subscribe(self, identifier: int, reader: Reader) -> bytes:
         getter = identifier - GETTERS_TO_SUBSCRIPTIONS
@@ -299,7 +238,7 @@ class Session(Simulation):
         """Keep a subscription; return the answer.
 
         As in SUMO it adds to one that differs in its variables alone; one without variables ends
-        all of the object, whatever their time and range.
+        all of the object, whatever their range.
         """
         if not wanted.variables:
             self.subscriptions = [s for s in self.subscriptions if s.of != wanted.of]
@@ -317,15 +256,11 @@ class Session(Simulation):
 
     def results(self) -> bytes:
         """Return the answer to a step behind its status: the subscribed values."""
-        now = self.time_s
-        due = [
-            subscription
-            for subscription in self.subscriptions
-            if subscription.begin_s <= now
-            and (subscription.end_s == FOR_EVER or now <= subscription.end_s)
-        ]
-        answers = []
-        for subscription in due:
+        answers, now_s = [], self.time_s
+        for subscription in self.subscriptions:
+            over = now_s > subscription.end_s != FOR_EVER
+            if now_s < subscription.begin_s or over:
+                continue
             # Of what SUMO cannot tell any more there is no answer.
             with suppress(RefusedError):
                 answers.append(self._result(subscription))
@@ -333,8 +268,8 @@ class Session(Simulation):
 
     def _result(self, subscription: Subscription) -> bytes:
         object_id = subscription.object_id
-        if subscription.getter == GET_VEHICLE and object_id:
-            self.vehicle(object_id)
+        if subscription.getter == GET_VEHICLE and object_id and object_id not in self.sumo.at_m:
+            raise RefusedError(f"Vehicle '{object_id}' is not known.")
         name, count = tp.raw_string(object_id), bytes((len(subscription.variables),))
         if subscription.domain is None:
             head = bytes((subscription.getter + GETTERS_TO_SUBSCRIPTIONS + TO_RESPONSE,))
@@ -348,17 +283,22 @@ class Session(Simulation):
     def _around(self, subscription: Subscription) -> list[str]:
         """Return the objects of a subscription's domain that are near its object."""
         getter, domain, object_id = subscription.getter, subscription.domain, subscription.object_id
-        assert domain is not None, "of what is around"  # noqa: S101
         if getter == domain == GET_VEHICLE:
-            return self.around(object_id, subscription.range_m)
-        command = getter + GETTERS_TO_CONTEXTS
-        asked = bytes((command,)) + struct.pack("!dd", FOR_EVER, FOR_EVER)
-        asked += tp.raw_string(object_id) + bytes((domain,))
-        asked += struct.pack("!d", subscription.range_m)
-        name = name_of(command)
-        around = self._ask_sumo(name, asked + bytes((1, ID_COUNT)), tp.objects_in)
-        self._ask_sumo(name, asked + bytes((0,)), lambda _: None)
-        return around
+            me = self.sumo.point(object_id)
+            points = {other: self.sumo.point(other) for other in self.sumo.at_m}
+            return [
+                other
+                for other, at in points.items()
+                if math.dist(me[2:4], at[2:4]) <= subscription.range_m
+            ]
+        mine = _domain_of(getter)
+        given = object_id, domain, subscription.range_m
+        self.sumo.call(f"{mine}.subscribeContext", *given, [ID_COUNT])
+        try:
+            found = self.sumo.call(f"{mine}.getContextSubscriptionResults", object_id)
+        finally:
+            self.sumo.call(f"{mine}.unsubscribeContext", *given)
+        return list(found)
 
     def _values(self, subscription: Subscription, object_id: str) -> bytes:
         getter = subscription.domain or subscription.getter
@@ -371,6 +311,50 @@ class Session(Simulation):
                 parts.append(bytes((variable, tp.ERROR)) + tp.string(str(refused)))
         return b"".join(parts)
 
+
+ID_COUNT: Final = 0x01
+
+
+def _domain_of(getter: int) -> str:
+    """Return what a domain is called, by the identifier of its questions."""
+    for (command, _), found in named().items():
+        if command == getter:
+            return found.functions[0].partition(".")[0]
+    raise RefusedError(f"there is no domain 0x{getter:02x}")
+
+
+def version_answer() -> bytes:
+    """Return the answer to the question for the version, behind its status."""
+    text = tp.raw_string(f"SUMO {SUMO_VERSION}, hosted by merge-sumo")
+    return tp.command(bytes((GET_VERSION,)) + tp.raw_integer(API_VERSION) + text)
+
+
+def _expected(session: Session, _: str) -> bytes:
+    return tp.integer(max(len(session.sumo.at_m), EXPECTED * session.expected))
+
+
+def _position(session: Session, name: str, *height_m: float) -> bytes:
+    return tp.position(*session.sumo.point(name)[2:4], *height_m)
+
+
+OWN_ANSWERS: Final[dict[tuple[int, int], Callable[[Session, str], bytes]]] = {
+    # SUMO's own answers to these are those before the vehicle was put where it is.
+    (GET_VEHICLE, 0x42): _position,  # getPosition
+    (GET_VEHICLE, 0x39): lambda s, name: _position(s, name, 0.0),  # getPosition3D
+    (GET_VEHICLE, 0x43): lambda s, name: tp.double(s.sumo.point(name)[4]),  # getAngle
+    (GET_VEHICLE, LANE_CHANGE_MODE): lambda s, name: tp.integer(
+        s.lane_change_mode if name == NAME_OF_VUT else 0
+    ),
+    # Several of SUMO's steps may pass in one of the client's, and an episode may end in it.
+    (GET_SIMULATION, 0x73): lambda s, _: tp.integer(len(s.departed)),
+    (GET_SIMULATION, 0x74): lambda s, _: tp.strings(s.departed),
+    (GET_SIMULATION, 0x71): lambda s, _: tp.integer(len(s.departed)),  # loaded
+    (GET_SIMULATION, 0x72): lambda s, _: tp.strings(s.departed),
+    (GET_SIMULATION, 0x79): lambda s, _: tp.integer(len(s.arrived)),
+    (GET_SIMULATION, 0x7A): lambda s, _: tp.strings(s.arrived),
+    (GET_SIMULATION, 0x7D): _expected,  # getMinExpectedNumber
+}
+"""What is answered here and not by SUMO, by the numbers of domain and variable."""
 
 _WITH_PARAMETER: Final = {(GET_VEHICLE, 0x68), (GET_VEHICLE, 0x78), (GET_VEHICLE, PARAMETER)}
 """Variables that take a parameter: getLeader, getFollower, getParameter."""

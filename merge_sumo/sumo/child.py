@@ -1,0 +1,195 @@
+"""A SUMO in a process of its own, which nobody reaches but this process: it has no port.
+
+The two talk in JSON over a pair of sockets that no one else has. What is said to the child may hand
+over a connection; what the child says is read as data.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.binding import sumo_environment
+from merge_sumo.system.lifeline import end_with
+
+MESSAGES: Final = "messages"
+"""In the folder of a child: what it, and SUMO, write to standard error."""
+MOST_BYTES: Final = 1 << 24
+_LENGTH: Final = struct.Struct("!I")
+
+
+class ChildDiedError(Exception):
+    """The process is gone; the text says how it ended."""
+
+
+class Channel:
+    """Messages in JSON over one end of a pair of sockets."""
+
+    def __init__(self, end: socket.socket) -> None:
+        """Take an end."""
+        self.end = end
+
+    def send(self, message: Mapping[str, Any]) -> None:
+        """Send a message; OSError where the other is gone."""
+        content = json.dumps(message).encode()
+        self.end.sendall(_LENGTH.pack(len(content)) + content)
+
+    def receive(self, patience_s: float | None = None) -> dict[str, Any]:
+        """Return the next message; raises TimeoutError, EOFError, OSError, ValueError."""
+        self.end.settimeout(patience_s)
+        try:
+            (length,) = _LENGTH.unpack(self._exactly(_LENGTH.size))
+            if length > MOST_BYTES:
+                raise ValueError("too long for a message")
+            message = json.loads(self._exactly(length))
+        finally:
+            self.end.settimeout(None)
+        if not isinstance(message, dict):
+            raise ValueError("no message")
+        return message
+
+    def _exactly(self, count: int) -> bytes:
+        content = self.end.recv(count)
+        while len(content) < count:
+            part = self.end.recv(count - len(content))
+            if not part:
+                raise EOFError
+            content += part
+        return content
+
+    def give(self, connection: socket.socket, process: int) -> None:
+        """Hand a connection over to the process at the other end, which waits for it."""
+        if sys.platform == "win32":
+            shared = connection.share(process)
+            self.end.sendall(_LENGTH.pack(len(shared)) + shared)
+        else:
+            socket.send_fds(self.end, [b"!"], [connection.fileno()])
+
+    def take(self) -> socket.socket:
+        """Return the connection that is handed over."""
+        if sys.platform == "win32":
+            (length,) = _LENGTH.unpack(self._exactly(_LENGTH.size))
+            return socket.fromshare(self._exactly(length))
+        _, (descriptor, *_), _, _ = socket.recv_fds(self.end, 1, 1)
+        return socket.socket(fileno=descriptor)
+
+
+class SumoChild:
+    """A process of ours that runs code of ours with a SUMO; the code begins by `opened()`."""
+
+    def __init__(self, boot: str, folder: Path, settings: Mapping[str, Any]) -> None:
+        """Start it in a folder of its own; `UserError` where it cannot be started.
+
+        `boot` is Python code that is told `settings`, as JSON, as its last argument.
+        """
+        ours, theirs = socket.socketpair()
+        self.channel = Channel(ours)
+        self._folder = folder
+        unix = sys.platform != "win32"
+        lifeline, self._lifeline = os.pipe() if unix else (-1, -1)
+        descriptors = (theirs.fileno(), lifeline) if unix else ()
+        told = {**settings, "path": sys.path, "descriptors": descriptors, "folder": str(folder)}
+        try:
+            with (folder / MESSAGES).open("wb") as messages:
+                self.process = subprocess.Popen(  # noqa: S603 (our own code)
+                    [sys.executable, "-P", "-c", boot, json.dumps(told)],
+                    stdin=subprocess.DEVNULL if unix else subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=messages,
+                    pass_fds=descriptors,
+                    cwd=folder,
+                    env=sumo_environment(),
+                    # Ctrl-C in a terminal is heard by this process, which then ends the child.
+                    start_new_session=True,
+                )
+        except OSError as error:
+            ours.close()
+            if unix:
+                os.close(self._lifeline)
+            raise UserError(f"cannot start a process for SUMO: {error.strerror}") from error
+        finally:
+            if unix:
+                os.close(lifeline)
+                theirs.close()
+        if sys.platform == "win32":
+            assert self.process.stdin is not None, "piped"  # noqa: S101
+            self.process.stdin.write(theirs.share(self.process.pid))
+            self.process.stdin.close()
+            theirs.close()
+
+    def ask(
+        self,
+        message: Mapping[str, Any],
+        patience_s: float | None = None,
+        connection: socket.socket | None = None,
+    ) -> dict[str, Any]:
+        """Return what the child answers; raises `ChildDiedError`, and TimeoutError for nothing.
+
+        `connection` is handed over; the message says that it is.
+        """
+        try:
+            self.channel.send(message)
+            if connection is not None:
+                self.channel.give(connection, self.process.pid)
+            return self.channel.receive(patience_s)
+        except TimeoutError:
+            raise
+        except (OSError, EOFError, ValueError) as error:
+            raise ChildDiedError(self._how_it_ended()) from error
+
+    def receive(self, patience_s: float) -> dict[str, Any]:
+        """Return what the child says unasked; raises as `ask` does."""
+        try:
+            return self.channel.receive(patience_s)
+        except TimeoutError:
+            raise
+        except (OSError, EOFError, ValueError) as error:
+            raise ChildDiedError(self._how_it_ended()) from error
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self.channel.end.close()
+        if self._lifeline >= 0:
+            os.close(self._lifeline)
+            self._lifeline = -1
+
+    def said(self) -> str:
+        """Return the first line that it, or SUMO, wrote to standard error."""
+        with suppress(OSError), (self._folder / MESSAGES).open("rb") as file:
+            line = file.read(2000).decode("utf-8", errors="replace").strip().partition("\n")[0]
+            return line.removeprefix("Error: ")
+        return ""
+
+    def _how_it_ended(self) -> str:
+        with suppress(subprocess.TimeoutExpired):
+            code = self.process.wait(2.0)
+            if code < 0:
+                return f"was ended by signal {-code}"
+            return f"ended with exit code {code}"
+        return "broke the channel"
+
+
+def opened() -> tuple[Channel, dict[str, Any]]:
+    """Return, in a child, its end of the channel and what it was told; it ends with its parent."""
+    settings: dict[str, Any] = json.loads(sys.argv[-1])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "win32":
+        end = socket.fromshare(sys.stdin.buffer.read())
+    else:
+        descriptor, lifeline = settings["descriptors"]
+        end_with(lifeline)
+        end = socket.socket(fileno=descriptor)
+    return Channel(end), settings

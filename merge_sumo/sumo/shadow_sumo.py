@@ -1,0 +1,284 @@
+"""The shadow SUMO: it has the net as it is in its file, and decides what commands to the VUT mean.
+
+Ours hosts copies of two lanes under other names. This one has all of the road by the ids of the
+file. After each of its steps the vehicles are put where ours has them. It runs as libsumo in a
+process of its own (`child.py`), so no port is open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+from lxml import etree
+
+from merge_sumo.errors import UserError
+from merge_sumo.sumo import allowed, received
+from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint, Piece
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
+
+NET: Final = "road.net.xml"
+TYPES: Final = "types.add.xml"
+OPTIONS: Final = (
+    *("--step-length", str(DT_S)),
+    *("--collision.action", "none"),
+    *("--insertion-checks", "none"),
+    *("--time-to-teleport", "-1"),
+    *("--default.speeddev", "0"),
+    *("--xml-validation", "never"),
+    *("--no-step-log", "true"),
+    *("--no-warnings", "true"),
+    *("--duration-log.disable", "true"),
+)
+COMMANDED: Final = 32
+"""Speed mode without SUMO's own checks, for vehicles that no client commands."""
+COMMANDED_VUT: Final = 38
+"""Speed mode of the VUT as it departs: its limits of acceleration act, SUMO's checks do not."""
+COLOURS: Final = (230, 64, 38, 255), (26, 89, 230, 255)
+"""Of the cars of the mainline, and of the VUT."""
+FASTEST_MPS: Final = 45.0
+"""What a car can drive wherever the road allows less; the limit of the shipped road."""
+WIDTH_M: Final = 1.8
+HEIGHT_M: Final = 1.5
+NAME_OF_VUT: Final = VEHICLES[VUT]
+SPEED_MARGIN_MPS: Final = 2.0
+"""More than a vehicle gains in a step, unless a controller commands it without any limit."""
+
+State = tuple[float, float, float]
+"""Position along the lanes in m, M = 0; speed in m/s; acceleration of the last step in m/s2."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShadowRoad:
+    """Where vehicles may be: both paths, and how far the net goes behind M."""
+
+    mainline: LanePath
+    ramp: LanePath
+    drawn_after_m: float
+    drops: str
+    """"mainline" or "ramp" where its lane ends at M, else ""."""
+
+    @property
+    def dropped(self) -> LanePath | None:
+        """Return the path whose lane ends at M."""
+        return {"mainline": self.mainline, "ramp": self.ramp}.get(self.drops)
+
+    @property
+    def beside(self) -> Piece:
+        """Return the lane that goes on beside one that ends at M."""
+        other = self.ramp if self.drops == "mainline" else self.mainline
+        return next(piece for piece in reversed(other.pieces) if piece.start_m < 0.0)
+
+    def path(self, name: str) -> LanePath:
+        """Return the lanes that a vehicle drives on."""
+        return self.ramp if name == NAME_OF_VUT else self.mainline
+
+    def point(self, name: str, x_m: float) -> LanePoint:
+        """Return where a vehicle is."""
+        return self.path(name).point(x_m)
+
+    @classmethod
+    def of(cls, road: Corridor) -> Self:
+        """Return that of a corridor."""
+        drops = "ramp" if road.ramp_approach.yields else "mainline"
+        return cls(road.mainline, road.ramp, road.drawn_after_m, drops if road.lane_drop else "")
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON has it."""
+        return asdict(self)
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Self:
+        """Return what `to_record` gave."""
+        mainline, ramp = (
+            LanePath(
+                tuple(
+                    Piece(**{**piece, "shape": tuple(map(tuple, piece["shape"]))})
+                    for piece in record[path]["pieces"]
+                )
+            )
+            for path in ("mainline", "ramp")
+        )
+        return cls(mainline, ramp, record["drawn_after_m"], record["drops"])
+
+
+def write_files(folder: Path, road: Corridor, scenario: Scenario) -> None:
+    """Write what a shadow SUMO loads; `UserError` for a net that cannot be read."""
+    name = f"the net {road.path}"
+    content = received.read_bytes(
+        road.path, "the net", follow_links=True, limit=received.MAX_NET_BYTES
+    )
+    (folder / NET).write_bytes(received.cleaned(content, allowed.ROAD_NET, name))
+    (folder / TYPES).write_bytes(_types(road, scenario))
+
+
+class ShadowSumo:
+    """libsumo with the road of a scenario and its vehicles; one a process."""
+
+    def __init__(self, folder: Path, road: ShadowRoad, names: Sequence[str]) -> None:
+        """Take the folder of `write_files`; `load` starts it."""
+        self._libsumo = load_libsumo()
+        self._road, self._names = road, names
+        files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
+        self._options = [*files, *OPTIONS]
+        self._started = False
+        self.at_m: dict[str, float] = {}
+        """The vehicles on the road, and where they are along their lanes."""
+
+    @property
+    def time_s(self) -> float:
+        """Simulation time."""
+        return float(self._libsumo.simulation.getTime())
+
+    def load(self) -> None:
+        """Start with an empty road at time 0; `UserError` where SUMO cannot use the net."""
+        libsumo = self._libsumo
+        try:
+            if self._started:
+                libsumo.load(self._options)
+            else:
+                libsumo.start(["sumo", *self._options])
+                self._started = True
+            for name in self._names:
+                libsumo.route.add(f"route.{name}", _edges(self._road.path(name)))
+        except libsumo.TraCIException as error:
+            raise UserError(str(error)) from error
+        self.at_m = {}
+
+    def call(self, function: str, *arguments: Any) -> Any:
+        """Return what libsumo's function says, named as "vehicle.getSpeed".
+
+        Raises `RefusedError` where SUMO refuses, or has no such function of these arguments.
+        """
+        domain, _, name = function.partition(".")
+        called = getattr(getattr(self._libsumo, domain, None), name, None)
+        if called is None:
+            raise RefusedError(f"SUMO has no {function} here")
+        try:
+            return called(*arguments)
+        except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
+            raise RefusedError(str(error)) from error
+        except (TypeError, ValueError, OverflowError, NotImplementedError) as error:
+            given = ", ".join(f"{argument!r:.40}" for argument in arguments)
+            raise RefusedError(f"{function} takes no ({given})") from error
+
+    def enter(self, states: Mapping[str, State]) -> None:
+        """Make a step in which the vehicles depart, and put them into their states."""
+        vehicle = self._libsumo.vehicle
+        for name, state in states.items():
+            start = self._start(name, state)
+            vehicle.add(name, f"route.{name}", typeID=name, **start)
+            vehicle.setColor(name, COLOURS[name == NAME_OF_VUT])
+        self.at_m = {name: x_m for name, (x_m, _, _) in states.items()}
+        self.step()
+        for name in self.at_m:
+            vehicle.setLaneChangeMode(name, 0)
+            vehicle.setSpeedMode(name, COMMANDED_VUT if name == NAME_OF_VUT else COMMANDED)
+        if NAME_OF_VUT in self.at_m:
+            vehicle.setSpeed(NAME_OF_VUT, states[NAME_OF_VUT][1])
+        self.put(states)
+
+    def step(self) -> float | None:
+        """Make a step; return the speed that SUMO gives the VUT, None where it is not there.
+
+        A vehicle that comes to the end of the net arrives.
+        """
+        self._change_lanes()
+        self._libsumo.simulation.step()
+        left = self._libsumo.vehicle.getIDList()
+        self.at_m = {name: x_m for name, x_m in self.at_m.items() if name in left}
+        return self.wanted_mps()
+
+    def wanted_mps(self) -> float | None:
+        """Return the speed of the VUT."""
+        if NAME_OF_VUT not in self.at_m:
+            return None
+        return float(self._libsumo.vehicle.getSpeed(NAME_OF_VUT))
+
+    def put(self, states: Mapping[str, State]) -> None:
+        """Put the vehicles that are on the road into their states.
+
+        Those beyond the end of the net, where paths go on without a road, arrive.
+        """
+        vehicle = self._libsumo.vehicle
+        for name in list(self.at_m):
+            x_m, v_mps, a_mps2 = states[name]
+            if x_m >= self._road.drawn_after_m:
+                vehicle.remove(name)
+                del self.at_m[name]
+                continue
+            point = self._road.point(name, x_m)
+            vehicle.moveTo(name, point.lane, point.position_m)
+            vehicle.setPreviousSpeed(name, v_mps, a_mps2)
+            if name != NAME_OF_VUT:
+                vehicle.setSpeed(name, v_mps)
+            self.at_m[name] = x_m
+
+    def clear(self) -> None:
+        """Take all vehicles from the road."""
+        for name in self.at_m:
+            self._libsumo.vehicle.remove(name)
+        self.at_m = {}
+
+    def point(self, name: str) -> LanePoint:
+        """Return where a vehicle is; SUMO's own answer is that before it was put there."""
+        return self._road.point(name, self.at_m[name])
+
+    def _change_lanes(self) -> None:
+        """Let who comes to the end of a lane that ends at M go on beside it: SUMO would stop."""
+        dropped, vehicle = self._road.dropped, self._libsumo.vehicle
+        for name, x_m in self.at_m.items():
+            ends = x_m < 0.0 and dropped is not None and self._road.path(name) is dropped
+            if ends and x_m + (vehicle.getSpeed(name) + SPEED_MARGIN_MPS) * DT_S >= 0.0:
+                beside = self._road.beside
+                vehicle.moveTo(name, beside.lane, beside.length_m + x_m)
+
+    def _start(self, name: str, state: State) -> dict[str, str]:
+        """Return where a vehicle departs; it can do so on the first edge of its route only."""
+        path = self._road.path(name)
+        point = path.point(state[0])
+        edge, lane = _edge_of(point.lane), point.lane.rpartition("_")[2]
+        # It is told its own speed behind the step; SUMO lets none depart faster than the limit.
+        own_mps = self._libsumo.vehicletype.getMaxSpeed(name)
+        fastest_mps = min(path.piece(state[0]).speed_limit_mps, own_mps)
+        speed = {"departSpeed": str(min(state[1], fastest_mps))}
+        if edge != _edges(path)[0]:
+            return {"departLane": "best", **speed}
+        return {"departLane": lane, "departPos": str(point.position_m), **speed}
+
+
+class RefusedError(Exception):
+    """A command that is answered by an error, as SUMO would; the connection goes on."""
+
+
+def _edge_of(lane: str) -> str:
+    return lane.rpartition("_")[0]
+
+
+def _edges(path: LanePath) -> list[str]:
+    return list(dict.fromkeys(_edge_of(p.lane) for p in path.pieces if not p.is_internal))
+
+
+def _types(road: Corridor, scenario: Scenario) -> bytes:
+    root = etree.Element("additional")
+    for who in VEHICLES[: scenario.vehicles]:
+        length_m = scenario.vut_length_m if who == NAME_OF_VUT else scenario.pov_length_m
+        values = {
+            "id": who,
+            "length": repr(length_m),
+            "width": repr(WIDTH_M),
+            "height": repr(HEIGHT_M),
+            "minGap": "0",
+            # Where SUMO's models drive the VUT, an episode must not depend on those before it.
+            "sigma": "0",
+            "maxSpeed": repr(max(road.speed_limit_mps, FASTEST_MPS)),
+            "accel": repr(scenario.a_max_mps2),
+            "decel": repr(-scenario.a_min_mps2),
+            "emergencyDecel": repr(-scenario.a_min_mps2),
+            "guiShape": "passenger/sedan",
+        }
+        etree.SubElement(root, "vType", values)
+    return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
