@@ -120,9 +120,9 @@ def car(image: np.ndarray, who: str) -> np.ndarray:
 NEVER_CONNECTED = """
 import time
 from merge_sumo.cli import main
-from merge_sumo.sumo import client
+from merge_sumo.sumo.child import Channel
 
-client.load_traci().connect = lambda *_, **__: time.sleep(600)
+Channel.receive = lambda *_, **__: time.sleep(600)
 main()
 """
 STOPS = {"SIGTERM": 143, "SIGHUP": 129, "SIGKILL": -9, "SIGINT": 1}
@@ -146,7 +146,7 @@ def test_no_window_is_left_of_a_command_that_is_stopped_before_it_is_connected(
             start_new_session=True,
         )
         try:
-            while not any("sumo-gui" in program.split()[0] for program in marked(mark)):
+            while not any("merge_sumo.sumo.live" in program for program in marked(mark)):
                 assert command.poll() is None
                 time.sleep(0.05)
             command.send_signal(signal.Signals[name])

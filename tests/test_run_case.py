@@ -155,7 +155,7 @@ class TestInSumoGui:
     def test_a_window_that_is_closed_is_said_in_a_sentence(self, window):
         def close_window(this: Window) -> None:
             if this._shown == 20:
-                this._connection._process.kill()
+                this._child.process.kill()
             step(this)
 
         step = Window.step

@@ -1,7 +1,9 @@
 """sumo-gui in the place of libsumo: a case is shown while it is run.
 
-libsumo has no window. sumo-gui takes the same commands over TraCI, with the same numbers: a world
-that is given a `Window` as its binding moves the same to the last bit.
+sumo-gui takes the same commands as libsumo, with the same numbers: a world that is given a `Window`
+as its binding moves the same to the last bit. It runs in a process of its own (`child.py`), which
+is killed in the end: it opens no port, a process can have one window in its life, and libsumo does
+not come back from closing it.
 """
 
 from __future__ import annotations
@@ -11,14 +13,15 @@ import shutil
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
 
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.binding import scratch_folder
-from merge_sumo.sumo.client import end_program, load_traci, open_program
+from merge_sumo.sumo.binding import load_libsumo, scratch_folder
+from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, opened
 from merge_sumo.sumo.replay_folder import COLOURS, WINDOW, view_settings
 from merge_sumo.system.interrupt import stopping_in_order
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
@@ -37,6 +40,12 @@ SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off."""
 VIEW: Final = "View #0"
 LABEL: Final = "label"
+OPENS_S: Final = 60.0
+"""Time that the window has to open."""
+BOOT: Final = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[-1])['path']; "
+    "from merge_sumo.sumo.live import main; main()"
+)
 
 
 def check_display() -> None:
@@ -54,10 +63,9 @@ class Window:
     """
 
     def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
-        """Look for a display and for SUMO's client; the window opens with the world."""
+        """Look for a display; the window opens with the world."""
         check_display()
-        self._traci = load_traci()
-        self.TraCIException: type[Exception] = self._traci.TraCIException
+        self.TraCIException: type[Exception] = RefusedByWindowError
         self.FatalTraCIError: type[Exception] = _NeverError
         self._sleep = sleep
         self._opened = ExitStack()
@@ -75,42 +83,61 @@ class Window:
             look = ("--gui-settings-file", str(view), "--window-size", ",".join(map(str, WINDOW)))
             # The window reads the net behind our back, when the world has removed its files.
             files = [_kept(argument, stage) for argument in command[1:]]
-            options = [*files, *look, "--start", "--delay", "0"]
-            process, self._connection = open_program("sumo-gui", options)
-            opened.callback(end_program, process)
+            options = ["sumo-gui", *files, *look, "--start", "--delay", "0"]
+            self._child = SumoChild(BOOT, stage, {})
+            opened.callback(self._child.kill)
+            try:
+                self._call("start", options, patience_s=OPENS_S)
+            except (UserError, TimeoutError) as error:
+                why = self._child.said() or "it does not answer"
+                raise UserError(f"sumo-gui did not open: {why}") from error
             self._opened = opened.pop_all()
-        self.vehicle = _Told(self._connection.vehicle, self._traci.FatalTraCIError)
-        self.route = _Told(self._connection.route, self._traci.FatalTraCIError)
+        self.vehicle = _Domain("vehicle", self._call)
+        self.route = _Domain("route", self._call)
+        self._gui = _Domain("gui", self._call)
         self.simulation = self
+
+    def _call(
+        self, function: str, *arguments: Any, patience_s: float | None = None, **options: Any
+    ) -> Any:
+        """Return what the window's libsumo answers; `UserError` when it is closed."""
+        message = {"call": function, "arguments": arguments, "options": options}
+        try:
+            answer = self._child.ask(message, patience_s)
+        except ChildDiedError as error:
+            raise _closed() from error
+        if "refused" in answer:
+            raise RefusedByWindowError(answer["refused"])
+        if "closed" in answer:
+            raise _closed()
+        return answer["value"]
 
     def step(self) -> None:
         """Make a step when its time has come; real time, from the second one on."""
-        with self._told():
-            if self._shown:
-                self._look()
-                now_s = time.monotonic()
-                first = self._due_s is None
-                self._due_s = now_s + BEFORE_S if first else self._due_s + DT_S  # type: ignore[operator]
-                self._sleep(max(self._due_s - now_s, 0.0))
-            self._connection.simulationStep()
-            self._shown += 1
-            if self._shown == 1:
-                self._colour()
+        if self._shown:
+            self._look()
+            now_s = time.monotonic()
+            first = self._due_s is None
+            self._due_s = now_s + BEFORE_S if first else self._due_s + DT_S  # type: ignore[operator]
+            self._sleep(max(self._due_s - now_s, 0.0))
+        self._call("simulation.step")
+        self._shown += 1
+        if self._shown == 1:
+            self._colour()
 
     def wait(self) -> None:
         """Hold the cars where they are until the window is closed; only the clock runs on.
 
         Without steps sumo-gui would not hear that it is to close.
         """
-        with suppress(UserError), self._told():
+        with suppress(UserError):
             self._look()
-            vehicle = self._connection.vehicle
-            for name in vehicle.getIDList():
-                vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
-                vehicle.setPreviousSpeed(name, 0.0, 0.0)
-                vehicle.setSpeed(name, 0.0)
+            for name in self.vehicle.getIDList():
+                self.vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
+                self.vehicle.setPreviousSpeed(name, 0.0, 0.0)
+                self.vehicle.setSpeed(name, 0.0)
             while True:
-                self._connection.simulationStep()
+                self._call("simulation.step")
                 self._sleep(LOOK_S)
 
     def close(self) -> None:
@@ -127,7 +154,7 @@ class Window:
 
     def _colour(self) -> None:
         """Give the cars the colours that they have in a replay."""
-        vehicle = self._connection.vehicle
+        vehicle = self.vehicle
         for name in vehicle.getIDList():
             colour = [round(255 * float(part)) for part in COLOURS[_who(name)].split(",")]
             vehicle.setColor(name, (*colour, 255))
@@ -137,7 +164,7 @@ class Window:
 
         It is in the middle, and the others are in the picture.
         """
-        vehicle, places = self._connection.vehicle, {}
+        vehicle, places = self.vehicle, {}
         for name in vehicle.getIDList():
             text = f"{_who(name).upper()} {vehicle.getSpeed(name):.1f} m/s"
             vehicle.setParameter(name, LABEL, text)
@@ -149,44 +176,53 @@ class Window:
             *(SEEN * max(abs(to[0] - x), abs(to[1] - y) * wide / high) for to in places.values()),
         )
         box = x - half_m, y - half_m * high / wide, x + half_m, y + half_m * high / wide
-        self._connection.gui.setBoundary(VIEW, *box)
-
-    def _told(self) -> _Closed:
-        return _Closed(self._traci.FatalTraCIError)
+        self._gui.setBoundary(VIEW, *box)
 
 
 class _NeverError(Exception):
     """What a window raises in the place of libsumo's fatal error: it has another for that."""
 
 
-class _Closed:
-    """Turns the end of the connection into a sentence."""
-
-    def __init__(self, fatal: type[Exception]) -> None:
-        self._fatal = fatal
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, _kind: object, error: object, _trace: object) -> None:
-        if isinstance(error, (self._fatal, OSError)):
-            raise UserError("the window was closed before the case had ended") from None
+class RefusedByWindowError(Exception):
+    """What a window raises in the place of libsumo's exception."""
 
 
-class _Told:
-    """A domain of TraCI whose end of the connection is a sentence."""
+def _closed() -> UserError:
+    return UserError("the window was closed before the case had ended")
 
-    def __init__(self, domain: Any, fatal: type[Exception]) -> None:
-        self._domain, self._fatal = domain, fatal
 
-    def __getattr__(self, name: str) -> Any:
-        function = getattr(self._domain, name)
+class _Domain:
+    """A domain of libsumo, in the window's process."""
 
-        def call(*arguments: Any, **options: Any) -> Any:
-            with _Closed(self._fatal):
-                return function(*arguments, **options)
+    def __init__(self, name: str, call: Callable[..., Any]) -> None:
+        self._name, self._call = name, call
 
-        return call
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        return partial(self._call, f"{self._name}.{name}")
+
+
+def main() -> None:
+    """Do in the window's process what the other one asks for, until it ends this one."""
+    channel, _ = opened()
+    libsumo = load_libsumo()
+    with suppress(EOFError, OSError):
+        _serve(channel, libsumo)
+
+
+def _serve(channel: Channel, libsumo: Any) -> None:
+    while True:
+        message = channel.receive()
+        called = libsumo
+        for name in message["call"].split("."):
+            called = getattr(called, name)
+        try:
+            value = called(*message["arguments"], **message["options"])
+        except libsumo.TraCIException as error:
+            channel.send({"refused": str(error)})
+        except libsumo.FatalTraCIError:
+            channel.send({"closed": True})
+        else:
+            channel.send({"value": None if message["call"] == "start" else value})
 
 
 def _who(name: str) -> str:
