@@ -470,8 +470,8 @@ class TestCampaigns:
         page = (harsh.folder / "report.html").read_text(encoding="utf-8")
         assert code == 0
         assert "A case fails when brake_after_mps2 &gt; 2" in page
-        assert "(brake_after_mps2 &gt; 2), " in page
-        assert "within 6 m at M), " not in page
+        assert "(brake_after_mps2 &gt; 2; " in page
+        assert "within 6 m at M; " not in page
         assert '"margin"' in page
 
     def test_go_on_with_the_same_criterion_only(self, harsh):

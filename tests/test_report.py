@@ -72,7 +72,7 @@ class TestThePage:
         text = text_of(page)
         assert f"handmade: 1 error and {found} failures (" in text
         assert f"{found} failures in 180 cases" in text
-        assert text.index("of them contacts") < text.index("Failure mode coverage")
+        assert text.index("within 6 m at M;") < text.index("Failure mode coverage")
 
     def test_loads_nothing_and_runs_nothing_but_its_own_script(self, page):
         root = root_of(page)

@@ -87,16 +87,15 @@ def _failures(
 
 
 def failures_in_words(failures: Sequence[Outcome], rule: Rule) -> str:
-    """Return how many failures there are and how many of them are contacts, in a clause."""
-    number = len(failures)
-    contacts = sum(o.measures.severity == Severity.CONTACT for o in failures)
-    what = "conflict" if rule.criterion.is_papers else "failure"
-    said = f"{counted(number, what)} ({rule.in_words})"
-    if number == 1:
-        return f"{said}, {'a contact' if contacts else 'no contact'}"
-    if contacts == number:
-        return f"{said}, all of them contacts"
-    return f"{said}, {contacts or 'none'} of them {'a contact' if contacts == 1 else 'contacts'}"
+    """Return how many failures there are, what fails, and how severe they are, in a clause."""
+    found = Counter(outcome.measures.severity for outcome in failures)
+    severe = [
+        f"{number} {word}" if word in (Severity.HARSH, Severity.SAFE) else counted(number, word)
+        for word in Severity
+        if (number := found[word])
+    ]
+    told = "; ".join(filter(None, (rule.in_words, ", ".join(severe))))
+    return f"{counted(len(failures), 'failure')} ({told})"
 
 
 def avoidable_words(failures: Sequence[Outcome], crash_m: float) -> str | None:

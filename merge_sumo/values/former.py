@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.values.merge import REACTION_S, needed_braking_mps2
 from merge_sumo.values.scenario import Scenario
 from merge_sumo.values.severity import severity_of
 from merge_sumo.values.trajectory import End
-
-NEW: Final = (
-    *("severity", "bumper_gap_m", "clearance_m", "before_clearance_m", "brake_after_mps2"),
-)
-"""Fields that release 0.1 did not record."""
 
 
 def take_from_0_1(values: dict[str, Any], scenario: Scenario) -> None:
