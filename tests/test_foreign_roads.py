@@ -445,16 +445,18 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
         assert (row["lane"], row["edge"], row["index"]) == (at.lane, (edge, edge), int(index))
         assert row["at"] == pytest.approx((at.position_m, at.x_m, at.y_m, at.angle_deg), abs=1e-9)
         # The client sees the net of the file: there the last lane is not continued.
-        length_m = min(piece.length_m, road.drawn_after_m - piece.start_m)
-        sizes = length_m, piece.speed_limit_mps, piece.speed_limit_mps
+        sizes = (
+            min(piece.length_m, road.drawn_after_m - piece.start_m),
+            piece.speed_limit_mps,
+            piece.speed_limit_mps,
+        )
         assert (row["length"], *row["limit"]) == pytest.approx(sizes, abs=1e-9)
         assert (row["on"], row["on edge"]) == (True, True)
         if not piece.is_internal:
             shape = tuple((x, y) for x, y, _ in pieces[at.lane].shape)
             assert row["shape"] == shape[: len(shape) - (piece is path.pieces[-1])]
             assert row["next"] == edge
-    lanes = [row["lane"] for row in rows if row["who"] == "vut"]
-    driven_on = list(dict.fromkeys(lanes))
+    driven_on = list(dict.fromkeys(row["lane"] for row in rows if row["who"] == "vut"))
     at = [p.lane for p in road.ramp.pieces].index(driven_on[0])
     assert driven_on == [p.lane for p in road.ramp.pieces[at : at + len(driven_on)]]
     assert len(driven_on) >= 2

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plans import plan_for
+from processes import ports_of
 
 from merge_sumo.campaigns.single import case_of, run_one
 from merge_sumo.errors import UserError
@@ -151,6 +152,20 @@ class TestInSumoGui:
         assert (live.trajectory.motion == without.trajectory.motion).all()
         assert live.outcome == without.outcome
         assert len(slept) == len(live.trajectory.motion) - 1, "every step waits for its time"
+
+    def test_opens_no_port(self, window):
+        ports: list[list[str]] = []
+
+        def look(this: Window) -> None:
+            ports.append(ports_of(this._child.process.pid))
+            step(this)
+
+        step = Window.step
+        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
+        window.setattr(Window, "step", look)
+        run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
+        assert len(ports) > 20
+        assert not any(ports)
 
     def test_a_window_that_is_closed_is_said_in_a_sentence(self, window):
         def close_window(this: Window) -> None:

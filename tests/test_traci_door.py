@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import pwd
+import signal
 import socket
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from pathlib import Path
 import pytest
 import traci
 from conftest import require, some
-from processes import none_left
+from processes import none_left, ports_of
 from raw_traci import Client, GoneError
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
@@ -31,6 +32,7 @@ from merge_sumo.values.trajectory import End
 TESTS = Path(__file__).parent
 RAW = TESTS / "raw_traci.py"
 OURS = f"{sys.executable} {RAW} {{port}}"
+CAMPAIGN = sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", "traci"
 GIVES = (
     "import sys, traci\n"
     "traci.init(int(sys.argv[1]), numRetries=600)\n"
@@ -288,51 +290,39 @@ class TestAnotherUser:
             f"runpy.run_path({str(RAW)!r}, run_name='__main__')"
         )
 
-    @pytest.mark.long
-    def test_reaches_no_port_of_sumo(self, nobody, tmp_path):
-        """All that listens while a controller asks SUMO is our door, on the loopback interface."""
-        port, before = free_port(), set(listening())
-        asks = tmp_path / "asks.py"
-        asks.write_text(
-            "import sys, time, traci\n"
-            "traci.init(int(sys.argv[1]))\n"
-            "while traci.simulation.getMinExpectedNumber() > 0:\n"
-            "    traci.simulationStep()\n"
-            "    if 'vut' in traci.vehicle.getIDList():\n"
-            "        traci.vehicle.getNextLinks('vut')\n"
-            "        time.sleep(0.02)\n"
-            "traci.close()\n"
-        )
-        seen: set[str] = set()
-        stopped = threading.Event()
 
-        def look() -> None:
-            while not stopped.is_set():
-                seen.update(set(listening()) - before)
-                time.sleep(0.02)
+def test_the_sumo_that_a_controller_asks_has_no_port(tmp_path):
+    """Of all sockets by TCP or UDP, its process has the client's connection alone."""
+    port, seen, stopped = free_port(), list[list[str]](), threading.Event()
+    asks = tmp_path / "asks.py"
+    asks.write_text(
+        "import sys, time, traci\n"
+        "traci.init(int(sys.argv[1]))\n"
+        "while traci.simulation.getMinExpectedNumber() > 0:\n"
+        "    traci.simulationStep()\n"
+        "    if 'vut' in traci.vehicle.getIDList():\n"
+        "        traci.vehicle.getNextLinks('vut')\n"
+        "        time.sleep(0.02)\n"
+        "traci.close()\n"
+    )
 
-        thread = threading.Thread(target=look)
-        thread.start()
-        try:
-            command = f"{sys.executable} {asks} {{port}}"
-            (trajectory,) = run_cases(factory(f"traci:{port}", command=command), cases_of(1))
-        finally:
-            stopped.set()
-            thread.join()
-        assert trajectory.error is None
-        assert f"0100007F:{port:04X}" in seen
-        others = seen - {f"0100007F:{port:04X}"}
-        assert not [address for address in others if not address.startswith("0100007F")]
+    def look() -> None:
+        while not stopped.is_set():
+            for process in shadows():
+                with suppress(OSError):
+                    seen.append(ports_of(process))
+            time.sleep(0.02)
 
-
-def listening() -> list[str]:
-    """Return the addresses at which anybody on this machine listens by TCP."""
-    lines = [
-        line.split()
-        for table in ("tcp", "tcp6")
-        for line in Path("/proc/net", table).read_text().splitlines()[1:]
-    ]
-    return [local for _, local, _, state, *_ in lines if state == "0A"]
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        command = f"{sys.executable} {asks} {{port}}"
+        (trajectory,) = run_cases(factory(f"traci:{port}", command=command), cases_of(1))
+    finally:
+        stopped.set()
+        thread.join()
+    assert trajectory.error is None
+    assert {tuple(found) for found in seen} == {(), (f"0100007F:{port:04X}",)}
 
 
 @pytest.mark.skipif(not traci_peer.KNOWN_HERE, reason="needs /proc/net/tcp")
@@ -494,3 +484,35 @@ def test_who_serves_is_locked_and_keeps_no_file_of_its_own(tmp_path):
     assert trajectory.error is None
     assert "does not carry out simulation.saveState" in log.read_text()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["asks.py", "controller.log"]
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", pytest.param("SIGINT", marks=pytest.mark.long)])
+def test_a_campaign_that_is_stopped_while_a_controller_thinks_ends_at_once(name, tmp_path):
+    """And not when the controller's deadline of ten minutes has passed; nothing is left."""
+    thinks, begun = tmp_path / "thinks.py", tmp_path / "begun"
+    thinks.write_text(
+        "import sys, time\n"
+        f"sys.path.insert(0, {str(TESTS)!r})\n"
+        "from raw_traci import Client\n"
+        "Client(int(sys.argv[1])).drive(4)\n"
+        f"open({str(begun)!r}, 'w').close()\n"
+        "time.sleep(600)\n"
+    )
+    asked = ("--cases", "5", "--deadline", "600", "--out", str(tmp_path / "run"))
+    command = f"{sys.executable} {thinks} {{port}}"
+    with none_left():
+        campaign = subprocess.Popen(
+            [*CAMPAIGN, "--vut-command", command, *asked],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+        try:
+            while not begun.exists():
+                assert campaign.poll() is None
+                time.sleep(0.05)
+            campaign.send_signal(signal.Signals[name])
+            _, said = campaign.communicate(timeout=120)
+        finally:
+            campaign.kill()
+    assert campaign.returncode != 0
+    assert b"Traceback" not in said

@@ -131,7 +131,7 @@ class TraciVut(Driver):
     def close(self) -> None:
         """Let the client see the last arrival and end; then end it."""
         ends = True
-        if self._client is not None:
+        if self._client is not None and self._shadow.listens:
             with suppress(FaultError):
                 answer = self._ask({"do": "farewell"})
                 ends = bool(answer.get("closed") or answer.get("gone"))
@@ -299,8 +299,11 @@ class TraciVut(Driver):
         if self._client is not None:
             self._client.close()
             self._client = None
-            with suppress(ChildDiedError, TimeoutError):
-                self._shadow.ask({"do": "drop"}, WORK_S)
+            if self._shadow.listens:
+                with suppress(ChildDiedError, TimeoutError):
+                    self._shadow.ask({"do": "drop"}, WORK_S)
+            else:
+                self._shadow.close()
 
 
 class Shadow:
@@ -312,6 +315,8 @@ class Shadow:
         self._opened = ExitStack()
         self._child: SumoChild | None = None
         self._ready = False
+        self.listens = False
+        """Whether it has answered all that it was asked: a person may stop us before."""
 
     def start(self) -> None:
         """Have it started, if it does not run; `UserError` where SUMO cannot use the net.
@@ -343,6 +348,7 @@ class Shadow:
                 self._get_ready()
         assert self._child is not None, "started"  # noqa: S101
         self._child.ask({"do": "connect", "deadline_s": deadline_s}, WORK_S, connection)
+        self.listens = True
 
     def _get_ready(self) -> None:
         assert self._child is not None, "started"  # noqa: S101
@@ -356,13 +362,16 @@ class Shadow:
         """Return its answer; raises `ChildDiedError`, or TimeoutError where there is none."""
         if self._child is None:
             raise ChildDiedError("is not there")
+        self.listens = False
         try:
-            return self._child.ask(message, patience_s)
+            answer = self._child.ask(message, patience_s)
         except ChildDiedError:
             self.close()
             raise
+        self.listens = True
+        return answer
 
     def close(self) -> None:
         """End it."""
-        self._child = None
+        self._child, self.listens = None, False
         self._opened.close()
