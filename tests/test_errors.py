@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 
 import pytest
 
+import merge_sumo as ms
 from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.drivers.vuts.signatures import check_call, check_methods
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenarios.scenario_file import named_scenario
@@ -90,6 +93,82 @@ def test_a_formula_is_refused_with_the_place_of_the_mistake():
 def test_a_name_that_nobody_knows_is_answered_with_one_that_was_meant(make, said):
     with pytest.raises(UserError, match=said):
         make()
+
+
+class TestAWrongSignature:
+    @pytest.mark.parametrize("in_process", [False, True])
+    @pytest.mark.parametrize(
+        ("source", "said"),
+        [
+            (
+                "class V:\n\n    def act(self):\n        return 0.0\n",
+                "my.py:3: act(self) takes 1 argument, act(self, seen) is called",
+            ),
+            (
+                "class V:\n    def act(self, seen): return 0.0\n    def reset(self): ...\n",
+                "my.py:3: reset(self) takes 1 argument, reset(self, seen) is called",
+            ),
+            (
+                "class V:\n    @staticmethod\n    def act(): return 0.0\n",
+                "my.py:2: act() takes 0 arguments, act(seen) is called",
+            ),
+            (
+                "class V:\n    @classmethod\n    def act(cls, a, b): return 0.0\n",
+                "my.py:2: act(cls, a, b) takes 3 arguments, act(cls, seen) is called",
+            ),
+            (
+                "class V:\n    def act_batch(self, seen): ...\n    def reset(self, seen): ...\n",
+                "my.py:3: reset(self, seen) takes 2 arguments, reset(self, corridor, seen) is "
+                "called",
+            ),
+            ("def V():\n    return 0.0\n", "my.py:1: V() takes 0 arguments, V(seen) is called"),
+            (
+                "def V(x, v, *rest, gain):\n    return 0.0\n",
+                "my.py:1: V(x, v, *rest, gain=...) takes 4 arguments, V(seen) is called",
+            ),
+        ],
+    )
+    def test_is_named_in_the_users_file(
+        self, source, said, in_process, tmp_path, monkeypatch, command_line
+    ):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "my.py").write_text(source)
+        hosted = ("--in-process",) if in_process else ()
+        code, out, err = command_line("campaign", "--vut", "my.py:V", *hosted, "--out", "run")
+        assert (code, out, err) == (2, "", f"merge-sumo: {said}\n")
+        assert not (tmp_path / "run").exists()
+
+    def test_of_an_object_is_told_from_python(self):
+        class Mine:
+            def act(self, seen, gain):
+                return 0.0
+
+        for vut in (Mine, Mine()):
+            with pytest.raises(
+                UserError, match=r"test_errors\.py:\d+: act\(self, seen, gain\) takes"
+            ):
+                ms.campaign(vut, cases=1)
+
+    @pytest.mark.parametrize(
+        "source",
+        [
+            "def f(*arguments, **named): ...",
+            "def f(seen, gain=1.0): ...",
+            "class f:\n    def act(self, *rest): ...\n    def reset(self, seen, seed=0): ...",
+            "class f:\n    act = staticmethod(lambda seen: 0.0)",
+            "class f:\n    reset = None\n    def act(self, seen): ...",
+            "import functools\nclass f:\n    act = functools.partialmethod(lambda s, a, b: 0.0, 1)",
+        ],
+    )
+    def test_is_none_where_the_call_fits(self, source):
+        names: dict = {}
+        exec(source, names)  # noqa: S102
+        check = (
+            check_methods
+            if isinstance(names["f"], type)
+            else partial(check_call, arguments=("seen",))
+        )
+        check(names["f"])
 
 
 class TestAnOptionThatIsGivenTwice:

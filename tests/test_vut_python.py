@@ -273,7 +273,7 @@ class Vut:
         ("Vut = 3", "Vut", "a VUT is a class with `act"),
         ("Vut = object()", "Vut", "a VUT is a class with `act"),
         ("class Vut: pass", "Vut", "a VUT is a class with `act"),
-        ("def Vut(): pass", "Vut", "a VUT is a class with `act"),
+        ("def Vut(): pass", "Vut", "Vut() takes 0 arguments, Vut(seen) is called"),
         ("1 / 0", "Vut", "ZeroDivisionError"),
         ("import sys; sys.exit(1)", "Vut", "SystemExit"),
         ("def Vut(:", "Vut", "SyntaxError"),

@@ -19,6 +19,7 @@ from typing import Any, Final
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.drivers.vuts.python import BatchedVut, CallableVut, PythonVut, takes_one, vut_of
+from merge_sumo.drivers.vuts.signatures import check_methods
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.workers import workers_or_cores
@@ -125,6 +126,7 @@ def here_vut(argument: str, options: VutOptions) -> Vut:
 def vut_of_object(vut: Any, name: str, options: VutOptions) -> Vut:
     """Return the VUT that an object is; `UserError` for one that is none."""
     made: Vut
+    check_methods(vut)
     if isinstance(vut, type) or inspect.isroutine(vut):
         made = vut_of(vut, name, options)
     elif callable(getattr(vut, "act_batch", None)):

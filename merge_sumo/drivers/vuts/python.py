@@ -29,6 +29,7 @@ from merge_sumo.drivers.vuts.base import (
     seen_at_start,
     text_of,
 )
+from merge_sumo.drivers.vuts.signatures import check_call, check_methods
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
@@ -67,7 +68,14 @@ def python_vut(spec: str, options: VutOptions) -> Vut:
 
 
 def vut_of(target: Any, spec: str, options: VutOptions) -> Vut:
-    """Return the VUT that a class or a function makes; `UserError` for anything else."""
+    """Return the VUT that a class or a function makes; `UserError` for anything else.
+
+    Also where it cannot be called as VUTs are.
+    """
+    if isinstance(target, type):
+        check_methods(target)
+    elif inspect.isroutine(target):
+        check_call(target, ("seen",))
     if isinstance(target, type) and callable(getattr(target, "act_batch", None)):
 
         def make_batched(corridors: int, _world: World | None) -> Driver:

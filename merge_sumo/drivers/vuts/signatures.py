@@ -1,0 +1,85 @@
+"""Whether a user's class, object or function can be called as a VUT is; if not, where it stands."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable
+from inspect import Parameter
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.errors import UserError
+from merge_sumo.system.printable import printable
+
+OF_ONE: Final = {"act": ("seen",), "reset": ("seen",), "close": ()}
+OF_A_BATCH: Final = {"act_batch": ("seen",), "reset": ("corridor", "seen"), "close": ()}
+"""Methods of a VUT, and what each is called with."""
+_VARIABLE: Final[dict[object, str]] = {
+    Parameter.VAR_POSITIONAL: "*",
+    Parameter.VAR_KEYWORD: "**",
+}
+
+
+def check_methods(vut: Any) -> None:
+    """Raise `UserError` where a method of a class or object cannot be called as a VUT's is.
+
+    The sentence names the file and line of the method. Methods whose signature Python does not know
+    are left alone, as are attributes that are no methods.
+    """
+    batched = callable(getattr(vut, "act_batch", None))
+    for name, arguments in (OF_A_BATCH if batched else OF_ONE).items():
+        method = inspect.getattr_static(vut, name, None)
+        first: tuple[str, ...] = ()
+        if isinstance(method, staticmethod | classmethod):
+            first = ("cls",) if isinstance(method, classmethod) else ()
+            method = method.__func__
+        elif not isinstance(vut, type) and name in getattr(vut, "__dict__", {}):
+            pass  # an attribute of the object is called as it is
+        else:
+            first = ("self",)
+        if inspect.isfunction(method):
+            check_call(method, (*first, *arguments))
+
+
+def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None:
+    """Raise `UserError` where a function cannot be called with so many arguments in order."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return
+    parameters = list(signature.parameters.values())
+    if _fit(parameters, len(arguments)):
+        return
+    name, count = printable(getattr(function, "__name__", "it")), len(parameters)
+    taken = f"{count} argument{'' if count == 1 else 's'}"
+    shown = ", ".join(map(_parameter, parameters))
+    raise UserError(
+        f"{_place(function)}{name}({shown}) takes {taken}, {name}({', '.join(arguments)}) is called"
+    )
+
+
+def _fit(parameters: list[Parameter], count: int) -> bool:
+    """Return whether parameters take exactly so many positional arguments."""
+    in_order = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    places = [parameter for parameter in parameters if parameter.kind in in_order]
+    needed = [p for p in parameters if p.default is p.empty and p.kind not in _VARIABLE]
+    more = any(parameter.kind is Parameter.VAR_POSITIONAL for parameter in parameters)
+    named = any(parameter.kind is Parameter.KEYWORD_ONLY for parameter in needed)
+    return len(needed) <= count and (more or count <= len(places)) and not named
+
+
+def _parameter(parameter: Parameter) -> str:
+    stars = _VARIABLE.get(parameter.kind, "")
+    by_name = "=..." if parameter.kind is Parameter.KEYWORD_ONLY else ""
+    return f"{stars}{printable(parameter.name)}{by_name}"
+
+
+def _place(function: Callable[..., Any]) -> str:
+    """Return "FILE:LINE: " of a function that is written in a file, else nothing."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    if code is None or not Path(code.co_filename).is_file():
+        return ""
+    path = os.path.relpath(code.co_filename)
+    path = code.co_filename if path.startswith(os.pardir) else path
+    return f"{printable(path)}:{code.co_firstlineno}: "
