@@ -49,22 +49,9 @@ def measures_page() -> str:
     return f"# Measures\n\n{about.strip()}\n\n| name | what it is |\n|---|---|\n{rows}"
 
 
-def python_page() -> str:
-    """Return the functions of `merge_sumo` with their signatures and docstrings."""
-    import merge_sumo
-
-    text = "# Functions\n\n`import merge_sumo as ms`\n"
-    for name in sorted(set(merge_sumo.__all__) - {"__version__"}):
-        thing = getattr(merge_sumo, name)
-        title = f"{name}{inspect.signature(thing)}" if inspect.isfunction(thing) else name
-        text += f"\n## {name}\n\n```text\n{title}\n\n{inspect.getdoc(thing)}\n```\n"
-    return text
-
-
 GENERATED: dict[str, Callable[[], str]] = {
     "reference/cli.md": cli_page,
     "reference/measures.md": measures_page,
-    "reference/python.md": python_page,
 }
 
 

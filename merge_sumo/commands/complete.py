@@ -27,13 +27,17 @@ def vuts(incomplete: str) -> Completions:
     from merge_sumo.drivers.vut import KINDS, built_in_vuts
     from merge_sumo.drivers.vuts.python import installed_vuts
 
-    kinds = [(kind.form.partition(":")[0], kind.what) for kind in KINDS.values()]
     if ":" in incomplete:
         return _beginning(incomplete, _names_in(incomplete.rpartition(":")[0]))
     named = [(name, "built in") for name in built_in_vuts()]
     named += [(name, "installed") for name in installed_vuts()]
-    named += [(name if name == "traci" else f"{name}:", what) for name, what in kinds]
+    named += [(_begun(name, kind.form), kind.what) for name, kind in KINDS.items()]
     return _beginning(incomplete, [*named, *_files(incomplete, (".py",), ":")])
+
+
+def _begun(name: str, form: str) -> str:
+    """Return the beginning of the specs of a kind, as far as all of them have it."""
+    return f"{name}:" if form.startswith(f"{name}:") else name
 
 
 def _names_in(source: str) -> Completions:

@@ -62,9 +62,13 @@ class GroupedCommand(OnceCommand):
         self.params.sort(key=lambda p: order.get(getattr(p, "rich_help_panel", None) or "", -1))
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; a `Notice` becomes a sentence on standard error."""
+        """Run the command; a `Notice` becomes a sentence on standard error, and so does Ctrl-C."""
         with notices_said():
-            return super().invoke(ctx)
+            try:
+                return super().invoke(ctx)
+            except KeyboardInterrupt:
+                typer.echo("stopped", err=True)
+                raise
 
 
 @contextmanager

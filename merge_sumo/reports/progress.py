@@ -141,9 +141,11 @@ class Bars:
         """Return the bars."""
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Leave the bars as they are."""
-        if self._tasks:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Leave the bars as they are; remove them where the work was stopped."""
+        # Not by the bars: Ctrl-C may have come before the first of them was noted.
+        if self._progress.live.is_started:
+            self._progress.live.transient = error is not None
             self._progress.stop()
 
 

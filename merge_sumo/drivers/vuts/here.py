@@ -14,17 +14,39 @@ from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol, SupportsFloat
 
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.vuts.base import Vut, VutOptions, text_of
-from merge_sumo.drivers.vuts.python import BatchedVut, CallableVut, PythonVut, takes_one, vut_of
+from merge_sumo.drivers.vuts.base import Seen, Vut, VutOptions, text_of
+from merge_sumo.drivers.vuts.python import (
+    BatchedVut,
+    CallableVut,
+    PythonVut,
+    SeenBatch,
+    takes_one,
+    vut_of,
+)
 from merge_sumo.drivers.vuts.signatures import check_methods
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.workers import workers_or_cores
 
-AnyVut = str | type | Callable[..., Any] | object
+
+class Acts(Protocol):
+    """A controller of one corridor."""
+
+    def act(self, seen: Seen, /) -> SupportsFloat:
+        """Return the acceleration for the next 0.1 s, in m/s2."""
+
+
+class ActsInBatches(Protocol):
+    """A controller of all K corridors at once."""
+
+    def act_batch(self, seen: SeenBatch, /) -> Any:
+        """Return the accelerations for the next 0.1 s, in m/s2, (K,)."""
+
+
+AnyVut = str | type[Any] | Callable[[Seen], SupportsFloat] | Acts | ActsInBatches
 """A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
 HERE: Final = "here"
 """The part of their specs before the colon."""

@@ -1,0 +1,102 @@
+"""Assertions on a controller: a campaign that raises `AssertionError` where it finds something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, Unpack
+
+from merge_sumo import api
+from merge_sumo.campaigns.run import failures
+from merge_sumo.drivers.vuts.here import AnyVut
+from merge_sumo.reports.coordinates import described
+from merge_sumo.reports.motion import verdict_of
+from merge_sumo.reports.verdict import NOTHING_TESTED
+from merge_sumo.results import CampaignRun
+from merge_sumo.samplers import DEFAULT_SAMPLER
+from merge_sumo.setup import Setup
+from merge_sumo.system.printable import printable, quoted
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
+
+DEFAULT_CASES: Final = 200
+"""Cases of an assertion: seconds for a controller that answers at once."""
+
+
+def assert_no_failures(
+    vut: AnyVut,
+    *,
+    level: int | str = "all",
+    sampler: str = DEFAULT_SAMPLER,
+    cases: int = DEFAULT_CASES,
+    seed: int = 0,
+    out: Path | str | None = None,
+    workers: int = 1,
+    **setup: Unpack[Setup],
+) -> CampaignRun:
+    """Test a VUT in a campaign, and raise `AssertionError` where a case fails or ends in an error.
+
+    Args:
+        vut: vehicle under test: a spec, a class, a function, or an object.
+        level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
+        sampler: name of what chooses the cases.
+        cases: number of cases.
+        seed: same seed, same cases, same result.
+        out: new folder to write; `runs/<vut>-<date>` by default.
+        workers: processes that run cases; the outcomes are the same.
+        setup: how a case is run and judged, as of `merge_sumo.campaign`: `fail_when` says what
+            counts as a failure.
+
+    Returns:
+        The campaign, where nothing fails. A timeout is no failure, unless `fail_when` says so.
+
+    Raises:
+        AssertionError: where a case fails, ends in an error, or no case reaches the merge point.
+            The message names what was found, the worst case, the report, and the command that
+            replays the case.
+        UserError: for values that make no campaign.
+    """
+    __tracebackhide__ = True
+    run = api.campaign(
+        vut,
+        level=level,
+        sampler=sampler,
+        cases=cases,
+        seed=seed,
+        out=out,
+        workers=workers,
+        progress=False,
+        **setup,
+    )
+    message = _message(run, seed)
+    if message is not None:
+        raise AssertionError(message)
+    return run
+
+
+def _message(run: CampaignRun, seed: int) -> str | None:
+    """Return what an assertion says of a campaign; None where there is nothing to say."""
+    outcomes = run.run.outcomes
+    failed = failures(outcomes)
+    wrong = [*failed, *(outcome for outcome in outcomes if outcome.measures.end.is_error)]
+    if run.verdict.tested and not wrong:
+        return None
+    said = [f"{run.run.vut}: {run.verdict.counts}, with seed {seed}"]
+    if not run.run.criterion.is_papers:
+        said.append(f"  a case fails when {run.run.criterion.words}")
+    said += run.verdict.trouble_lines()
+    if not run.verdict.tested:
+        said.append(f"  {NOTHING_TESTED}")
+    if wrong:
+        said += _worst(run, wrong[0], "worst case" if failed else "first error")
+    return "\n".join(map(printable, [*said, f"  report: {run.report_file}"]))
+
+
+def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
+    """Return which case to look at, and how."""
+    case, index = outcome.case, outcome.index
+    return [
+        f"  {title}: case {index}, POV level {level_name(case.level)}, {described(case)}",
+        f"    {verdict_of(outcome, run.trajectory(index))}",
+        f"    replay it: merge-sumo replay {quoted(run.folder)} {index} --gui",
+        f"    run it again: merge-sumo run --case {quoted(run.folder)} {index}",
+    ]

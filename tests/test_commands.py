@@ -1,0 +1,224 @@
+"""The command line as a whole: groups of options, help, completion, and how it stops."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.commands import complete
+from merge_sumo.commands.grouped import GROUP_OF, GROUPS, unwrapped
+
+ENDS = ".", ":", "!", "?"
+
+
+def commands() -> dict[str, Any]:
+    """Return all commands by what a person types."""
+    found = {}
+    waiting: list[tuple[str, Any]] = [("", typer.main.get_command(cli.app))]
+    while waiting:
+        name, one = waiting.pop()
+        below = getattr(one, "commands", {})
+        waiting += [(f"{name} {part}".strip(), command) for part, command in below.items()]
+        if not below:
+            found[name] = one
+    return found
+
+
+COMMANDS = commands()
+
+
+def help_of(name: str, columns: int) -> str:
+    done = CliRunner().invoke(
+        cli.app, [*name.split(), "--help"], env={"COLUMNS": str(columns), "TERM": "dumb"}
+    )
+    assert done.exit_code == 0
+    return done.output
+
+
+class TestOptions:
+    @pytest.mark.parametrize("name", COMMANDS)
+    def test_stand_in_groups(self, name):
+        options = [p for p in COMMANDS[name].params if p.param_type_name == "option"]
+        assert [p.name for p in options if p.name != "help" and p.name not in GROUP_OF] == []
+        groups = [p.rich_help_panel for p in options if p.name != "help"]
+        order = list(GROUPS)
+        assert groups == sorted(groups, key=order.index)
+
+    def test_have_one_group_and_are_somewhere(self):
+        used = {p.name for command in COMMANDS.values() for p in command.params}
+        assert sum(map(len, GROUPS.values())) == len(GROUP_OF)
+        assert set(GROUP_OF) - used == set()
+
+    def test_are_the_same_wherever_they_make_sense(self):
+        has = {
+            option: {name for name, c in COMMANDS.items() if option in {p.name for p in c.params}}
+            for option in ("as_json", "quiet", "workers", "level")
+        }
+        assert set(COMMANDS) == has["as_json"]
+        runs_cases = {"campaign", "certify", "compare", "probability", "rerun", "truth"}
+        assert has["workers"] == {*runs_cases, "reproduce"}
+        assert has["quiet"] == {*runs_cases, "reproduce", "train"}
+        assert has["level"] == {*runs_cases, "run"} - {"probability"}
+
+
+class TestHelp:
+    @pytest.mark.parametrize("columns", [80, 100])
+    @pytest.mark.parametrize("name", COMMANDS)
+    def test_wraps_no_paragraph_twice(self, name, columns):
+        shown = help_of(name, columns)
+        above = shown.split("╭")[0].splitlines()
+        assert max(map(len, shown.splitlines())) <= columns
+        for line, below in pairwise(above):
+            if line.strip() and below.strip():  # a line in the middle of a paragraph is full
+                assert len(line.rstrip()) + 1 + len(below.split()[0]) > columns - 2
+
+    def test_shows_defaults_that_are_said_in_words(self):
+        shown = " ".join(help_of("campaign", 100).replace("│", " ").split())
+        assert "[default: (runs/VUT-DATE)]" in shown
+        assert "[default: (few, later more" in shown
+
+    def test_joins_the_lines_of_a_paragraph(self):
+        assert unwrapped("A\n    b.\n\n    C\n    d.\n    ") == "A b.\n\nC d."
+
+
+class TestCompletion:
+    def test_of_a_vut_knows_names_kinds_files_and_what_is_in_them(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        Path("mine.py").write_text("class Vut: ...\ndef drive(seen): ...\n_x = 1\nraise SystemExit")
+        assert [value for value, _ in complete.vuts("design")] == ["design1", "design2"]
+        assert tuple(
+            next(value for value, _ in complete.vuts(begun)) for begun in ("tr", "fm", "mi")
+        ) == ("traci", "fmu:", "mine.py:")
+        names = [value for value, _ in complete.vuts("mine.py:")]
+        assert names == ["mine.py:Vut", "mine.py:drive"]
+        assert complete.vuts("mine.py:d") == [("mine.py:drive", "")]
+
+    def test_of_a_run_shows_the_newest_first(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        for age, name in enumerate(("new", "old")):
+            folder = Path("runs") / name
+            folder.mkdir(parents=True)
+            settings = folder / "campaign.json"
+            settings.write_text("{}")
+            os.utime(settings, (1e9 - age, 1e9 - age))
+        (Path("runs") / "none").mkdir()
+        assert [v for v, _ in complete.runs("")][:2] == ["runs/new", "runs/old"]
+        assert [v for v, _ in complete.runs("runs/o")] == ["runs/old"]
+
+    def test_of_samplers_goes_on_behind_a_comma(self):
+        found = [value for value, _ in complete.samplers("uniform,")]
+        assert "uniform,gpr" in found
+        assert "uniform,uniform" not in found
+
+    @pytest.mark.parametrize(
+        ("typed", "wanted"),
+        [
+            ("campaign --sampler co", "coverage"),
+            ("campaign --level o", "own"),
+            ("certify --scenario us23-", "us23-traffic"),
+            ("check-vut des", "design1"),
+            ("policies export vu", "vut1"),
+        ],
+    )
+    def test_answers_a_shell(self, typed, wanted):
+        words = f"merge-sumo {typed}"
+        asked = {
+            "_MERGE_SUMO_COMPLETE": "complete_bash",
+            "COMP_WORDS": words,
+            "COMP_CWORD": str(len(words.split()) - 1),
+        }
+        done = CliRunner().invoke(cli.app, [], prog_name="merge-sumo", env=asked)
+        assert wanted in done.output.split()
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")
+class TestCtrlC:
+    """On a terminal: what is drawn is ended, the cursor is shown, and the exit code is 130."""
+
+    @pytest.mark.parametrize(
+        "command",
+        [
+            "campaign --vut design1 --level 0 --cases 4000 --batch 20 --out run",
+            "truth --vut design1 --level 0 --cases 9000 --workers 1",
+        ],
+        ids=lambda command: command.split()[0],
+    )
+    def test_leaves_the_terminal_as_it_was(self, tmp_path, command):
+        text, code = on_a_terminal(command, tmp_path)
+        assert code == 130
+        assert text.count("\x1b[?25l") == text.count("\x1b[?25h") > 0
+        last = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text).replace("\r", "").splitlines()[-1]
+        assert last.startswith("stopped")
+        assert "Traceback" not in text
+
+    def test_prints_no_control_sequence_where_there_is_no_terminal(self, tmp_path):
+        command = "campaign --vut design1 --level 0 --cases 4000 --batch 20 --out run"
+        process = subprocess.Popen(
+            [sys.executable, "-m", "merge_sumo.cli", *command.split()],
+            cwd=tmp_path,
+            env=environment(tmp_path),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        assert process.stderr is not None
+        said = process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        _, rest = process.communicate(timeout=120)
+        assert process.returncode == 130
+        assert b"\x1b" not in said + rest
+        assert b"go on with: merge-sumo campaign --resume run" in rest
+
+
+def environment(folder: Path) -> dict[str, str]:
+    return {
+        **os.environ,
+        "MERGE_SUMO_CACHE": str(folder / "cache"),
+        "TERM": "xterm",
+        "COLUMNS": "100",
+    }
+
+
+def on_a_terminal(command: str, folder: Path) -> tuple[str, int]:
+    """Run a command on a pseudo-terminal until Ctrl-C; return its output and its exit code."""
+    ours, theirs = os.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "merge_sumo.cli", *command.split()],
+        cwd=folder,
+        env=environment(folder),
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+    )
+    os.close(theirs)
+    shown, pressed, until_s = b"", False, time.monotonic() + 120
+    while time.monotonic() < until_s:
+        try:
+            some = os.read(ours, 65536)
+        except OSError:  # the other end is closed
+            break
+        if not some:
+            break
+        shown += some
+        if b"cases" in shown and not pressed:
+            pressed = True
+            os.kill(process.pid, signal.SIGINT)
+    os.close(ours)
+    return shown.decode(errors="replace"), process.wait(timeout=60)
+
+
+def test_the_words_of_a_docstring_end_as_sentences():
+    for name, command in COMMANDS.items():
+        assert re.split(r"\n\n", command.help or "")[0].endswith(ENDS), name

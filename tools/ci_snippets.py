@@ -1,0 +1,56 @@
+"""What docs/tutorials/ci.md shows for the CI of a controller, as files and as a script.
+
+python tools/ci_snippets.py github FOLDER    the commands of the GitHub workflow, one per line
+python tools/ci_snippets.py gitlab FOLDER    those of the GitLab job
+
+The files of the page, the controller and its test, are written into FOLDER, a new one. `.ci/run`
+runs the commands there with the built wheel, so what the page shows is what is tested. Commands of
+`apt-get` are left out: they need root, and `.ci/run` installs the same packages itself.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "tutorials" / "ci.md"
+TITLED = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+GITHUB, GITLAB = ".github/workflows/merge.yml", ".gitlab-ci.yml"
+
+
+def files(text: str) -> dict[str, str]:
+    """Return the files that a page shows, by name: blocks with a title."""
+    return dict(TITLED.findall(text))
+
+
+def commands(kind: str, text: str) -> list[str]:
+    """Return the commands of the GitHub workflow or the GitLab job of a page."""
+    shown = files(text)
+    if kind == "github":
+        (job,) = yaml.safe_load(shown[GITHUB])["jobs"].values()
+        return _lines(step["run"] for step in job["steps"] if "run" in step)
+    (job,) = yaml.safe_load(shown[GITLAB]).values()
+    return _lines([*job.get("before_script", ()), *job["script"]])
+
+
+def _lines(scripts: Any) -> list[str]:
+    lines = [line for script in scripts for line in str(script).splitlines()]
+    return [line for line in lines if line.strip() and "apt-get" not in line]
+
+
+def main(kind: str, folder: Path) -> None:
+    """Write the files of the page into a new folder, and print the commands."""
+    text = PAGE.read_text(encoding="utf-8")
+    folder.mkdir(parents=True)
+    for name, content in files(text).items():
+        if not name.startswith("."):
+            (folder / name).write_text(content, encoding="utf-8")
+    print("\n".join(commands(kind, text)))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))
