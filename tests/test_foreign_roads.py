@@ -41,6 +41,7 @@ from merge_sumo.sumo.replay_folder import (
     CONFIG,
     HOLD_STEPS,
     HOSTED_NET,
+    LABELS,
     RECORD,
     SURROUNDINGS,
     TYPES,
@@ -54,7 +55,7 @@ from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
-FILES = {CONFIG, HOSTED_NET, SURROUNDINGS, TYPES, RECORD, VIEW, CASE}
+FILES = {CONFIG, HOSTED_NET, SURROUNDINGS, TYPES, LABELS, RECORD, VIEW, CASE}
 LANE_WIDTH_M = 3.2
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,11 +17,20 @@ from lxml import etree
 from PIL import Image
 from processes import marked, none_left
 
+import merge_sumo
 from merge_sumo.campaigns.conductor import export_case
 from merge_sumo.campaigns.run import failures
-from merge_sumo.sumo.replay_folder import COLOURS, SURROUNDINGS_COLOUR, VIEW, write_scenario
+from merge_sumo.sumo.replay_folder import (
+    LABELS,
+    SURROUNDINGS_COLOUR,
+    VIEW,
+    write_scenario,
+)
+from merge_sumo.sumo.replay_labels import COLOURS
 
 PICTURE_TIMES_S = (2.0, 7.0)
+LABELS_SHARE = 0.2
+"""Of the height of a picture, from the top: there are the labels."""
 NEAR = 40
 """Distance in each channel of 255 below which a pixel has a colour."""
 
@@ -113,8 +123,11 @@ def places(image: np.ndarray, colour: tuple[float, ...]) -> np.ndarray:
 
 
 def car(image: np.ndarray, who: str) -> np.ndarray:
-    """Return the pixels of a car."""
-    return places(image, tuple(255.0 * float(part) for part in COLOURS[who].split(",")))
+    """Return the pixels of a car, which is below the labels."""
+    labels = round(LABELS_SHARE * image.shape[0])
+    return np.array([labels, 0]) + places(
+        image[labels:], tuple(255.0 * float(part) for part in COLOURS[who].split(","))
+    )
 
 
 NEVER_CONNECTED = """
@@ -207,3 +220,29 @@ def test_on_a_foreign_road_the_picture_has_lanes_those_beside_them_and_both_cars
         for image in foreign_pictures
     )
     assert late < early
+
+
+def test_the_window_has_the_case_the_verdict_and_the_colours_of_the_report(run, pictures, tmp_path):
+    outcome = failures(run.outcomes)[0]
+    export_case(run, outcome.index, tmp_path / "case")
+    labels = etree.parse(tmp_path / "case" / LABELS).getroot()
+    case, verdict, *legend = [str(param.get("value")) for param in labels.iter("param")]
+    assert case.startswith(f"case {outcome.index}, POV level {outcome.case.level}: x_POV0 ")
+    assert verdict.startswith(f"{outcome.measures.severity}, fails: ")
+    assert legend == ["POV", "VUT"]
+    css = (Path(merge_sumo.__file__).parent / "reports" / "templates" / "report.css").read_text()
+    for image in pictures:
+        top = image[: round(LABELS_SHARE * image.shape[0])]
+        assert len(places(top, (26.0, 26.0, 26.0))) > 100, "a text"
+        for who in ("pov", "vut"):
+            (named,) = set(re.findall(f"--{who}: #([0-9a-f]{{6}})", css.partition("@media")[0]))
+            rgb = tuple(255.0 * float(part) for part in COLOURS[who].split(","))
+            assert rgb == pytest.approx(tuple(bytes.fromhex(named)), abs=2.0)
+            assert len(places(top, rgb)) > 20, "a dot of the legend"
+
+
+def test_no_text_lies_on_the_cars(run, tmp_path):
+    export_case(run, failures(run.outcomes)[0].index, tmp_path / "case")
+    view = etree.parse(tmp_path / "case" / VIEW).getroot()
+    (vehicles,) = view.iter("vehicles")
+    assert not any(str(name).endswith("_show") for name in vehicles.attrib)

@@ -27,6 +27,7 @@ from merge_sumo.sumo.replay_folder import (
     CONFIG,
     HOLD_STEPS,
     HOSTED_NET,
+    LABELS,
     NET,
     RECORD,
     SURROUNDINGS,
@@ -41,7 +42,7 @@ from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
 SHIPPED = sorted(path.parent for path in Path(__file__).parents[1].glob(f"scenarios/*/{CONFIG}"))
-FILES = {CONFIG, NET, TYPES, RECORD, VIEW, CASE}
+FILES = {CONFIG, NET, TYPES, LABELS, RECORD, VIEW, CASE}
 ROW = 40
 """A row of the record in the middle of the episode, at 4.0 s."""
 
@@ -144,7 +145,7 @@ def sumo_plays(monkeypatch):
 
 
 class TestAnExport:
-    def test_is_exactly_six_files(self, collision):
+    def test_is_exactly_these_files(self, collision):
         assert {path.name for path in collision.iterdir()} == FILES
 
     def test_returns_the_configuration_to_open(self, run, tmp_path):
@@ -191,9 +192,9 @@ class TestAnExport:
 
 
 class TestAnHonestRecordReplaysIdentically:
-    @pytest.mark.parametrize("end", [End.MERGED, End.TIMEOUT])
-    def test_of_a_campaign(self, run, tmp_path, end):
-        outcome = next(o for o in run.outcomes if o.measures.end is end)
+    @pytest.mark.parametrize("failed", [False, True])
+    def test_of_a_campaign(self, run, tmp_path, failed):
+        outcome = next(o for o in run.outcomes if o.failed is failed)
         export_case(run, outcome.index, tmp_path / "case")
         steps = len(run.trajectory(outcome.index).motion) - 1
         assert_identical(tmp_path / "case", steps)

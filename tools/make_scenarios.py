@@ -25,10 +25,10 @@ from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import Trajectory
 
 STYLES: dict[str, dict[str, Any]] = {
-    "POV": {"color": "#d62728"},
-    "VUT": {"color": "#1f77b4"},
-    "car ahead": {"color": "#e69f00", "linestyle": "--"},
-    "car behind": {"color": "#e69f00", "linestyle": ":"},
+    "POV": {"color": "#e69f00"},
+    "VUT": {"color": "#0072b2"},
+    "car ahead": {"color": "#009e73", "linestyle": "--"},
+    "car behind": {"color": "#a6518b", "linestyle": ":"},
 }
 """Lines of the vehicles, in the order of their rows."""
 SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"

@@ -198,6 +198,30 @@ SURROUNDINGS: Final = {
 }
 """What is drawn beside the road."""
 
+_LABEL = matching(
+    r"(?:[A-Za-z0-9_ ,:+\-]|(?<=[0-9])\.(?=[0-9])|(?<=m)/(?=s)){0,250}",
+    "a text of letters, digits and . , : + - _",
+)
+LABELS: Final = {
+    "additional": Allowed(
+        {},
+        {
+            "poi": Allowed(
+                {
+                    "id": _ID,
+                    "color": _COLOUR,
+                    "layer": number(-1000, 1000),
+                    **dict.fromkeys(("x", "y"), _PLACE),
+                    **dict.fromkeys(("width", "height"), number(0, 1000)),
+                },
+                {"param": Allowed({"key": _WORD, "value": _LABEL}, required=("key", "value"))},
+                required=("id", "x", "y"),
+            )
+        },
+    )
+}
+"""What is written beside the road."""
+
 _MOTION: Final = {
     "id": _WHO,
     "x": _PLACE,

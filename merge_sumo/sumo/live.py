@@ -22,9 +22,10 @@ from lxml import etree
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
 from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, opened
-from merge_sumo.sumo.replay_folder import COLOURS, WINDOW, view_settings
+from merge_sumo.sumo.replay_folder import WINDOW, view_settings
+from merge_sumo.sumo.replay_labels import COLOURS, beside
 from merge_sumo.system.interrupt import stopping_in_order
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
+from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT
 
 LEAST_M: Final = 120.0
 """Width of the road that the window shows at least, with the VUT in the middle."""
@@ -166,10 +167,13 @@ class Window:
         """
         vehicle, places = self.vehicle, {}
         for name in vehicle.getIDList():
-            text = f"{_who(name).upper()} {vehicle.getSpeed(name):.1f} m/s"
-            vehicle.setParameter(name, LABEL, text)
             places[_who(name)] = vehicle.getPosition(name)
         x, y = places[VEHICLES[VUT]]
+        for name in vehicle.getIDList():
+            who = _who(name)
+            text = f"{who.upper()} {vehicle.getSpeed(name):.1f} m/s"
+            ahead = x >= places[VEHICLES[POV]][0] if who == VEHICLES[VUT] else places[who][0] > x
+            vehicle.setParameter(name, LABEL, beside(text, ahead=ahead))
         wide, high = WINDOW
         half_m = max(
             LEAST_M / 2.0,

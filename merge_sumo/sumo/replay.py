@@ -21,6 +21,7 @@ from merge_sumo.sumo.replay_folder import (
     CONFIG,
     HOLD_STEPS,
     HOSTED_NET,
+    LABELS,
     NET,
     RECORD,
     SURROUNDINGS,
@@ -88,6 +89,7 @@ class _Episode:
     road: Road
     types: etree._Element
     record: etree._Element
+    labels: etree._Element | None
     rows: Rows
     x_m: dict[tuple[float, str], float | None]
     """Lane coordinates of the rows; None for a lane on which a vehicle does not drive."""
@@ -126,7 +128,15 @@ def _received(folder: Path) -> _Episode:
     vtypes = _checked_types(types, folder / TYPES)
     root, rows = _checked_record(record, folder / RECORD, _vehicles(vtypes))
     x_m = _lane_coordinates(root, road.corridor)
-    return _Episode(road, vtypes, root, rows, x_m)
+    return _Episode(road, vtypes, root, _checked_labels(folder), rows, x_m)
+
+
+def _checked_labels(folder: Path) -> etree._Element | None:
+    """Return the labels of a folder; None of one that has none, as older ones."""
+    if not os.path.lexists(folder / LABELS):
+        return None
+    content = received.read_bytes(folder / LABELS, "the file", follow_links=False)
+    return received.parse(content, allowed.LABELS, f"the file {folder / LABELS}")[0]
 
 
 def _checked_hosted(net: bytes, surroundings: bytes, folder: Path) -> Road:
@@ -173,7 +183,7 @@ def _checked_record(
 def _staged(episode: _Episode) -> Iterator[Path]:
     """Yield a temporary folder that holds an episode, with nothing in it that was not checked."""
     with scratch_folder() as stage:
-        write_files(stage, episode.road, episode.types, episode.record)
+        write_files(stage, episode.road, episode.types, episode.record, episode.labels)
         yield stage
 
 

@@ -22,6 +22,7 @@ from merge_sumo.sumo.corridor import Corridor, LanePath
 from merge_sumo.sumo.finder import find_corridor
 from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.sumo.netfile import NetFile, Point
+from merge_sumo.sumo.replay_labels import COLOURS, INK, TEXT, Picture, labels_of
 from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.system.folders import new_folder
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
@@ -35,25 +36,28 @@ HOSTED_NET: Final = "road.net.xml"
 """The net of any other road."""
 SURROUNDINGS: Final = "surroundings.add.xml"
 TYPES: Final = "vehicles.add.xml"
+LABELS: Final = "labels.add.xml"
 RECORD: Final = "episode.fcd.xml"
 VIEW: Final = "view.settings.xml"
 CASE: Final = "case.json"
 SPEED_LIMIT_MPS: Final = 200.0
 """Above every speed: SUMO lets a vehicle enter a replay no faster than its lane allows."""
 
-COLOURS: Final = {
-    "pov": "0.90,0.25,0.15",
-    "vut": "0.10,0.35,0.90",
-    "ahead": "0.95,0.60,0.15",
-    "behind": "0.95,0.60,0.15",
-}
 WINDOW: Final = (1280, 800)
+SHAPE: Final = 614.0 / 1270.0
+"""Height of the picture in that window, as a share of its width."""
+WHOLE_WIDTH_M: Final = 683.0
+"""Of the picture of the shipped road."""
 SEEN: Final = 1.6
 """Width of the picture, as a multiple of where the cars drove."""
 SMALLEST_M: Final = 100.0
 """Of such a width."""
 EXAGGERATED: Final = 1.0 / 175.0
 """How much larger cars are drawn than they are, for a metre of the picture's width."""
+MOVING_INK: Final = "0.85,0.30,0.05"
+"""Of labels at cars: it is read on a black road and beside it."""
+LETTERS: Final = "60"
+"""Size of the labels."""
 REAL_TIME_MS: Final = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
 PALE: Final = "0.93,0.93,0.90"
@@ -79,11 +83,6 @@ class Road:
         """Name of the net in the folder."""
         return NET if self.surroundings is None else HOSTED_NET
 
-    @property
-    def additional(self) -> list[str]:
-        """Names of the other files that SUMO loads at the start."""
-        return [TYPES] if self.surroundings is None else [TYPES, SURROUNDINGS]
-
 
 def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: Trajectory) -> Path:
     """Write an episode as a replay folder and return the path of its configuration.
@@ -93,7 +92,9 @@ def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: T
     written = _road(road, folder)
     with new_folder(folder) as new:
         (new / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
-        write_files(new, written, _types(trajectory), _fcd(written.corridor, trajectory))
+        record = _fcd(written.corridor, trajectory)
+        labels = labels_of(outcome, _picture(written, record))
+        write_files(new, written, _types(trajectory), record, labels)
     return folder / CONFIG
 
 
@@ -127,15 +128,25 @@ def corridor_of_hosted(content: bytes, path: Path) -> Corridor:
     return find_corridor(NetFile(path, content), main + out, ramp + out, room_after_m=0.0)
 
 
-def write_files(folder: Path, road: Road, types: etree._Element, record: etree._Element) -> None:
-    """Write all that SUMO reads, the configuration last."""
+def write_files(
+    folder: Path,
+    road: Road,
+    types: etree._Element,
+    record: etree._Element,
+    labels: etree._Element | None,
+) -> None:
+    """Write all that SUMO reads, the configuration last; without labels where there are none."""
     (folder / road.file).write_bytes(road.net)
     (folder / TYPES).write_bytes(received.serialize(types))
     if road.surroundings is not None:
         (folder / SURROUNDINGS).write_bytes(received.serialize(road.surroundings))
+    if labels is not None:
+        (folder / LABELS).write_bytes(received.serialize(labels))
     (folder / RECORD).write_bytes(received.serialize(record))
-    (folder / VIEW).write_bytes(received.serialize(_view(road, record)))
-    (folder / CONFIG).write_bytes(received.serialize(_config(road, len(record))))
+    (folder / VIEW).write_bytes(received.serialize(_view(_picture(road, record))))
+    additional = {TYPES: types, SURROUNDINGS: road.surroundings, LABELS: labels}
+    names = [name for name, root in additional.items() if root is not None]
+    (folder / CONFIG).write_bytes(received.serialize(_config(road, names, len(record))))
 
 
 def _types(trajectory: Trajectory) -> etree._Element:
@@ -202,33 +213,36 @@ def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
     return root
 
 
-def _view(road: Road, record: etree._Element) -> etree._Element:
+def _picture(road: Road, record: etree._Element) -> Picture:
+    """Return what the window shows at first."""
     if road.surroundings is None:
-        exaggeration, viewport = "4", ("440", "-110", "-20")
-    else:
-        exaggeration, viewport = _viewport(road.corridor, record)
-    return view_settings(exaggeration, viewport)
+        return Picture("4", "440", -110.0, -20.0, WHOLE_WIDTH_M, WHOLE_WIDTH_M * SHAPE)
+    return _picture_of(road.corridor, record)
+
+
+def _view(picture: Picture) -> etree._Element:
+    viewport = picture.zoom, f"{picture.x_m:g}", f"{picture.y_m:g}"
+    return view_settings(picture.exaggeration, viewport)
 
 
 def view_settings(
     exaggeration: str, viewport: tuple[str, str, str], label: str | None = None
 ) -> etree._Element:
-    """Return the settings of a view with large cars, named or labelled by one of their parameters.
+    """Return the settings of a view with large cars, labelled by one of their parameters.
 
-    `viewport` is zoom, x and y.
+    `viewport` is zoom, x and y. Without a `label` cars have none.
     """
     root = etree.Element("viewsettings")
-    text = "vehicleName" if label is None else "vehicleText"
     scheme = etree.SubElement(root, "scheme", name="merge")
-    vehicles = {
-        "vehicleQuality": "3",
-        "vehicle_exaggeration": exaggeration,
-        f"{text}_show": "1",
-        f"{text}_size": "60",
-        f"{text}_color": "0.1,0.1,0.1",
-        **({} if label is None else {"vehicleTextParam": label, "vehicleText_bgColor": PALE}),
-    }
+    vehicles = {"vehicleQuality": "3", "vehicle_exaggeration": exaggeration}
+    if label is not None:
+        vehicles |= {"vehicleTextParam": label, **_text("vehicleText", "70", MOVING_INK)}
     etree.SubElement(scheme, "vehicles", vehicles)
+    etree.SubElement(
+        scheme,
+        "pois",
+        {"poiTextParam": TEXT, **_text("poiText", LETTERS, INK), "poiText_bgColor": PALE},
+    )
     etree.SubElement(scheme, "background", backgroundColor=PALE, showGrid="0")
     zoom, x, y = viewport
     etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
@@ -236,8 +250,18 @@ def view_settings(
     return root
 
 
-def _viewport(road: Corridor, record: etree._Element) -> tuple[str, tuple[str, str, str]]:
-    """Return how cars are enlarged, and zoom and centre of a picture of where they drove.
+def _text(of: str, size: str, colour: str) -> dict[str, str]:
+    """Return how a text is shown; its size is that on the screen."""
+    return {
+        f"{of}_show": "1",
+        f"{of}_size": size,
+        f"{of}_color": colour,
+        f"{of}_constantSize": "1",
+    }
+
+
+def _picture_of(road: Corridor, record: etree._Element) -> Picture:
+    """Return a picture of where the cars drove, and how they are enlarged in it.
 
     At a zoom of 100 the picture has the whole net.
     """
@@ -254,13 +278,14 @@ def _viewport(road: Corridor, record: etree._Element) -> tuple[str, tuple[str, s
     whole_m, (driven_m, x, y) = box(net)[0], box(cars or net)
     seen_m = SEEN * max(driven_m, SMALLEST_M)
     exaggeration = f"{max(EXAGGERATED * seen_m, 1.0):.1f}"
-    return exaggeration, (f"{100.0 * whole_m / seen_m:.0f}", f"{x:.0f}", f"{y:.0f}")
+    zoom = f"{100.0 * whole_m / seen_m:.0f}"
+    return Picture(exaggeration, zoom, round(x), round(y), seen_m, seen_m * SHAPE)
 
 
-def _config(road: Road, timesteps: int) -> etree._Element:
+def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Element:
     end_s = timesteps * DT_S
     sections = {
-        "input": {"net-file": road.file, "additional-files": ",".join(road.additional)},
+        "input": {"net-file": road.file, "additional-files": ",".join(additional)},
         "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
         "processing": {
             "collision.action": "none",
