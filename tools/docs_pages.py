@@ -34,7 +34,40 @@ def cli_page() -> str:
     # An example is on a line of its own in --help, and is a block here.
     text = re.sub(r"^Example:\s+(.*)$", r"```text\n\1\n```", text, flags=re.MULTILINE)
     head = "# Commands\n\nThis is `merge-sumo COMMAND --help` of all commands.\n"
-    return text.replace("# `merge-sumo`\n", head, 1)
+    return text.replace("# `merge-sumo`\n", head + _options_table(command), 1)
+
+
+SHARED = (
+    *("level", "scenario", "policies", "pov", "net", "fail_when", "deadline", "workers", "dask"),
+    *("out", "json", "quiet"),
+)
+"""Options that several commands have, as columns of a table."""
+
+
+def _options_table(application: Any) -> str:
+    """Return which command has which of the options that several have."""
+    rows, waiting = [], [("", application)]
+    while waiting:
+        name, command = waiting.pop(0)
+        below = getattr(command, "commands", {})
+        waiting += [(f"{name} {part}".strip(), one) for part, one in below.items()]
+        if not below:
+            has = {option.lstrip("-") for p in command.params for option in p.opts}
+            marks = ["x" if name.replace("_", "-") in has else "" for name in SHARED]
+            rows.append(f"| `{name}` | {' | '.join(marks)} |")
+    titles = " | ".join(f"`--{name.replace('_', '-')}`" for name in SHARED)
+    rule = "|---" * (len(SHARED) + 1) + "|"
+    about = "\nOptions that several commands have are the same in all of them:\n\n"
+    return f"{about}| command | {titles} |\n{rule}\n" + "\n".join(rows) + COMPLETION
+
+
+COMPLETION = """
+
+`merge-sumo --install-completion` teaches your shell to complete commands, options and values: VUTs
+(`my.py:` shows the classes and functions of a file, which is not run), levels, samplers, scenarios,
+gates, networks, and the folders of campaigns, the newest first. `--show-completion` prints what it
+would add.
+"""
 
 
 def measures_page() -> str:
