@@ -38,6 +38,7 @@ COMPARE = (
 def world_with(run, root: Path, **changes) -> World:
     world = World(root, **changes)
     shutil.copytree(run.folder, root / "run")
+    world.cache.mkdir()
     return world
 
 

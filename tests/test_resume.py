@@ -269,10 +269,10 @@ class TestTwoProcessesOnOneFolder:
     def test_that_create_one_folder_leave_it_to_the_first(self, tmp_path, monkeypatch):
         take_name = folders._take_name
 
-        def overtaken(new: Path, path: Path, option: str) -> None:
+        def overtaken(new: Path, path: Path, shown: Path, option: str) -> None:
             monkeypatch.setattr(folders, "_take_name", take_name)
-            Journal.create(path, {"first": True})
-            take_name(new, path, option)
+            Journal.create(shown, {"first": True})
+            take_name(new, path, shown, option)
 
         monkeypatch.setattr(folders, "_take_name", overtaken)
         with pytest.raises(UserError, match="run exists"):

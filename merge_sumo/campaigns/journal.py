@@ -13,6 +13,7 @@ import json
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -30,6 +31,7 @@ from merge_sumo.campaigns.run import (
     to_line,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.system.anchors import Anchor
 from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_folder
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.trust import begun_here
@@ -47,12 +49,13 @@ class Journal:
     The folder appears whole or not at all, and what was appended once stays.
     """
 
-    def __init__(self, folder: Path, outcomes: io.FileIO, *, begun: bool) -> None:
-        """Take the folder and its open outcomes; use `create` or `reopen`.
+    def __init__(self, folder: Path, place: Anchor, outcomes: io.FileIO, *, begun: bool) -> None:
+        """Take the folder by name and as it is held, and its open outcomes.
 
-        `begun` is whether this user began the campaign there.
+        Use `create` or `reopen`. `begun` is whether this user began the campaign there.
         """
         self.folder = folder
+        self._place = place
         self._begun = begun
         self._outcomes = outcomes
         self._threads = ThreadPoolExecutor(MOST_SYNCS)
@@ -61,12 +64,15 @@ class Journal:
     @classmethod
     def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
         """Create the folder with its settings; `UserError` when it exists or cannot be written."""
-        with new_folder(folder) as new:
+        with new_folder(folder) as new, ExitStack() as undo:
             (new / TRAJECTORIES).mkdir()
             _write(new / SETTINGS, _settings_text(settings))
-            journal = cls(folder, (new / OUTCOMES).open("wb", buffering=0), begun=True)
+            place = Anchor(new)
+            undo.callback(place.close)
+            journal = cls(folder, place, (new / OUTCOMES).open("wb", buffering=0), begun=True)
             note_run(new, folder, settings, begun=True)  # before a kill can leave the folder alone
             sync_folder(new)
+            undo.pop_all()
         return journal
 
     @classmethod
@@ -79,16 +85,21 @@ class Journal:
         """
         check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
         check_own(*(folder / TRAJECTORIES).glob("*"))
+        undo = ExitStack()
         try:
-            outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
+            place = Anchor(folder)
+            undo.callback(place.close)
+            outcomes = (place.path / OUTCOMES).open("r+b", buffering=0)
+            undo.callback(outcomes.close)
         except OSError as error:
+            undo.close()
             if error.errno in (errno.ENOENT, errno.ENOTDIR):
                 raise UserError(
                     f"{folder} is not a campaign to go on with: it has no {OUTCOMES}"
                 ) from error
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
         try:
-            journal = cls(folder, outcomes, begun=begun_here(folder, SETTINGS))
+            journal = cls(folder, place, outcomes, begun=begun_here(folder, SETTINGS))
             run = Run(folder)
             whole = run.outcomes[: run.whole_batches()]
             dropped = len(run.outcomes) - len(whole) + run.torn
@@ -99,10 +110,10 @@ class Journal:
                 outcomes.truncate(length)
                 os.fsync(outcomes.fileno())
         except OSError as error:
-            outcomes.close()
+            undo.close()
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
         except BaseException:
-            outcomes.close()
+            undo.close()
             raise
         return journal, run, dropped
 
@@ -113,12 +124,12 @@ class Journal:
         `UserError` when they cannot be written; what was there before stays. A disk syncs several
         batches at once in little more time than one.
         """
-        paths = [batch_file(self.folder, batch[0][0].batch) for batch in batches]
+        paths = [batch_file(self._place.path, batch[0][0].batch) for batch in batches]
         lines, arrays = zip(*map(_encoded, batches), strict=True)
         try:
             end = self._outcomes.seek(0, os.SEEK_END)
             list(self._threads.map(_write, paths, arrays))
-            sync_folder(self.folder / TRAJECTORIES)
+            sync_folder(self._place.path / TRAJECTORIES)
             try:
                 _write_all(self._outcomes, b"".join(lines))
             except OSError:
@@ -132,7 +143,7 @@ class Journal:
 
     def rewrite_settings(self, settings: dict[str, Any]) -> None:
         """Put other settings in the place of those that were there, all or nothing."""
-        replace_own(self.folder / SETTINGS, _settings_text(settings))
+        replace_own(self.folder / SETTINGS, _settings_text(settings), place=self._place.path)
         self.note_own(settings)
 
     def note_own(self, settings: dict[str, Any]) -> None:
@@ -147,6 +158,7 @@ class Journal:
         """Close the folder; another process may write it."""
         self._threads.shutdown()
         self._outcomes.close()
+        self._place.close()
 
 
 def _encoded(batch: Batch) -> tuple[bytes, bytes]:

@@ -9,7 +9,6 @@ independently from it (`interval.py`).
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -28,7 +27,7 @@ from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.system.folders import check_new_file, write_new
+from merge_sumo.system.folders import add_to, check_new_file, write_new
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
 from merge_sumo.values.score import Outcome
@@ -153,14 +152,10 @@ def _run(
 
 
 def _append(lines: Path, outcomes: Sequence[Outcome], draws: Draws) -> None:
-    try:
-        with lines.open("a" if outcomes[0].index else "x", encoding="utf-8") as file:
-            for o in outcomes:
-                record = o.to_record()
-                record["weight"] = float(draws.weight[o.index])
-                record["plain"] = bool(draws.plain[o.index])
-                file.write(json.dumps(record, allow_nan=False) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise UserError(f"cannot write {lines}: {error.strerror}") from error
+    content = ""
+    for o in outcomes:
+        record = o.to_record()
+        record["weight"] = float(draws.weight[o.index])
+        record["plain"] = bool(draws.plain[o.index])
+        content += json.dumps(record, allow_nan=False) + "\n"
+    add_to(lines, content.encode(), new=outcomes[0].index == 0)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.anchors import Anchor, anchored
 
 TEMPORARY: Final = ".merge-sumo-"
 """How the name begins under which a folder or file is written; the name has 28 bytes."""
@@ -28,6 +29,8 @@ LONGEST_NAME: Final = 255
 """Bytes of a name that file systems take."""
 ROOM: Final = 64
 """Bytes that the name of a file of ours in a folder needs, with the folder's other name."""
+NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+"""Flags to open a file that is no link."""
 DEFAULT: Final = Path("runs")
 """Folder of what nobody gave a name to."""
 
@@ -120,19 +123,25 @@ def check_own(*paths: Path) -> None:
 def new_folder(path: Path, option: str = "--out") -> Iterator[Path]:
     """Give an empty folder to fill; it is at `path` in the end, or nowhere.
 
+    What is given leads to the folder whatever somebody puts into its place meanwhile.
+
     Raises `UserError` where `path` exists, or when something cannot be written. Then what was made
     here is gone again, folders above `path` included.
     """
     check_new(path, option)
-    with ExitStack() as undo:
+    with ExitStack() as held, ExitStack() as undo:
         try:
             _make_above(path, undo)
-            new = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}")
-            new.mkdir()
-            undo.callback(shutil.rmtree, new, ignore_errors=True)
-            yield new
-            _take_name(new, path, option)
-            sync_folder(path.parent)
+            parent = Anchor(path.parent)
+            held.callback(parent.close)
+            name = f"{TEMPORARY}{secrets.token_hex(8)}"
+            new = parent.new_folder(name)
+            held.callback(new.close)
+            undo.callback(_remove_if_empty, parent.path / name)
+            undo.callback(_remove_all_in, new.path)
+            yield new.path
+            _take_name(parent.path / name, parent.path / path.name, path, option)
+            sync_folder(parent.path)
         except OSError as error:
             raise cannot_write(path, error) from error
         undo.pop_all()
@@ -175,7 +184,17 @@ def _remove_if_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _take_name(new: Path, path: Path, option: str) -> None:
+def _remove_all_in(folder: Path) -> None:
+    """Remove what is in a folder of ours, as far as that can be."""
+    with suppress(OSError):
+        for path in list(folder.iterdir()):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+
+def _take_name(new: Path, path: Path, shown: Path, option: str) -> None:
     """Rename a folder, and never over another one: a rename replaces one that is empty."""
     if sys.platform == "win32":  # a rename replaces nothing there
         new.rename(path)
@@ -183,7 +202,7 @@ def _take_name(new: Path, path: Path, option: str) -> None:
     try:
         path.mkdir()
     except FileExistsError as error:
-        raise _exists(path, option) from error
+        raise _exists(shown, option) from error
     try:
         new.replace(path)
     except BaseException:
@@ -200,10 +219,10 @@ def new_file(path: Path, option: str = "--out", mode: int = 0o666) -> Iterator[B
     try:
         if _is_there(path):
             raise _exists(path, option)
-        with _temporary(path, mode) as (new, file):
+        with anchored(path.parent) as parent, _temporary(parent / path.name, mode) as (new, file):
             yield file
             file.flush()
-            _name_file(new, path, mode)
+            _name_file(new, parent / path.name, mode)
     except FileExistsError as error:
         raise _exists(path, option) from error
     except OSError as error:
@@ -245,19 +264,39 @@ def write_new(path: Path, content: bytes, option: str = "--out", mode: int = 0o6
         file.write(content)
 
 
-def replace_own(path: Path, content: bytes) -> None:
+def replace_own(path: Path, content: bytes, *, place: Path | None = None) -> None:
     """Write a file of ours, in the place of an older one, whole or not at all; sync it.
+
+    `place` leads to its folder where that is held (`anchors`), whatever has its name now.
 
     Raises `UserError` when a link is there or it cannot be written.
     """
-    check_own(path)
+    check_own(path if place is None else place / path.name)
     try:
-        with _temporary(path) as (new, file):
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-            new.replace(path)
-        sync_folder(path.parent)
+        with anchored(place or path.parent) as parent:
+            with _temporary(parent / path.name) as (new, file):
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+                new.replace(parent / path.name)
+            sync_folder(parent)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def add_to(path: Path, content: bytes, *, new: bool) -> None:
+    """Add to a file of ours, which is begun where `new`, and sync it.
+
+    Raises `UserError` where a link is there, something that was not begun, or it cannot be written.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | NO_LINK | (os.O_EXCL if new else 0)
+    try:
+        with anchored(path.parent) as parent:
+            descriptor = os.open(parent / path.name, flags, 0o666)
+            with os.fdopen(descriptor, "ab") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(descriptor)
     except OSError as error:
         raise cannot_write(path, error) from error
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import queue
 import time
 from collections.abc import Callable, Mapping
@@ -33,7 +34,14 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.corridor import Corridor
-from merge_sumo.system.folders import cannot_write, check_own, make_place, replace_own, write_new
+from merge_sumo.system.folders import (
+    NO_LINK,
+    cannot_write,
+    check_own,
+    make_place,
+    replace_own,
+    write_new,
+)
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.spawning import forget_safe_path, without_cwd
 from merge_sumo.system.workers import leave_signals_to_parent
@@ -273,7 +281,9 @@ def _log(folder: Path, name: str, mode: str, line: str = "") -> None:
     """Begin the log of a network's training, or add to it; `UserError` when it is not written."""
     path = folder / f"{name}{LOG}"
     try:
-        with path.open(mode, encoding="utf-8") as log:
+        with open(
+            path, mode, encoding="utf-8", opener=lambda name, flags: os.open(name, flags | NO_LINK)
+        ) as log:
             log.write(line)
     except OSError as error:
         raise cannot_write(path, error) from error
