@@ -288,7 +288,7 @@ class TestTheWire:
 
     def test_answers_are_unpacked_as_they_were_packed(self):
         packed = wire.pack_answers(np.array([1.0, np.nan]), {1: "\ud800 no"})
-        answers, reasons = wire.unpack_answers(packed, 2)
+        answers, reasons, _ = wire.unpack_answers(packed, 2)
         assert answers.tolist()[0] == 1.0
         assert np.isnan(answers[1])
         assert reasons == {1: "\ud800 no"}

@@ -36,6 +36,7 @@ from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_f
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.trust import begun_here
 from merge_sumo.values.score import Outcome
+from merge_sumo.values.signals import to_record
 from merge_sumo.values.trajectory import Trajectory
 
 Batch = list[tuple[Outcome, Trajectory]]
@@ -165,9 +166,13 @@ def _encoded(batch: Batch) -> tuple[bytes, bytes]:
     """Return the lines of a batch, and the file of its trajectories."""
     outcomes, trajectories = zip(*batch, strict=True)
     lines = "".join(map(to_line, outcomes)).encode()
+    signals = {str(o.index): to_record(t.signals) for o, t in batch if t.signals}
+    text = json.dumps(signals, allow_nan=False).encode()
+    kept: dict[str, Any] = {"signals": np.frombuffer(text, np.uint8)} if signals else {}
     arrays = io.BytesIO()
     np.savez(
         arrays,
+        **kept,
         index=np.array([o.index for o in outcomes]),
         rows=np.array([len(t.motion) for t in trajectories]),
         motion=np.concatenate([t.motion.reshape(len(t.motion), -1) for t in trajectories]),

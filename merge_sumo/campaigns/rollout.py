@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from merge_sumo.drivers.following import Following, keep_behind_vut
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
+from merge_sumo.values.signals import Left, series
 from merge_sumo.values.trajectory import End, Trajectory
 
 RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
@@ -52,6 +53,8 @@ class _Episode:
     """The row in which the VUT is at M, where it goes on behind M."""
     clipped: int = 0
     """Answers that were clipped before M."""
+    left: list[tuple[int, Left]] = field(default_factory=list)
+    """Signals, by the row of the episode at which the VUT left them."""
 
 
 def rollout(
@@ -264,12 +267,20 @@ class _Rollout:
             answer = np.asarray(self.vut.act(scene), dtype=np.float64)
             if answer.shape != (corridors,):
                 raise ValueError(f"answered shape {answer.shape} instead of ({corridors},)")
+            self.note_signals()
             return answer
         except (SimulationError, VutLostError):
             raise
         except WRONGS as error:
             self.raised = f"{type(error).__name__}: {error}"
             return np.full(corridors, np.nan)
+
+    def note_signals(self) -> None:
+        """Note what the VUT has left with its answers."""
+        for corridor, left in self.vut.signals().items():
+            episode = self.episodes[corridor]
+            if left and episode is not None:
+                episode.left.append((self.row - 1 - episode.first_row, left))
 
     def only_numbers(self, answer: FloatArray) -> FloatArray:
         """Return answers, (A, K), with 0 where one is no number; note whose doing that was."""
@@ -305,11 +316,14 @@ class _Rollout:
         motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
         clipped = int(self.clipped[corridor])
         if episode.merge_row is None:
-            return episode.index, Trajectory(episode.case, motion, end, error, clipped)
+            signals = series(episode.left, len(motion))
+            alone = Trajectory(episode.case, motion, end, error, clipped, signals=signals)
+            return episode.index, alone
         steps = episode.merge_row - episode.first_row
         before, after = motion[: steps + 1].copy(), motion[steps:]
         before[-1, :, 2] = 0.0
-        merged = Trajectory(episode.case, before, End.MERGED, None, episode.clipped, after)
+        signals = series(episode.left, len(before))
+        merged = Trajectory(episode.case, before, End.MERGED, None, episode.clipped, after, signals)
         return episode.index, merged
 
 

@@ -31,6 +31,7 @@ from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
+from merge_sumo.values.signals import Signals, from_record
 from merge_sumo.values.trajectory import Trajectory
 
 SETTINGS: Final = "campaign.json"
@@ -66,6 +67,8 @@ class Run:
         self.scenario = scenario_of(self.settings, folder / SETTINGS)
         self.criterion = _criterion_of(self.settings, folder / SETTINGS)
         self._batches: dict[int, dict[int, FloatArray]] = {}
+        self._signals: dict[int, Signals] = {}
+        """By index, of the batches that were read."""
         if outcomes is None:
             self._read()
         else:
@@ -114,7 +117,12 @@ class Run:
             raise UserError(f"{path} has no trajectory of case {index}")
         measures = outcome.measures
         return Trajectory(
-            outcome.case, motion, measures.end, measures.error, measures.clipped_steps
+            outcome.case,
+            motion,
+            measures.end,
+            measures.error,
+            measures.clipped_steps,
+            signals=self._signals.get(index),
         )
 
     def whole_batches(self) -> int:
@@ -139,7 +147,10 @@ class Run:
             try:
                 arrays = read_arrays(path)
                 arrays.pop("lines_sha256", None)
-                self._batches[batch] = _motion_by_case(self.scenario.vehicles, **arrays)
+                text = arrays.pop("signals", None)
+                motion = _motion_by_case(self.scenario.vehicles, **arrays)
+                self._signals |= {} if text is None else _signals_by_case(text, motion)
+                self._batches[batch] = motion
             except UNREADABLE_NPZ as error:
                 raise UserError(f"cannot read the trajectories in {path}: {error}") from error
         return self._batches[batch]
@@ -303,6 +314,19 @@ def _motion_by_case(
         raise ValueError("the rows of the cases are not those of the motion")
     parts = np.split(motion.reshape(-1, vehicles, 3), np.cumsum(rows)[:-1])
     return dict(zip(index.tolist(), parts, strict=True))
+
+
+def _signals_by_case(
+    text: NDArray[np.uint8], motion: Mapping[int, FloatArray]
+) -> dict[int, Signals]:
+    """Return the signals of each case; ValueError or TypeError where they do not fit the motion."""
+    if text.dtype != np.uint8 or text.ndim != 1:
+        raise ValueError(f"the signals are {text.dtype} of shape {text.shape}")
+    try:
+        record = _decode(text.tobytes().decode())
+    except RecursionError as error:
+        raise ValueError("the signals are no JSON") from error
+    return {int(index): from_record(of, len(motion[int(index)])) for index, of in record.items()}
 
 
 def _check_lines(folder: Path, text: bytes, outcomes: list[Outcome]) -> None:

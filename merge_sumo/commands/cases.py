@@ -121,7 +121,9 @@ def run(
         if as_json:
             kept = {} if out is None else {"out": str(out)}
             motion = {"motion": found.trajectory.motion.tolist()}
-            typer.echo(json.dumps({**found.outcome.to_record(), **kept, **motion}))
+            signals = {} if found.trajectory.signals is None else found.trajectory.signals
+            left = {"signals": signals} if signals else {}
+            typer.echo(json.dumps({**found.outcome.to_record(), **kept, **motion, **left}))
             return
         for line in found.lines():
             show(line)

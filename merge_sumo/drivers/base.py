@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import POV, VUT
+from merge_sumo.values.signals import Left
 
 
 class Scene(NamedTuple):
@@ -108,6 +110,9 @@ class PovLostError(VutLostError):
     """It was the driver of the POV that lost it."""
 
 
+NO_SIGNALS: Final[Mapping[int, Left]] = {}
+
+
 class Driver(ABC):
     """Drives the same vehicle in K corridors at once; the corridors are independent."""
 
@@ -129,6 +134,10 @@ class Driver(ABC):
     def reason(self, corridor: int) -> str | None:
         """Return why the last answer for a corridor was not finite, if the driver knows."""
         return None
+
+    def signals(self) -> Mapping[int, Left]:
+        """Return what the controllers left with their last answers, by corridor."""
+        return NO_SIGNALS
 
     def files(self) -> tuple[Path, ...]:
         """Return the files of the user's that have decided on its answers so far."""

@@ -30,7 +30,11 @@ from merge_sumo.values.trajectory import Trajectory
 
 TABLE: Final = "trajectories"
 SEVERITY: Final = "severity"
-"""Column with one of our words: no text of a stranger is in a table."""
+"""Column with one of our words."""
+SIGNAL: Final = "signal_"
+"""Begins the names of the columns of signals, whose names and words are a stranger's."""
+FORMULA: Final = ("=", "+", "-", "@")
+"""What begins a formula for a spreadsheet."""
 ROAD: Final = "road.xodr"
 _EPOCH: Final = datetime(2000, 1, 1)
 MINOR_VERSION: Final = 2
@@ -40,6 +44,7 @@ CONTROLLER: Final = "EgoController"
 HEIGHT_M: Final = 1.5
 WHEEL_M: Final = 0.7
 
+Row = tuple[float | str | None, ...]
 WriteCase = Callable[[Run, int, Path, Corridor], Path]
 """Writes a case of a run into a new folder; returns the path of the file to open."""
 
@@ -85,7 +90,9 @@ def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str
     check_new(path)
     if file_format == "parquet":
         polars = _need("polars")
-    columns, rows = columns_of(run.scenario), _rows(run, indices)
+    names = _signal_names(run, indices)
+    columns = (*columns_of(run.scenario), *(f"{SIGNAL}{name}" for name in names))
+    rows = _rows(run, indices, names)
     make_place(folder)
     with new_file(path) as file:
         if file_format == "parquet":
@@ -94,28 +101,64 @@ def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str
             numbers = dict.fromkeys(columns, polars.Float64)
             schema = numbers | dict.fromkeys(("case", "level"), polars.Int64)
             schema[SEVERITY] = polars.String
+            for place in range(len(columns) - len(names), len(columns)):
+                if any(isinstance(row[place], str) for row in rows):
+                    schema[columns[place]] = polars.String
+                    rows = [_with_text(row, place) for row in rows]
             polars.DataFrame(rows, schema, orient="row").write_parquet(content)
             file.write(content.getbuffer())
         else:
             text = io.TextIOWrapper(file, encoding="utf-8", newline="")
             writer = csv.writer(text)
             writer.writerow(columns)
-            writer.writerows(rows)
+            writer.writerows(map(_without_formulas, rows))
             text.flush()
             text.detach()
     return path
 
 
-def _rows(run: Run, indices: Sequence[int]) -> list[tuple[float | str | None, ...]]:
-    rows: list[tuple[float | str | None, ...]] = []
+def _signal_names(run: Run, indices: Sequence[int]) -> list[str]:
+    """Return the names of the signals of cases, in the order in which they first come."""
+    cases = (run.trajectory(index).signals or {} for index in indices)
+    return list(dict.fromkeys(name for signals in cases for name in signals))
+
+
+def _without_formulas(row: Row) -> Row:
+    """Return a row in which no text is a formula."""
+    return tuple(
+        f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+        for value in row
+    )
+
+
+def _with_text(row: Row, place: int) -> Row:
+    """Return a row with a text in a place: a column has numbers or texts."""
+    value = row[place]
+    return row if value is None else (*row[:place], str(value), *row[place + 1 :])
+
+
+def _rows(run: Run, indices: Sequence[int], names: Sequence[str]) -> list[Row]:
+    rows: list[Row] = []
     for index in indices:
         trajectory = run.trajectory(index)
         case = trajectory.case
         place = [c.of(case) for c in coordinates(run.scenario)]
         severity = run.outcome(index).measures.severity
+        left = trajectory.signals or {}
+        signals = [left.get(name, (None,) * len(trajectory.motion)) for name in names]
         motion = trajectory.motion.reshape(len(trajectory.motion), -1)
         for step, state in enumerate(motion.tolist()):
-            rows.append((index, case.level, round(step * DT_S, 1), *state, *place, severity))
+            rows.append(
+                (
+                    index,
+                    case.level,
+                    round(step * DT_S, 1),
+                    *state,
+                    *place,
+                    severity,
+                    *(values[step] for values in signals),
+                )
+            )
     return rows
 
 

@@ -94,7 +94,8 @@ def _measures(found: Measures) -> Iterator[str]:
 def motion_lines(trajectory: Trajectory, every_s: float = 1.0) -> list[str]:
     """Return the motion as a table: a row for each second and for the end of the episode.
 
-    Of every vehicle x in m, v in m/s and, where there are two, a in m/s2; then the strip.
+    Of every vehicle x in m, v in m/s and, where there are two, a in m/s2; then the strip, and the
+    signals that the VUT has left.
     """
     motion, last = trajectory.motion, len(trajectory.motion) - 1
     vehicles = motion.shape[1]
@@ -115,8 +116,16 @@ def motion_lines(trajectory: Trajectory, every_s: float = 1.0) -> list[str]:
             for x, v, a in motion[row].tolist()
         )
         strip = _strip(motion[row, :, 0].tolist(), low_m, high_m)
-        lines.append(f"{row * DT_S:5.1f}{values}   {strip}")
+        left = _signals(trajectory, row)
+        lines.append(f"{row * DT_S:5.1f}{values}   {strip}{left}")
     return lines
+
+
+def _signals(trajectory: Trajectory, row: int) -> str:
+    """Return what the VUT left at a row, or "" for nothing."""
+    left = {name: values[row] for name, values in (trajectory.signals or {}).items()}
+    said = (f"{name} {value}" for name, value in left.items() if value is not None)
+    return "".join(f"  {one}" for one in said)
 
 
 def _strip(x_m: list[float], low_m: float, high_m: float) -> str:

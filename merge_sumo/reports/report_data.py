@@ -25,6 +25,7 @@ from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
 from merge_sumo.values.severity import Severity
+from merge_sumo.values.signals import to_record
 from merge_sumo.values.trajectory import End, Trajectory
 
 SVO_NEAR_RAD: Final = 0.1
@@ -62,6 +63,7 @@ def page_data(facts: Facts) -> dict[str, Any]:
             if o.measures.error
         },
         "speeds": speeds,
+        "signals": {i: to_record(t.signals) for i, t in facts.motion.items() if t.signals},
         "maps": _maps(facts),
         "search": _search(facts),
         "replay": f"merge-sumo replay {_quoted(facts.run.folder)}",

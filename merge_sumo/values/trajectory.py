@@ -11,6 +11,7 @@ from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, POV, VUT
+from merge_sumo.values.signals import Signals
 
 
 class End(StrEnum):
@@ -58,7 +59,8 @@ class Trajectory:
     (`severity.py`), and whether that is a failure is the criterion's. `error` says what the VUT or
     the simulation did wrong. `clipped_steps` counts the answers of the VUT that were outside the
     limits of acceleration and were clipped. `after` is the motion behind M where the scenario has
-    it followed up, its first row that of the merge; it is measured and not kept.
+    it followed up, its first row that of the merge; it is measured and not kept. `signals` are what
+    the VUT left for each row, where it left any.
     """
 
     case: Case
@@ -67,6 +69,7 @@ class Trajectory:
     error: str | None = None
     clipped_steps: int = 0
     after: FloatArray | None = None
+    signals: Signals | None = None
 
     def __repr__(self) -> str:
         """Return its end in a line: the motion is an array of hundreds of numbers."""

@@ -26,6 +26,7 @@ from merge_sumo.sumo.world import World
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT
+from merge_sumo.values.signals import Left, as_signals
 from merge_sumo.values.trajectory import as_reason
 
 
@@ -288,6 +289,7 @@ class PerCorridor(Driver):
         self._watch = Watch(deadline_s)
         self._reasons: list[str | None] = [None] * corridors
         self._renew_first = [False] * corridors
+        self._signals: dict[int, Left] = {}
 
     @abstractmethod
     def renew(self, corridor: int) -> None:
@@ -317,6 +319,7 @@ class PerCorridor(Driver):
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
+        self._signals = {}
         answers = [0.0] * self.corridors
         met = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
         rows = (scene.active, scene.step, scene.x_m.T, scene.v_mps.T)
@@ -339,6 +342,14 @@ class PerCorridor(Driver):
     def reason(self, corridor: int) -> str | None:
         """Return what the controller of a corridor did wrong."""
         return self._reasons[corridor]
+
+    def leave(self, corridor: int, left: object) -> None:
+        """Keep what a controller has left with its answer."""
+        self._signals[corridor] = as_signals(left)
+
+    def signals(self) -> Mapping[int, Left]:
+        """Return what the controllers left with their last answers, by corridor."""
+        return self._signals
 
     def _number(self, corridor: int, seen: Seen) -> float:
         return as_number(self.answer(corridor, seen))

@@ -143,7 +143,7 @@ class _Hosting:
         answers = driver.act(scene)
         wrong = np.flatnonzero(~np.isfinite(answers) & scene.active).tolist()
         reasons = {k: reason for k in wrong if (reason := driver.reason(k)) is not None}
-        return wire.pack_answers(answers, reasons)
+        return wire.pack_answers(answers, reasons, driver.signals())
 
 
 def _hear_signals() -> None:

@@ -35,6 +35,7 @@ from merge_sumo.drivers.vuts.wire import About, Frame, WireError
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.signals import Left
 
 SUPPORTED: Final = os.name == "posix"
 """Elsewhere descriptors do not pass to another process, and a VUT runs in this one."""
@@ -322,6 +323,7 @@ class HostedVut(Driver):
         self._spec, self._options = spec, options
         self._begun: list[tuple[int, Case]] = []
         self._reasons: dict[int, str] = {}
+        self._signals: dict[int, Left] = {}
         self._files: set[Path] = set()
         self._host = self._started()
 
@@ -349,13 +351,18 @@ class HostedVut(Driver):
                 # Not its driver, but what surrounds it failed: the VUT has changed that.
                 self._host.kill()
                 raise VutLostError(str(wire.from_json(answer.content, str)), final=True)
-            answers, self._reasons = wire.unpack_answers(answer.content, self.corridors)
+            said = wire.unpack_answers(answer.content, self.corridors)
+            self._reasons, self._signals = said.reasons, said.signals
         except HostDiedError as died:
             raise VutLostError(died.reason, self._own(died.corridor), final=died.hung) from None
-        except (WireError, KeyError, ValueError):
+        except (WireError, KeyError, ValueError, AttributeError):
             self._host.kill()
             raise VutLostError(_how_it_ended(None)) from None
-        return answers
+        return said.a_mps2
+
+    def signals(self) -> Mapping[int, Left]:
+        """Return what the VUT left with its last answers."""
+        return self._signals
 
     def reason(self, corridor: int) -> str | None:
         """Return what the VUT did wrong in a corridor."""

@@ -130,8 +130,13 @@ class PythonVut(PerCorridor):
             self.renew_next(corridor)
 
     def answer(self, corridor: int, seen: Seen) -> Any:
-        """Call `act`."""
-        return self._objects[corridor].act(seen)
+        """Call `act`, and keep the `signals` that it leaves."""
+        vut = self._objects[corridor]
+        answer = vut.act(seen)
+        left = getattr(vut, "signals", None)
+        if left is not None:
+            self.leave(corridor, left)
+        return answer
 
     def close(self) -> None:
         """Call `close`, if there is one; what it raises comes too late to matter."""
@@ -162,8 +167,12 @@ class FunctionVut(PerCorridor):
         """Do nothing."""
 
     def answer(self, corridor: int, seen: Seen) -> Any:
-        """Call the function."""
-        return self._function(seen)
+        """Call the function, and keep the `signals` that it leaves as its attribute."""
+        answer = self._function(seen)
+        left = getattr(self._function, "signals", None)
+        if left is not None:
+            self.leave(corridor, left)
+        return answer
 
 
 class BatchedVut(Driver):

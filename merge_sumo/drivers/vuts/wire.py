@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
 from functools import lru_cache
@@ -17,9 +17,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.base import NO_SIGNALS, Scene
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import RANGES, US23, Scenario
+from merge_sumo.values.signals import Left, as_signals
 
 
 class About(IntEnum):
@@ -173,17 +174,36 @@ def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     return begun, Scene(active, step, x_m, v_mps, met)
 
 
-def pack_answers(answers: FloatArray, reasons: dict[int, str]) -> bytes:
-    """Return accelerations, (K,), and the reasons of those that are not finite, as bytes."""
+class Answers(NamedTuple):
+    """Accelerations, (K,), and by corridor why one is not finite, and what was left with it."""
+
+    a_mps2: FloatArray
+    reasons: dict[int, str]
+    signals: dict[int, Left]
+
+
+def pack_answers(
+    answers: FloatArray, reasons: Mapping[int, str], signals: Mapping[int, Left] = NO_SIGNALS
+) -> bytes:
+    """Return accelerations, (K,), the reasons of those that are not finite, and signals."""
+    more = {"reasons": reasons, "signals": signals}
     return np.ascontiguousarray(answers, dtype=np.float64).tobytes() + (
-        to_json(reasons) if reasons else b""
+        to_json(more) if reasons or signals else b""
     )
 
 
-def unpack_answers(content: bytes, k: int) -> tuple[FloatArray, dict[int, str]]:
-    """Return what `pack_answers` packed for `k` corridors; raises `WireError`."""
+def unpack_answers(content: bytes, k: int) -> Answers:
+    """Return what `pack_answers` packed for `k` corridors.
+
+    Raises `WireError`, KeyError, ValueError or AttributeError for what it did not.
+    """
     if len(content) < 8 * k:
         raise WireError("it has too few answers")
     answers = np.frombuffer(content, np.float64, k)
-    said = from_json(content[8 * k :], dict) if len(content) > 8 * k else {}
-    return answers, {int(corridor): str(reason) for corridor, reason in said.items()}
+    if len(content) == 8 * k:
+        return Answers(answers, {}, {})
+    said = from_json(content[8 * k :], dict)
+    reasons = {int(corridor): str(reason) for corridor, reason in said["reasons"].items()}
+    # Who wrote this runs a stranger's code: what it left is checked here, too.
+    left = {int(corridor): as_signals(values) for corridor, values in said["signals"].items()}
+    return Answers(answers, reasons, {c: values for c, values in left.items() if 0 <= c < k})

@@ -330,7 +330,7 @@ function tip(event, text) {
   tipBox.style.top = `${below ? event.clientY + 14 : event.clientY - 10 - tipBox.offsetHeight}px`;
 }
 /* ---------- plots over time ---------- */
-function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags = [], xTicks = 4, decimals = null }) {
+function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags = [], xTicks = 4, yTicks = true, decimals = null }) {
   const [, , w, h] = svg.getAttribute("viewBox").split(" ").map(Number);
   const left = 40, right = w - 12, top = 8, bottom = h - 28;
   const X = (x) => left + (x - xRange[0]) / (xRange[1] - xRange[0] || 1) * (right - left);
@@ -341,7 +341,7 @@ function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags
     draw(svg, "rect", { class: "danger", x: left, y: a, width: right - left, height: b - a });
   }
   const step = nice((yRange[1] - yRange[0]) / 5);
-  for (let y = Math.ceil(yRange[0] / step) * step; y <= yRange[1] + 1e-12; y += step) {
+  for (let y = Math.ceil(yRange[0] / step) * step; yTicks && y <= yRange[1] + 1e-12; y += step) {
     draw(svg, "line", { class: "grid", x1: left, x2: right, y1: Y(y), y2: Y(y) });
     draw(svg, "text", { x: left - 5, y: Y(y) + 4, "text-anchor": "end" }, fixed(Math.abs(y) < step / 1e6 ? 0 : y, decimals ?? digits(step)));
   }
@@ -489,11 +489,39 @@ function showMotion(i) {
       lines: [...(other ? [{ name: "gap beside", points: over(otherGap) }] : []), ...others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }))],
     }),
   ];
+  charts.push(...signalCharts(i, end));
   slider.max = final;
   byId("views").classList.toggle("two", other !== null);
   views[0].show(moving, `Case ${cases.index[i]}`);
   views[1].show(other, `Case ${cases.index[beside] ?? ""}`);
   at(failed(i) || other ? final : 0);
+}
+function signalCharts(i, end) { // what the VUT has left for each step: numbers as a line, words as bars
+  const box = byId("signals"), left = Object.entries(data.signals[cases.index[i]] ?? {});
+  box.replaceChildren();
+  box.hidden = left.length === 0;
+  return left.map(([name, runs]) => {
+    const figure = box.appendChild(document.createElement("figure"));
+    figure.appendChild(document.createElement("figcaption")).textContent = `signal ${name}`;
+    const spans = []; // [from, to, value], in seconds
+    let row = 0;
+    for (const [count, value] of runs) {
+      if (value !== null) spans.push([row * DT, (row + count) * DT, value]);
+      row += count;
+    }
+    const svg = draw(figure, "svg", { viewBox: "0 0 240 150", role: "img", "aria-label": `Signal ${name} over time` });
+    const values = [...new Set(spans.map(([, , value]) => value))], words = values.some((value) => typeof value === "string");
+    const common = { xRange: [0, end], xLabel: "time, s" };
+    if (!words) {
+      const points = spans.map(([from, to, y]) => [[from, y], [to, y]]);
+      return plot(svg, { ...common, yRange: range(values), lines: points.map((part, n) => ({ name: "vut", points: n && spans[n - 1][1] === spans[n][0] ? [points[n - 1][1], ...part] : part })) });
+    }
+    const shown = values.slice(0, 8).map(String), place = (value) => shown.length - 1 - shown.indexOf(String(value));
+    const bars = spans.filter(([, , value]) => shown.includes(String(value))).map(([x0, x1, value]) => ({ name: "vut word", x0, x1, y0: place(value) + 0.1, y1: place(value) + 0.45 }));
+    const chart = plot(svg, { ...common, yRange: [0, shown.length], lines: [], bars, yTicks: false });
+    for (const [n, word] of shown.entries()) draw(svg, "text", { x: 44, y: 8 + (n + 0.45) * 114 / shown.length }, word);
+    return chart;
+  });
 }
 const extent = (values) => [Math.min(...values), Math.max(...values)];
 function pose(path, along) { // front bumper at a lane coordinate of a path

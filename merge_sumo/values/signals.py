@@ -1,0 +1,110 @@
+"""Signals: named numbers and words that a controller leaves for each step, such as its mode.
+
+They decide nothing. They are kept with the motion of a case, drawn beside it, and exported. Names
+and words are a stranger's: they are bounded, and printable.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby, islice
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.system.printable import printable
+
+Left = dict[str, float | str]
+"""What is left at one step, by name."""
+Signals = Mapping[str, tuple[float | str | None, ...]]
+"""By name, a value for each row of the motion of a case; None where none was left."""
+
+MOST_NAMES: Final = 8
+"""Signals of a case; what else is left is dropped."""
+CHARACTERS: Final = 40
+"""Of a name, and of a word."""
+
+
+def as_signals(left: object) -> Left:
+    """Return what a controller has left as it is kept; what is no number and no word is dropped.
+
+    Numbers have six digits, names and words are cut. A number that is not finite is none.
+    """
+    if not isinstance(left, dict):
+        return {}
+    kept: Left = {}
+    for name, value in islice(left.items(), MOST_NAMES):
+        known = _value(value)
+        if known is not None and isinstance(name, str):
+            kept[_word(name)] = known
+    return kept
+
+
+def _value(value: object) -> float | str | None:
+    if isinstance(value, bool | np.bool_):
+        return "true" if value else "false"
+    if isinstance(value, int | float | np.integer | np.floating):
+        try:
+            number = float(f"{float(value):.6g}")
+        except (OverflowError, ValueError):
+            return None
+        return number if math.isfinite(number) else None
+    return _word(value) if isinstance(value, str) else None
+
+
+def _word(text: str) -> str:
+    # Of a kind of string of its own, the characters that it has.
+    return printable(str.__str__(text)[:CHARACTERS])[:CHARACTERS]
+
+
+def series(left: Iterable[tuple[int, Left]], rows: int) -> Signals | None:
+    """Return the signals of a case of so many rows, from what was left: (row, by name).
+
+    None where nothing was left. Of more than `MOST_NAMES`, the first ones.
+    """
+    columns: dict[str, list[float | str | None]] = {}
+    for row, values in left:
+        if row >= rows:
+            break
+        for name, value in values.items():
+            if name not in columns:
+                if len(columns) == MOST_NAMES:
+                    continue
+                columns[name] = [None] * rows
+            columns[name][row] = value
+    return {name: tuple(values) for name, values in columns.items()} or None
+
+
+def to_record(signals: Signals) -> dict[str, list[list[Any]]]:
+    """Return signals as JSON keeps them: by name, [how often, value] for values that stay."""
+    return {
+        name: [[len(list(same)), value] for value, same in groupby(values)]
+        for name, values in signals.items()
+    }
+
+
+def from_record(record: object, rows: int) -> Signals:
+    """Return the signals of a case of so many rows; ValueError or TypeError for what is none."""
+    if not isinstance(record, dict) or not 0 < len(record) <= MOST_NAMES:
+        raise ValueError("it has no signals, or too many")
+    return {_checked_name(name): _expanded(runs, rows) for name, runs in record.items()}
+
+
+def _checked_name(name: str) -> str:
+    if _word(name) != name:
+        raise ValueError("a name is not as it is written")
+    return name
+
+
+def _expanded(runs: Sequence[Any], rows: int) -> tuple[float | str | None, ...]:
+    values: list[float | str | None] = []
+    for count, value in runs:
+        if type(count) is not int or not 0 < count <= rows - len(values):
+            raise ValueError("it has other rows than the motion")
+        if value is not None and (isinstance(value, bool) or _value(value) != value):
+            raise ValueError("a value is not as it is written")
+        values += [value] * count
+    if len(values) != rows:
+        raise ValueError("it has other rows than the motion")
+    return tuple(values)
