@@ -38,7 +38,12 @@ def list_scenarios(as_json: JsonOption = False) -> None:
 @scenario.command("new")
 def new_scenario(
     file: Annotated[Path, typer.Argument(help="New TOML file to write.")],
-    net: Annotated[Path, typer.Option(help="SUMO net; netconvert makes one of OSM, OpenDRIVE.")],
+    net: Annotated[
+        Path,
+        typer.Option(
+            help="SUMO net, or a map of which netconvert makes one beside FILE: .osm, .xodr."
+        ),
+    ],
     mainline: Annotated[str, typer.Option(help='Edges of the mainline, past M: "e1 e2".')],
     ramp: Annotated[str, typer.Option(help='Edges of the ramp, past M: "r1 e2".')],
     as_json: JsonOption = False,
@@ -55,25 +60,41 @@ def new_scenario(
     from merge_sumo.scenarios.drawing import road_svg
     from merge_sumo.scenarios.scenario_file import SUFFIX, to_toml
     from merge_sumo.scenarios.suggestion import about, suggested
+    from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
+    from merge_sumo.sumo.finder import find_corridor
+    from merge_sumo.sumo.netfile import NetFile
     from merge_sumo.sumo.road import road_of
     from merge_sumo.system.folders import check_new_file, write_new
 
     if file.suffix != SUFFIX:
         raise UserError(f"{file} is to be a scenario: name it NAME{SUFFIX}")
     picture = file.with_suffix(".svg")
-    for path in (file, picture):
+    edges = tuple(mainline.split()), tuple(ramp.split())
+    written, map_file = [file, picture], net if is_map(net) else None
+    if map_file is not None:
+        net = file.with_suffix(".net.xml")
+        written.append(net)
+    for path in written:
         check_new_file(path, "FILE")
-    road = road_of(net, tuple(mainline.split()), tuple(ramp.split()))
+    if map_file is not None:
+        made = net_of_map(map_file)
+        try:
+            find_corridor(NetFile(map_file, made), *edges)
+        except UserError as error:
+            raise UserError(f"{error}; to look at its edges: `{command_for(map_file)}`") from error
+        write_new(net, made, "FILE")
+    road = road_of(net, *edges)
     found = suggested(road, file.stem)
     beside = os.path.relpath(net.resolve(), file.parent.resolve())
     write_new(picture, road_svg(road, found), "FILE")
     write_new(file, to_toml(replace(found, net=beside), about(road)).encode(), "FILE")
     if as_json:
-        typer.echo(json.dumps({"about": about(road), "written": [str(file), str(picture)]}))
+        typer.echo(json.dumps({"about": about(road), "written": list(map(str, written))}))
         return
     for line in about(road):
         show(line)
-    show(f"written: {file}, and its picture {picture}")
+    made_of = "" if map_file is None else f", and its net {net}, made of {map_file}"
+    show(f"written: {file}, and its picture {picture}{made_of}")
 
 
 @scenario.command("check")

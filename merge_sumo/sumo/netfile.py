@@ -87,7 +87,9 @@ class NetFile:
         except etree.XMLSyntaxError as error:
             raise UserError(f"the net {path} is not readable XML: {error!s:.200}") from error
         if self._root.tag != "net":
-            raise UserError(f"{path} is no SUMO net: it does not begin with <net>")
+            made = str(self._root.tag) in ("osm", "OpenDRIVE")
+            how = "; `merge-sumo scenario new` makes one of such a map" if made else ""
+            raise UserError(f"{path} is no SUMO net: it does not begin with <net>{how}")
         self._edges = {str(edge.get("id")): edge for edge in self._root.iterfind("edge")}
         self._known: dict[str, Lane] = {}
 
