@@ -110,6 +110,7 @@ def measure_ranges(scenario: Scenario, speeds: Speeds) -> dict[str, Range]:
     return {
         "ttc_s": Range(ABOVE_0, inf),
         "clearance_m": Range(-deepest_m, inf),
+        "before_clearance_m": Range(-(length_m + WIDTH_M), inf),
         "bumper_gap_m": Range(-length_m, inf),
         "dx_m": Range(-(scenario.mainline_m + speeds.vut_mps * DT_S + ROUNDING), inf),
         "dv_mps": Range(-speeds.vut_mps, speeds.car_mps),
