@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plans import plan_for
 
 import merge_sumo as ms
 from merge_sumo.campaigns.avoidance import (
@@ -27,13 +28,15 @@ from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.povs import Povs, own_pov
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.drivers.vut import vut_factory
+from merge_sumo.drivers.vuts.base import VutOptions
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import report_page
 from merge_sumo.scenarios.scenario_file import named_scenario
 from merge_sumo.system.workers import InProcess, Workers, open_workers
-from merge_sumo.values.scenario import US23
+from merge_sumo.values.scenario import OWN, US23
 
 LONG = pytest.mark.long
 
@@ -148,6 +151,17 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_le
         in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
     assert drive_again(plan, failing) == in_sumo
     assert len({one.latest_takeover_s for one in in_sumo}) > 3
+
+
+def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
+    path = tmp_path / "keeps.py"
+    path.write_text("def keeps(seen):\n    return 0.0\n", encoding="utf-8")
+    povs = Povs(own=own_pov(f"{path}:keeps", VutOptions(in_process=True)))
+    failing = []
+    for one in found[:4]:
+        failure = run.trajectory(one.index)
+        failing.append((one.index, replace(failure, case=replace(failure.case, level=OWN))))
+    assert drive_again(plan_for("careful", povs=povs), failing) == found[:4]
 
 
 class TestWorkers:
