@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import partial
+from typing import Any
 
 import pytest
 
@@ -143,7 +144,8 @@ class TestAWrongSignature:
             def act(self, seen, gain):
                 return 0.0
 
-        for vut in (Mine, Mine()):
+        wrong: list[Any] = [Mine, Mine()]
+        for vut in wrong:
             with pytest.raises(
                 UserError, match=r"test_errors\.py:\d+: act\(self, seen, gain\) takes"
             ):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from merge_sumo.campaigns.run import Run
@@ -221,6 +221,11 @@ def cases(draw: Any) -> dict[str, Any]:
     return found
 
 
+UNTIMED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+"""No test compares a clock."""
+
+
+@UNTIMED
 @given(CONDITIONS, st.lists(cases(), min_size=1, max_size=20))
 @example(Comparison("ttc_s", 0.0, True), [{"ttc_s": 5e-324, "end": "MERGED"}])
 def test_never_and_always_are_true_of_all_values_inside_the_ranges(condition, values):
@@ -232,6 +237,7 @@ def test_never_and_always_are_true_of_all_values_inside_the_ranges(condition, va
         assert not (always and not met)
 
 
+@UNTIMED
 @given(CONDITIONS)
 def test_what_is_never_met_is_always_missed(condition):
     assert DOMAIN.is_never(condition) == DOMAIN.is_always(Negation(condition))
