@@ -16,7 +16,8 @@ from merge_sumo.campaigns.single import case_of, run_one
 from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, motion_lines
 from merge_sumo.scenarios.scenario_file import named_scenario
-from merge_sumo.sumo.live import Window
+from merge_sumo.sumo.live import LABEL, Window
+from merge_sumo.sumo.replay_labels import TEXT, case_line, verdict_line
 from merge_sumo.values.case import Case
 
 STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
@@ -152,6 +153,25 @@ class TestInSumoGui:
         assert (live.trajectory.motion == without.trajectory.motion).all()
         assert live.outcome == without.outcome
         assert len(slept) == len(live.trajectory.motion) - 1, "every step waits for its time"
+
+    def test_the_window_says_the_case_and_the_verdict_and_labels_keep_apart(self, window):
+        lines: list[str] = []
+        labels: list[str] = []
+
+        def look(this: Window) -> None:
+            this._look()
+            lines.extend(this._poi.getParameter(name, TEXT) for name in this._poi.getIDList())
+            names = this.vehicle.getIDList()
+            labels.extend(this.vehicle.getParameter(name, LABEL) for name in names)
+
+        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
+        window.setattr(Window, "wait", look)
+        live = run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
+        assert lines == [case_line(COLLIDES), verdict_line(live.outcome)]
+        first, second = sorted(labels)  # a space is before any letter
+        assert first.startswith(" ")
+        assert second.endswith(" ")
+        assert {label.split()[0] for label in labels} == {"POV", "VUT"}
 
     def test_opens_no_port(self, window):
         ports: list[list[str]] = []

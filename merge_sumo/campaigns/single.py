@@ -13,6 +13,7 @@ from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.live import Window
+from merge_sumo.sumo.replay_labels import case_line, verdict_line
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import Scenario, level_name
 from merge_sumo.values.score import Outcome
@@ -120,11 +121,14 @@ def run_one(
         Window() if live else nullcontext() as window,
         plan.open(window) as ground,
     ):
+        if window is not None:
+            window.write(case_line(case))
         episodes = ground.run([case])
         _, trajectory = next(episodes)
         lines = centre_lines(plan.net)
         ended = Ended(plan.criterion.outcome(0, 0, trajectory, lines), trajectory)
         on_end(ended)
         if window is not None:
+            window.write(verdict_line(ended.outcome))
             window.wait()  # before the corridor is made ready for the next case
     return ended

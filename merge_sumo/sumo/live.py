@@ -23,7 +23,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
 from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, opened
 from merge_sumo.sumo.replay_folder import WINDOW, view_settings
-from merge_sumo.sumo.replay_labels import COLOURS, beside
+from merge_sumo.sumo.replay_labels import COLOURS, TEXT, beside
 from merge_sumo.system.interrupt import stopping_in_order
 from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT
 
@@ -41,6 +41,12 @@ SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off."""
 VIEW: Final = "View #0"
 LABEL: Final = "label"
+LINE_AT: Final = 0.86
+"""Height of the first line above the middle, as a share of half of the picture's height."""
+LINE_APART: Final = 0.11
+LINE_COLOUR: Final = (26, 26, 26, 255)
+LINE_LAYER: Final = 200
+LINE_M: Final = 0.1
 OPENS_S: Final = 60.0
 """Time that the window has to open."""
 BOOT: Final = (
@@ -72,6 +78,9 @@ class Window:
         self._opened = ExitStack()
         self._due_s: float | None = None
         self._shown = 0
+        self._lines: list[str] = []
+        self._written = 0
+        """Lines that have a place in the window."""
 
     def start(self, command: list[str]) -> None:
         """Open sumo-gui on what libsumo would be started with."""
@@ -96,6 +105,7 @@ class Window:
         self.vehicle = _Domain("vehicle", self._call)
         self.route = _Domain("route", self._call)
         self._gui = _Domain("gui", self._call)
+        self._poi = _Domain("poi", self._call)
         self.simulation = self
 
     def _call(
@@ -112,6 +122,10 @@ class Window:
         if "closed" in answer:
             raise _closed()
         return answer["value"]
+
+    def write(self, line: str) -> None:
+        """Add a line to what stands at the top of the window, from the next look on."""
+        self._lines.append(line)
 
     def step(self) -> None:
         """Make a step when its time has come; real time, from the second one on."""
@@ -181,6 +195,18 @@ class Window:
         )
         box = x - half_m, y - half_m * high / wide, x + half_m, y + half_m * high / wide
         self._gui.setBoundary(VIEW, *box)
+        self._put_lines(x, y, half_m * high / wide)
+
+    def _put_lines(self, x: float, y: float, half_height_m: float) -> None:
+        """Put the lines at the top of the picture, whose middle is (x, y)."""
+        for number, line in enumerate(self._lines):
+            name = f"line{number}"
+            at = x, y + half_height_m * (LINE_AT - number * LINE_APART)
+            if number >= self._written:
+                self._poi.add(name, *at, LINE_COLOUR, "", LINE_LAYER, "", LINE_M, LINE_M)
+                self._poi.setParameter(name, TEXT, line)
+                self._written = number + 1
+            self._poi.setPosition(name, *at)
 
 
 class _NeverError(Exception):

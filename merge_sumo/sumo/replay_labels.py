@@ -73,7 +73,7 @@ def beside(text: str, *, ahead: bool) -> str:
 def labels_of(outcome: Outcome, picture: Picture) -> etree._Element:
     """Return the labels of an episode as an additional file."""
     root = etree.Element("additional")
-    lines = (case_line(outcome.index, outcome.case), verdict_line(outcome))
+    lines = (case_line(outcome.case, outcome.index), verdict_line(outcome))
     for number, (line, height) in enumerate(zip(lines, LINES, strict=True)):
         at = picture.x_m, picture.y_m + height * picture.height_m
         _label(root, f"line{number}", at, line)
@@ -88,11 +88,12 @@ def labels_of(outcome: Outcome, picture: Picture) -> etree._Element:
     return root
 
 
-def case_line(index: int, case: Case) -> str:
-    """Return which case it is."""
+def case_line(case: Case, index: int | None = None) -> str:
+    """Return which case it is, with its index where it has one."""
     values = ((getattr(case, field), words) for field, words in COORDINATES)
     parts = [words.format(value) for value, words in values if value is not None]
-    return f"case {index}, POV level {level_name(case.level)}: {', '.join(parts)}"
+    named = "" if index is None else f"case {index}, "
+    return f"{named}POV level {level_name(case.level)}: {', '.join(parts)}"
 
 
 def verdict_line(outcome: Outcome) -> str:
