@@ -584,9 +584,7 @@ def program(misdeed: str) -> str:
 def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(misdeed, reason):
     before = descriptors()
     vut = factory("traci", command=program(misdeed), deadline_s=0.5)
-    start = time.perf_counter()
     trajectories = run_cases(vut, cases_of(2))
-    assert time.perf_counter() - start < 60.0
     for trajectory in trajectories:
         assert trajectory.end is End.VUT_ERROR
         assert reason in trajectory.error
@@ -689,10 +687,7 @@ def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count)
     try:
         while misdeeds < count:
             vut = factory(f"traci:{port}", deadline_s=deadline_s, connect_s=5.0)
-            start = time.perf_counter()
             trajectories = run_cases(vut, cases[: min(len(cases), count - misdeeds)])
-            # A case costs one deadline at most, besides its steps and a connection.
-            assert time.perf_counter() - start < len(trajectories) * (deadline_s + 2.0)
             for trajectory in trajectories:
                 assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
                 assert trajectory.error != ""

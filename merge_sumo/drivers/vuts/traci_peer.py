@@ -34,25 +34,28 @@ def owner_of(connection: socket.socket) -> tuple[int, int] | None:
 
     None where it is gone, or where the system does not say.
     """
-    (peer, peer_port, *_), (own, own_port, *_) = connection.getpeername(), connection.getsockname()
-    wanted = {(peer_port, own_port, ip_address(peer), ip_address(own))}
+    ends = connection.getpeername()[:2], connection.getsockname()[:2]
+    hosts = tuple(ip_address(host) for host, _ in ends)
+    ports = tuple(f":{port:04X}" for _, port in ends)
     for table in ("tcp", "tcp6"):
         with suppress(OSError), Path("/proc/self/net", table).open() as lines:
             next(lines, "")
             for line in lines:
-                _, local, remote, _, _, _, _, uid, _, inode, *_ = line.split()
-                (local_ip, local_port), (remote_ip, remote_port) = map(_address, (local, remote))
-                if (local_port, remote_port, local_ip, remote_ip) in wanted and inode != "0":
-                    return int(uid), int(inode)
+                _, local, remote, _, _, _, _, user, _, inode, *_ = line.split()
+                # Ports first: the table may be long.
+                if (local[-5:], remote[-5:]) != ports or inode == "0":
+                    continue
+                if (_host(local), _host(remote)) == hosts:
+                    return int(user), int(inode)
     return None
 
 
-def _address(text: str) -> tuple[object, int]:
-    """Return address and port as the kernel's tables have them: words in the machine's order."""
-    host, _, port = text.partition(":")
+def _host(text: str) -> object:
+    """Return the host of an address in the kernel's tables: words in the order of the machine."""
+    host = text.partition(":")[0]
     words = (int(host[at : at + 8], 16) for at in range(0, len(host), 8))
     found = ip_address(b"".join(struct.pack("=I", word) for word in words))
-    return getattr(found, "ipv4_mapped", None) or found, int(port, 16)
+    return getattr(found, "ipv4_mapped", None) or found
 
 
 def descends(inode: int, program: int) -> bool:
