@@ -52,6 +52,7 @@ from merge_sumo.setup import (
     Settings,
     Setup,
     check_keywords,
+    no_check,
     recordable,
     scenario_of,
     settings_for,
@@ -91,7 +92,7 @@ def campaign(
     workers: int = 1,
     dask: str | None = None,
     on_case: OnCase | None = None,
-    check: Callable[[], None] = lambda: None,
+    check: Callable[[], None] | None = None,
     progress: bool | None = None,
     **setup: Unpack[Setup],
 ) -> CampaignRun:
@@ -138,10 +139,12 @@ def campaign(
     folder = dated(settings.vut) if out is None else Path(out)
     road = road_for(settings.scenario, None if net is None else Path(net))
     notice_unseen(settings, setup.get("scenario", US23.name), setup.get("policies"))
-    how = Running(workers=count, dask=dask, on_case=on_case, check=check, progress=progress)
+    how = Running(
+        workers=count, dask=dask, on_case=on_case, check=check or no_check, progress=progress
+    )
 
     def run(there: Workers, _: CampaignPanel, told: OnCase) -> Run:
-        return run_campaign(settings, folder, road, told, workers=there, check=check)
+        return run_campaign(settings, folder, road, told, workers=there, check=how.check)
 
     return concluded(settings, folder, road, run, how)
 

@@ -21,7 +21,7 @@ from merge_sumo.reports.progress import is_watched
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.results import CampaignRun
 from merge_sumo.scenarios.suggestion import unseen
-from merge_sumo.setup import Settings, check_keywords, recordable
+from merge_sumo.setup import Settings, check_keywords, no_check, recordable
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.system.folders import link_latest
 from merge_sumo.system.printable import quoted
@@ -111,7 +111,7 @@ def resume(
     workers: int = 1,
     dask: str | None = None,
     on_case: OnCase | None = None,
-    check: Callable[[], None] = lambda: None,
+    check: Callable[[], None] | None = None,
     progress: bool | None = None,
     **given: Unpack[Settings],
 ) -> CampaignRun:
@@ -148,7 +148,9 @@ def resume(
         settings, named = replace(settings, levels=levels), {**named, "levels": levels}
     check_report(folder)
     road = road_for(settings.scenario, None if net is None else Path(net))
-    how = Running(workers=count, dask=dask, on_case=on_case, check=check, progress=progress)
+    how = Running(
+        workers=count, dask=dask, on_case=on_case, check=check or no_check, progress=progress
+    )
 
     def go_on(there: Workers, panel: CampaignPanel, told: OnCase) -> Run:
         return resume_campaign(
@@ -159,7 +161,7 @@ def resume(
             given=named,
             force=force,
             workers=there,
-            check=check,
+            check=how.check,
             warn=lambda sentence: warnings.warn(sentence, Notice, stacklevel=2),
             trust=trust_vut,
         )

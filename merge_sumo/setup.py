@@ -90,6 +90,10 @@ class Hosting(TypedDict, total=False):
     in_process: bool
 
 
+def no_check() -> None:
+    """Let a verb go on: what is called after every batch where nothing else is."""
+
+
 def check_keywords(function: str, given: Mapping[str, Any], known: Any) -> None:
     """Raise `TypeError`, as Python does, for a keyword that a function does not have."""
     names = known.__optional_keys__

@@ -36,6 +36,7 @@ from merge_sumo.setup import (
     Hosting,
     Setup,
     check_keywords,
+    no_check,
     recordable,
     settings_for,
 )
@@ -260,7 +261,7 @@ def certify(
     resume: bool = False,
     workers: int | None = 1,
     dask: str | None = None,
-    check: Callable[[], None] = lambda: None,
+    check: Callable[[], None] | None = None,
     progress: bool | None = None,
     **setup: Unpack[Setup],
 ) -> CertificateResult:
@@ -303,7 +304,7 @@ def certify(
             runs_points_on(there, settings, road, folder),
             resume=resume,
             on_cases=counter.ended,
-            check=check,
+            check=check or no_check,
         )
     return CertificateResult(done, folder / certificate.CERTIFICATE)
 

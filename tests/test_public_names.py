@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import pydoc
 import re
@@ -15,6 +16,11 @@ import merge_sumo as ms
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "reference" / "python.md"
+KNOWN = {
+    *("Any", "FloatArray", "ForwardRef", "Mapping", "NDArray", "None", "Path", "Sequence"),
+    *("AnyVut", "Bounds", "Quartiles", "Signals"),
+}
+"""Names of the standard library and of numpy, and of unions that the page writes out."""
 FUNCTIONS = sorted(name for name in ms.__all__ if inspect.isfunction(getattr(ms, name)))
 
 RIGHT = """
@@ -138,8 +144,24 @@ class TestTheNames:
     def test_return_what_is_on_the_page(self, name):
         shown = set(re.findall(r"^::: [\w.]+\.(\w+)$", PAGE.read_text(), re.MULTILINE))
         returned = str(inspect.signature(getattr(ms, name)).return_annotation)
-        ours = set(re.findall(r"[A-Z]\w+", returned)) - {"Path", "PolicyCheck"}
+        ours = set(re.findall(r"[A-Z]\w+", returned)) - {"Path"}
         assert ours <= shown
+
+
+def test_classes_of_attributes_of_what_is_returned_are_on_the_page():
+    paths = re.findall(r"^::: ([\w.]+)$", PAGE.read_text(), re.MULTILINE)
+    shown = {path.rpartition(".")[2] for path in paths}
+    missing = {}
+    for path in paths:
+        module, _, name = path.rpartition(".")
+        one = getattr(importlib.import_module(module), name)
+        if not isinstance(one, type):
+            continue
+        got = (value.fget for value in vars(one).values() if isinstance(value, property))
+        named = [str(inspect.signature(get).return_annotation) for get in got if get]
+        named += map(str, getattr(one, "__annotations__", {}).values())
+        missing[name] = set(re.findall(r"\b[A-Z]\w+", " ".join(named))) - shown - KNOWN
+    assert {name: classes for name, classes in missing.items() if classes} == {}
 
 
 def test_a_keyword_that_is_unknown_is_a_type_error_that_says_which_was_meant():
