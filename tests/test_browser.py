@@ -300,7 +300,7 @@ def test_all_cases_sort_and_open(browser, made, size):
             by_gap.click()
             assert page.locator(f"#table th[aria-sort={way}]").inner_text().startswith("Δx at M")
             told = [o for o in made.outcomes if o.measures.dx_m is not None]
-            told.sort(key=lambda o: (order * round(o.measures.dx_m, 2), o.index))
+            told.sort(key=lambda o: (order * round(o.measures.dx_m, 4), o.index))
             assert rows(page) == [o.index for o in told[:100]]
         row = page.locator("#table tbody tr").nth(5)
         row.click()
@@ -336,7 +336,7 @@ def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser
         filters.locator("[name=measure]").select_option(label="Δx at M m")
         filters.locator("[name=from]").fill("-8")
         filters.locator("[name=to]").fill("-6")
-        inside = [o.index for o in made.outcomes if -8 <= round(o.measures.dx_m or 0, 2) <= -6]
+        inside = [o.index for o in made.outcomes if -8 <= round(o.measures.dx_m or 0, 4) <= -6]
         assert sorted(rows(page)) == inside
         assert inside
 
