@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import re
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -221,6 +223,16 @@ class TestEnvironments:
         agent.learn(300)
         changed = [not torch.equal(*p) for p in zip(before, agent.policy.parameters(), strict=True)]
         assert any(changed)
+
+
+def test_the_tutorial_shows_the_code_that_its_commands_run():
+    root = Path(__file__).parent.parent
+    page = (root / "docs/tutorials/reinforcement-learning.md").read_text(encoding="utf-8")
+    code = (root / "examples/merging_agent.py").read_text(encoding="utf-8")
+    first, *blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    assert "make_vec" in first
+    assert len(blocks) == 3
+    assert all(block in code for block in blocks)
 
 
 class TestDdqn:
