@@ -18,8 +18,10 @@ from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.campaigns.avoidance import write_avoidance
+from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.driven_again import Avoidance
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.reports import comparison, comparison_page, diagnosis, report, report_facts
 from merge_sumo.reports.campaign_progress import CampaignProgress
 from merge_sumo.reports.coordinates import WRITTEN
@@ -802,3 +804,40 @@ def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):
             assert bright.count() == wanted
         page.select_option("#avoided-by", "none")
         assert bright.count() == len(others)
+
+
+LEAVES = """
+class Vut:
+    def act(self, seen):
+        late = seen.x_vut_m > -90.0
+        self.signals = {"mode <b>": "late" if late else "early", "level": 2.0 if late else -1.0}
+        return 1.0
+"""
+
+
+def test_signals_are_drawn_beside_the_motion_and_follow_its_slider(browser, tmp_path):
+    (tmp_path / "my_vut.py").write_text(LEAVES, encoding="utf-8")
+    vut = f"{tmp_path / 'my_vut.py'}:Vut"
+    settings = CampaignSettings(vut=vut, levels=(0,), cases=24, batch=24, sampler="uniform")
+    run = run_campaign(settings, tmp_path / "run")
+    with shown(browser, report.write_report(run)) as page:
+        page.evaluate(f"location.hash = '#case-{Facts(run).shown[0].index}'")
+        figures = page.locator("#signals figure")
+        figures.nth(1).wait_for()
+        assert figures.count() == 2
+        assert page.locator("#signals figcaption").all_text_contents() == [
+            "signal mode <b>",
+            "signal level",
+        ]
+        words = figures.nth(0).locator("svg text").all_text_contents()
+        assert {"early", "late"} <= set(words)
+        early, late = (box["x"] for box in map(_box, figures.nth(0).locator("rect.word").all()))
+        assert early < late
+        page.evaluate("at(0)")
+        before = _box(figures.nth(1).locator(".now"))["x"]
+        page.evaluate("at(final)")
+        assert _box(figures.nth(1).locator(".now"))["x"] > before + 50
+
+
+def _box(locator):
+    return locator.bounding_box()
