@@ -9,13 +9,13 @@ import sys
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 MARK = "MERGE_SUMO_ATTACK"
 """Environment variable by which the processes of a world are found."""
-PATIENCE_S = 300.0
+PATIENCE_S = 600.0
 
 
 @dataclass
@@ -100,16 +100,6 @@ class World:
     def left_in_temporary(self) -> list[str]:
         """Return the names of what is in the folder for temporary files."""
         return sorted(path.name for path in self.temporary.iterdir())
-
-
-def wait_for(condition: Callable[[], bool], patience_s: float = 60.0) -> bool:
-    """Wait until a condition holds; return whether it did in time."""
-    end = time.monotonic() + patience_s
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.05)
-    return True
 
 
 SIGNALS: dict[str, Sequence[int]] = {

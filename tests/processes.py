@@ -1,10 +1,11 @@
-"""Which processes a test has left behind, by a mark that they inherit."""
+"""What processes a test has left behind, by a mark that they inherit; waiting, and CPU time."""
 
 from __future__ import annotations
 
+import resource
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -22,8 +23,37 @@ def marked(mark: str) -> list[str]:
     return found
 
 
+LOOKS = 12_000
+LOOK_S = 0.05
+"""Ten minutes of sleep or more: what stops a test that hangs, and measures nothing."""
+
+
+def wait_for(condition: Callable[[], object]) -> bool:
+    """Wait until a condition holds; return whether it did before a test counts as hanging."""
+    for _ in range(LOOKS):
+        if condition():
+            return True
+        time.sleep(LOOK_S)
+    return False
+
+
+def cpu_s() -> float:
+    """Return the CPU time of this process and of those of its children that it has waited for."""
+    spent = [resource.getrusage(of) for of in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in spent)
+
+
 @contextmanager
-def none_left(patience_s: float = 5.0) -> Iterator[str]:
+def at_most_cpu_s(limit_s: float) -> Iterator[None]:
+    """Check that what is done within takes no more CPU time, on however busy a machine."""
+    before_s = cpu_s()
+    yield
+    spent_s = cpu_s() - before_s
+    assert spent_s <= limit_s
+
+
+@contextmanager
+def none_left() -> Iterator[str]:
     """Check that nothing that is started within, by whomever, is left a little later.
 
     Yields the mark.
@@ -32,10 +62,7 @@ def none_left(patience_s: float = 5.0) -> Iterator[str]:
         mark = secrets.token_hex(8)
         patch.setenv("MERGE_SUMO_TEST", mark)
         yield mark
-        until = time.monotonic() + patience_s
-        while (left := marked(mark)) and time.monotonic() < until:
-            time.sleep(0.05)
-        assert left == []
+        assert wait_for(lambda: not marked(mark)), marked(mark)
 
 
 def ports_of(process: int) -> list[str]:

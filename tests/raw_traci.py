@@ -26,21 +26,23 @@ def command(identifier: int, payload: bytes = b"") -> bytes:
     return struct.pack("!BiB", 0, len(payload) + 6, identifier) + payload
 
 
+RETRY_S = 0.02
+
+
 class GoneError(Exception):
     """The server closed the connection."""
 
 
 class Client:
     def __init__(self, port: int, patience_s: float = 10.0) -> None:
-        until = time.monotonic() + patience_s
-        while True:
+        for left in reversed(range(max(round(patience_s / RETRY_S), 1))):
             try:
                 self.socket = socket.create_connection(("127.0.0.1", port), timeout=patience_s)
                 break
             except OSError:
-                if time.monotonic() > until:
+                if not left:
                     raise
-                time.sleep(0.02)
+                time.sleep(RETRY_S)
 
     def send(self, *commands: bytes) -> None:
         content = b"".join(commands)

@@ -342,3 +342,19 @@ class TestTheChecksThemselves:
     )
     def test_let_loopback_pass(self, source):
         assert open_listeners(source) == []
+
+
+CLOCKS = frozenset({"monotonic", "perf_counter", "time", "monotonic_ns", "perf_counter_ns"})
+
+
+@pytest.mark.parametrize("path", sorted(Path(__file__).parent.glob("*.py")), ids=lambda p: p.name)
+def test_no_test_compares_a_clock(path):
+    """A machine may be busy: CPU time is measured, and work is counted (`processes.py`)."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Compare):
+            read = {
+                call.func.attr if isinstance(call.func, ast.Attribute) else call.func.id
+                for call in ast.walk(node)
+                if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute | ast.Name)
+            }
+            assert not read & CLOCKS, f"{path.name}, line {node.lineno}"

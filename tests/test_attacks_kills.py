@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from attacks import SIGNALS, World, stop, tell, wait_for
+from attacks import SIGNALS, World, stop, tell
+from processes import wait_for
 
 from merge_sumo.system import folders
 from merge_sumo.system.folders import TEMPORARY

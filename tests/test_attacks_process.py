@@ -11,7 +11,7 @@ from collections import Counter
 
 import pytest
 from attacks import World, tell
-from test_workers import cluster, wait_until, workers_at
+from test_workers import cluster, workers_at
 
 import merge_sumo as ms
 from merge_sumo.campaigns.conductor import run_campaign
@@ -19,7 +19,7 @@ from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.system.workers import dask_workers
 
-__all__ = ["cluster", "wait_until", "workers_at"]
+__all__ = ["cluster", "workers_at"]
 
 MANY = """
 import gc, json, os, sys, tempfile, threading

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -203,8 +202,8 @@ def on_a_terminal(command: str, folder: Path) -> tuple[str, int]:
         start_new_session=True,
     )
     os.close(theirs)
-    shown, pressed, until_s = b"", False, time.monotonic() + 120
-    while time.monotonic() < until_s:
+    shown, pressed = b"", False
+    while True:
         try:
             some = os.read(ours, 65536)
         except OSError:  # the other end is closed
@@ -216,7 +215,7 @@ def on_a_terminal(command: str, folder: Path) -> tuple[str, int]:
             pressed = True
             os.kill(process.pid, signal.SIGINT)
     os.close(ours)
-    return shown.decode(errors="replace"), process.wait(timeout=60)
+    return shown.decode(errors="replace"), process.wait(timeout=600)
 
 
 def test_the_words_of_a_docstring_end_as_sentences():

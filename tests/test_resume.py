@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from conftest import some
+from processes import wait_for
 from typer.testing import CliRunner
 
 from merge_sumo import cli
@@ -326,7 +327,7 @@ class TestASignal:
         folder = tmp_path / "run"
         process = started(folder, "--batch", "40")
         process.send_signal(number)
-        _, said = process.communicate(timeout=300)
+        _, said = process.communicate(timeout=600)
         assert process.returncode == 128 + number
         assert "finishing the running batch" in said
         assert f"merge-sumo campaign --resume {folder}" in said
@@ -342,7 +343,7 @@ class TestASignal:
         process.send_signal(signal.SIGTERM)
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=300)
+        _, said = process.communicate(timeout=600)
         assert process.returncode == 130
         assert f"merge-sumo campaign --resume {folder}" in said
         assert "Traceback" not in said
@@ -372,17 +373,10 @@ def started(folder: Path, *options: str) -> subprocess.Popen[str]:
     process = subprocess.Popen(
         [*COMMAND, *LONG, "--out", str(folder), *options], stderr=subprocess.PIPE, text=True
     )
-    wait_for(lambda: (folder / OUTCOMES).exists() or process.poll() is not None)
+    assert wait_for(lambda: (folder / OUTCOMES).exists() or process.poll() is not None)
     time.sleep(0.3)
     assert process.poll() is None, process.stderr.read()
     return process
-
-
-def wait_for(condition, patience_s: float = 300.0) -> None:
-    start = time.monotonic()
-    while not condition():
-        assert time.monotonic() - start < patience_s
-        time.sleep(0.02)
 
 
 class TestTheCommand:

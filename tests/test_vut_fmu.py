@@ -73,6 +73,33 @@ def test_what_an_fmu_does_wrong_is_the_outcome_of_its_own_case(unit, version, fa
             assert trajectory.end is End.MERGED
 
 
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("volatile int *p = 0; *p = 1;", "by signal 11 (SIGSEGV)"),
+        ("abort();", "by signal 6 (SIGABRT)"),
+        ("_Exit(3);", "exit code 3"),
+        ("exit(0);", "exit code 0"),
+        ("__builtin_trap();", "by signal 4 (SIGILL)"),
+        ("for (;;);", "took longer than the deadline of 1 s"),
+        ("void *p; while ((p = malloc(1 << 26))) *(char *)p = 1; abort();", "by signal 6"),
+    ],
+)
+@pytest.mark.parametrize("version", some(["2.0", "3.0"], "3.0"))
+def test_a_binary_that_crashes_ends_its_own_case_alone(unit, version, fault, reason):
+    cases = cases_of(6)
+    fast = {case.v_pov0_mps > 30.0 for case in cases}
+    assert fast == {True, False}
+    spec = f"fmu:{unit(version, fault=fault)}"
+    trajectories = run_cases(factory(spec, deadline_s=1.0, memory_gib=0.5), cases)
+    for case, trajectory in zip(cases, trajectories, strict=True):
+        if case.v_pov0_mps > 30.0:
+            assert trajectory.end is End.VUT_ERROR
+            assert reason in trajectory.error
+        else:
+            assert trajectory.end is End.MERGED
+
+
 def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
     (tmp_path / "text.fmu").write_text("no unit")
     good, other = unit(), unit(names=("a", "b", "c", "d", "e"))

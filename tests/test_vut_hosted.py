@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from misbehaviours import STUBBORN
-from processes import none_left
+from processes import none_left, wait_for
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
 from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
@@ -52,13 +52,6 @@ def spec(tmp_path):
     return write
 
 
-def until(condition, patience_s: float = 60.0) -> None:
-    end = time.monotonic() + patience_s
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def campaign(spec: str, out: Path, *more: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", spec, "--level", "0"]
     command += ["--cases", "4", "--batch", "4", "--quiet", "--out", str(out), *more]
@@ -71,7 +64,7 @@ def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_
 ):
     with none_left():
         parent = campaign(spec(HANGS), tmp_path / "run", "--workers", workers, "--deadline", "600")
-        until((tmp_path / "hangs").exists)
+        assert wait_for((tmp_path / "hangs").exists)
         os.kill(parent.pid, signal.SIGKILL)
         parent.wait()
         parent.stderr.close()
@@ -80,11 +73,11 @@ def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_
 def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
     with none_left():
         parent = campaign(spec(HANGS), tmp_path / "run", "--deadline", "600")
-        until((tmp_path / "hangs").exists)
+        assert wait_for((tmp_path / "hangs").exists)
         for _ in range(2):
             os.kill(parent.pid, signal.SIGINT)
             time.sleep(0.5)
-        _, said = parent.communicate(timeout=60)
+        _, said = parent.communicate(timeout=600)
     assert parent.returncode == 130
     assert b"Traceback" not in said
     assert b"go on with" in said

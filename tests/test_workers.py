@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plans import plan_for
+from processes import wait_for
 
 from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.ground import lost_case, run_cases, runs_on
@@ -199,7 +200,7 @@ class TestLocalProcesses:
         assert parent.returncode == -signal.SIGKILL, parent.stderr
         orphans = [int(word) for word in parent.stdout.split()]
         assert orphans
-        wait_until(lambda: not any(running(orphan) for orphan in orphans))
+        assert wait_for(lambda: not any(running(orphan) for orphan in orphans))
 
 
 def running(process: int) -> bool:
@@ -209,13 +210,6 @@ def running(process: int) -> bool:
     except OSError:
         return False
     return status.rpartition(")")[2].split()[0] != "Z"
-
-
-def wait_until(condition, patience_s: float = 60.0) -> None:
-    start = time.monotonic()
-    while not condition():
-        assert time.monotonic() - start < patience_s
-        time.sleep(0.05)
 
 
 class TestACampaign:
@@ -276,11 +270,11 @@ def cluster(tmp_path):
     start = partial(subprocess.Popen, stdout=log, stderr=log, env=environment)
     processes = [start(scheduler)]
     try:
-        wait_until(lambda: contact.exists() and contact.stat().st_size > 0)
+        assert wait_for(lambda: contact.exists() and contact.stat().st_size > 0)
         processes += [start(worker), start(worker)]
         address = json.loads(contact.read_text())["address"]
         assert address.startswith("tcp://127.0.0.1:")
-        wait_until(lambda: workers_at(address) == 2)
+        assert wait_for(lambda: workers_at(address) == 2)
         yield address, processes[1:]
     finally:
         for process in processes:

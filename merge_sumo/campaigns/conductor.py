@@ -22,7 +22,7 @@ from merge_sumo.campaigns.learning import lessons
 from merge_sumo.campaigns.ownership import FILES
 from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.repeats import repeat, write_repeats
-from merge_sumo.campaigns.run import SETTINGS, Run, spread_failures
+from merge_sumo.campaigns.run import RAN_AGAIN, SETTINGS, Run, spread_failures
 from merge_sumo.campaigns.settings import (
     RECORDED_BY_DEFAULT,
     CampaignSettings,
@@ -160,7 +160,7 @@ def resume_campaign(
     journal, before, dropped = Journal.reopen(folder)
     net = net or road_for(before.scenario)
     with journal, workers_or_here(workers) as there:
-        recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, SEAL)}
+        recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, RAN_AGAIN, SEAL)}
         settings = settings_of(folder, before.settings, given, trust=trust)
         record = record_of(settings, net)
         # Where policies are decides nothing: what is in them does.
@@ -191,6 +191,8 @@ def resume_campaign(
         if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
             record[FORCED] = [*_forced(before), *([forced] if changes else [])]
+        if before.ran_again:
+            record[RAN_AGAIN] = before.ran_again
         if changes or moved or grown:
             journal.rewrite_settings(record)
         else:
@@ -244,9 +246,12 @@ def _go_on(
     sampler = make_sampler(settings.sampler, settings.pool, settings.seed, games)
     stop = settings.stopping_rule()
     files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
+    again = record.get(RAN_AGAIN, 0)
 
     def noting_files(cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
+        nonlocal again
         for place, done in ahead(cases):
+            again += done.again
             for name, loaded in zip(FILES, (done.files, done.pov_files), strict=True):
                 files[name] = loaded | files[name]  # what was known stays
             yield place, done
@@ -272,8 +277,10 @@ def _go_on(
         for ran in ahead.together(batches):
             journal.append(*ran)
             ended += [outcome for batch in ran for outcome, _ in batch]
-            noted = {name: known or None for name, known in files.items()}
-            if noted != {name: record[name] for name in FILES}:
+            noted: dict[str, object] = {name: known or None for name, known in files.items()}
+            if again:
+                noted[RAN_AGAIN] = again
+            if noted != {name: record.get(name) for name in noted}:
                 record |= noted
                 journal.rewrite_settings(record)
             check()

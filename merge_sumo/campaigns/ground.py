@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from threading import RLock
@@ -23,9 +23,10 @@ from merge_sumo.sumo.centre_lines import centre_lines
 from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import World
+from merge_sumo.system.blame import MAX_DEATHS
 from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.resources import resource
-from merge_sumo.system.workers import MAX_DEATHS, Workers, when_worker_ends
+from merge_sumo.system.workers import Workers, when_worker_ends
 from merge_sumo.values.case import Case
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import Scenario
@@ -64,9 +65,14 @@ class ProvingGround:
             opened.callback(self.pov.close)
             self._opened = opened.pop_all()
 
-    def run(self, cases: Iterable[Case]) -> Iterator[tuple[int, Trajectory]]:
-        """Run cases; yield (place in `cases`, trajectory) as they end."""
-        return rollout(self.world, self.pov, self.vut, cases)
+    def run(
+        self, cases: Iterable[Case], ran_again: set[int] | None = None
+    ) -> Iterator[tuple[int, Trajectory]]:
+        """Run cases; yield (place in `cases`, trajectory) as they end.
+
+        `ran_again` is told the places of those that ran again: see `rollout`.
+        """
+        return rollout(self.world, self.pov, self.vut, cases, ran_again)
 
     def __enter__(self) -> Self:
         """Return the proving ground."""
@@ -133,6 +139,7 @@ class Ran:
         files: those of the user's that the VUT has loaded, with their hashes.
         pov_files: those that a POV of the user's own has loaded.
         margin: that of the plan's criterion; None where it needs none.
+        again: whether it ran again, because a process had died or had been stopped.
     """
 
     measures: Measures
@@ -140,6 +147,7 @@ class Ran:
     files: Files = field(default_factory=dict)
     pov_files: Files = field(default_factory=dict)
     margin: float | None = None
+    again: bool = False
 
     @property
     def score(self) -> float | None:
@@ -156,14 +164,15 @@ _one_at_a_time = RLock()
 def run_cases(plan: GroundPlan, cases: Sequence[Case]) -> list[Ran]:
     """Run cases on the proving ground of this process and return what became of each."""
     with opened_ground(plan) as ground:
-        ran = dict(ground.run(cases))
+        ran_again: set[int] = set()
+        ran = dict(ground.run(cases, ran_again))
         files = hashed(ground.vut.files()), hashed(ground.pov.files())
     lines = centre_lines(plan.net)
     done: list[Ran] = []
     measured = measure_all([ran[place] for place in range(len(cases))], lines)
     for place, measures in enumerate(measured):
         margin = plan.criterion.margin(ran[place], measures)
-        done.append(Ran(measures, ran[place], *files, margin))
+        done.append(Ran(measures, ran[place], *files, margin, place in ran_again))
     return done
 
 
@@ -203,6 +212,10 @@ def lost_case(case: Case) -> Ran:
     return Ran(measure(trajectory), trajectory)
 
 
+def _marked(ran: Ran) -> Ran:
+    return replace(ran, again=True)
+
+
 RunCases = Callable[[Sequence[Case]], Iterable[tuple[int, Ran]]]
 """Runs cases somewhere; gives (place, what became of the case) in any order."""
 
@@ -216,13 +229,15 @@ class OnWorkers:
 
     def __call__(self, cases: Sequence[Case]) -> Iterator[tuple[int, Ran]]:
         """Run cases; yield (place, what became of the case) in any order."""
-        return self.workers.run(partial(run_cases, self.plan), cases, lost_case)
+        return self.workers.run(partial(run_cases, self.plan), cases, lost_case, ran_again=_marked)
 
     def chunks(
         self, chunks: Iterable[Sequence[Case]]
     ) -> Generator[tuple[int, Sequence[Ran]], None, None]:
         """Run chunks; yield (place of the first case, what became of the chunk) in any order."""
-        return self.workers.run_chunks(partial(run_cases, self.plan), chunks, lost_case)
+        return self.workers.run_chunks(
+            partial(run_cases, self.plan), chunks, lost_case, ran_again=_marked
+        )
 
 
 def runs_on(workers: Workers, plan: GroundPlan) -> OnWorkers:

@@ -14,6 +14,8 @@ from merge_sumo.campaigns.equation_world import EquationWorld
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import Following, keep_behind_vut
 from merge_sumo.sumo.world import SimulationError, World
+from merge_sumo.system.blame import Blame
+from merge_sumo.system.pulse import Pulse
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
 from merge_sumo.values.signals import Left, series
@@ -32,8 +34,8 @@ WRONGS: Final = (Exception, SystemExit)
 OF_THE_POV: Final = "the POV: "
 """Begins the reason of an error that is the doing of a POV."""
 
-MAX_LOSSES: Final = 2
-"""A case that made the driver lose its memory so often, on its own, is not tried again."""
+MOST_PAUSES: Final = 2
+"""So often an error of an episode is put down to this process having been stopped."""
 
 END_OF_ROAD_M: Final = 20.0
 """No vehicle is followed up to where the road ends."""
@@ -58,7 +60,11 @@ class _Episode:
 
 
 def rollout(
-    world: World | EquationWorld, pov: Driver, vut: Driver, cases: Iterable[Case]
+    world: World | EquationWorld,
+    pov: Driver,
+    vut: Driver,
+    cases: Iterable[Case],
+    ran_again: set[int] | None = None,
 ) -> Iterator[tuple[int, Trajectory]]:
     """Run cases in the world; yield (place in `cases`, trajectory) as the episodes end.
 
@@ -69,13 +75,22 @@ def rollout(
     wrong ends its episode as VUT_ERROR, what the POV does wrong as SIM_ERROR; where that took the
     memory of the others' controllers with it, they begin anew. When SUMO fails, the episodes that
     were running end as SIM_ERROR, SUMO is started again, and the others go on.
+
+    `system/blame.py` says whose doing a death is; an error that comes when this process was stopped
+    is nobody's. `ran_again` is told the places of cases that ran again alone, or because of a stop,
+    and were not to blame.
     """
-    return _Rollout(world, pov, vut, cases).run()
+    return _Rollout(world, pov, vut, cases, ran_again).run()
 
 
 class _Rollout:
     def __init__(
-        self, world: World | EquationWorld, pov: Driver, vut: Driver, cases: Iterable[Case]
+        self,
+        world: World | EquationWorld,
+        pov: Driver,
+        vut: Driver,
+        cases: Iterable[Case],
+        ran_again: set[int] | None = None,
     ) -> None:
         corridors, vehicles = world.corridors, len(world.x_m)
         self.world, self.pov, self.vut = world, pov, vut
@@ -88,7 +103,14 @@ class _Rollout:
         """Those that may have been at fault: each runs alone, so that a second loss is its own."""
         self.quarantine = False
         """Whether a suspect runs alone."""
-        self.losses: Counter[tuple[int, End]] = Counter()
+        self.blame = Blame[tuple[int, End]]()
+        self.ran_again = set() if ran_again is None else ran_again
+        self.struck = set[int]()
+        """Those that ran when something died of which nobody knows whose doing it was."""
+        self.pulse = Pulse()
+        self.pauses = 0
+        self.excused: Counter[int] = Counter()
+        """How often the error of an episode was put down to a pause, by its index."""
         self.episodes: list[_Episode | None] = [None] * corridors
         self.active = np.zeros(corridors, dtype=bool)
         self.step = np.zeros(corridors, dtype=np.int64)
@@ -110,6 +132,11 @@ class _Rollout:
         """The row of this step."""
 
     def run(self) -> Iterator[tuple[int, Trajectory]]:
+        with self.pulse:
+            yield from self.episodes_as_they_end()
+        self.ran_again |= self.struck
+
+    def episodes_as_they_end(self) -> Iterator[tuple[int, Trajectory]]:
         world, everywhere = self.world, range(self.world.corridors)
         self.refill(everywhere)
         while self.next_timeout < NEVER:  # as long as an episode runs
@@ -118,7 +145,7 @@ class _Rollout:
                 world.advance()
                 world.command(self.ask_drivers())
             except VutLostError as lost:
-                yield from self.begin_anew(lost)
+                yield from self.begin_anew(lost, paused=self.was_paused())
                 continue
             except SimulationError as error:
                 for corridor in np.flatnonzero(self.active).tolist():
@@ -126,6 +153,8 @@ class _Rollout:
                 world.restart()
                 self.errors.clear()
                 self.refill(everywhere)
+                continue
+            if self.errors and self.was_paused() and self.excuse():
                 continue
             self.step += 1
             arrived = world.x_m[VUT] >= 0.0
@@ -158,27 +187,57 @@ class _Rollout:
         on_the_road = bool(x_m.max() < self.world.road.mainline.after_m - END_OF_ROAD_M)
         return self.row < self.timeout_at[corridor] and on_the_road
 
-    def begin_anew(self, lost: VutLostError) -> Iterator[tuple[int, Trajectory]]:
+    def was_paused(self) -> bool:
+        """Return whether this process was stopped since this was asked before."""
+        before, self.pauses = self.pauses, self.pulse.pauses()
+        return self.pauses > before
+
+    def excuse(self) -> bool:
+        """Begin what runs anew after a pause, unless that was done for all who have an error."""
+        running = self.running()
+        wrong = {running[corridor].index for corridor in self.errors}
+        if all(self.excused[index] >= MOST_PAUSES for index in wrong):
+            return False
+        self.excused.update(wrong)
+        self.ran_again |= wrong
+        self.again += [(episode.index, episode.case) for episode in running.values()]
+        self.begin_others()
+        return True
+
+    def running(self) -> dict[int, _Episode]:
+        """Return the episodes that run, by corridor."""
+        episodes = enumerate(self.episodes)
+        return {k: e for k, e in episodes if e is not None and self.active[k]}
+
+    def begin_anew(self, lost: VutLostError, *, paused: bool) -> Iterator[tuple[int, Trajectory]]:
         """Start over what was running; yield the episode that is known to be at fault, if any."""
-        running = np.flatnonzero(self.active).tolist()
+        running = self.running()
         alone = len(running) == 1
         end, reason = End.VUT_ERROR, lost.reason
         if isinstance(lost, PovLostError):
             end, reason = End.SIM_ERROR, OF_THE_POV + lost.reason
         named = None if lost.corridor is None else lost.corridor % self.world.corridors
-        guilty = running[0] if alone else named if named in running else None
-        for corridor in running:
-            episode = self.episodes[corridor]
-            assert episode is not None, "it runs"  # noqa: S101
+        guilty = next(iter(running)) if alone else named if named in running else None
+        for corridor, episode in running.items():
             if guilty is not None and corridor != guilty:
                 self.again.append((episode.index, episode.case))
-                continue
-            self.losses[episode.index, end] += guilty is not None
-            # Beside others it may have been a thread of theirs that struck it.
-            if alone and (lost.final or self.losses[episode.index, end] >= MAX_LOSSES):
+            elif self.blame.died(
+                (episode.index, end),
+                alone=alone,
+                named=guilty is not None,
+                repeatable=lost.final and not paused,
+                killed=lost.killed,
+            ):
+                self.ran_again.discard(episode.index)
+                self.struck.clear()
                 yield self.finish(corridor, end, reason)
             else:
+                (self.struck if guilty is None else self.ran_again).add(episode.index)
                 self.suspects.append((episode.index, episode.case))
+        self.begin_others()
+
+    def begin_others(self) -> None:
+        """Leave what was running, and begin what is to run now."""
         self.errors.clear()
         self.active[:] = False
         self.quarantine = bool(self.suspects)

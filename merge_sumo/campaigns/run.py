@@ -42,6 +42,8 @@ NAME_CHARACTERS: Final = 300
 _FORMER: Final = {"collision": PAPER_CRITERION.fail_when}
 _FORMER_NAME: Final = re.compile(r"\bgap_m\b")
 """What release 0.1 called the paper's criterion, and the measure `bumper_gap_m`."""
+RAN_AGAIN: Final = "ran_again"
+"""Key of `campaign.json`: how many cases ran again because a process had died or was stopped."""
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json`: the hash of all other keys with their values."""
 UNREADABLE_RECORD: Final = (
@@ -99,6 +101,24 @@ class Run:
     def pov(self) -> str:
         """The name of a POV of the tester's own, fit to be shown anywhere."""
         return printable(str(self.settings.get("pov"))[:NAME_CHARACTERS])
+
+    @property
+    def ran_again(self) -> int:
+        """Number of cases that ran again because a process had died or had been stopped."""
+        said = self.settings.get(RAN_AGAIN)
+        return said if isinstance(said, int) and said > 0 else 0
+
+    @property
+    def ran_again_in_words(self) -> str:
+        """A sentence on the cases that ran again; empty where none did."""
+        if not self.ran_again:
+            return ""
+        one = self.ran_again == 1
+        return (
+            f"{self.ran_again} {'case' if one else 'cases'} ran again, because a process of "
+            f"{'it' if one else 'theirs'} was killed or stopped, and {'has' if one else 'have'} "
+            "the outcome of the last time."
+        )
 
     def outcome(self, index: int) -> Outcome:
         """Return the outcome of a case; `UserError` when the campaign has no such case."""

@@ -248,6 +248,8 @@ def _print_summary(
         counts = ", ".join(f"{number} {name}" for name, number in summary.severities.items())
         show(f"  severity: {counts}")
     print_troubles(verdict)
+    if run.ran_again:
+        show(f"  {run.ran_again_in_words}")
     for note in doubts(run.outcomes, run.criterion):
         show(f"  note: {note}")
     for level, found in summary.levels.items():

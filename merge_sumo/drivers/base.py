@@ -98,12 +98,20 @@ class VutLostError(Exception):
         corridor: whose doing it was; None where nobody knows.
         final: whether the case whose doing it was would do it again; a process that died may have
             died of what came before.
+        killed: whether SIGKILL ended its process.
     """
 
-    def __init__(self, reason: str, corridor: int | None = None, *, final: bool = False) -> None:
+    def __init__(
+        self,
+        reason: str,
+        corridor: int | None = None,
+        *,
+        final: bool = False,
+        killed: bool = False,
+    ) -> None:
         """Take what happened, and what is known of it."""
         super().__init__(reason)
-        self.reason, self.corridor, self.final = reason, corridor, final
+        self.reason, self.corridor, self.final, self.killed = reason, corridor, final, killed
 
 
 class PovLostError(VutLostError):

@@ -50,7 +50,8 @@ class OtherSeat(Driver):
         try:
             return self._driver.act(other)
         except VutLostError as lost:
-            raise PovLostError(lost.reason, lost.corridor, final=lost.final) from lost
+            how = {"final": lost.final, "killed": lost.killed}
+            raise PovLostError(lost.reason, lost.corridor, **how) from lost
 
     def reason(self, corridor: int) -> str | None:
         """Return what the driver did wrong in a corridor."""

@@ -53,9 +53,10 @@ def page_words(facts: Facts) -> dict[str, Any]:
     ]
     if facts.surprises:
         tables.append(("Ten largest errors of the twin's predictions", facts.surprises))
+    found = headline(facts.verdict, summary, facts.worst, facts.kinds, rule)
     return {
         "vut": facts.run.vut,
-        "headline": headline(facts.verdict, summary, facts.worst, facts.kinds, rule),
+        "headline": " ".join(filter(None, (found, facts.run.ran_again_in_words))),
         "unrepeatable": repeats.unrepeatable(facts.repeats),
         "careful": in_a_sentence(facts.avoidance.values()),
         "avoidance": _avoidance(facts),

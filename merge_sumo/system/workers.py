@@ -32,6 +32,7 @@ from numbers import Integral
 from typing import Any, Final, Generic, Self, TypeVar
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.blame import Blame
 from merge_sumo.system.limits import check_threads
 from merge_sumo.system.spawning import forget_safe_path, without_cwd, without_main
 
@@ -39,8 +40,6 @@ MAX_CHUNK: Final = 500
 """Items that a worker takes at a time; what bounds its memory."""
 RECYCLE_AFTER: Final = 200
 """Chunks after which a worker process is replaced by a new one: a VUT may leak memory."""
-MAX_DEATHS: Final = 2
-"""An item that ends so many workers on its own is not tried again."""
 POOL_THREADS: Final = 4
 """Threads and processes that a pool takes, besides its workers."""
 WORKER_THREADS: Final = 4
@@ -57,7 +56,7 @@ class Workers:
     """Runs functions on chunks of items through an executor; to be closed, or used in `with`.
 
     A chunk whose worker dies runs again, alone and then item by item, so that the one item that
-    ends its worker each time is found; after `MAX_DEATHS` it is given up, and only that one.
+    ends its worker each time is found; only that one is given up, when `system/blame.py` says so.
     """
 
     def __init__(
@@ -91,6 +90,7 @@ class Workers:
         lost: Callable[[T], R],
         *,
         chunk: int | None = None,
+        ran_again: Callable[[R], R] | None = None,
     ) -> Generator[tuple[int, R], None, None]:
         """Yield (place in `items`, result) as chunks end.
 
@@ -98,15 +98,16 @@ class Workers:
             function: gives one result for each item of a chunk. It goes to other processes, so it
                 is found by its name there, and it must be safe to run twice.
             items: what to work on.
-            lost: gives the result of an item that ended its worker `MAX_DEATHS` times.
+            lost: gives the result of an item that is to blame for the deaths of its workers.
             chunk: items in a chunk; by default as many as give every worker one chunk, up to
                 `MAX_CHUNK`.
+            ran_again: marks the result of an item that ran again because a worker had died.
 
         Raises what `function` raises, and `UserError` when the executor goes away.
         """
         size = chunk or max(1, min(MAX_CHUNK, math.ceil(len(items) / self.count)))
         chunks = (items[first : first + size] for first in range(0, len(items), size))
-        for first, results in self.run_chunks(function, chunks, lost):
+        for first, results in self.run_chunks(function, chunks, lost, ran_again=ran_again):
             yield from enumerate(results, start=first)
 
     def run_chunks(
@@ -114,12 +115,15 @@ class Workers:
         function: Callable[[Sequence[T]], Sequence[R]],
         chunks: Iterable[Sequence[T]],
         lost: Callable[[T], R],
+        *,
+        ran_again: Callable[[R], R] | None = None,
     ) -> Generator[tuple[int, Sequence[R]], None, None]:
         """Yield (place of the first item, results) as chunks end; raise as `run` does.
 
-        A chunk is only taken from `chunks` when a worker may want it.
+        A chunk is only taken from `chunks` when a worker may want it. `ran_again` marks the results
+        of items that ran again because a worker had died.
         """
-        fresh = _in_a_row(chunks)
+        fresh, blame = _in_a_row(chunks), Blame[range]()
         suspects: deque[_Chunk[T]] = deque()
         running: dict[Future[Sequence[R]], _Chunk[T]] = {}
         try:
@@ -136,12 +140,16 @@ class Workers:
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     ended = running.pop(future)
                     try:
-                        yield ended.first, future.result()
+                        results = future.result()
                     except self._died:
                         self._broken = True
-                        yield from ended.died(alone, suspects, lost)
+                        if ended.died(blame, alone, suspects):
+                            yield ended.first, [lost(ended.items[0])]
                     except CancelledError as error:  # we cancel only what nobody waits for
                         raise UserError("the workers went away: look after the cluster") from error
+                    else:
+                        again = ran_again if ended.struck else None
+                        yield ended.first, [again(r) for r in results] if again else results
         finally:
             self._left = [future for future in running if not future.cancel()]
 
@@ -183,24 +191,29 @@ class Workers:
 
 @dataclass(slots=True)
 class _Chunk(Generic[T]):
-    """Items that go to a worker together, and how many workers they ended on their own."""
+    """Items that go to a worker together, and whether a worker has died of them or beside them."""
 
     first: int
     items: Sequence[T]
-    deaths: int = 0
+    struck: bool = False
 
-    def died(
-        self, alone: bool, suspects: deque[_Chunk[T]], lost: Callable[[T], R]
-    ) -> Iterator[tuple[int, Sequence[R]]]:
-        """Take note of a death: try again, item by item where it was surely ours, or give up."""
-        self.deaths += alone
-        if len(self.items) > 1 and self.deaths:
-            for k in range(len(self.items)):
-                suspects.append(_Chunk(self.first + k, self.items[k : k + 1]))
-        elif self.deaths < MAX_DEATHS:
+    def died(self, blame: Blame[range], alone: bool, suspects: deque[_Chunk[T]]) -> bool:
+        """Take note of a death: return whether it is the one item's doing, else try again.
+
+        A chunk that ended its worker alone is tried item by item.
+        """
+        self.struck = True
+        places = range(self.first, self.first + len(self.items))
+        if len(places) == 1:
+            if blame.died(places, alone=alone):
+                return True
             suspects.append(self)
+        elif alone:
+            for k, place in enumerate(places):
+                suspects.append(_Chunk(place, self.items[k : k + 1], struck=True))
         else:
-            yield self.first, [lost(self.items[0])]
+            suspects.append(self)
+        return False
 
 
 def _in_a_row(chunks: Iterable[Sequence[T]]) -> Iterator[_Chunk[T]]:

@@ -16,11 +16,10 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
 from typing import Any, Final
 
 import numpy as np
@@ -34,6 +33,8 @@ from merge_sumo.drivers.vuts.output import Output
 from merge_sumo.drivers.vuts.wire import About, Frame, WireError
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.blame import how_it_ended
+from merge_sumo.system.pulse import AwakeClock
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.signals import Left
 
@@ -83,7 +84,7 @@ def _facts(spec: str, options: VutOptions) -> _Facts:
     key = spec, str(Path.cwd()), options.memory_gib
     known = _known.get(key)
     if known is None or any(_stamp(file) != stamp for file, stamp in known.stamps):
-        host = Host(spec, options)
+        host = _first(lambda: Host(spec, options))
         try:
             said = host.said
         finally:
@@ -91,6 +92,14 @@ def _facts(spec: str, options: VutOptions) -> _Facts:
         stamps = tuple((file, _stamp(file)) for file in said["files"])
         known = _known[key] = _Facts(said["max_corridors"], said["max_workers"], stamps)
     return known
+
+
+def _first(opened: Callable[[], Host]) -> Host:
+    """Return what opens a VUT for the first time; where its process dies, it is opened again."""
+    try:
+        return opened()
+    except OpeningDiedError:
+        return opened()
 
 
 def _stamp(file: str) -> Stamp | None:
@@ -107,13 +116,20 @@ class HostDiedError(Exception):
     Attributes:
         reason: how that happened.
         corridor: whose controller was being asked; None where nobody knows.
-        hung: whether it was killed.
+        hung: whether it was killed because it hung.
+        killed: whether somebody else killed it, or it itself.
     """
 
-    def __init__(self, reason: str, corridor: int | None, *, hung: bool) -> None:
+    def __init__(
+        self, reason: str, corridor: int | None, *, hung: bool = False, killed: bool = False
+    ) -> None:
         """Take what is known."""
         super().__init__(reason)
-        self.reason, self.corridor, self.hung = reason, corridor, hung
+        self.reason, self.corridor, self.hung, self.killed = reason, corridor, hung, killed
+
+
+class OpeningDiedError(UserError):
+    """The process died while the VUT was opened; its cause is a `HostDiedError`."""
 
 
 class Host:
@@ -167,7 +183,7 @@ class Host:
         except WireError:
             corridor = self._corridor()
             self.kill()
-            raise HostDiedError(_how_it_ended(None), corridor, hung=False) from None
+            raise HostDiedError(how_it_ended(None), corridor) from None
         except BaseException:  # a person stops: nobody waits for the answer any more
             self.kill()
             raise
@@ -244,7 +260,7 @@ class Host:
         except HostDiedError as died:
             line = self._output.last_line()
             printed = f" (it printed: {line})" if line else ""
-            raise UserError(
+            raise OpeningDiedError(
                 f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
             ) from died
         if answer.about is About.REFUSED:
@@ -252,18 +268,22 @@ class Host:
         return answer.content
 
     def _answer(self, patience_s: float) -> Frame:
-        noted, since_s = Asked.read(self._asked)[0], monotonic()
+        noted, clock = Asked.read(self._asked)[0], AwakeClock(2.0 * LOOK_S)
         while True:
             answer = wire.take(self._buffer)
             if answer is not None and answer.number == self._number:
                 return answer
             now = Asked.read(self._asked)[0]
             if now != noted:
-                noted, since_s = now, monotonic()
-            elif monotonic() - since_s > patience_s:
+                noted = now
+                clock.restart()
+            elif clock.elapsed_s() > patience_s:
                 corridor = self._corridor()
                 self.kill()
-                raise HostDiedError(_too_late(patience_s, self._options), corridor, hung=True)
+                late = f"took longer than {patience_s:g} s"
+                if patience_s != self._options.connect_s:
+                    late = Watch(self._options.deadline_s).too_late
+                raise HostDiedError(late, corridor, hung=True)
             if answer is not None:
                 continue  # of a child that the VUT forked
             if self._poll.poll(1e3 * min(LOOK_S, patience_s)):
@@ -281,7 +301,7 @@ class Host:
         except subprocess.TimeoutExpired:
             code = None  # it closed the channel and goes on
         self.kill()
-        return HostDiedError(_how_it_ended(code), corridor, hung=False)
+        return HostDiedError(how_it_ended(code), corridor, killed=code == -signal.SIGKILL)
 
     def _corridor(self) -> int | None:
         corridor = Asked.read(self._asked)[1]
@@ -296,24 +316,6 @@ def _end_strays(inherited: str) -> None:
                 os.kill(int(process.name), signal.SIGKILL)
 
 
-def _too_late(patience_s: float, options: VutOptions) -> str:
-    if patience_s == options.connect_s:
-        return f"took longer than {patience_s:g} s"
-    return Watch(options.deadline_s).too_late
-
-
-def _how_it_ended(code: int | None) -> str:
-    if code is None:
-        return "broke the channel to its process"
-    if code >= 0:
-        return f"ended its process with exit code {code}"
-    try:
-        name = signal.Signals(-code).name
-    except ValueError:
-        name = "unknown"
-    return f"ended its process by signal {-code} ({name})"
-
-
 class HostedVut(Driver):
     """Passes every step on to the process of the VUT."""
 
@@ -325,7 +327,7 @@ class HostedVut(Driver):
         self._reasons: dict[int, str] = {}
         self._signals: dict[int, Left] = {}
         self._files: set[Path] = set()
-        self._host = self._started()
+        self._host = _first(self._started)
 
     def begin(self, corridor: int, case: Case) -> None:
         """Note that an episode begins; the VUT is told with the next scene."""
@@ -336,6 +338,10 @@ class HostedVut(Driver):
         if not self._host.alive:
             try:
                 self._host = self._started()
+            except OpeningDiedError as error:
+                died = error.__cause__
+                killed = isinstance(died, HostDiedError) and died.killed
+                raise VutLostError(str(error), killed=killed) from error
             except UserError as error:
                 self._begun.clear()
                 self._reasons = dict.fromkeys(range(self.corridors), f"started anew: {error}")
@@ -354,10 +360,11 @@ class HostedVut(Driver):
             said = wire.unpack_answers(answer.content, self.corridors)
             self._reasons, self._signals = said.reasons, said.signals
         except HostDiedError as died:
-            raise VutLostError(died.reason, self._own(died.corridor), final=died.hung) from None
+            own, how = self._own(died.corridor), {"final": died.hung, "killed": died.killed}
+            raise VutLostError(died.reason, own, **how) from None
         except (WireError, KeyError, ValueError, AttributeError):
             self._host.kill()
-            raise VutLostError(_how_it_ended(None)) from None
+            raise VutLostError(how_it_ended(None)) from None
         return said.a_mps2
 
     def signals(self) -> Mapping[int, Left]:
