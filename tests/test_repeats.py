@@ -204,6 +204,25 @@ def test_a_certificate_of_what_remembers_is_none(vut, tmp_path):
     assert "nothing is certain" in done.sentence
 
 
+def test_an_error_of_the_second_time_says_nothing(vut, tmp_path):
+    source = """
+EPISODES = []
+def Vut(seen):
+    EPISODES.append(None) if seen.t_s == 0.0 else None
+    return 1.0 if len(EPISODES) <= 60 else None
+"""
+    run = campaign(vut(source), tmp_path / "run")
+    assert not any(outcome.measures.end.is_error for outcome in run.outcomes)
+    assert read_repeats(run) == []
+
+
+def test_a_client_that_nobody_starts_is_not_waited_for_again(run):
+    settings = CampaignSettings(vut="traci", levels=(0,))
+    assert chosen_again(run.outcomes, settings) == []
+    started = CampaignSettings(vut="traci", vut_command="python3 client.py {port}", levels=(0,))
+    assert len(chosen_again(run.outcomes, started)) == 8
+
+
 def test_drivers_of_the_package_run_once(run, tmp_path):
     assert read_repeats(run) == []
     assert not (run.folder / REPEATS).exists()

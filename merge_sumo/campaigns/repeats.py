@@ -71,15 +71,17 @@ class Repeat:
 def repeat(run: Run, settings: CampaignSettings, run_cases: RunCases) -> list[Repeat]:
     """Run some cases of a campaign again; return what became of them, in the order of the cases.
 
-    None run again where the package brings all that drives. Cases whose trajectory is lost are left
-    out.
+    None run again where the package brings all that drives, nor of a TraCI client that nobody
+    starts: it may have gone. Cases whose trajectory is lost, and those that end in an error now,
+    are left out.
     """
     chosen = chosen_again(run.outcomes, settings)
     recorded = {o.index: motion for o in chosen if (motion := _trajectory(run, o)) is not None}
     again = [outcome for outcome in chosen if outcome.index in recorded]
     found = []
     for place, ran in run_cases([outcome.case for outcome in again]) if again else ():
-        found.append(compared(again[place], recorded[again[place].index], ran))
+        if not ran.measures.end.is_error:  # of a slow machine, perhaps
+            found.append(compared(again[place], recorded[again[place].index], ran))
     return sorted(found, key=lambda one: one.index)
 
 
@@ -91,6 +93,8 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
     a slow machine's doing.
     """
     built_in, own = built_in_vuts(), settings.povs.own
+    if settings.vut.partition(":")[0] == "traci" and settings.vut_command is None:
+        return []
     tested = [
         outcome
         for outcome in outcomes
