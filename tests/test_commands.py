@@ -74,7 +74,7 @@ class TestOptions:
 
 class TestHelp:
     @pytest.mark.parametrize("columns", [80, 100])
-    @pytest.mark.parametrize("name", COMMANDS)
+    @pytest.mark.parametrize("name", ["", "scenario", "policies", *COMMANDS])
     def test_wraps_no_paragraph_twice(self, name, columns):
         shown = help_of(name, columns)
         above = shown.split("╭")[0].splitlines()

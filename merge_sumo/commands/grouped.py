@@ -98,6 +98,10 @@ def notices_said() -> Iterator[None]:
 class Commands(typer.Typer):
     """An application whose commands are `GroupedCommand`s."""
 
+    def __init__(self, *, help: str, **options: Any) -> None:
+        """Take the help, each paragraph of which may stand in several lines."""
+        super().__init__(help=unwrapped(help), **options)
+
     def command(self, name: str | None = None, **options: Any) -> Callable[[Function], Function]:
         """Register a function as a command; its docstring is the help."""
 
