@@ -517,5 +517,5 @@ def test_a_resumed_campaign_that_was_broken_and_is_forced_on_is_judged_as_a_whol
     )
     run_campaign(settings, tmp_path / "run")
     shutil.copytree(tmp_path / "run", tmp_path / "longer")
-    resumed = resume_campaign(tmp_path / "longer", given={"cases": 15}, force=True)
+    resumed = resume_campaign(tmp_path / "longer", given={"cases": 15}, force=True, trust=True)
     assert judge(resumed.outcomes).timeouts == 15
