@@ -25,11 +25,18 @@ from merge_sumo.system.lifeline import end_with
 MESSAGES: Final = "messages"
 """In the folder of a child: what it, and SUMO, write to standard error."""
 MOST_BYTES: Final = 1 << 24
+SIGKILL: Final = -9
+"""Exit code of what SIGKILL ended; Windows has no such signal."""
 _LENGTH: Final = struct.Struct("!I")
 
 
 class ChildDiedError(Exception):
-    """The process is gone; the text says how it ended."""
+    """The process is gone; the text says how it ended, `killed` whether SIGKILL ended it."""
+
+    def __init__(self, how: str, *, killed: bool = False) -> None:
+        """Take how it ended."""
+        super().__init__(how)
+        self.killed = killed
 
 
 class Channel:
@@ -145,7 +152,7 @@ class SumoChild:
         except TimeoutError:
             raise
         except (OSError, EOFError, ValueError) as error:
-            raise ChildDiedError(self._how_it_ended()) from error
+            raise self._death() from error
 
     def receive(self, patience_s: float) -> dict[str, Any]:
         """Return what the child says unasked; raises as `ask` does."""
@@ -154,7 +161,7 @@ class SumoChild:
         except TimeoutError:
             raise
         except (OSError, EOFError, ValueError) as error:
-            raise ChildDiedError(self._how_it_ended()) from error
+            raise self._death() from error
 
     def kill(self) -> None:
         """End it, whatever it does."""
@@ -173,13 +180,14 @@ class SumoChild:
             return line.removeprefix("Error: ")
         return ""
 
-    def _how_it_ended(self) -> str:
+    def _death(self) -> ChildDiedError:
+        """Return how it ended."""
         with suppress(subprocess.TimeoutExpired):
             code = self.process.wait(2.0)
             if code < 0:
-                return f"was ended by signal {-code}"
-            return f"ended with exit code {code}"
-        return "broke the channel"
+                return ChildDiedError(f"was ended by signal {-code}", killed=code == SIGKILL)
+            return ChildDiedError(f"ended with exit code {code}")
+        return ChildDiedError("broke the channel")
 
 
 def opened() -> tuple[Channel, dict[str, Any]]:

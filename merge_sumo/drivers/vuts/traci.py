@@ -22,7 +22,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.drivers.vuts.base import Seen, Vut, VutOptions, seen_in
 from merge_sumo.drivers.vuts.process import TOKEN_VARIABLE, Program, split_command
 from merge_sumo.drivers.vuts.traci_door import HOST, Door, Peer
@@ -100,7 +100,7 @@ class TraciVut(Driver):
         self._patience_s = options.connect_s
         try:
             self._connect()
-        except FaultError as error:
+        except (FaultError, VutLostError) as error:
             self.close()
             raise UserError(str(error)) from error
         except BaseException:
@@ -132,7 +132,7 @@ class TraciVut(Driver):
         """Let the client see the last arrival and end; then end it."""
         ends = True
         if self._client is not None and self._shadow.listens:
-            with suppress(FaultError):
+            with suppress(FaultError, VutLostError):
                 answer = self._ask({"do": "farewell"})
                 ends = bool(answer.get("closed") or answer.get("gone"))
         self._disconnect(grace=ends)
@@ -183,7 +183,11 @@ class TraciVut(Driver):
         try:
             answer = self._shadow.ask(message, self._options.deadline_s + WORK_S)
         except ChildDiedError as died:
-            raise FaultError(f"the SUMO that answers the controller {died}") from died
+            # Killed from outside, or by what the client asked: the case runs again, and tells.
+            self._disconnect()
+            raise VutLostError(
+                f"the SUMO that answers the controller {died}", killed=died.killed
+            ) from died
         except TimeoutError as error:
             self._shadow.close()
             raise FaultError(
