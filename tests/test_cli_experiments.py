@@ -61,7 +61,8 @@ class TestCompare:
         }
 
     def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
-        monkeypatch.setattr("merge_sumo.campaigns.truth.DENSE_CASES", 900)
+        for module in ("merge_sumo.studies", "merge_sumo.study_results"):
+            monkeypatch.setattr(f"{module}.DENSE_CASES", 900)
         tiny = (*COMPARE, "--samplers", "uniform", "--seeds", 1, "--cases", 10, "--batch", 10)
         found: dict = {}
         for option in ("", "--dense", "--dense", "", "--no-dense"):

@@ -35,7 +35,7 @@ def test_the_classifiers_begin_with_the_oldest_python_that_it_takes():
 def test_types_are_checked_everywhere_and_strictly_outside_of_the_tests():
     mypy = CONFIG["tool"]["mypy"]
     assert mypy["strict"]
-    assert mypy["files"] == ["merge_sumo", "tools", "tests"]
+    assert mypy["files"] == ["merge_sumo", "tools", "tests", "examples"]
     strict = next(o for o in mypy["overrides"] if "merge_sumo.*" in o["module"])
     tools = sorted(path.stem for path in (ROOT / "tools").glob("*.py"))
     assert strict["module"] == ["merge_sumo.*", *tools]

@@ -51,7 +51,8 @@ def test_installing_is_all_that_comes_before():
 def test_the_steps_lead_to_a_failing_case(campaign, command_line, monkeypatch):
     folder, worst = campaign
     monkeypatch.chdir(folder)
-    assert command_line(*CHECK)[0] == 0
+    code, _, err = command_line(*CHECK)
+    assert code == 0, err
     code, out, _ = command_line(*the_worst(RUN, worst))
     assert (code, "contact" in out) == (FAILS, True)
     assert command_line(*RERUN)[0] == 0, "nothing has changed yet"
@@ -67,4 +68,5 @@ def test_the_last_step_shows_it_live(campaign, command_line, display, monkeypatc
     monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
     arguments = the_worst(LIVE, worst)
     assert arguments == [*the_worst(RUN, worst), "--gui"]
-    assert command_line(*arguments)[0] == FAILS
+    code, _, err = command_line(*arguments)
+    assert code == FAILS, err

@@ -97,7 +97,9 @@ class TestGames:
         )
         assert np.isnan(found).all()
 
-    @pytest.mark.parametrize("text", ["unsafe", 'pet_s < 2.5 or end == "TIMEOUT"'])
+    @pytest.mark.parametrize(
+        "text", ["unsafe or before_clearance_m < 0", 'pet_s < 2.5 or end == "TIMEOUT"']
+    )
     def test_are_judged_as_cases_are(self, text, tmp_path):
         (tmp_path / "slows.py").write_text(SLOWS)
         criterion, pool, road = Criterion(text), Pool(levels=(0,)), road_for(US23)
