@@ -229,7 +229,7 @@ class TestWhatWasNotTested:
         }
         by_message = list(lists.values())[:3]
         assert by_message == [[3, 6], [9], [0, 1, 2, 4]]
-        names = ("Ten worst failures, one of each region first", "Ten nearest misses")
+        names = ("Ten worst failures, one of each region first", "Ten cases nearest to a failure")
         others = {index for name in names for index in lists[name]}
         assert len(others) > 10
         assert others & {0, 1, 2, 3, 4, 6, 9} == set()

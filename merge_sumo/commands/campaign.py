@@ -246,7 +246,7 @@ def _print_summary(
         show(f"  a case fails when {run.criterion.words}")
     if summary.severities:
         counts = ", ".join(f"{number} {name}" for name, number in summary.severities.items())
-        show(f"  severity: {counts}")
+        show(f"  severity of all cases: {counts}")
     print_troubles(verdict)
     if run.ran_again:
         show(f"  {run.ran_again_in_words}")

@@ -162,6 +162,7 @@ def compare_runs(
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --out changes.html
     """
     from merge_sumo import api
+    from merge_sumo.reports.verdict import counted
 
     check_tolerance(tolerance)
     runs = {"A": api.open_run(a), "B": api.open_run(b)}
@@ -190,7 +191,9 @@ def compare_runs(
             print_troubles(one.verdict)
         _print_comparison(compared, {"A": a, "B": b})
         worse = "worse" if why else "not worse"
-        show(f"B is {worse} than A, with a tolerance of {tolerance:g}")
+        alone = sum(level.changes["not run again"] for level in compared.levels.values())
+        known = f"; {counted(alone, 'failure')} ran with one of them alone" if alone else ""
+        show(f"B is {worse} than A, with a tolerance of {tolerance:g}{known}")
         for sentence in why:
             show(f"  {sentence}")
         if out is not None:

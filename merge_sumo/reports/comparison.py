@@ -81,7 +81,10 @@ def compare_runs(
     ]
     cases.sort(key=telling)
     return RunComparison(
-        {level: level_change(level, cases, own_a, own_b) for level in levels},
+        {
+            level: level_change(level, cases, own_a, own_b, records_only=not rerun)
+            for level in levels
+        },
         cases,
         f"with {_what(own_a)} of A, B {again_b.how}; with {_what(own_b)} of B, A {again_a.how}",
     )
@@ -248,8 +251,12 @@ def level_change(
     own_b: Sequence[Outcome],
     *,
     same_cases: bool = False,
+    records_only: bool = False,
 ) -> LevelChange:
-    """Return what changed at a level; `same_cases` where those of B are those of A, run again."""
+    """Return what changed at a level; `same_cases` where those of B are those of A, run again.
+
+    `records_only` where neither was asked to run cases again.
+    """
     at_level = [case for case in cases if case.case.level == level]
     fails_a = [c.case for c in at_level if _fails(c.score_a)]
     fails_b = [c.case for c in at_level if _fails(c.score_b)]
@@ -265,8 +272,10 @@ def level_change(
         untested_a = _untested(alone_a, alone_a.cases, own_ends_a)
         untested_b = _untested(alone_b, alone_b.cases, own_ends_b)
 
-    # Where one fails and the other gives no verdict, nothing was fixed and nothing broke.
-    silent = (Change.NO_VERDICT_OF_A, Change.NO_VERDICT_OF_B)
+    # Where one fails and the other gives no verdict, or could not be run, nothing is known to be
+    # fixed and nothing to be broken. Records alone are compared as they are.
+    silent = {Change.NO_VERDICT_OF_A, Change.NO_VERDICT_OF_B}
+    silent |= set() if records_only else {Change.NOT_RUN_AGAIN}
     unknown = [
         c.case for c in at_level if c.change in silent and (_fails(c.score_a) or _fails(c.score_b))
     ]

@@ -201,7 +201,7 @@ class FailureBox:
     @property
     def what(self) -> str:
         """Return the kinds of failure in words."""
-        if len(self.kinds) == 1:
+        if len(self.kinds) == 1 and self.kinds[0][1] == self.failures:
             return f"{self.kinds[0][0]}: {MEANING[self.kinds[0][0]]}"
         return ", ".join(f"{count} {kind}" for kind, count in self.kinds)
 

@@ -80,8 +80,13 @@ def _failures(
     text += f", never at level {in_words(never)}." if never else "."
     common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
     if common:
-        kind, count = common[0]
-        share = "All are" if count == summary.failures else f"{count} of {summary.failures} are"
+        (kind, count), of_a_kind = common[0], sum(o.index in kinds for o in worst)
+        near = (
+            ""
+            if of_a_kind == summary.failures
+            else f" with front bumpers within {rule.crash_m:g} m"
+        )
+        share = "All are" if count == summary.failures else f"{count} of {of_a_kind}{near} are"
         text += f" {share} of the kind “{kind}”: {MEANING[kind]}."
     return text
 

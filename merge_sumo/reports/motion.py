@@ -12,7 +12,7 @@ from typing import Final
 from merge_sumo.reports.coordinates import described
 from merge_sumo.reports.diagnosis import MEANING, diagnose
 from merge_sumo.reports.verdict import message_of
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
+from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -26,7 +26,7 @@ MEASURES: Final = (
     ("score", "score P", ""),
     ("dx_m", "front bumpers, x_POV - x_VUT", "m"),
     ("bumper_gap_m", "bumper gap at M", "m"),
-    ("clearance_m", "smallest gap from M on", "m"),
+    ("clearance_m", "smallest gap, driving on", "m"),
     ("before_clearance_m", "smallest clearance before M", "m"),
     ("dv_mps", "v_POV - v_VUT", "m/s"),
     ("ttc_s", "time to collision", "s"),
@@ -51,7 +51,7 @@ def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
         verdict_of(outcome, trajectory),
         *_margin(outcome),
         "",
-        *_measures(outcome.measures),
+        *_measures(outcome.measures, _met(outcome.measures)),
         "",
         *motion_lines(trajectory),
     ]
@@ -60,15 +60,22 @@ def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
 def verdict_of(outcome: Outcome, trajectory: Trajectory) -> str:
     """Return what became of an episode in a sentence."""
     found = outcome.measures
-    met = "POV" if found.nearest == VEHICLES[0] else f"car {found.nearest}"
+    met = _met(found)
     at = f"{found.end.value} at {found.t_end_s:g} s"
     if found.end is not End.MERGED:
         return f"{at}: {message_of(found)}"
     first = "VUT" if found.merged_first == "VUT" else met
     apart = f"the front bumper of the {first} is {abs(found.dx_m or 0.0):.1f} m ahead at M"
+    if met != "POV" and first == "VUT":
+        apart += f" of that of the {met}"
     kind = diagnose(trajectory, found).kind
     how = "" if kind is None else f" ({kind}: {MEANING[kind]})"
     return f"{at}, {found.severity}{_impact(found)}: {apart}{how}"
+
+
+def _met(found: Measures) -> str:
+    """Return the car of the mainline that the measures are of: the nearest at the end."""
+    return "POV" if found.nearest == VEHICLES[POV] else f"car {found.nearest}"
 
 
 def _impact(found: Measures) -> str:
@@ -82,9 +89,11 @@ def _margin(outcome: Outcome) -> Iterator[str]:
         yield f"{'fails' if outcome.failed else 'does not fail'}: margin {outcome.margin:.3g}"
 
 
-def _measures(found: Measures) -> Iterator[str]:
-    for name, what, unit in MEASURES:
-        value = getattr(found, name)
+def _measures(found: Measures, met: str) -> Iterator[str]:
+    if met != "POV":
+        yield f"  of the {met}, which is nearest to the VUT at the end:"
+    for name, text, unit in MEASURES:
+        value, what = getattr(found, name), text.replace("POV", met)
         if value is not None:
             yield f"  {what:<31} {value:10.2f} {unit}".rstrip()
     if found.clipped_steps:

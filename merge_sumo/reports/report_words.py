@@ -49,7 +49,7 @@ def page_words(facts: Facts) -> dict[str, Any]:
     ]
     tables += [
         ("Ten worst failures, one of each region first", facts.spread),
-        ("Ten nearest misses", facts.near[:LISTED]),
+        ("Ten cases nearest to a failure", facts.near[:LISTED]),
     ]
     if facts.surprises:
         tables.append(("Ten largest errors of the twin's predictions", facts.surprises))

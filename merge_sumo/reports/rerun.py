@@ -101,12 +101,23 @@ class Rerun(InLines):
             f"{len(changed)} verdicts changed:" if len(changed) > 1 else "one verdict changed:"
         )
         for one in changed[:MOST_CHANGED]:
-            became = f"{one.before.measures.became} -> {one.after.measures.became}"
+            became = _became(one.before, one.after)
             change = one.change.replace("of A", "before").replace("of B", "now")
             said.append(f"  case {one.before.index}: {became} ({change})")
         if len(changed) > MOST_CHANGED:
             said.append(f"  and {len(changed) - MOST_CHANGED} others")
         return said
+
+
+def _became(before: Outcome, after: Outcome) -> str:
+    """Return what became of a case before and now; where the words are one, which is a failure."""
+    words = [one.measures.became for one in (before, after)]
+    if words[0] == words[1]:
+        words = [
+            f"{word}, {'a failure' if one.failed else 'no failure'}"
+            for word, one in zip(words, (before, after), strict=True)
+        ]
+    return " -> ".join(words)
 
 
 def settings_today(

@@ -675,7 +675,7 @@ function allCases() { // gives what shows the cases that the filters let through
     number("score", "score", 0), ...(cases.margin ? [number("margin", "margin", 2)] : []),
     number("dx", "Δx at M m", 1), number("dv", "dv m/s", 1), number("ttc", "TTC s", 1), number("pet", "PET s", 1),
     number("vut_brake", "VUT brakes m/s\u00b2", 1), number("pov_brake", "POV brakes m/s\u00b2", 1), number("t_end", "time s", 1),
-    number("clearance", "clearance m", 1), number("bumper_gap", "bumper gap at M m", 1), number("impact", "impact m/s", 1), number("brake_after", "braking asked after M m/s\u00b2", 1),
+    number("clearance", "clearance m", 1), number("before_clearance", "clearance before M m", 1), number("bumper_gap", "bumper gap at M m", 1), number("impact", "impact m/s", 1), number("brake_after", "braking asked after M m/s\u00b2", 1),
   ];
   const all = cases.index.map((_, i) => i), PART = 100;
   let by = columns.find(({ name }) => name === "score"), way = 1, found = all, rows = 0;
