@@ -63,6 +63,12 @@ def check_display() -> None:
         )
 
 
+ANSWERS_S: Final = 60.0
+"""A window that takes longer for a call hangs."""
+ROOM: Final = 1.3
+"""The view is wider than what it has to show by this, and moved again where that is too little."""
+
+
 class Window:
     """A sumo-gui that a `World` takes for libsumo; steps take as long as what they show.
 
@@ -79,6 +85,8 @@ class Window:
         self._due_s: float | None = None
         self._shown = 0
         self._lines: list[str] = []
+        self._half_m = 0.0
+        """Half of the width that the view shows; 0 before it follows the VUT."""
         self._written = 0
         """Lines that have a place in the window."""
 
@@ -109,7 +117,7 @@ class Window:
         self.simulation = self
 
     def _call(
-        self, function: str, *arguments: Any, patience_s: float | None = None, **options: Any
+        self, function: str, *arguments: Any, patience_s: float = ANSWERS_S, **options: Any
     ) -> Any:
         """Return what the window's libsumo answers; `UserError` when it is closed."""
         message = {"call": function, "arguments": arguments, "options": options}
@@ -117,6 +125,8 @@ class Window:
             answer = self._child.ask(message, patience_s)
         except ChildDiedError as error:
             raise _closed() from error
+        except TimeoutError as error:
+            raise UserError("sumo-gui does not answer any more: run the case again") from error
         if "refused" in answer:
             raise RefusedByWindowError(answer["refused"])
         if "closed" in answer:
@@ -179,9 +189,10 @@ class Window:
 
         It is in the middle, and the others are in the picture.
         """
-        vehicle, places = self.vehicle, {}
+        vehicle, places, vut = self.vehicle, {}, ""
         for name in vehicle.getIDList():
             places[_who(name)] = vehicle.getPosition(name)
+            vut = name if _who(name) == VEHICLES[VUT] else vut
         x, y = places[VEHICLES[VUT]]
         for name in vehicle.getIDList():
             who = _who(name)
@@ -193,8 +204,15 @@ class Window:
             LEAST_M / 2.0,
             *(SEEN * max(abs(to[0] - x), abs(to[1] - y) * wide / high) for to in places.values()),
         )
-        box = x - half_m, y - half_m * high / wide, x + half_m, y + half_m * high / wide
-        self._gui.setBoundary(VIEW, *box)
+        # The window draws in another thread, and moving its view from ours may hang it: that is
+        # done as seldom as can be.
+        if not self._half_m / ROOM**2 < half_m <= self._half_m:
+            self._half_m = half_m = ROOM * half_m
+            half_high_m = half_m * high / wide
+            box = x - half_m, y - half_high_m, x + half_m, y + half_high_m
+            self._gui.setBoundary(VIEW, *box)
+            self._gui.trackVehicle(VIEW, vut)
+        half_m = self._half_m
         self._put_lines(x, y, half_m * high / wide)
 
     def _put_lines(self, x: float, y: float, half_height_m: float) -> None:
