@@ -19,6 +19,7 @@ from accounts import Account, second_account
 from foreign_nets import corridor_of
 
 from merge_sumo import cli
+from merge_sumo.campaigns import ground
 from merge_sumo.campaigns.conductor import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -46,6 +47,13 @@ def require(available: bool, reason: str) -> None:
 def some(values: Iterable[Any], *kept: object) -> list[Any]:
     """Return parameters of a test: the default run takes the kept ones, `-m long` the others."""
     return [v if v in kept else pytest.param(v, marks=pytest.mark.long) for v in values]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_simulation_left() -> Iterator[None]:
+    """Close what `run_cases` keeps open in this process: libsumo holds one simulation at a time."""
+    yield
+    ground._close_ground()
 
 
 @pytest.fixture(scope="session")
