@@ -34,7 +34,7 @@ def take_from_0_1(values: dict[str, Any], scenario: Scenario) -> None:
     if math.isinf(brake):
         values["impact_speed_mps"] = abs(dv)
     clearance = gap - max(closing, 0.0) * REACTION_S
-    close = score < -500.0
+    close = abs(dx) < scenario.dx_crash_m
     severity = severity_of(End.MERGED, clearance, is_close=close, brake_mps2=brake)
     values["severity"] = None if severity is None else severity.value
     values["bumper_gap_m"], values["clearance_m"], values["brake_after_mps2"] = (
