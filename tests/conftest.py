@@ -19,11 +19,11 @@ from accounts import Account, second_account
 from foreign_nets import corridor_of
 
 from merge_sumo import cli
-from merge_sumo.campaigns import ground
-from merge_sumo.campaigns.conductor import run_campaign
+from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.engine import simulator as ground
+from merge_sumo.road.corridor import Corridor
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
 
@@ -53,7 +53,7 @@ def some(values: Iterable[Any], *kept: object) -> list[Any]:
 def no_simulation_left() -> Iterator[None]:
     """Close what `run_cases` keeps open in this process: libsumo holds one simulation at a time."""
     yield
-    ground._close_ground()
+    ground._close_simulator()
 
 
 @pytest.fixture(scope="session")

@@ -25,18 +25,18 @@ import libsumo
 import numpy as np
 import traci
 
-from merge_sumo.campaigns.rollout import rollout
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.drivers.pov import PovLibrary
-from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.rollout import rollout
+from merge_sumo.road.merge import road_of
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.hosting import HostedPath, hosted_net, hosted_paths
-from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import MAX_SPEED_MPS, SPEED_MODE_COMMANDED, SUMO_OPTIONS, World
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.scenario import DT_S, MAX_STEPS, US23, VEHICLES, X_VUT0_M, Scenario
 from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.vuts.registry import vut_factory
 
 KS = (1, 8, 32, 64)
 STEPS = 80

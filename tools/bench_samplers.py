@@ -24,12 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.conductor import conduct
-from merge_sumo.campaigns.ground import GroundPlan, Ran, run_cases
+from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.truth import Truth, ground_truth
+from merge_sumo.engine.simulator import CaseResult, SimulationPlan, run_cases
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.studies.truth import Truth, ground_truth
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.criterion import Criterion
@@ -77,7 +77,7 @@ def changed(constants: dict[str, Any]) -> Iterator[None]:
 
 
 def search(
-    name: str, level: int, seed: int, plan: GroundPlan, truth: Truth
+    name: str, level: int, seed: int, plan: SimulationPlan, truth: Truth
 ) -> tuple[list[float], int, float]:
     """Return FMC / truth at SHOWN, the real regions found, and the seconds of the sampler."""
     pool = Pool(levels=(level,))
@@ -97,7 +97,7 @@ def search(
 
         return wrapper
 
-    def run(cases: Sequence[Case]) -> Iterable[tuple[int, Ran]]:
+    def run(cases: Sequence[Case]) -> Iterable[tuple[int, CaseResult]]:
         return enumerate(run_cases(plan, cases))
 
     sampler.ask = timed(sampler.ask)  # type: ignore[method-assign]
@@ -117,7 +117,9 @@ def search(
     return [curve[n] / whole if whole else math.nan for n in SHOWN], regions, seconds
 
 
-def bench(name: str, level: int, seeds: int, plan: GroundPlan, truth: Truth, first: int = 0) -> str:
+def bench(
+    name: str, level: int, seeds: int, plan: SimulationPlan, truth: Truth, first: int = 0
+) -> str:
     """Return a line of medians over the seeds, from the first one on."""
     runs = [search(name, level, seed, plan, truth) for seed in range(first, first + seeds)]
     shares = np.median([run[0] for run in runs], axis=0)

@@ -37,16 +37,16 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.ahead import Ahead, proposals
-from merge_sumo.campaigns.conductor import conduct, run_campaign
-from merge_sumo.campaigns.ground import GroundPlan, Ran, run_cases
+from merge_sumo.campaigns.campaign import conduct, run_campaign
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.prefetch import Ahead, proposals
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.truth import _scores
+from merge_sumo.engine.simulator import CaseResult, SimulationPlan, run_cases
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.studies.truth import _scores
 from merge_sumo.system.workers import LocalProcesses, Workers
 from merge_sumo.values.case import Case, FloatArray, Pool, from_unit, to_unit
 from merge_sumo.values.criterion import Criterion
@@ -67,7 +67,7 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def scores_and_memory(plan: GroundPlan, points: Sequence[FloatArray]) -> list[tuple[Any, ...]]:
+def scores_and_memory(plan: SimulationPlan, points: Sequence[FloatArray]) -> list[tuple[Any, ...]]:
     """Run cases of level 0 as `truth` does; say which process did and how large it is."""
     return [(score, os.getpid(), memory_mb()) for score in _scores(plan, 0, points)]
 
@@ -163,7 +163,7 @@ def whole_campaigns(cases: int, rounds: int) -> dict[str, list[float]]:
 class Served:
     """Gives what became of cases as it comes from a worker process, with no work done for it."""
 
-    def __init__(self, ran: Sequence[Ran]) -> None:
+    def __init__(self, ran: Sequence[CaseResult]) -> None:
         """Serve what became of `MAX_CHUNK` cases."""
         # So quick that every chunk but the first is as large as can be.
         self.workers = SimpleNamespace(count=1e-9)
@@ -171,7 +171,7 @@ class Served:
 
     def chunks(
         self, chunks: Iterable[Sequence[Case]]
-    ) -> Generator[tuple[int, Sequence[Ran]], None, None]:
+    ) -> Generator[tuple[int, Sequence[CaseResult]], None, None]:
         """Yield (place of the first case, what became of the chunk)."""
         first = 0
         for chunk in chunks:

@@ -31,14 +31,14 @@ import traci
 from build_fmu import build_fmu
 
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.drivers.onnx_export import export_onnx
-from merge_sumo.drivers.vut import vut_factory
-from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.road import road_of
 from merge_sumo.sumo.world import SUMO_OPTIONS
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.onnx_export import export_onnx
+from merge_sumo.vuts.registry import vut_factory
 
 STEPS = 80
 """Of an episode."""

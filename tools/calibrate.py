@@ -35,7 +35,7 @@ from merge_sumo.drivers.gap_acceptance import GapAcceptanceVut, GapDesign
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver, policies_of
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
-from merge_sumo.scenarios.scenario_file import named_scenario
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.case import Case, FloatArray, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc, regions
 from merge_sumo.values.scenario import DT_S, US23, Scenario

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.campaigns import journal
-from merge_sumo.campaigns.conductor import resume_campaign, run_campaign
+from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.sumo.binding import load_libsumo

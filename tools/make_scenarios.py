@@ -13,10 +13,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from merge_sumo.campaigns.ground import road_for
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.scenarios.scenario_file import named_scenario
-from merge_sumo.sumo.centre_lines import centre_lines
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.values.case import Case
 from merge_sumo.values.criterion import Criterion

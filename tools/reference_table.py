@@ -15,13 +15,13 @@ import statistics
 import tempfile
 from pathlib import Path
 
-from merge_sumo.campaigns.avoidance import avoidance
-from merge_sumo.campaigns.conductor import run_campaign
-from merge_sumo.campaigns.driven_again import CAREFUL, TAKES_OVER
-from merge_sumo.campaigns.ground import road_for
+from merge_sumo.analysis.summary import summarise
+from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.reports.summary import summarise
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.studies.avoidance import avoidance
+from merge_sumo.studies.counterfactuals import CAREFUL, TAKES_OVER
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import LEVELS, US23
 from merge_sumo.values.trajectory import End

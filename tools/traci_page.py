@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from merge_sumo.drivers.vuts.traci_calls import NOT_ANSWERED, Kind, kind_of, reason_against
-from merge_sumo.drivers.vuts.traci_session import ASKS, OWN_ANSWERS
 from merge_sumo.sumo.traci_names import Named, named
+from merge_sumo.vuts.traci.calls import NOT_ANSWERED, Kind, kind_of, reason_against
+from merge_sumo.vuts.traci.session import ASKS, OWN_ANSWERS
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
 HEAD = """# What a TraCI controller can do

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.campaigns.run import SETTINGS
-from merge_sumo.drivers.vut import runs_code
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.trust import Code, doubt, note_own
+from merge_sumo.vuts.registry import runs_code
 
 FILES: Final = ("vut_files", "pov_files")
 """Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""

@@ -9,15 +9,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from merge_sumo.campaigns.ground import MAX_CORRIDORS, GroundPlan, road_for
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.drivers.povs import Povs
-from merge_sumo.drivers.vut import VutFactory, vut_factory
-from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.engine.povs import Povs
+from merge_sumo.engine.simulator import MAX_CORRIDORS, SimulationPlan, road_for
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.registry import VutFactory, vut_factory
 
 if TYPE_CHECKING:
     from merge_sumo.campaigns.settings import CampaignSettings
-    from merge_sumo.sumo.corridor import Corridor
+    from merge_sumo.road.corridor import Corridor
     from merge_sumo.values.criterion import Criterion
     from merge_sumo.values.scenario import Scenario
 
@@ -29,7 +29,7 @@ def resolve(
     criterion: Criterion,
     povs: Povs | None = None,
     corridors: int = MAX_CORRIDORS,
-) -> GroundPlan:
+) -> SimulationPlan:
     """Return the plan for a VUT on the road of a scenario.
 
     Args:
@@ -47,7 +47,7 @@ def resolve(
     criterion.check(scenario)
     if not isinstance(vut, VutFactory):
         vut = vut_factory(vut, VutOptions(policies=povs.policies))
-    return GroundPlan(
+    return SimulationPlan(
         vut=vut,
         corridors=corridors,
         net=road_for(scenario),
@@ -64,7 +64,7 @@ def plan_of(
     cases: int = MAX_CORRIDORS,
     log: Path | None = None,
     vut: VutFactory | None = None,
-) -> GroundPlan:
+) -> SimulationPlan:
     """Return the plan of a campaign.
 
     Args:
@@ -75,7 +75,7 @@ def plan_of(
         vut: the driver in the place of the campaign's VUT.
     """
     vut, povs = vut or settings.vut_factory, settings.povs
-    return GroundPlan(
+    return SimulationPlan(
         vut=vut if log is None else vut.with_log(log),
         corridors=min(MAX_CORRIDORS, cases),
         net=net,

@@ -20,16 +20,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.ground import Ran, RunCases
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.drivers.vut import built_in_vuts
+from merge_sumo.engine.simulator import CaseResult, RunCases
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VEHICLES
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.registry import built_in_vuts
 
 REPEATS: Final = "repeats.jsonl"
 MOST: Final = 20
@@ -115,7 +115,7 @@ def spread_places(cases: int, count: int) -> list[int]:
     return [*others, *reversed(range(first))]
 
 
-def compared(outcome: Outcome, recorded: Trajectory, ran: Ran) -> Repeat:
+def compared(outcome: Outcome, recorded: Trajectory, ran: CaseResult) -> Repeat:
     """Return how the second run of a case compares with the recorded one."""
     differs_from_s, first = _difference(recorded, ran.trajectory)
     now = Outcome(outcome.index, outcome.batch, outcome.case, ran.measures, margin=ran.margin)

@@ -10,19 +10,17 @@ from typing import Any, Final, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from merge_sumo.campaigns.convergence import StoppingRule
-from merge_sumo.campaigns.learning import hashes, lessons
 from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
-from merge_sumo.campaigns.software import versions
+from merge_sumo.campaigns.stopping import StoppingRule
+from merge_sumo.campaigns.transfer import hashes, lessons
 from merge_sumo.drivers.policies import how_to_train, policies_in, policies_of
-from merge_sumo.drivers.povs import POLICIES, Povs, own_pov
-from merge_sumo.drivers.vut import VutFactory, vut_factory
-from merge_sumo.drivers.vuts.base import VutOptions
+from merge_sumo.engine.povs import POLICIES, Povs, own_pov
+from merge_sumo.engine.versions import versions
 from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import (
@@ -35,6 +33,8 @@ from merge_sumo.values.scenario import (
     level_name,
 )
 from merge_sumo.values.score import Outcome
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.registry import VutFactory, vut_factory
 
 DEFAULT_CASES: Final = 800
 

@@ -44,10 +44,10 @@ from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DEADLINE_S, LEVELS, MEMORY_GIB, level_name
 
 if TYPE_CHECKING:
+    from merge_sumo.analysis.summary import Summary
+    from merge_sumo.analysis.verdict import Gate, Verdict
+    from merge_sumo.api.results import CampaignRun
     from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports.summary import Summary
-    from merge_sumo.reports.verdict import Gate, Verdict
-    from merge_sumo.results import CampaignRun
 
 
 @app.command()
@@ -149,8 +149,8 @@ def campaign(
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
     """
     from merge_sumo import api
+    from merge_sumo.analysis.verdict import parse_gates
     from merge_sumo.reports.junit import check_junit
-    from merge_sumo.reports.verdict import parse_gates
     from merge_sumo.system.interrupt import Interrupt, Stopped
 
     if resume is not None and out is not None:
@@ -180,9 +180,9 @@ def campaign(
 
 def _conclude(found: CampaignRun, gates: list[Gate], junit: Path | None, *, as_json: bool) -> bool:
     """Print what a campaign found; return whether it passed."""
-    from merge_sumo.reports.doubts import notes_on
+    from merge_sumo.analysis.plausibility import notes_on
+    from merge_sumo.analysis.verdict import NOTHING_TESTED
     from merge_sumo.reports.junit import write_junit
-    from merge_sumo.reports.verdict import NOTHING_TESTED
 
     run, summary, verdict, careful = found.run, found.summary, found.verdict, found.careful
     results = [gate.check(verdict, summary) for gate in gates]
@@ -235,10 +235,10 @@ def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path 
 def _print_summary(
     run: Run, summary: Summary, verdict: Verdict, careful: str | None, report_file: Path
 ) -> None:
-    from merge_sumo.campaigns.conductor import SCENARIOS, case_name
+    from merge_sumo.analysis.plausibility import doubts
+    from merge_sumo.analysis.verdict import counted
+    from merge_sumo.campaigns.campaign import SCENARIOS, case_name
     from merge_sumo.campaigns.run import failures
-    from merge_sumo.reports.doubts import doubts
-    from merge_sumo.reports.verdict import counted
 
     print_unrepeatable(run)
     show(verdict.counts)

@@ -42,8 +42,8 @@ from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
-    from merge_sumo.reports.rerun import Rerun
-    from merge_sumo.results import CaseRun
+    from merge_sumo.api.results import CaseRun
+    from merge_sumo.studies.rerun import Rerun
 
 
 @app.command()
@@ -114,7 +114,7 @@ def run(
     Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
     """
     from merge_sumo import api
-    from merge_sumo.campaigns.single import FIELDS
+    from merge_sumo.campaigns.one_case import FIELDS
     from merge_sumo.values.trajectory import End
 
     def ended(found: CaseRun) -> None:

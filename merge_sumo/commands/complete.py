@@ -24,8 +24,8 @@ def _beginning(incomplete: str, values: Iterable[tuple[str, str]]) -> Completion
 
 def vuts(incomplete: str) -> Completions:
     """Return the VUTs by name, the kinds of one's own, and Python files in the folder."""
-    from merge_sumo.drivers.vut import KINDS, built_in_vuts
-    from merge_sumo.drivers.vuts.python import installed_vuts
+    from merge_sumo.vuts.python import installed_vuts
+    from merge_sumo.vuts.registry import KINDS, built_in_vuts
 
     if ":" in incomplete:
         return _beginning(incomplete, _names_in(incomplete.rpartition(":")[0]))
@@ -92,7 +92,7 @@ def samplers(incomplete: str) -> Completions:
 
 def scenarios(incomplete: str) -> Completions:
     """Return the shipped scenarios, and TOML files."""
-    from merge_sumo.scenarios.scenario_file import shipped_scenarios
+    from merge_sumo.road.scenario_file import shipped_scenarios
 
     shipped = [(name, "shipped") for name in shipped_scenarios()]
     return _beginning(incomplete, [*shipped, *_files(incomplete, (".toml",))])

@@ -171,9 +171,9 @@ def reproduce(
     Example:  merge-sumo reproduce --seeds 10 --out reproduction
     """
     from merge_sumo.campaigns.settings import povs_of
-    from merge_sumo.reports import reproduce as paper
-    from merge_sumo.reports import table2
+    from merge_sumo.reports import reproduction as paper
     from merge_sumo.reports.progress import Bars, rate_text
+    from merge_sumo.studies import table2
     from merge_sumo.system.workers import open_workers
 
     if seeds is None:

@@ -26,7 +26,7 @@ from merge_sumo.commands.shared import (
 from merge_sumo.system.printable import quoted
 
 if TYPE_CHECKING:
-    from merge_sumo.reports.changes import RunComparison
+    from merge_sumo.studies.changes import RunComparison
 
 
 class Format(StrEnum):
@@ -162,7 +162,7 @@ def compare_runs(
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --out changes.html
     """
     from merge_sumo import api
-    from merge_sumo.reports.verdict import counted
+    from merge_sumo.analysis.verdict import counted
 
     check_tolerance(tolerance)
     runs = {"A": api.open_run(a), "B": api.open_run(b)}

@@ -24,7 +24,7 @@ def list_scenarios(as_json: JsonOption = False) -> None:
 
     Example:  merge-sumo scenario list
     """
-    from merge_sumo.scenarios.scenario_file import named_scenario, shipped_scenarios
+    from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 
     scenarios = {name: named_scenario(name) for name in shipped_scenarios()}
     if as_json:
@@ -57,13 +57,13 @@ def new_scenario(
     import os
     from dataclasses import replace
 
-    from merge_sumo.scenarios.drawing import road_svg
-    from merge_sumo.scenarios.scenario_file import SUFFIX, to_toml
-    from merge_sumo.scenarios.suggestion import about, suggested
+    from merge_sumo.campaigns.scenario_suggestion import about, suggested
+    from merge_sumo.road.drawing import road_svg
+    from merge_sumo.road.finder import find_corridor
+    from merge_sumo.road.merge import road_of
+    from merge_sumo.road.netfile import NetFile
+    from merge_sumo.road.scenario_file import SUFFIX, to_toml
     from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
-    from merge_sumo.sumo.finder import find_corridor
-    from merge_sumo.sumo.netfile import NetFile
-    from merge_sumo.sumo.road import road_of
     from merge_sumo.system.folders import check_new_file, write_new
 
     if file.suffix != SUFFIX:
@@ -112,10 +112,10 @@ def check_scenario(
 
     Example:  merge-sumo scenario check us23
     """
-    from merge_sumo.campaigns.ground import road_for
+    from merge_sumo.campaigns.scenario_suggestion import about, unseen
     from merge_sumo.drivers.policies import policies_in
-    from merge_sumo.scenarios.scenario_file import named_scenario
-    from merge_sumo.scenarios.suggestion import about, unseen
+    from merge_sumo.engine.simulator import road_for
+    from merge_sumo.road.scenario_file import named_scenario
     from merge_sumo.system.printable import quoted
 
     if policies is not None:

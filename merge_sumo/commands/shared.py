@@ -14,8 +14,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 
 if TYPE_CHECKING:
+    from merge_sumo.analysis.verdict import Verdict
     from merge_sumo.campaigns.run import Run
-    from merge_sumo.reports.verdict import Verdict
 
 
 app = Commands(

@@ -35,8 +35,8 @@ def vuts(policies: PoliciesOption = None, as_json: JsonOption = False) -> None:
     Example:  merge-sumo vuts
     """
     from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
-    from merge_sumo.drivers.vut import KINDS, LEARNED, PYTHON, built_in_vuts
-    from merge_sumo.drivers.vuts.python import installed_vuts
+    from merge_sumo.vuts.python import installed_vuts
+    from merge_sumo.vuts.registry import KINDS, LEARNED, PYTHON, built_in_vuts
 
     trained = read_manifest(policies_of() if policies is None else policies_in(policies))
     built_in = [name for name in built_in_vuts() if LEARNED.get(name, name) in (name, *trained)]
@@ -103,9 +103,9 @@ def export_policy(
 
     Example:  merge-sumo policies export vut1 --out vut1.onnx
     """
-    from merge_sumo.drivers.onnx_export import export_onnx
     from merge_sumo.drivers.policies import policies_in, policies_of
-    from merge_sumo.scenarios.scenario_file import named_scenario
+    from merge_sumo.road.scenario_file import named_scenario
+    from merge_sumo.vuts.onnx_export import export_onnx
 
     played = None if scenario is None else named_scenario(scenario)
     folder = policies_of(played or US23) if policies is None else policies_in(policies)

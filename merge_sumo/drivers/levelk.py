@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import level0_time_to
-from merge_sumo.drivers.units import Units
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario_scale import Units
 
 BRAKING: Final = (1.0, 0.75, 0.5, 0.25)
 """Shares of the hardest braking that a learned driver chooses from,"""

@@ -19,8 +19,8 @@ delay, stops it before M or brings it there at least `dx_crash_m` behind the oth
    from 0 by the model's jerk, and begins again at 0 after a step without braking.
 
 The drawn angle of the ramp means nothing, so the lateral conditions of the models became times to
-M. `tests/test_cut_in.py` compares the models with their published code, and the ramp driver with
-a table that was made by another implementation of the rules above.
+M. `tests/drivers/test_cut_in.py` compares the models with their published code, and the ramp driver
+with a table that was made by another implementation of the rules above.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 They are of rear-end conflicts on one lane, for two vehicles with a gap between them: the rear one
 has to react. Parameters are those of the JRC-FSM reference implementation (European Commission,
 Joint Research Centre: ec-jrc/JRC-FSM, commit 01b05c2), which compares the models on the cut-ins of
-UN Regulation No. 157. `tests/test_cut_in.py` compares these functions with tables made by it.
+UN Regulation No. 157. `tests/drivers/test_cut_in.py` compares these functions with its tables.
 
 `drivers/reference.py` applies the models to a merge.
 """

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from merge_sumo.analysis.coordinates import described
+from merge_sumo.analysis.verdict import counted, in_words
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
-from merge_sumo.reports.changes import Change, ComparedCase, RunComparison
-from merge_sumo.reports.coordinates import described
 from merge_sumo.reports.report import policy_hash
 from merge_sumo.reports.static_map import map_of
-from merge_sumo.reports.verdict import counted, in_words
+from merge_sumo.studies.changes import Change, ComparedCase, RunComparison
 from merge_sumo.system.folders import write_new
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name

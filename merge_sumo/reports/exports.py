@@ -16,11 +16,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.conductor import case_name
+from merge_sumo.analysis.coordinates import coordinates
+from merge_sumo.campaigns.campaign import case_name
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
-from merge_sumo.reports.coordinates import coordinates
-from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.experiments import Comparison
 from merge_sumo.errors import UserError
+from merge_sumo.studies.benchmark import Comparison
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
 from merge_sumo.values.fmc import RADIUS

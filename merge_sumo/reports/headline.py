@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from merge_sumo.reports.diagnosis import MEANING, Kind
-from merge_sumo.reports.summary import Summary
-from merge_sumo.reports.verdict import Verdict, counted, in_words
+from merge_sumo.analysis.diagnosis import MEANING, Kind
+from merge_sumo.analysis.summary import Summary
+from merge_sumo.analysis.verdict import Verdict, counted, in_words
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import HARSH_MPS2
 from merge_sumo.values.scenario import level_name

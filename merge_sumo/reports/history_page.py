@@ -9,10 +9,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from merge_sumo.reports.diagnosis import Kind
-from merge_sumo.reports.history import History, LevelOfVersion
-from merge_sumo.reports.history_steps import MEANING, Became
+from merge_sumo.analysis.diagnosis import Kind
 from merge_sumo.reports.report import policy_hash
+from merge_sumo.studies.history import History, LevelOfVersion
+from merge_sumo.studies.history_steps import MEANING, Became
 from merge_sumo.system.folders import write_new
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.severity import Severity

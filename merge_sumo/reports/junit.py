@@ -14,15 +14,15 @@ from typing import Final
 
 from lxml import etree
 
-from merge_sumo.campaigns.run import Run
-from merge_sumo.errors import UserError
-from merge_sumo.reports.coordinates import described
-from merge_sumo.reports.verdict import (
+from merge_sumo.analysis.coordinates import described
+from merge_sumo.analysis.verdict import (
     NOTHING_TESTED,
     GateResult,
     Verdict,
     message_of,
 )
+from merge_sumo.campaigns.run import Run
+from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome

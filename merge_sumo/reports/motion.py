@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from merge_sumo.reports.coordinates import described
-from merge_sumo.reports.diagnosis import MEANING, diagnose
-from merge_sumo.reports.verdict import message_of
+from merge_sumo.analysis.coordinates import described
+from merge_sumo.analysis.diagnosis import MEANING, diagnose
+from merge_sumo.analysis.verdict import message_of
 from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory

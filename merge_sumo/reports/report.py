@@ -15,12 +15,12 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from merge_sumo.analysis.summary import Summary
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report_data import page_data
-from merge_sumo.reports.report_facts import Facts, OnPart
+from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.report_words import page_words
-from merge_sumo.reports.summary import Summary
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import level_name
@@ -81,7 +81,7 @@ def report_page(
         (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
         for name in ("report.css", "report.js")
     )
-    facts = Facts(run, summary, workers, on_part)
+    facts = ReportModel(run, summary, workers, on_part)
     words = page_words(facts)
     facts.part_ended()
     data = json.dumps(page_data(facts), allow_nan=False, separators=(",", ":"))

@@ -11,16 +11,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.reports.coordinates import Coordinate
-from merge_sumo.reports.diagnosis import (
+from merge_sumo.analysis.coordinates import Coordinate
+from merge_sumo.analysis.diagnosis import (
     Diagnosis,
     Kind,
 )
-from merge_sumo.reports.foretelling import off_m
-from merge_sumo.reports.report_facts import ERROR_CHARACTERS, Facts
+from merge_sumo.analysis.verdict import shortened
 from merge_sumo.reports.report_maps import maps_of
-from merge_sumo.reports.verdict import shortened
-from merge_sumo.sumo.corridor import Corridor, LanePath
+from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
+from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.studies.prediction_quality import off_m
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
@@ -42,7 +42,7 @@ UNKNOWN: Final = Diagnosis(None, None, False, False, None)
 """Of a case whose motion is lost."""
 
 
-def page_data(facts: Facts) -> dict[str, Any]:
+def page_data(facts: ReportModel) -> dict[str, Any]:
     """Return what the script draws from: plain JSON."""
     speeds, offsets = _packed(facts.motion)
     return {
@@ -71,7 +71,7 @@ def page_data(facts: Facts) -> dict[str, Any]:
     }
 
 
-def _boxes(facts: Facts) -> list[dict[str, Any]]:
+def _boxes(facts: ReportModel) -> list[dict[str, Any]]:
     """Return level and cases of the regions in words, of the cases that are shown."""
     shown = {o.index for o in facts.shown}
     return [
@@ -80,7 +80,7 @@ def _boxes(facts: Facts) -> list[dict[str, Any]]:
     ]
 
 
-def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
+def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
     ends, kinds, severities = list(End), list(Kind), list(Severity)
     columns: dict[str, list[Any]] = {}
     for o in facts.shown:
@@ -127,7 +127,7 @@ def _columns(facts: Facts, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
     return columns or {"index": []}
 
 
-def _avoidance(facts: Facts, index: int) -> dict[str, Any]:
+def _avoidance(facts: ReportModel, index: int) -> dict[str, Any]:
     """Return who would have avoided a case, where that is known."""
     if not facts.avoidance:
         return {}
@@ -153,7 +153,7 @@ def _coordinate(c: Coordinate) -> dict[str, Any]:
     }
 
 
-def _maps(facts: Facts) -> dict[int, dict[str, Any]]:
+def _maps(facts: ReportModel) -> dict[int, dict[str, Any]]:
     shown = {o.index for o in facts.shown}
     others = [o for o in facts.run.outcomes if o.index not in shown]
     return {
@@ -169,7 +169,7 @@ def _maps(facts: Facts) -> dict[int, dict[str, Any]]:
     }
 
 
-def _search(facts: Facts) -> dict[str, Any]:
+def _search(facts: ReportModel) -> dict[str, Any]:
     """Return cases, mean score and coverage of each level after groups of batches."""
     batches = sorted({o.batch for o in facts.run.outcomes})
     width = -(-len(batches) // MOST_STEPS) or 1

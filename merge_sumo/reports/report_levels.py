@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.reports.report_facts import Facts
+from merge_sumo.analysis.summary import LevelSummary
+from merge_sumo.analysis.surface import FEWEST_FAILURES
+from merge_sumo.analysis.verdict import counted
 from merge_sumo.reports.report_maps import pairs_of
-from merge_sumo.reports.summary import LevelSummary
-from merge_sumo.reports.surface import FEWEST_FAILURES
-from merge_sumo.reports.verdict import counted
+from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.system.printable import two_digits
 from merge_sumo.values.empty_ball import EmptyBall
 from merge_sumo.values.fmc import fmc
@@ -62,7 +62,7 @@ FMC_AXES: Final = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Ends of an axis of coverages; balls at the faces of the pool reach out of it."""
 
 
-def levels_of(facts: Facts) -> tuple[list[Level], str]:
+def levels_of(facts: ReportModel) -> tuple[list[Level], str]:
     """Return what the page says of each level, and the end of the axis of the coverages."""
     plausible = {
         level: None if surface is None else surface.plausible_fmc()
@@ -106,7 +106,7 @@ def levels_of(facts: Facts) -> tuple[list[Level], str]:
 
 
 def _fmc_axis(
-    facts: Facts, plausible: Mapping[int, float | None], truth: Mapping[int, float | None]
+    facts: ReportModel, plausible: Mapping[int, float | None], truth: Mapping[int, float | None]
 ) -> float:
     """Return the coverage at which the bars of all levels end: a round number."""
     most = max(
@@ -119,14 +119,14 @@ def _fmc_axis(
     return next((end for end in FMC_AXES if most <= end), FMC_AXES[-1])
 
 
-def _third(facts: Facts, level: int) -> Third | None:
+def _third(facts: ReportModel, level: int) -> Third | None:
     if len(facts.run.scenario.dimensions(level)) != 3:
         return None
     found = facts.coordinates_of(level)[2]
     return Third(found.name, round(found.dimension.low, 2), round(found.dimension.high, 2))
 
 
-def _pairs(facts: Facts, level: int) -> list[str]:
+def _pairs(facts: ReportModel, level: int) -> list[str]:
     """Return the pairs of coordinates that a level's map may show, the first one first."""
     found = facts.coordinates_of(level)
     return [
@@ -136,7 +136,7 @@ def _pairs(facts: Facts, level: int) -> list[str]:
     ]
 
 
-def _note(facts: Facts, level: int, found: LevelSummary) -> str:
+def _note(facts: ReportModel, level: int, found: LevelSummary) -> str:
     if found.cases and not found.tested:
         return f"Nothing was tested in {counted(found.cases, 'case')}."
     text = f"{counted(found.failures, 'failure')} in {counted(found.cases, 'case')}"
@@ -151,7 +151,7 @@ def _note(facts: Facts, level: int, found: LevelSummary) -> str:
     return text + "."
 
 
-def _unseen(facts: Facts, level: int, ball: EmptyBall) -> str:
+def _unseen(facts: ReportModel, level: int, ball: EmptyBall) -> str:
     """Return the largest ball that no case has entered, in a clause."""
     axes = facts.coordinates_of(level)
     spans = [(c, c.dimension.high - c.dimension.low) for c in axes]

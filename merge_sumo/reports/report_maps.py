@@ -16,9 +16,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.campaigns.truth import Truth
-from merge_sumo.reports.foretelling import Expected
-from merge_sumo.reports.surface import Grid, Surface, nodes
+from merge_sumo.analysis.surface import Grid, Surface, nodes
+from merge_sumo.studies.prediction_quality import Expected
+from merge_sumo.studies.truth import Truth
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import Scenario

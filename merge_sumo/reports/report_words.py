@@ -7,31 +7,31 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from merge_sumo.campaigns import repeats
-from merge_sumo.campaigns.avoidance import in_a_sentence
-from merge_sumo.campaigns.run import SETTINGS, TRAJECTORIES, Run
-from merge_sumo.campaigns.truth import TRUTH_CASES
-from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.drivers.vuts.output import LOG, end_of
-from merge_sumo.reports.diagnosis import (
+from merge_sumo.analysis.diagnosis import (
     BRAKED_MPS,
     MEANING,
 )
-from merge_sumo.reports.doubts import notes_on
-from merge_sumo.reports.foretelling import foretold_in_words
+from merge_sumo.analysis.plausibility import notes_on
+from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
+from merge_sumo.analysis.verdict import counted, in_words
+from merge_sumo.campaigns import repeats
+from merge_sumo.campaigns.run import SETTINGS, TRAJECTORIES, Run
+from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.reports.headline import Rule, after_words, avoidable_words, before_words, headline
-from merge_sumo.reports.report_facts import ERROR_CHARACTERS, LISTED, Facts
 from merge_sumo.reports.report_levels import Level, levels_of
-from merge_sumo.reports.surface import FEWEST_FAILURES, PLAUSIBLE
-from merge_sumo.reports.verdict import counted, in_words
+from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
+from merge_sumo.studies.avoidance import in_a_sentence
+from merge_sumo.studies.prediction_quality import foretold_in_words
+from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.printable import printable
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import meanings
+from merge_sumo.vuts.output import LOG, end_of
 
 
-def page_words(facts: Facts) -> dict[str, Any]:
+def page_words(facts: ReportModel) -> dict[str, Any]:
     """Return what the template needs for text and tables."""
     settings, summary = facts.run.settings, facts.summary
     criterion = facts.run.criterion
@@ -119,7 +119,7 @@ def _radii(levels: Sequence[Level]) -> str:
     )
 
 
-def _kinds(facts: Facts) -> list[dict[str, Any]]:
+def _kinds(facts: ReportModel) -> list[dict[str, Any]]:
     found = Counter(facts.kinds.values())
     avoidable = Counter(facts.kinds[o.index] for o in facts.worst if _avoidable_kind(facts, o))
     return [
@@ -133,7 +133,7 @@ def _kinds(facts: Facts) -> list[dict[str, Any]]:
     ]
 
 
-def _avoidance(facts: Facts) -> list[tuple[str, str]]:
+def _avoidance(facts: ReportModel) -> list[tuple[str, str]]:
     """Return by driver how many failures it avoids; nothing where that is not known."""
     known = list(facts.avoidance.values())
     if not known:
@@ -143,7 +143,7 @@ def _avoidance(facts: Facts) -> list[tuple[str, str]]:
     return [(name, f"{count} of {len(known)}") for name, count in counts.items()]
 
 
-def _avoidable_kind(facts: Facts, outcome: Outcome) -> bool:
+def _avoidable_kind(facts: ReportModel, outcome: Outcome) -> bool:
     return outcome.index in facts.kinds and bool(outcome.measures.avoidable)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.reports.coordinates import Coordinate, coordinates
+from merge_sumo.analysis.coordinates import Coordinate, coordinates
 from merge_sumo.values.case import Case
 
 LEFT: Final = 52.0

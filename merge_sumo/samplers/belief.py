@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit, logit
 
-from merge_sumo.samplers.base import LevelHistory
+from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import radius_for
@@ -124,7 +124,7 @@ class Belief:
         self._weights = np.exp(np.array(best) - max(best))
 
 
-class Trust:
+class Calibration:
     """How far P(fail) is to be trusted, near failures and far from them.
 
     Cases are picked where P(fail) is large, so among them it is too large more often than not.

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from merge_sumo.samplers.base import LevelHistory
 from merge_sumo.samplers.belief import Belief
+from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import radius_for
 

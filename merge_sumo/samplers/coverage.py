@@ -14,16 +14,17 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.samplers.allocation import even_shares
-from merge_sumo.samplers.base import LevelHistory, Sampler
-from merge_sumo.samplers.belief import Belief, Trust, gap_m, has_gaps
+from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.belief import Belief, Calibration, gap_m, has_gaps
 from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
-from merge_sumo.samplers.foresight import Record
+from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, greedy
-from merge_sumo.samplers.ground import Ground
-from merge_sumo.samplers.informed import FEWEST, informed_batch
+from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.samplers.prediction_skill import PredictionSkill
+from merge_sumo.samplers.twin_guided import FEWEST, informed_batch
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.foretold import Foretold
+from merge_sumo.values.prediction import Foretold
 from merge_sumo.values.scenario import DX_CRASH_M
 
 FIRST_BATCH: Final = 10
@@ -99,7 +100,7 @@ class CoverageSampler(Sampler):
         covered = 0.0
         for level in self.pool.levels:
             history = self.history(level)
-            ground = Ground(history.dims)
+            ground = CoverageGrid(history.dims)
             ground.cover(ground.balls(history.points[history.failed]), 1.0)
             covered += ground.covered_balls()
         return gain / covered if covered > 0.0 else np.inf
@@ -127,7 +128,7 @@ class CoverageSampler(Sampler):
                 return record.noted(_Search(history, rng, n).batch(n), play)
             return informed_batch(history, n, rng, play, record)
 
-    def _record(self, level: int, history: LevelHistory) -> Record:
+    def _record(self, level: int, history: LevelHistory) -> PredictionSkill:
         """Return what the games have been worth, by what all levels have seen."""
         last = self.told(level)[-REPLAYED:]
         replayed: dict[int, FloatArray] = {}
@@ -139,7 +140,7 @@ class CoverageSampler(Sampler):
         # What stands for a gap under another criterion has the limit of the paper's scenario.
         stands_in = any(outcome.margin is not None for outcome in told)
         limit_m = DX_CRASH_M if stands_in else self.pool.scenario.dx_crash_m
-        return Record(told, level, limit_m, replayed)
+        return PredictionSkill(told, level, limit_m, replayed)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: half of them evenly, the rest by the next gain.
@@ -161,9 +162,9 @@ class _Search:
 
     def __init__(self, history: LevelHistory, rng: np.random.Generator, n: int) -> None:
         failing = history.points[history.failed]
-        self._ground = Ground(history.dims)
+        self._ground = CoverageGrid(history.dims)
         self._ground.cover(self._ground.balls(failing), 1.0)
-        limit, trust = _limit(history), Trust(history)
+        limit, trust = _limit(history), Calibration(history)
         belief = Belief(history, limit)
         candidates = of_belief(history, belief, rng, n)
         probability, balls = trust.of(belief, candidates), self._ground.balls(candidates)

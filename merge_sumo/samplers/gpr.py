@@ -9,8 +9,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from merge_sumo.samplers.allocation import last_failure_share, softmax_shares
-from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler
-from merge_sumo.samplers.ground import Ground
+from merge_sumo.samplers.base import LevelwiseSampler
+from merge_sumo.samplers.coverage_grid import CoverageGrid
+from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.surrogate import most_telling
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.score import FAILURE_SCORE
@@ -99,7 +100,7 @@ class _Posterior:
         self._badness = badness + 1e-6
         self._variance = self._kernel.diag(queries) - np.square(self._explained).sum(axis=0)
         self._taken = np.zeros(len(queries), dtype=bool)
-        self._ground = Ground(queries.shape[1], fine=False)
+        self._ground = CoverageGrid(queries.shape[1], fine=False)
         self._ground.cover(self._ground.balls(failures), 1.0)
         self._balls = self._ground.balls(queries)
 

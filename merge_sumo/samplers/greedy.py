@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.samplers.ground import Ground
+from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.foretold import Foretold
+from merge_sumo.values.prediction import Foretold
 
 PICKED: Final = 0.8
 """Share of a pick's ball that counts as covered at least for the later picks of the batch."""
@@ -35,7 +35,7 @@ class Proposal:
 
 
 def greedy(
-    ground: Ground,
+    ground: CoverageGrid,
     points: FloatArray,
     aim: FloatArray,
     probability: FloatArray,

@@ -8,8 +8,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.annealing import AnnealingSampler
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.coverage import CoverageSampler
-from merge_sumo.samplers.foresight import Foreteller
 from merge_sumo.samplers.gpr import GprSampler
+from merge_sumo.samplers.prediction_skill import Foreteller
 from merge_sumo.samplers.subset import SubsetSampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.system.suggestions import meant

@@ -12,7 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.samplers.base import LevelHistory, LevelwiseSampler, reflect
+from merge_sumo.samplers.base import LevelwiseSampler, reflect
+from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.score import FAILURE_SCORE
 

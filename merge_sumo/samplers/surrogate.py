@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.special import log_ndtr, ndtr
 
-from merge_sumo.samplers.base import LevelHistory
+from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import FloatArray
 
 LEARN_FROM: Final = 150

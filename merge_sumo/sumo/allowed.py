@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from merge_sumo.sumo.received import Allowed, Values, is_number, matching, number
+from merge_sumo.road.received import Allowed, Values, is_number, matching, number
 from merge_sumo.values.scenario import VEHICLES
 
 

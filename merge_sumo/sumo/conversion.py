@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo import received
+from merge_sumo.road import received
+from merge_sumo.road.received import Allowed, matching, number
 from merge_sumo.sumo.binding import run_program, scratch_folder
-from merge_sumo.sumo.received import Allowed, matching, number
 from merge_sumo.system.printable import printable, quoted
 
 OSM: Final = ".osm"

@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 
 from lxml import etree
 
-from merge_sumo.sumo.corridor import Approach, Corridor, Piece
-from merge_sumo.sumo.netfile import Point
+from merge_sumo.road.corridor import Approach, Corridor, Piece
+from merge_sumo.road.netfile import Point
 
 COPY: Final = "@"
 """Stands in an id for the number of the copy."""

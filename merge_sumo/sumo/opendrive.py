@@ -11,9 +11,10 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo import allowed, received
+from merge_sumo.road import received
+from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import run_program, scratch_folder
-from merge_sumo.sumo.corridor import Corridor, LanePath
 
 NET: Final = "road.net.xml"
 ROAD: Final = "road.xodr"

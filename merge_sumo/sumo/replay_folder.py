@@ -17,13 +17,13 @@ from typing import Final
 
 from lxml import etree
 
-from merge_sumo.sumo import received
-from merge_sumo.sumo.corridor import Corridor, LanePath
-from merge_sumo.sumo.finder import find_corridor
+from merge_sumo.road import received
+from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.road.finder import find_corridor
+from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
+from merge_sumo.road.netfile import NetFile, Point
 from merge_sumo.sumo.hosting import hosted_net
-from merge_sumo.sumo.netfile import NetFile, Point
 from merge_sumo.sumo.replay_labels import COLOURS, INK, TEXT, Picture, labels_of
-from merge_sumo.sumo.road import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.system.folders import new_folder
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT
 from merge_sumo.values.score import Outcome

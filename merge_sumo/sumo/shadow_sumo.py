@@ -15,9 +15,10 @@ from typing import Any, Final, Self
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo import allowed, received
+from merge_sumo.road import received
+from merge_sumo.road.corridor import Corridor, LanePath, LanePoint, Piece
+from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import load_libsumo
-from merge_sumo.sumo.corridor import Corridor, LanePath, LanePoint, Piece
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
 NET: Final = "road.net.xml"

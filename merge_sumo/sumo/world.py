@@ -32,10 +32,10 @@ import numpy as np
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
-from merge_sumo.sumo.corridor import Corridor
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.sumo.road import road_of
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, US23, VEHICLES, VUT, Scenario
 

@@ -45,7 +45,7 @@ POOL_THREADS: Final = 4
 WORKER_THREADS: Final = 4
 """Those of a worker and of the process of a VUT, besides one for each core in NumPy."""
 DASK_TIMEOUT_S: Final = 30.0
-LOADED: Final = "merge_sumo.campaigns.ground"
+LOADED: Final = "merge_sumo.engine.simulator"
 """What a local worker is there for: loaded before it is asked to, and by its name alone."""
 
 T = TypeVar("T")

@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import Final, Unpack
 
 from merge_sumo import api
+from merge_sumo.analysis.coordinates import described
+from merge_sumo.analysis.verdict import NOTHING_TESTED
+from merge_sumo.api.results import CampaignRun
+from merge_sumo.api.setup import Setup
 from merge_sumo.campaigns.run import failures
-from merge_sumo.drivers.vuts.here import AnyVut
-from merge_sumo.reports.coordinates import described
 from merge_sumo.reports.motion import verdict_of
-from merge_sumo.reports.verdict import NOTHING_TESTED
-from merge_sumo.results import CampaignRun
 from merge_sumo.samplers import DEFAULT_SAMPLER
-from merge_sumo.setup import Setup
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
+from merge_sumo.vuts.in_memory import AnyVut
 
 DEFAULT_CASES: Final = 200
 """Cases of an assertion: seconds for a controller that answers at once."""

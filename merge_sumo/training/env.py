@@ -21,19 +21,19 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from merge_sumo.campaigns.ground import road_for
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, actions_mps2
 from merge_sumo.drivers.policies import load_driver
-from merge_sumo.drivers.units import Units
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.world import World
 from merge_sumo.training.game import Role, of_two
 from merge_sumo.training.reward import Reward, RewardWeights, pov_reward
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import POV, SVO, US23, VUT, Scenario
+from merge_sumo.values.scenario_scale import Units
 
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])

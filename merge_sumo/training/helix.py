@@ -21,7 +21,6 @@ from typing import Any, Final
 
 from safetensors.numpy import save
 
-from merge_sumo.campaigns.ground import road_for
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import (
     MANIFEST,
@@ -32,8 +31,9 @@ from merge_sumo.drivers.policies import (
     scenario_of,
     scenario_record,
 )
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.corridor import Corridor
+from merge_sumo.road.corridor import Corridor
 from merge_sumo.system.folders import (
     NO_LINK,
     cannot_write,

@@ -16,9 +16,9 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.units import Units
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, US23, Scenario
+from merge_sumo.values.scenario_scale import Units
 
 FULL_GAP_M: Final = 45.0
 """In the paper's scenario a gap is full when it is this much wider than one that is not critical:

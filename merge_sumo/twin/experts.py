@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.twin.watching import Inputs
+from merge_sumo.twin.observation import Inputs
 from merge_sumo.values.case import FloatArray
 
 GROUPS: Final = 4
@@ -29,7 +29,7 @@ class Steps:
     """What the VUT saw and did in the steps of one case.
 
     Attributes:
-        inputs: see `Watcher`, (T, inputs); those of the present are the first `now`.
+        inputs: see `Observation`, (T, inputs); those of the present are the first `now`.
         now: how many these are.
         a_mps2: what it did, (T,).
         own: whether it was this VUT, and not one whose campaign is learned from.

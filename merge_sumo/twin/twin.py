@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.povs import Povs
+from merge_sumo.engine.povs import Povs
 from merge_sumo.twin.experts import GROUPS, Expert, Steps
-from merge_sumo.twin.playing import Games
-from merge_sumo.twin.watching import Inputs, Watcher
+from merge_sumo.twin.observation import Inputs, Observation
+from merge_sumo.twin.rollout import TwinRollout
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
@@ -50,7 +50,7 @@ class Twin:
         `others` are motions, (T + 1, A, 3), of campaigns that are learned from.
         """
         self._pool, self._seed = pool, seed
-        self._games = Games(pool, povs, criterion, lines)
+        self._games = TwinRollout(pool, povs, criterion, lines)
         self._batch: dict[int, int] = {}
         self._steps: dict[int, Steps] = {}
         self._others = self._watched(others, own=False)
@@ -158,7 +158,7 @@ class Twin:
         for place, motion in enumerate(motions):
             together[: len(motion), ..., place] = motion
             together[len(motion) :, ..., place] = motion[-1, ..., :]
-        watcher = Watcher(self._pool.scenario, len(motions))
+        watcher = Observation(self._pool.scenario, len(motions))
         last = np.zeros(len(motions))
         seen = []
         for x_v_a in together[:-1]:

@@ -18,9 +18,9 @@ import numpy as np
 from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
-from merge_sumo.values.foretold import Foretold
 from merge_sumo.values.former import take_from_0_1
 from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
+from merge_sumo.values.prediction import Foretold
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.severity import Severity, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason

@@ -1,0 +1,1 @@
+"""Pure functions of the outcomes of a campaign."""

@@ -1,0 +1,276 @@
+"""The verdict on a campaign: what ran without a result, why, and whether a gate is met.
+
+A case is tested when the VUT reaches the merge point: there it fails or not. An error (of the
+VUT or of the simulation) and a timeout say nothing about merging, so they come first wherever a
+campaign is shown, and a campaign in which no case was tested has passed nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from merge_sumo.analysis.summary import Summary
+from merge_sumo.errors import UserError
+from merge_sumo.system.printable import printable
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.severity import Severity
+from merge_sumo.values.trajectory import End
+
+ERRORS: Final = {End.VUT_ERROR: "a VUT error", End.SIM_ERROR: "an error of the simulation"}
+"""Ends of an episode that went wrong, in words."""
+MESSAGE_CHARACTERS: Final = 300
+"""Of a message that is shown; `outcomes.jsonl` has the whole."""
+MOST_MESSAGES: Final = 5
+"""Messages of errors and timeouts that are printed; the report has the others."""
+QUOTED_CHARACTERS: Final = 120
+"""Of a message within a sentence."""
+NOTHING_TESTED: Final = "nothing was tested: the VUT reached the merge point in no case"
+_VARYING: Final = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)")
+"""Measured values and addresses: messages that differ in them alone are one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """Cases that ended without a test, in the same way.
+
+    Attributes:
+        end: VUT_ERROR, SIM_ERROR or TIMEOUT.
+        message: what the first of them says, on one line, without characters that do not print.
+        cases: their indices, ascending.
+    """
+
+    end: End
+    message: str
+    cases: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of cases."""
+        return len(self.cases)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it: how many cases, and the first of them."""
+        return {
+            "end": self.end.value,
+            "message": self.message,
+            "cases": self.count,
+            "example": self.cases[0],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of the cases of a campaign.
+
+    Attributes:
+        cases: cases that ran.
+        failures: cases that fail under the criterion.
+        contacts: failures in which bodies touch.
+        errors: cases that ended as VUT_ERROR or SIM_ERROR.
+        timeouts: cases in which the VUT never reached the merge point.
+        troubles: errors and timeouts by message: errors first, then the most frequent.
+    """
+
+    cases: int
+    failures: int
+    contacts: int
+    errors: int
+    timeouts: int
+    troubles: tuple[Trouble, ...]
+
+    @property
+    def tested(self) -> int:
+        """Cases in which the VUT reached the merge point."""
+        return self.cases - self.errors - self.timeouts
+
+    @property
+    def counts(self) -> str:
+        """Return the result in a line: errors and timeouts, where there are any, then failures."""
+        found = in_counts(self.errors, self.timeouts, self.failures)
+        contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
+        return f"{in_words(found)}{contacts} in {counted(self.cases, 'case')}"
+
+    @property
+    def sentences(self) -> list[str]:
+        """Return what went wrong, and how often; empty where every case was tested."""
+        said = []
+        for end, name in ERRORS.items():
+            groups = [trouble for trouble in self.troubles if trouble.end is end]
+            if groups:
+                number = sum(trouble.count for trouble in groups)
+                most = groups[0]
+                some = "" if len(groups) == 1 else f", {most.count} of them"
+                said.append(
+                    f"{self._cases(number)} ended in {name}{some}: "
+                    f"“{shortened(most.message, QUOTED_CHARACTERS)}”."
+                )
+        if self.timeouts:
+            there = "" if self.timeouts == self.cases else "there "
+            said.append(
+                f"{self._cases(self.timeouts)} timed out: {there}the VUT never reached the "
+                "merge point."
+            )
+        if self.cases and not self.tested:
+            said.append("Nothing was tested.")
+        return said
+
+    def trouble_lines(self) -> list[str]:
+        """Return what ended in an error or a timeout, by message; empty where nothing did."""
+        said = [
+            f"  {trouble.count} {trouble.end}, the first in case {trouble.cases[0]}: "
+            f"{trouble.message}"
+            for trouble in self.troubles[:MOST_MESSAGES]
+        ]
+        others = self.troubles[MOST_MESSAGES:]
+        if others:
+            number = sum(trouble.count for trouble in others)
+            said.append(f"  {number} with {len(others)} other messages")
+        return said
+
+    def _cases(self, number: int) -> str:
+        if number < self.cases:
+            return f"{number} of {self.cases} cases"
+        return "The only case" if self.cases == 1 else f"All {self.cases} cases"
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what JSON shows of contacts, errors and timeouts."""
+        return {
+            "contacts": self.contacts,
+            "errors": self.errors,
+            "timeouts": self.timeouts,
+            "troubles": [trouble.to_record() for trouble in self.troubles],
+        }
+
+
+def judge(outcomes: Iterable[Outcome]) -> Verdict:
+    """Return the verdict on outcomes."""
+    cases = failures = contacts = errors = timeouts = 0
+    groups: dict[tuple[End, str], tuple[str, list[int]]] = {}
+    for outcome in outcomes:
+        cases += 1
+        measures = outcome.measures
+        failures += outcome.failed
+        contacts += outcome.failed and measures.severity == Severity.CONTACT
+        if outcome.is_tested:
+            continue
+        errors += measures.end.is_error
+        timeouts += not measures.end.is_error
+        message = message_of(measures)
+        key = measures.end, _VARYING.sub("#", message)
+        groups.setdefault(key, (message, []))[1].append(outcome.index)
+    troubles = [
+        Trouble(end, message, tuple(indices)) for (end, _), (message, indices) in groups.items()
+    ]
+    troubles.sort(key=lambda t: (not t.end.is_error, -t.count, t.cases[0]))
+    return Verdict(cases, failures, contacts, errors, timeouts, tuple(troubles))
+
+
+def message_of(measures: Measures) -> str:
+    """Return why a case was not tested, on one line and fit to be shown anywhere."""
+    if measures.error is not None:
+        # Cut before it is escaped: a message may have megabytes.
+        return shortened(printable(measures.error[: MESSAGE_CHARACTERS + 1]), MESSAGE_CHARACTERS)
+    if measures.end.is_error:
+        return "no reason given"
+    return f"the VUT did not reach the merge point in {measures.t_end_s:g} s"
+
+
+def shortened(text: str, characters: int) -> str:
+    """Return a text, or its beginning where it is longer."""
+    return text if len(text) <= characters else text[: characters - 3] + "..."
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def in_counts(errors: int, timeouts: int, failures: int) -> list[str]:
+    """Return the numbers in words: errors and timeouts only where there are any, then failures."""
+    wrong = [counted(n, what) for n, what in ((errors, "error"), (timeouts, "timeout")) if n]
+    return [*wrong, counted(failures, "failure")]
+
+
+def in_words(parts: Sequence[str]) -> str:
+    """Return a list in words: a, b and c."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """What a campaign must not show: more than `above` of something.
+
+    Attributes:
+        what: "failures", "errors", "timeouts" (a number of cases) or "fmc" (at some POV level).
+        above: the gate is met beyond this.
+    """
+
+    what: str
+    above: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """The gate as it is written."""
+        return f"{self.what}>{self.above}" if self.what == "fmc" else self.what
+
+    def check(self, verdict: Verdict, summary: Summary) -> GateResult:
+        """Return whether a campaign meets the gate, and what it shows."""
+        if self.what == "fmc":
+            level, most = max(
+                ((level, found.fmc) for level, found in summary.levels.items()),
+                key=lambda pair: pair[1],
+                default=(0, 0.0),
+            )
+            said = f"FMC {most:.4f} at level {level_name(level)}"
+            return GateResult(self.name, most > self.above, said)
+        number: int = getattr(verdict, self.what)
+        return GateResult(self.name, number > 0, counted(number, self.what.removesuffix("s")))
+
+
+@dataclass(frozen=True, slots=True)
+class GateResult:
+    """Whether a campaign meets a gate, and what it shows."""
+
+    name: str
+    met: bool
+    found: str
+
+    @property
+    def sentence(self) -> str:
+        """Return it as a line."""
+        return f"gate {self.name}: {'met' if self.met else 'not met'} ({self.found})"
+
+
+def parse_gates(texts: Iterable[str]) -> list[Gate]:
+    """Return the gates that `--gate` names, each once; `UserError` for what is none."""
+    gates: dict[str, Gate] = {}
+    for text in texts:
+        gate = _parse_gate(text)
+        gates[gate.name] = gate
+    return list(gates.values())
+
+
+def _parse_gate(text: str) -> Gate:
+    if text in ("failures", "errors", "timeouts"):
+        return Gate(text)
+    what, sign, number = (part.strip() for part in text.partition(">"))
+    if (what, sign) != ("fmc", ">"):
+        raise UserError(
+            f"there is no gate {printable(text)!r}: choose failures, errors, timeouts or "
+            '"fmc>X" (in quotes, or the shell takes the ">")'
+        )
+    try:
+        above = float(number)
+    except ValueError:
+        above = math.nan
+    if not 0.0 <= above < 1.0:
+        raise UserError(
+            f'the gate {printable(text)!r} can never be told: X of "fmc>X" is a number from 0 to '
+            "below 1"
+        )
+    return Gate("fmc", above)

@@ -1,0 +1,134 @@
+"""One case on its own: the same world, drivers and verdict as in a campaign."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any, Final
+
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.engine.simulator import SimulationPlan
+from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.sumo.live import Window
+from merge_sumo.sumo.replay_labels import case_line, verdict_line
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import Scenario, level_name
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import Trajectory
+
+DEBUG_DEADLINE_S: Final = 86_400.0
+"""A person at a breakpoint takes their time."""
+FIELDS: Final = {
+    "x_pov0_m": "--x",
+    "v_pov0_mps": "--v",
+    "svo_rad": "--psi",
+    "v_vut0_mps": "--v-vut0",
+    "headway_ahead_s": "--headway-ahead",
+    "headway_behind_s": "--headway-behind",
+}
+"""Fields of a case that a person gives, by their names in `Case`, and the option of each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A case that was run: its outcome, and what happened."""
+
+    outcome: Outcome
+    trajectory: Trajectory
+
+
+def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
+    """Return the case of a scenario with values by the names of its fields.
+
+    Raises `UserError` for a coordinate of the pool that is missing, for one that the pool at this
+    level does not have, and for values with which the scenario cannot be set up.
+    """
+    given: dict[str, float] = {}
+    for name, value in values.items():
+        try:
+            given |= {} if value is None else {name: float(value)}
+        except (TypeError, ValueError):
+            raise UserError(f"{name} is {value!r}: it must be a number") from None
+    fixed = scenario.v_vut0_mps
+    if isinstance(fixed, float):
+        given.setdefault("v_vut0_mps", fixed)
+    for dimension in scenario.dimensions(level):
+        if dimension.field not in given:
+            raise UserError(
+                f"{FIELDS[dimension.field]} ({dimension.field}) is missing: the pool has "
+                f"{dimension.low:g} to {dimension.high:g}"
+            )
+    known = {"v_vut0_mps", *(dimension.field for dimension in scenario.dimensions(level))}
+    for name in given.keys() - known:
+        raise UserError(
+            f"{FIELDS.get(name, name)} ({name}) is none of the coordinates of {scenario.name} at "
+            f"level {level_name(level)}: leave it out"
+        )
+    return Case(level=level, scenario=scenario, **given)
+
+
+def settings_and_case(
+    recorded: tuple[Run, int] | None,
+    level: int,
+    values: Mapping[str, Any],
+    given: Mapping[str, Any],
+    *,
+    trust: bool = False,
+) -> tuple[CampaignSettings, Case]:
+    """Return how a case is to be run, and the case.
+
+    Args:
+        recorded: a case of a campaign, (run, index): what is not given is as there.
+        level: its POV level.
+        values: coordinates of the case, by the names of their fields.
+        given: settings, by their names in `CampaignSettings`.
+        trust: run the controller that a folder names although it may be a stranger's.
+
+    Raises `UserError` as `case_of` and `CampaignSettings` do.
+    """
+    given = {**given, "levels": (level,), "cases": 1, "batch": 1, "sampler": "uniform"}
+    if recorded is None:
+        settings = CampaignSettings(**given)
+        return settings, case_of(settings.scenario, level, values)
+    run, index = recorded
+    before = run.outcome(index).case
+    if "vut" in given:
+        given.setdefault("vut_command", None)  # the command was that of the VUT that was
+    given.setdefault("stop_after_converged", None)
+    settings = settings_of(run.folder, run.settings, given, trust=trust)
+    dimensions = settings.scenario.dimensions(level)
+    kept = {name: getattr(before, name) for name in ("v_vut0_mps", *(d.field for d in dimensions))}
+    return settings, case_of(settings.scenario, level, {**kept, **values})
+
+
+def run_one(
+    plan: SimulationPlan,
+    case: Case,
+    *,
+    live: bool = False,
+    on_end: Callable[[Ended], None] = lambda _: None,
+) -> Ended:
+    """Run one case in SUMO; its outcome is that of the same case in a campaign.
+
+    With `live` sumo-gui shows it while it runs, in real time, and its last picture stays until a
+    person closes the window; `on_end` is told before that. Raises `UserError` when the window is
+    closed while the case runs.
+    """
+    with (
+        Window() if live else nullcontext() as window,
+        plan.open(window) as ground,
+    ):
+        if window is not None:
+            window.write(case_line(case))
+        episodes = ground.run([case])
+        _, trajectory = next(episodes)
+        lines = centre_lines(plan.net)
+        ended = Ended(plan.criterion.outcome(0, 0, trajectory, lines), trajectory)
+        on_end(ended)
+        if window is not None:
+            window.write(verdict_line(ended.outcome))
+            window.wait()  # before the corridor is made ready for the next case
+    return ended

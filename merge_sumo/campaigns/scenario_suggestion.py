@@ -1,0 +1,155 @@
+"""What a road suggests for a scenario on it, and what to know of a scenario before it is run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
+from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.values.scenario import US23, V_VUT0_MPS, Scenario
+from merge_sumo.values.scenario_scale import Units
+
+MARGIN: Final = 0.15
+"""The pool reaches this far beyond the starts from which both vehicles meet at M."""
+SLOWEST: Final = 0.7
+"""Of the speed limit: the mainline drives at least so fast."""
+ROOM: Final = 0.98
+"""Of the length of a path that is used."""
+
+
+def suggested(road: Corridor, name: str) -> Scenario:
+    """Return a scenario for a road: limits and lengths from the road, the rest as in the paper.
+
+    The VUT starts as far from M as in the paper, or as the ramp allows; the POV where, at some
+    speed that the mainline drives at, it is at M about when a VUT on the level-0 profile is.
+    """
+    limit_mps = min(limit_at(road.mainline, -1.0), US23.v_hw_max_mps)
+    x_vut0_m = max(US23.x_vut0_m, _down(-ROOM * road.ramp.before_m))
+    v_vut0_mps = round(min(V_VUT0_MPS, limit_at(road.ramp, x_vut0_m)), 1)
+    level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
+    due_s = float(
+        level0_time_to(np.array(-x_vut0_m), np.array(v_vut0_mps), v_cruise_mps=level0_v_mps)
+    )
+    slow, fast = round(SLOWEST * limit_mps, 1), round(limit_mps, 1)
+    low = max(-fast * due_s * (1.0 + MARGIN), -ROOM * road.mainline.before_m)
+    high = max(-slow * due_s * (1.0 - MARGIN), low / 2.0)
+    return replace(
+        US23,
+        name=name,
+        net=road.path.name,
+        mainline=road.mainline_edges,
+        ramp=road.ramp_edges,
+        x_pov0_m=(_down(low), _down(high)),
+        v_pov0_mps=(slow, fast),
+        x_vut0_m=x_vut0_m,
+        v_vut0_mps=v_vut0_mps,
+        v_hw_min_mps=slow,
+        v_hw_max_mps=fast,
+        v_min_mps=round(min(US23.v_min_mps, 0.5 * v_vut0_mps), 1),
+        level0_v_mps=level0_v_mps,
+        reach_m=max(US23.reach_m, float(math.ceil(-low))),
+    )
+
+
+def _down(x_m: float) -> float:
+    return math.ceil(x_m * 10.0) / 10.0
+
+
+def limit_at(path: LanePath, x_m: float) -> float:
+    """Return the speed limit at a coordinate of a path."""
+    found = [limit for start_m, limit in path.speed_limits_mps() if start_m <= x_m]
+    return found[-1] if found else path.speed_limits_mps()[0][1]
+
+
+def about(road: Corridor) -> list[str]:
+    """Return what was found of a road, in lines."""
+    lines = [f"net: {road.path.name}"]
+    for name, path, edges in (
+        ("mainline", road.mainline, road.mainline_edges),
+        ("ramp", road.ramp, road.ramp_edges),
+    ):
+        limits = ", ".join(
+            f"{limit:g} m/s from {max(start_m, -path.before_m):.0f} m"
+            for start_m, limit in path.speed_limits_mps()
+            if start_m < 0.0
+        )
+        lines.append(f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; limits: {limits}")
+    m = road.lane_point(0.0, on_ramp=True)
+    lines.append(f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), junction {road.junction_type}")
+    first = "ramp" if road.mainline_approach.yields else "mainline"
+    yields = road.mainline_approach.yields or road.ramp_approach.yields
+    lines.append(f"right of way: the {first} goes first" if yields else "right of way: none first")
+    if road.lane_drop:
+        lines.append("one path comes to M on a lane that ends")
+    return lines
+
+
+ALIKE: Final = 0.25
+"""What a number may differ from those of training, as a share of them, and a range be exceeded by,
+as a share of its width. In random scenarios as near as this the shipped POV-1 and VUT-1 had a mean
+regret of up to 4 % and collided nowhere avoidably; farther away, of up to 136 %."""
+
+
+def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
+    """Return in what a scenario lies outside of what the learned drivers were trained on.
+
+    `policies` is the folder of these drivers, by default of the shipped ones for the scenario. They
+    measure in the units of the scenario that they play, so what counts is what its numbers are like
+    in the one that they were trained for. Outside, levels 1 and 2 are extrapolations.
+    """
+    folder = policies or policies_of(scenario)
+    trained = {scenario_of(entry) for entry in read_manifest(folder).values()}
+    if not trained:
+        return [f"{folder} has no learned drivers"]
+    found = [sentence for known in trained for sentence in _differences(scenario, known)]
+    return list(dict.fromkeys(found))
+
+
+def _differences(scenario: Scenario, trained: Scenario) -> list[str]:
+    """Return the numbers of a scenario that are not like those of training, in sentences."""
+    unit, known = Units.of(scenario), Units.of(trained)
+    length, speed, gap = (
+        getattr(known, name) / getattr(unit, name) for name in ("length", "speed", "gap")
+    )
+    time = known.time / unit.time
+    slowest = trained.v_hw_min_mps, scenario.v_hw_min_mps
+    pool = trained.v_pov0_mps[1] - trained.v_pov0_mps[0]
+    sentences = []
+
+    def compare(name: str, low: float, high: float, margin: float) -> None:
+        known_low, known_high = trained.bounds(name)
+        if low < known_low - margin or high > known_high + margin:
+            sentences.append(
+                f"{name} {_range(*scenario.bounds(name))} is like {_range(low, high)} in "
+                f"{trained.name} (trained on {_range(known_low, known_high)})"
+            )
+
+    low, high = (length * x for x in scenario.x_pov0_m)
+    compare("x_pov0_m", low, high, ALIKE * (trained.x_pov0_m[1] - trained.x_pov0_m[0]))
+    for name in ("v_pov0_mps", "v_vut0_mps"):
+        low, high = (slowest[0] + speed * (v - slowest[1]) for v in scenario.bounds(name))
+        compare(name, low, high, ALIKE * pool)
+    for name, factor in (
+        ("v_hw_min_mps", speed),
+        ("v_hw_max_mps", speed),
+        ("v_min_mps", speed),
+        ("a_min_mps2", speed / time),
+        ("a_max_mps2", speed / time),
+        ("level0_a_mps2", speed / time),
+        ("ttc_min_s", time),
+        ("dx_crash_m", length),
+        ("dx_critical_m", gap),
+    ):
+        like = factor * getattr(scenario, name)
+        compare(name, like, like, ALIKE * abs(getattr(trained, name)))
+    return sentences
+
+
+def _range(low: float, high: float) -> str:
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"

@@ -1,0 +1,55 @@
+"""K corridors that are moved by the paper's equations of motion alone, without SUMO.
+
+SUMO holds the same state to 1e-9 m (`sumo/world.py` checks that in every step), so an episode ends
+in the same way. It is for drivers of the package, which need nothing of SUMO.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.sumo.world import PARKING_M
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import DT_S, Scenario
+
+
+class EquationWorld:
+    """The state of the vehicles in `corridors` independent corridors, by eq. (4).
+
+    `x_m` and `v_mps` have shape (A, corridors), as those of a `World`.
+    """
+
+    def __init__(self, corridors: int, road: Corridor, scenario: Scenario) -> None:
+        """Park the vehicles of a scenario on a road."""
+        self.corridors, self.road, self.scenario = corridors, road, scenario
+        self.vehicles = scenario.vehicles
+        self.x_m: FloatArray = np.full((self.vehicles, corridors), -PARKING_M)
+        self.v_mps: FloatArray = np.zeros((self.vehicles, corridors))
+
+    def restart(self) -> None:
+        """Park all vehicles."""
+        self.x_m, self.v_mps = np.full_like(self.x_m, -PARKING_M), np.zeros_like(self.v_mps)
+
+    def place(
+        self, corridor: int, starts: Sequence[tuple[float, float]], *, own: bool = False
+    ) -> None:
+        """Put the vehicles of a corridor where an episode starts.
+
+        `starts` are (x in m, v in m/s) in the order of rows. `own` is for a `World` alone.
+        """
+        self.x_m[:, corridor], self.v_mps[:, corridor] = np.transpose(starts)
+
+    def park(self, corridor: int) -> None:
+        """Put the vehicles of a corridor aside, at a stand before M."""
+        self.x_m[:, corridor], self.v_mps[:, corridor] = -PARKING_M, 0.0
+
+    def advance(self) -> None:
+        """Do nothing: `command` makes the whole step."""
+
+    def command(self, a_mps2: FloatArray) -> None:
+        """Move all vehicles by one step of eq. (4) with accelerations, (A, corridors)."""
+        self.x_m = self.x_m + self.v_mps * DT_S
+        self.v_mps = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)

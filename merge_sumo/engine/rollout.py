@@ -1,0 +1,395 @@
+"""From cases to trajectories: two drivers in the SUMO world, or by eq. (4) alone."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
+from merge_sumo.drivers.following import Following, keep_behind_vut
+from merge_sumo.engine.kinematic_world import EquationWorld
+from merge_sumo.sumo.world import SimulationError, World
+from merge_sumo.system.blame import Blame
+from merge_sumo.system.pulse import Pulse
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
+from merge_sumo.values.signals import Left, series
+from merge_sumo.values.trajectory import End, Trajectory
+
+RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
+"""Rows of the record: an episode is copied out before its first row is written over."""
+
+
+ROUNDING_MPS2: Final = 1e-9
+"""An answer this little outside the limits is a rounding error, not a wish for more."""
+
+WRONGS: Final = (Exception, SystemExit)
+"""A black box may raise anything; only a person's own interruption is not its doing."""
+
+OF_THE_POV: Final = "the POV: "
+"""Begins the reason of an error that is the doing of a POV."""
+
+MOST_PAUSES: Final = 2
+"""So often an error of an episode is put down to this process having been stopped."""
+
+END_OF_ROAD_M: Final = 20.0
+"""No vehicle is followed up to where the road ends."""
+
+NEVER: Final = 2**62
+"""The step at which a corridor without an episode times out."""
+
+
+@dataclass(slots=True)
+class _Episode:
+    """What runs in a corridor."""
+
+    index: int
+    case: Case
+    first_row: int
+    merge_row: int | None = None
+    """The row in which the VUT is at M, where it goes on behind M."""
+    clipped: int = 0
+    """Answers that were clipped before M."""
+    left: list[tuple[int, Left]] = field(default_factory=list)
+    """Signals, by the row of the episode at which the VUT left them."""
+
+
+def rollout(
+    world: World | EquationWorld,
+    pov: Driver,
+    vut: Driver,
+    cases: Iterable[Case],
+    ran_again: set[int] | None = None,
+) -> Iterator[tuple[int, Trajectory]]:
+    """Run cases in the world; yield (place in `cases`, trajectory) as the episodes end.
+
+    `pov` drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
+
+    Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
+    episode does not depend on the number of corridors nor on its neighbours. What the VUT does
+    wrong ends its episode as VUT_ERROR, what the POV does wrong as SIM_ERROR; where that took the
+    memory of the others' controllers with it, they begin anew. When SUMO fails, the episodes that
+    were running end as SIM_ERROR, SUMO is started again, and the others go on.
+
+    `system/blame.py` says whose doing a death is; an error that comes when this process was stopped
+    is nobody's. `ran_again` is told the places of cases that ran again alone, or because of a stop,
+    and were not to blame.
+    """
+    return _Rollout(world, pov, vut, cases, ran_again).run()
+
+
+class _Rollout:
+    def __init__(
+        self,
+        world: World | EquationWorld,
+        pov: Driver,
+        vut: Driver,
+        cases: Iterable[Case],
+        ran_again: set[int] | None = None,
+    ) -> None:
+        corridors, vehicles = world.corridors, len(world.x_m)
+        self.world, self.pov, self.vut = world, pov, vut
+        self.mainline = [row for row in range(vehicles) if row != VUT]
+        self.following = Following(corridors) if len(self.mainline) > 1 else None
+        self.queue = enumerate(cases)
+        self.again: deque[tuple[int, Case]] = deque()
+        """Episodes that have to begin anew through no fault of theirs."""
+        self.suspects: deque[tuple[int, Case]] = deque()
+        """Those that may have been at fault: each runs alone, so that a second loss is its own."""
+        self.quarantine = False
+        """Whether a suspect runs alone."""
+        self.blame = Blame[tuple[int, End]]()
+        self.ran_again = set() if ran_again is None else ran_again
+        self.struck = set[int]()
+        """Those that ran when something died of which nobody knows whose doing it was."""
+        self.pulse = Pulse()
+        self.pauses = 0
+        self.excused: Counter[int] = Counter()
+        """How often the error of an episode was put down to a pause, by its index."""
+        self.episodes: list[_Episode | None] = [None] * corridors
+        self.active = np.zeros(corridors, dtype=bool)
+        self.step = np.zeros(corridors, dtype=np.int64)
+        self.clipped = np.zeros(corridors, dtype=np.int64)
+        self.errors: dict[int, tuple[End, str]] = {}
+        self.raised: str | None = None
+        """What the VUT raised instead of its last answer."""
+        self.a_min = np.zeros((vehicles, corridors))
+        self.a_max = np.zeros((vehicles, corridors))
+        self.timeout_at = np.full(corridors, NEVER)
+        """Rows of the record at which episodes time out."""
+        self.next_timeout = NEVER
+        # One row per step of the world, shared by all corridors: x, v, a of every vehicle.
+        self.follow_steps = round(world.scenario.follow_up_s / DT_S)
+        self.ring = RING_ROWS + self.follow_steps
+        self.record = np.zeros((self.ring, vehicles, 3, corridors))
+        self.row = 0
+        self.now = self.record[0]
+        """The row of this step."""
+
+    def run(self) -> Iterator[tuple[int, Trajectory]]:
+        with self.pulse:
+            yield from self.episodes_as_they_end()
+        self.ran_again |= self.struck
+
+    def episodes_as_they_end(self) -> Iterator[tuple[int, Trajectory]]:
+        world, everywhere = self.world, range(self.world.corridors)
+        self.refill(everywhere)
+        while self.next_timeout < NEVER:  # as long as an episode runs
+            self.observe()
+            try:
+                world.advance()
+                world.command(self.ask_drivers())
+            except VutLostError as lost:
+                yield from self.begin_anew(lost, paused=self.was_paused())
+                continue
+            except SimulationError as error:
+                for corridor in np.flatnonzero(self.active).tolist():
+                    yield self.finish(corridor, End.SIM_ERROR, f"SUMO failed: {error}")
+                world.restart()
+                self.errors.clear()
+                self.refill(everywhere)
+                continue
+            if self.errors and self.was_paused() and self.excuse():
+                continue
+            self.step += 1
+            arrived = world.x_m[VUT] >= 0.0
+            # In most steps no episode ends. Idle corridors stand before M.
+            if np.count_nonzero(arrived) or self.row >= self.next_timeout or self.errors:
+                ended = arrived | (self.row >= self.timeout_at)
+                ended[list(self.errors)] = True
+                corridors = np.flatnonzero(ended).tolist()
+                if self.follow_steps:
+                    corridors = [corridor for corridor in corridors if not self.goes_on(corridor)]
+                for corridor in corridors:
+                    if corridor in self.errors:
+                        yield self.finish(corridor, *self.errors.pop(corridor))
+                    else:
+                        yield self.finish(
+                            corridor, End.MERGED if arrived[corridor] else End.TIMEOUT
+                        )
+                self.refill(corridors)
+
+    def goes_on(self, corridor: int) -> bool:
+        """Return whether an episode goes on behind M; note where that begins."""
+        episode, x_m = self.episodes[corridor], self.world.x_m[:, corridor]
+        assert episode is not None, "only running episodes go on"  # noqa: S101
+        if corridor in self.errors or x_m[VUT] < 0.0:
+            return False
+        if episode.merge_row is None:
+            episode.merge_row, episode.clipped = self.row, int(self.clipped[corridor])
+            self.timeout_at[corridor] = self.row + self.follow_steps
+            self.next_timeout = int(self.timeout_at.min())
+        on_the_road = bool(x_m.max() < self.world.road.mainline.after_m - END_OF_ROAD_M)
+        return self.row < self.timeout_at[corridor] and on_the_road
+
+    def was_paused(self) -> bool:
+        """Return whether this process was stopped since this was asked before."""
+        before, self.pauses = self.pauses, self.pulse.pauses()
+        return self.pauses > before
+
+    def excuse(self) -> bool:
+        """Begin what runs anew after a pause, unless that was done for all who have an error."""
+        running = self.running()
+        wrong = {running[corridor].index for corridor in self.errors}
+        if all(self.excused[index] >= MOST_PAUSES for index in wrong):
+            return False
+        self.excused.update(wrong)
+        self.ran_again |= wrong
+        self.again += [(episode.index, episode.case) for episode in running.values()]
+        self.begin_others()
+        return True
+
+    def running(self) -> dict[int, _Episode]:
+        """Return the episodes that run, by corridor."""
+        episodes = enumerate(self.episodes)
+        return {k: e for k, e in episodes if e is not None and self.active[k]}
+
+    def begin_anew(self, lost: VutLostError, *, paused: bool) -> Iterator[tuple[int, Trajectory]]:
+        """Start over what was running; yield the episode that is known to be at fault, if any."""
+        running = self.running()
+        alone = len(running) == 1
+        end, reason = End.VUT_ERROR, lost.reason
+        if isinstance(lost, PovLostError):
+            end, reason = End.SIM_ERROR, OF_THE_POV + lost.reason
+        named = None if lost.corridor is None else lost.corridor % self.world.corridors
+        guilty = next(iter(running)) if alone else named if named in running else None
+        for corridor, episode in running.items():
+            if guilty is not None and corridor != guilty:
+                self.again.append((episode.index, episode.case))
+            elif self.blame.died(
+                (episode.index, end),
+                alone=alone,
+                named=guilty is not None,
+                repeatable=lost.final and not paused,
+                killed=lost.killed,
+            ):
+                self.ran_again.discard(episode.index)
+                self.struck.clear()
+                yield self.finish(corridor, end, reason)
+            else:
+                (self.struck if guilty is None else self.ran_again).add(episode.index)
+                self.suspects.append((episode.index, episode.case))
+        self.begin_others()
+
+    def begin_others(self) -> None:
+        """Leave what was running, and begin what is to run now."""
+        self.errors.clear()
+        self.active[:] = False
+        self.quarantine = bool(self.suspects)
+        self.refill(range(self.world.corridors))
+
+    def refill(self, corridors: Iterable[int]) -> None:
+        """Begin the next episodes in corridors whose own have ended."""
+        if self.quarantine:  # nothing else runs
+            self.quarantine = bool(self.suspects)
+            corridors = range(self.world.corridors)
+        for corridor in corridors:
+            self.active[corridor] = False
+        for corridor in corridors:
+            self.begin(corridor, *self.next_case())
+        self.next_timeout = int(self.timeout_at.min())
+
+    def next_case(self) -> tuple[int, Case | None]:
+        """Return what is to run next; None where a corridor is to stay empty."""
+        if self.quarantine:
+            return (-1, None) if self.active.any() else self.suspects.popleft()
+        if self.again:
+            return self.again.popleft()
+        return next(self.queue, (-1, None))
+
+    def begin(self, corridor: int, index: int, case: Case | None) -> None:
+        """Begin an episode in a corridor, or park it."""
+        self.active[corridor] = case is not None
+        self.step[corridor] = self.clipped[corridor] = 0
+        if case is None:
+            self.episodes[corridor] = None
+            self.world.park(corridor)
+            self.timeout_at[corridor] = NEVER
+            self.a_min[:, corridor] = self.a_max[:, corridor] = 0.0
+            return
+        scenario = case.scenario
+        self.a_min[:, corridor] = scenario.a_min_mps2
+        self.a_max[:, corridor] = scenario.a_max_mps2
+        self.timeout_at[corridor] = self.row + scenario.max_steps
+        self.episodes[corridor] = _Episode(index, case, self.row)
+        self.world.place(corridor, case.starts(), own=case.level == OWN)
+        for car in range(len(self.mainline)):
+            self.pov.begin(car * self.world.corridors + corridor, case)
+        if self.following is not None:
+            self.following.begin(corridor, case)
+        try:
+            self.vut.begin(corridor, case)
+        except WRONGS as error:
+            said = f"reset raised {type(error).__name__}: {error}"
+            self.errors[corridor] = End.VUT_ERROR, said
+
+    def observe(self) -> None:
+        """Write the state into the next row of the record."""
+        self.now = self.record[self.row % self.ring]
+        self.now[:, 0], self.now[:, 1] = self.world.x_m, self.world.v_mps
+        self.row += 1
+
+    def ask_drivers(self) -> FloatArray:
+        """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
+        x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
+        _check_finite(x_m, v_mps)
+        scene = Scene(self.active, self.step, x_m, v_mps)
+        cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
+        if following is not None:
+            scene = Scene(self.active, self.step, x_m, v_mps, following.met(x_m, v_mps))
+        answer = np.concatenate((cars[:VUT], self.ask_vut(scene)[None], cars[VUT:]))
+        # Before the limits of car following, which would turn an infinite answer into a number.
+        if not math.isfinite(np.vdot(answer, answer)):
+            answer = self.only_numbers(answer)
+        if following is not None:
+            following.limit(answer, x_m, v_mps)
+        if self.follow_steps:
+            keep_behind_vut(answer, x_m, v_mps, self.world.scenario)
+        acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
+        self.now[:, 2] = acceleration
+        off = answer - acceleration
+        # In most steps nobody asks for more than it may.
+        if np.vdot(off, off) > (0.5 * ROUNDING_MPS2) ** 2:
+            self.clipped += np.abs(off[VUT]) > ROUNDING_MPS2
+        return acceleration
+
+    def ask_vut(self, scene: Scene) -> FloatArray:
+        """Return the VUT's answer, (K,); no numbers, and a note, where it has raised something."""
+        corridors = self.world.corridors
+        self.raised = None
+        try:
+            answer = np.asarray(self.vut.act(scene), dtype=np.float64)
+            if answer.shape != (corridors,):
+                raise ValueError(f"answered shape {answer.shape} instead of ({corridors},)")
+            self.note_signals()
+            return answer
+        except (SimulationError, VutLostError):
+            raise
+        except WRONGS as error:
+            self.raised = f"{type(error).__name__}: {error}"
+            return np.full(corridors, np.nan)
+
+    def note_signals(self) -> None:
+        """Note what the VUT has left with its answers."""
+        for corridor, left in self.vut.signals().items():
+            episode = self.episodes[corridor]
+            if left and episode is not None:
+                episode.left.append((self.row - 1 - episode.first_row, left))
+
+    def only_numbers(self, answer: FloatArray) -> FloatArray:
+        """Return answers, (A, K), with 0 where one is no number; note whose doing that was."""
+        finite = np.isfinite(answer)
+        for row, corridor in np.argwhere(~finite & self.active).tolist():
+            said = f"answered {answer[row, corridor]}"
+            if row == VUT:
+                error = End.VUT_ERROR, self.raised or self.vut.reason(corridor) or said
+            else:
+                place = self.mainline.index(row) * self.world.corridors + corridor
+                error = End.SIM_ERROR, OF_THE_POV + (self.pov.reason(place) or said)
+            self.errors.setdefault(corridor, error)
+        return np.where(finite, answer, 0.0)
+
+    def finish(self, corridor: int, end: End, error: str | None = None) -> tuple[int, Trajectory]:
+        """Return the record of a corridor's episode; after an error without the last step.
+
+        An error behind M ends the follow-up alone: the VUT has merged.
+        """
+        episode = self.episodes[corridor]
+        assert episode is not None, "only running episodes end"  # noqa: S101
+        length = self.row - episode.first_row + (error is None)
+        first = episode.first_row % self.ring
+        rows = self.record[..., corridor]
+        # In two parts, of which the second is empty where the ring does not close.
+        parts = rows[first : first + length], rows[: max(first + length - self.ring, 0)]
+        motion = np.concatenate(parts)
+        if error is None:
+            motion[-1, :, 0] = self.world.x_m[:, corridor]
+            motion[-1, :, 1] = self.world.v_mps[:, corridor]
+        motion[-1, :, 2] = 0.0
+        # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
+        motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
+        clipped = int(self.clipped[corridor])
+        if episode.merge_row is None:
+            signals = series(episode.left, len(motion))
+            alone = Trajectory(episode.case, motion, end, error, clipped, signals=signals)
+            return episode.index, alone
+        steps = episode.merge_row - episode.first_row
+        before, after = motion[: steps + 1].copy(), motion[steps:]
+        before[-1, :, 2] = 0.0
+        signals = series(episode.left, len(before))
+        merged = Trajectory(episode.case, before, End.MERGED, None, episode.clipped, after, signals)
+        return episode.index, merged
+
+
+def _check_finite(x_m: FloatArray, v_mps: FloatArray) -> None:
+    """Raise `SimulationError` where a position or a speed, (A, K), is not finite."""
+    # In most steps the sums of squares are enough.
+    if math.isfinite(np.vdot(x_m, x_m) + np.vdot(v_mps, v_mps)):
+        return
+    if not (np.isfinite(x_m).all() and np.isfinite(v_mps).all()):
+        raise SimulationError("a position or a speed is not finite")

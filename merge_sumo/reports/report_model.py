@@ -1,0 +1,212 @@
+"""What the report shows of a run: cases, their motion, verdicts, and what is known beside them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Final, TypeVar
+
+from merge_sumo.analysis.coordinates import Coordinate, coordinates
+from merge_sumo.analysis.diagnosis import (
+    Diagnosis,
+    Kind,
+    diagnose,
+    failure_boxes,
+)
+from merge_sumo.analysis.summary import Summary, summarise
+from merge_sumo.analysis.surface import Surface, learn_surface
+from merge_sumo.analysis.verdict import Trouble, judge
+from merge_sumo.campaigns.repeats import read_repeats
+from merge_sumo.campaigns.run import SETTINGS, Run, failures, regions_of, spread_failures
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.engine.versions import versions
+from merge_sumo.errors import UserError
+from merge_sumo.reports.report_maps import GRID
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import road_of
+from merge_sumo.studies.avoidance import read_avoidance
+from merge_sumo.studies.prediction_quality import Expected, is_foretold, surprises
+from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey, read_truth
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, LEVELS, OWN
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import Trajectory
+
+LISTED: Final = 10
+"""Cases in a list, and messages of errors and timeouts."""
+SHOWN: Final = 2000
+"""Cases that the page holds one by one, with their motion; more are shown as counts."""
+ERROR_CHARACTERS: Final = 2000
+"""Of the message of a case; `outcomes.jsonl` has the whole."""
+
+OnPart = Callable[[int, int], None]
+"""Told how many parts of a report are ready, and how many there are."""
+T = TypeVar("T")
+
+
+class ReportModel:
+    """Everything that the page shows of a run."""
+
+    def __init__(
+        self,
+        run: Run,
+        summary: Summary | None = None,
+        workers: Workers | None = None,
+        on_part: OnPart = lambda _done, _total: None,
+    ) -> None:
+        """Read what the page shows; raises `UserError` where settings have no list of levels.
+
+        `summary` is that of the run, where it is known; on `workers`, where they are several
+        processes, its surrogates are asked. `on_part` is told how many parts of the report are
+        ready, and how many there are, from 0 on; also from another thread.
+        """
+        levels = run.settings.get("levels")
+        if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
+            raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
+        self.run = run
+        self.road = _road_of(run)
+        self.summary = summary or summarise(run.outcomes, levels)
+        self.verdict = judge(run.outcomes)
+        self.levels = list(self.summary.levels)
+        # The surrogate of each level; the cases; the text; the data.
+        self._on_part, self._parts, self._ready = on_part, len(self.levels) + 3, 0
+        self._counting = threading.Lock()
+        on_part(0, self._parts)
+        self._surfaces = _meanwhile(
+            partial(_surfaces, run, self.levels, workers, self.part_ended),
+        )
+        self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
+        self.worst = failures(run.outcomes)
+        self.regions = regions_of(self.worst)
+        self.spread = spread_failures(self.worst)[:LISTED]
+        self.avoidance = read_avoidance(run)
+        self.repeats = read_repeats(run)
+        self.near = sorted(
+            (o for o in run.outcomes if _is_told(o) and not o.failed),
+            key=lambda o: (o.score, o.index),
+        )
+        self.surprises = surprises(run.outcomes, run.scenario.dx_crash_m)[:LISTED]
+        self.expected = _expected(run, levels, self.road)
+        self.untested = [o for o in run.outcomes if not _is_told(o)]
+        examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
+        listed = [*(*examples, *self.spread, *self.near[:LISTED], *self.surprises)]
+        telling = {o.index: o for o in (*listed, *self.worst, *self.untested, *self.near)}
+        self.shown = sorted(list(telling.values())[:SHOWN], key=lambda outcome: outcome.index)
+        self.motion = {o.index: motion for o in self.shown if (motion := _motion(run, o.index))}
+        self.diagnoses: dict[int, Diagnosis] = {
+            o.index: diagnose(self.motion[o.index], o.measures)
+            for o in self.shown
+            if o.index in self.motion
+        }
+        self.kinds: dict[int, Kind] = {
+            index: found.kind for index, found in self.diagnoses.items() if found.kind is not None
+        }
+        self.boxes = [
+            box
+            for level in self.levels
+            for box in failure_boxes(self.worst + self.near, level, self.kinds)
+        ]
+        self.truths = {level: _truth(run, self.road, level) for level in self.levels}
+        self.part_ended()
+
+    def part_ended(self) -> None:
+        """Count a part of the report that is ready."""
+        with self._counting:
+            self._ready += 1
+            self._on_part(self._ready, self._parts)
+
+    @property
+    def surfaces(self) -> dict[int, Surface | None]:
+        """What a surrogate says of each level; they are learned while the rest is read."""
+        return self._surfaces.result()
+
+    def coordinates_of(self, level: int) -> tuple[Coordinate, ...]:
+        """Return the coordinates of a level, in the pool's order."""
+        return coordinates(self.run.scenario, (level,))
+
+    def troubles(self) -> Sequence[Trouble]:
+        """Return the errors and timeouts that are listed, by message."""
+        return self.verdict.troubles[:LISTED]
+
+    def examples_of(self, trouble: Trouble) -> list[Outcome]:
+        """Return the cases that are listed for a message."""
+        return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
+
+
+def _meanwhile(work: Callable[[], T]) -> Future[T]:
+    """Do some work in a thread of its own."""
+    thread = ThreadPoolExecutor(1)
+    try:
+        return thread.submit(work)
+    finally:
+        thread.shutdown(wait=False)
+
+
+def _surfaces(
+    run: Run, levels: Sequence[int], workers: Workers | None, on_level: Callable[[], None]
+) -> dict[int, Surface | None]:
+    """Return the surrogate of each level; what its map shows is worked out."""
+    surfaces = {}
+    for level in levels:
+        surface = surfaces[level] = learn_surface(run.outcomes, level, workers)
+        if surface is not None:
+            surface.work_out(GRID.get(len(run.scenario.dimensions(level))))
+        on_level()
+    return surfaces
+
+
+def _expected(run: Run, levels: Sequence[int], road: Corridor) -> Expected | None:
+    """Return where the twin of a run expects failures, if the run had one."""
+    if not is_foretold(run.outcomes):
+        return None
+    try:
+        return Expected(run, levels, road)
+    except UserError:
+        return None
+
+
+def _is_told(outcome: Outcome) -> bool:
+    return outcome.is_tested and outcome.score is not None
+
+
+def _motion(run: Run, index: int) -> Trajectory | None:
+    """Return the trajectory of a case; None where it is lost: the report goes without."""
+    try:
+        return run.trajectory(index)
+    except UserError:
+        return None
+
+
+def _road_of(run: Run) -> Corridor:
+    """Return the road of a run, or the shipped one to draw on where that is not there any more."""
+    try:
+        return road_for(run.scenario)
+    except UserError:
+        return road_of()
+
+
+def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
+    """Return the ground truth that is cached for what this run tested, if there is one."""
+    settings, fixed = run.settings, run.scenario.v_vut0_mps
+    same = (
+        settings.get("net_sha256") == road.sha256
+        and settings.get("versions") == versions()
+        and settings.get("v_vut0_mps") == (fixed if isinstance(fixed, float) else None)
+    )
+    if not same:
+        return None
+    kept = TruthKey(
+        vut=str(settings.get("vut")),
+        level=level,
+        cases=TRUTH_CASES[level],
+        seed=0,
+        command=settings.get("vut_command"),
+        deadline_s=settings.get("deadline_s", DEADLINE_S),
+        scenario=run.scenario,
+        policies=settings.get("policies_sha256", {}),
+        pov=settings.get("pov") if level == OWN else None,
+        criterion=run.criterion,
+    )
+    return read_truth(kept.path(), level, kept.cases, kept.scenario)

@@ -1,0 +1,167 @@
+"""A merge in any SUMO net: two paths of lanes that become one at M, as a value.
+
+Each path has its own coordinate: the distance of the front bumper along its lanes from the merge
+point M, in metres, negative before M. The lanes inside of junctions belong to the paths, so the
+coordinate is continuous, and M is where the first lane begins that both paths have.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from merge_sumo.errors import UserError
+from merge_sumo.road.netfile import Point
+
+DRAWN_MIN_M: Final = 0.1
+"""SUMO takes a lane for drawn as long as this when it is drawn shorter, and stops at its end."""
+
+
+class LanePoint(NamedTuple):
+    """Where a lane coordinate is: in the net (lane, position on it) and in the plane."""
+
+    lane: str
+    position_m: float
+    x_m: float
+    y_m: float
+    angle_deg: float
+    """Heading in SUMO's convention: degrees clockwise from north."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A lane of a path, with the coordinate at which it begins."""
+
+    lane: str
+    """Its id in the net file; an internal lane's begins with a colon."""
+    start_m: float
+    length_m: float
+    speed_limit_mps: float
+    shape: tuple[Point, ...]
+    """Points in the plane from its begin to its end; drawn length and `length_m` may differ."""
+
+    @property
+    def shares(self) -> list[float]:
+        """Shares of `length_m` at which the points of the shape are driven over."""
+        reach = list(accumulate((math.dist(a, b) for a, b in pairwise(self.shape)), initial=0.0))
+        whole = max(reach[-1], DRAWN_MIN_M)
+        return [along / whole for along in reach]
+
+    @property
+    def is_internal(self) -> bool:
+        """Whether the lane lies inside of a junction."""
+        return self.lane.startswith(":")
+
+    def point(self, position_m: float) -> tuple[float, float, float]:
+        """Return (x, y, angle) of a position on the lane, where SUMO draws it."""
+        # Where the lane is straight this is the share of its length, and nothing is rounded.
+        shares = self.shares
+        along = min(position_m / self.length_m, shares[-1])
+        segment = min(max(bisect.bisect_left(shares, along), 1), len(shares) - 1) - 1
+        begin, end = shares[segment : segment + 2]
+        (x0, y0, _), (x1, y1, _) = self.shape[segment : segment + 2]
+        share = (along - begin) / (end - begin)
+        angle_deg = math.degrees(math.atan2(x1 - x0, y1 - y0)) % 360.0
+        return x0 + share * (x1 - x0), y0 + share * (y1 - y0), angle_deg
+
+
+@dataclass(frozen=True, slots=True)
+class LanePath:
+    """The lanes that a vehicle drives on, one after the other."""
+
+    pieces: tuple[Piece, ...]
+
+    @property
+    def starts_m(self) -> list[float]:
+        """Lane coordinates at which the pieces begin."""
+        return [piece.start_m for piece in self.pieces]
+
+    @property
+    def before_m(self) -> float:
+        """Length before M."""
+        return -self.pieces[0].start_m
+
+    @property
+    def after_m(self) -> float:
+        """Length behind M."""
+        return self.pieces[-1].start_m + self.pieces[-1].length_m
+
+    def piece(self, x_m: float) -> Piece:
+        """Return the lane at a coordinate."""
+        return self.pieces[max(bisect.bisect_right(self.starts_m, x_m) - 1, 0)]
+
+    def point(self, x_m: float) -> LanePoint:
+        """Return where a lane coordinate is."""
+        piece = self.piece(x_m)
+        position_m = x_m - piece.start_m
+        return LanePoint(piece.lane, position_m, *piece.point(position_m))
+
+    def speed_limits_mps(self) -> list[tuple[float, float]]:
+        """Return (x_m from where on, limit) wherever the limit of the lanes changes."""
+        found: list[tuple[float, float]] = []
+        for piece in self.pieces:
+            if not found or found[-1][1] != piece.speed_limit_mps:
+                found.append((piece.start_m, piece.speed_limit_mps))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """How a path goes over the junction at M."""
+
+    state: str
+    """SUMO's letter for its right of way."""
+    yields: bool
+    """Whether the junction's rules make it yield to the other path."""
+    visibility_m: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Corridor:
+    """A merge in a net: everything that hosting, replay and exports need to know of the road."""
+
+    path: Path
+    sha256: str
+    """Hash of the net file."""
+    mainline_edges: tuple[str, ...]
+    ramp_edges: tuple[str, ...]
+    mainline: LanePath
+    ramp: LanePath
+    junction_type: str
+    """Of the junction at M."""
+    junction_id: str
+    mainline_approach: Approach
+    ramp_approach: Approach
+    lane_drop: bool
+    """Whether one path comes to M from a lane that ends."""
+    drawn_after_m: float
+    """Length behind M in the file; from there on the last lane is continued straight on."""
+    surroundings: tuple[tuple[Point, ...], ...]
+    """Shapes of the other lanes near M, for drawings."""
+
+    def lane_point(self, x_m: float, *, on_ramp: bool) -> LanePoint:
+        """Return where a lane coordinate of one of the paths is."""
+        return (self.ramp if on_ramp else self.mainline).point(x_m)
+
+    @property
+    def speed_limit_mps(self) -> float:
+        """Highest speed limit of both paths."""
+        pieces = self.mainline.pieces + self.ramp.pieces
+        return max(piece.speed_limit_mps for piece in pieces)
+
+    def check_room(self, mainline_m: float, ramp_m: float) -> None:
+        """Raise `UserError` when a path is shorter before M than its farthest start."""
+        for name, edges, path, needed_m in (
+            ("mainline", self.mainline_edges, self.mainline, mainline_m),
+            ("ramp", self.ramp_edges, self.ramp, ramp_m),
+        ):
+            if path.before_m < needed_m:
+                raise UserError(
+                    f"the {name} ({' '.join(edges)}) begins {path.before_m:.1f} m before the merge "
+                    f"point and a vehicle starts {needed_m:g} m before it: begin with an edge "
+                    "further upstream, or start nearer"
+                )

@@ -1,0 +1,70 @@
+"""A road as an SVG picture: its lanes, the two paths, M, and where vehicles start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lxml import etree
+
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.values.scenario import Scenario
+
+WIDTH_PX = 1000
+LANE_M = 3.2
+STEP_M = 5.0
+
+
+def road_svg(road: Corridor, scenario: Scenario) -> bytes:
+    """Return the picture of a road with the starts of a scenario on it."""
+    low_m = min(scenario.x_pov0_m[0], scenario.x_vut0_m)
+    paths = {
+        on_ramp: [
+            road.lane_point(x_m, on_ramp=on_ramp)[2:4]
+            for x_m in _steps(max(low_m, path.pieces[0].start_m), min(120.0, path.after_m))
+        ]
+        for on_ramp, path in ((False, road.mainline), (True, road.ramp))
+    }
+    window = [road.lane_point(x_m, on_ramp=False)[2:4] for x_m in _steps(*scenario.x_pov0_m)]
+    points = [*paths[False], *paths[True]]
+    left, right = min(x for x, _ in points) - 20.0, max(x for x, _ in points) + 20.0
+    bottom, top = min(y for _, y in points) - 20.0, max(y for _, y in points) + 20.0
+    root = etree.Element(
+        "svg",
+        xmlns="http://www.w3.org/2000/svg",
+        viewBox=f"{left:.1f} {-top:.1f} {right - left:.1f} {top - bottom:.1f}",
+        width=str(WIDTH_PX),
+    )
+    etree.SubElement(
+        root, "rect", x=f"{left:.1f}", y=f"{-top:.1f}", width="100%", height="100%", fill="#f7f6f3"
+    )
+    for shape in road.surroundings:
+        _line(root, [point[:2] for point in shape], "#dfdcd5", LANE_M)
+    _line(root, paths[False], "#c9c7c1", LANE_M)
+    _line(root, paths[True], "#c9c7c1", LANE_M)
+    _line(root, window, "#e69f00", LANE_M / 2.0)
+    vut = road.lane_point(scenario.x_vut0_m, on_ramp=True)[2:4]
+    m = road.lane_point(0.0, on_ramp=True)[2:4]
+    for (x, y), colour, name in (
+        (vut, "#0072b2", "VUT"),
+        (m, "#d55e00", "M"),
+        (window[0], "#e69f00", "POV"),
+    ):
+        etree.SubElement(root, "circle", cx=f"{x:.1f}", cy=f"{-y:.1f}", r="3", fill=colour)
+        text = etree.SubElement(
+            root, "text", {"x": f"{x + 4.0:.1f}", "y": f"{-y - 4.0:.1f}", "font-size": "9"}
+        )
+        text.text = name
+    return etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
+
+
+def _steps(low_m: float, high_m: float) -> list[float]:
+    count = max(int((high_m - low_m) / STEP_M), 1)
+    return [low_m + (high_m - low_m) * step / count for step in range(count + 1)]
+
+
+def _line(
+    root: etree._Element, points: Sequence[tuple[float, ...]], colour: str, width_m: float
+) -> None:
+    text = " ".join(f"{x:.2f},{-y:.2f}" for x, y, *_ in points)
+    attributes = {"points": text, "fill": "none", "stroke": colour}
+    etree.SubElement(root, "polyline", {**attributes, "stroke-width": f"{width_m:g}"})

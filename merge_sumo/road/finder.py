@@ -1,0 +1,266 @@
+"""Finding the merge in a net: where two sequences of edges come to one lane.
+
+Where the ramp ends in an auxiliary lane from which no connection leads on, the driver changes to
+the lane beside it where the auxiliary lane ends. The path then crosses the junction beside the
+connection of that lane, as if the net had a connection of its own for it, and M is behind the
+junction, where it is in a net that has one. The same holds where the lane of the mainline ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+from merge_sumo.road.corridor import Approach, Corridor, LanePath, Piece
+from merge_sumo.road.netfile import Lane, Link, NetFile, Point
+from merge_sumo.values.scenario import ROOM_AFTER_M
+
+SURROUNDINGS_M: Final = 500.0
+"""How near to M a lane beside the paths is drawn."""
+POINT_M: Final = 1e-6
+"""Length at which a lane is drawn that the file draws as a point."""
+
+
+def find_corridor(
+    net: NetFile,
+    mainline: Sequence[str],
+    ramp: Sequence[str],
+    *,
+    room_after_m: float = ROOM_AFTER_M,
+) -> Corridor:
+    """Find the merge of two sequences of edges in a net.
+
+    Both name the edge on which the paths become one, and may go on behind it. Where the file ends
+    nearer than `room_after_m` behind M, the last lane is continued straight on. Raises `UserError`
+    when an edge is unknown, a sequence is not connected, or they never meet.
+    """
+    own, tail = _split(net, tuple(mainline), tuple(ramp))
+    layers = [_layers(net, edges + tail, len(edges)) for edges in own]
+    meeting = _meeting(net, own, tail, layers)
+    onward = _onward(net, meeting.target, tail[meeting.place :])
+    shared = _placed(net, _continued(onward, room_after_m), 0.0)
+    junction_type = net.junction_type(meeting.ramp.source)
+    paths, approaches = [], []
+    links = (meeting.mainline, meeting.ramp)
+    for edges, found, link, other in zip(own, layers, links, reversed(links), strict=True):
+        before = _lanes_before(found[: len(edges) + meeting.place], link)
+        start_m = -math.fsum(lane.length_m for lane in before)
+        paths.append(LanePath((*_placed(net, before, start_m), *shared)))
+        if meeting.drop is not None:
+            yields = link is meeting.drop
+        elif junction_type.startswith("traffic_light"):
+            yields = link is meeting.ramp
+        else:
+            yields = net.yields(link, other)
+        approaches.append(Approach(link.state, yields, link.visibility_m))
+    return Corridor(
+        path=net.path,
+        sha256=net.sha256,
+        mainline_edges=tuple(mainline),
+        ramp_edges=tuple(ramp),
+        mainline=paths[0],
+        ramp=paths[1],
+        junction_type=junction_type,
+        junction_id=net.junction_id(meeting.ramp.source),
+        mainline_approach=approaches[0],
+        ramp_approach=approaches[1],
+        lane_drop=meeting.drop is not None,
+        drawn_after_m=math.fsum(lane.length_m for lane in onward),
+        surroundings=_surroundings(net, paths, shared[0].shape[0]),
+    )
+
+
+_Edges = tuple[str, ...]
+_Layer = dict[str, list[Link]]
+"""Lanes of an edge that a path can reach, by their ids, each with the links that lead to it."""
+
+
+class _Meeting(NamedTuple):
+    """The links by which both paths come to their first common lane."""
+
+    mainline: Link
+    ramp: Link
+    drop: Link | None
+    """The one of them that leaves a lane that ends."""
+    place: int
+    """Of the edge of the common lane, among the edges behind the paths' own."""
+
+    @property
+    def target(self) -> Lane:
+        """The common lane."""
+        return self.ramp.target
+
+
+def _split(net: NetFile, mainline: _Edges, ramp: _Edges) -> tuple[tuple[_Edges, _Edges], _Edges]:
+    """Return the edges that each path has for itself, and those that follow on both."""
+    for edge in mainline + ramp:
+        net.lanes(edge)
+    common = next((edge for edge in ramp if edge in mainline), None)
+    if common is None:
+        raise net.broken(
+            f"mainline ({' '.join(mainline)}) and ramp ({' '.join(ramp)}) never meet; name the "
+            "edge behind the merge point as the last one of both"
+        )
+    # A mainline may go round a ring and come by the edge again.
+    again = common in mainline[1:]
+    at = mainline.index(common, 1) if again else 0, ramp.index(common)
+    tails = mainline[at[0] :], ramp[at[1] :]
+    for own, other in zip(*tails, strict=False):
+        if own != other:
+            raise net.broken(
+                f"behind edge {common} the mainline goes to {own} and the ramp to {other}; name "
+                "the same edges behind the merge point"
+            )
+    if 0 in at:
+        who = "mainline" if at[0] == 0 else "ramp"
+        raise net.broken(
+            f"the {who} begins with edge {common}, which the other path uses too; name an edge "
+            f"before it: {' or '.join(net.edges_into(common)) or 'the net has none'}"
+        )
+    return (mainline[: at[0]], ramp[: at[1]]), max(tails, key=len)
+
+
+def _layers(net: NetFile, edges: _Edges, common: int) -> list[_Layer]:
+    """Return the lanes that a path can reach on each of its edges.
+
+    A lane of its own must lead to edge number `common`; behind that its lanes may end.
+    """
+    lanes = {lane.id: lane for lane in net.lanes(edges[0])}
+    layers: list[_Layer] = [{name: [] for name in lanes}]
+    for number, (edge, following) in enumerate(pairwise(edges), start=1):
+        layer: _Layer = {}
+        for lane in lanes.values():
+            for link in net.links(lane, following):
+                layer.setdefault(link.target.id, []).append(link)
+        if not layer and number <= common:
+            into = [name for name in net.edges_into(following) if name != edge]
+            does = "does" if len(into) == 1 else "do"
+            hint = f"; {' and '.join(into)} {does}" if into else ""
+            raise net.broken(f"edge {edge} does not lead to edge {following}{hint}")
+        lanes = {links[0].target.id: links[0].target for links in layer.values()}
+        layers.append(layer)
+    return layers
+
+
+def _meeting(
+    net: NetFile, own: tuple[_Edges, _Edges], tail: _Edges, layers: list[list[_Layer]]
+) -> _Meeting:
+    """Return where the paths meet: by connections, or where a lane of one of them ends."""
+    mainline, ramp = (found[len(edges) :] for found, edges in zip(layers, own, strict=True))
+    for place, edge in enumerate(tail):
+        common = mainline[place].keys() & ramp[place].keys()
+        both = [lane.id for lane in net.lanes(edge) if lane.id in common]
+        if both:
+            one, other = (min(found[place][both[0]], key=_swerve) for found in (mainline, ramp))
+            return _Meeting(one, other, drop=None, place=place)
+        if place + 1 == len(tail) or mainline[place + 1].keys() & ramp[place + 1].keys():
+            continue
+        lanes = {lane.id: lane for lane in net.lanes(edge)}
+        for ending, going in ((ramp, mainline), (mainline, ramp)):
+            for last in (lanes[name] for name in ending[place]):
+                for beside in (lanes[name] for name in going[place]):
+                    onward = net.links(beside, tail[place + 1])
+                    ends = not net.links(last, tail[place + 1])
+                    if ends and onward and abs(last.index - beside.index) == 1:
+                        drop = _drop(net, last, onward[0])
+                        one, other = (onward[0], drop) if ending is ramp else (drop, onward[0])
+                        return _Meeting(one, other, drop=drop, place=place + 1)
+    raise net.broken(
+        f"mainline and ramp have no lane in common up to the end of edge {tail[-1]}; name the edge "
+        "that follows on both"
+    )
+
+
+def _drop(net: NetFile, last: Lane, beside: Link) -> Link:
+    """Return the way from a lane that ends to where a link of the lane beside it leads."""
+    via: tuple[Lane, ...] = ()
+    if beside.via:
+        crossing = replace(
+            beside.via[0],
+            length_m=math.fsum(lane.length_m for lane in beside.via),
+            shape=(last.shape[-1], beside.target.shape[0]),
+        )
+        via = (crossing,)
+    state = "Z" if net.junction_type(last) == "zipper" else "m"
+    # A driver on it sees all along the lane beside.
+    return Link(last, beside.target, via, state, visibility_m=last.length_m)
+
+
+def _swerve(link: Link) -> tuple[int, int]:
+    """Order links: straight ones first, then from the right."""
+    return abs(link.source.index - link.target.index), link.source.index
+
+
+def _lanes_before(layers: list[_Layer], last: Link) -> list[Lane]:
+    """Return the lanes that lead over a link, from the first edge to before its target."""
+    lanes = [*reversed(last.via), last.source]
+    for layer in layers[:0:-1]:
+        link = min(layer[lanes[-1].id], key=_swerve)
+        lanes += [*reversed(link.via), link.source]
+    return lanes[::-1]
+
+
+def _onward(net: NetFile, first: Lane, edges: _Edges) -> list[Lane]:
+    """Return the lanes from one on along edges, the first of which it is on, as far as they go."""
+
+    @cache
+    def longest(lane: Lane, place: int) -> tuple[Lane, ...]:
+        following: tuple[Lane, ...] = ()
+        links = net.links(lane, edges[place + 1]) if place + 1 < len(edges) else []
+        for link in sorted(links, key=lambda link: abs(link.source.index - link.target.index)):
+            lanes = (*link.via, *longest(link.target, place + 1))
+            following = max(following, lanes, key=len)
+        return (lane, *following)
+
+    return list(longest(first, 0))
+
+
+def _continued(lanes: list[Lane], length_m: float) -> list[Lane]:
+    """Return lanes with the last one continued straight on to a length of all of them."""
+    missing_m = length_m - math.fsum(lane.length_m for lane in lanes)
+    if missing_m <= 0.0:
+        return lanes
+    last = lanes[-1]
+    before, end = _corners(last.shape)[-2:]
+    # As SUMO draws the lane: a metre of it is this long in the plane.
+    drawn_m = missing_m * last.drawn_m / last.length_m
+    share = drawn_m / math.dist(before, end)
+    x, y, z = (e + share * (e - b) for b, e in zip(before, end, strict=True))
+    longer = replace(last, length_m=last.length_m + missing_m, shape=(*last.shape, (x, y, z)))
+    return [*lanes[:-1], longer]
+
+
+def _placed(net: NetFile, lanes: Iterable[Lane], start_m: float) -> list[Piece]:
+    """Return lanes as pieces of a path that begins at a coordinate."""
+    pieces: list[Piece] = []
+    for lane in lanes:
+        shape = _corners(lane.shape)
+        if lane.length_m <= 0.0 or not shape:
+            raise net.broken(f"lane {lane.id} has no length")
+        if len(shape) == 1:
+            # Drawn as a point, as some lanes inside of junctions: it points where the last one did.
+            before, end = pieces[-1].shape[-2:]
+            ahead = POINT_M / math.dist(before, end)
+            (x, y, z), (dx, dy) = shape[0], (end[0] - before[0], end[1] - before[1])
+            shape = (*shape, (x + ahead * dx, y + ahead * dy, z))
+        pieces.append(Piece(lane.id, start_m, lane.length_m, lane.speed_limit_mps, shape))
+        start_m += lane.length_m
+    return pieces
+
+
+def _surroundings(
+    net: NetFile, paths: Sequence[LanePath], centre: Point
+) -> tuple[tuple[Point, ...], ...]:
+    """Return the shapes of the lanes near a point that are on no path."""
+    used = {piece.lane for path in paths for piece in path.pieces}
+    near = net.lanes_near(centre, SURROUNDINGS_M)
+    return tuple(lane.shape for lane in near if lane.id not in used)
+
+
+def _corners(shape: tuple[Point, ...]) -> tuple[Point, ...]:
+    """Return a shape without points that repeat the one before."""
+    return shape[:1] + tuple(b for a, b in pairwise(shape) if a != b)

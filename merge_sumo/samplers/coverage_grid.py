@@ -1,0 +1,126 @@
+"""What is covered already: the balls of the FMC as places, for samplers that must be quick.
+
+A ball is the places in it. In two and three dimensions these are the nodes of a grid. In more, a
+grid that is fine beside a ball has too many nodes; there they are the points of a sequence that
+fills space evenly, and a ball is the nearest so many of them to its middle.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from functools import lru_cache
+from typing import Final, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.fmc import RADIUS, fmc, radius_for
+
+CELL: Final = {2: 0.01, 3: 0.0125}
+"""Spacing of the grid, per dimension, on which coverage is counted,"""
+FINE_CELL: Final = {**CELL, 2: 0.0025}
+"""and where slivers count, which are what a case adds late in a search: in two dimensions a grid
+that shows them is cheap."""
+PLACES_PER_BALL: Final = 64
+"""Places in a ball where there is no grid."""
+MARGIN: Final = 1.1
+"""Radii by which the places reach beyond the unit cube."""
+
+IntArray = NDArray[np.int64]
+
+
+class CoverageGrid:
+    """The unit cube with a margin, as places with the chance not to be covered.
+
+    Attributes:
+        overlap: balls of points that are farther apart have no place in common.
+    """
+
+    def __init__(self, dims: int, *, fine: bool = True) -> None:
+        """Prepare an uncovered ground of `dims` dimensions."""
+        self._places = _places(dims, (FINE_CELL if fine else CELL).get(dims))
+        self.overlap: Final = self._places.overlap
+        self._open = np.ones(self._places.count, dtype=np.float32)
+
+    def copy(self) -> Self:
+        """Return a ground that is covered as this one is."""
+        other = copy(self)
+        other._open = self._open.copy()
+        return other
+
+    def balls(self, points: FloatArray) -> IntArray:
+        """Return the places in the ball around each point, (n, places)."""
+        return self._places.balls(points)
+
+    def new(self, balls: IntArray) -> FloatArray:
+        """Return the expected share of each ball that is not covered, (n,)."""
+        return np.asarray(self._open.take(balls).mean(axis=1), dtype=np.float64)
+
+    def cover(self, balls: IntArray, probability: float) -> None:
+        """Cover balls with a probability."""
+        self._open[balls] *= np.float32(1.0 - probability)
+
+    def covered_balls(self) -> float:
+        """Return the expected covered volume in balls."""
+        return float((1.0 - self._open).sum()) / self._places.per_ball
+
+
+class _Places(Protocol):
+    """Places in space, the same for every ground of that many dimensions.
+
+    Attributes:
+        count: their number.
+        per_ball: how many of them are in a ball.
+        overlap: balls of points that are farther apart have no place in common.
+    """
+
+    count: int
+    per_ball: int
+    overlap: float
+
+    def balls(self, points: FloatArray) -> IntArray: ...
+
+
+class _Grid:
+    """The nodes of a regular grid."""
+
+    def __init__(self, dims: int, cell: float) -> None:
+        self._cell = cell
+        reach = int(RADIUS / self._cell) + 1
+        side = round((1.0 + 2.0 * RADIUS) / self._cell) + 5
+        self._strides = side ** np.arange(dims)[::-1]
+        axes = np.meshgrid(*[np.arange(-reach, reach + 1)] * dims, indexing="ij")
+        offsets = np.stack(axes, axis=-1).reshape(-1, dims)
+        inside = np.square(offsets * self._cell).sum(axis=1) <= RADIUS**2
+        self._ball = offsets[inside] @ self._strides
+        self.count, self.per_ball = side**dims, len(self._ball)
+        self.overlap = 2.0 * RADIUS + math.sqrt(dims) * self._cell
+
+    def balls(self, points: FloatArray) -> IntArray:
+        corner = np.rint((points + RADIUS) / self._cell).astype(np.int64) + 2
+        return np.asarray((corner @ self._strides)[:, None] + self._ball, dtype=np.int64)
+
+
+class _Scattered:
+    """The points of a sequence of low discrepancy."""
+
+    def __init__(self, dims: int) -> None:
+        from scipy.stats.qmc import Halton
+
+        self.per_ball, self.overlap = PLACES_PER_BALL, math.inf
+        margin = MARGIN * radius_for(dims)
+        density = self.per_ball / fmc(np.zeros((1, dims)))
+        self.count = round(density * (1.0 + 2.0 * margin) ** dims)
+        sequence = Halton(dims, seed=np.random.default_rng(dims)).random(self.count)
+        self._tree = cKDTree(sequence * (1.0 + 2.0 * margin) - margin)
+
+    def balls(self, points: FloatArray) -> IntArray:
+        return np.asarray(self._tree.query(points, k=self.per_ball)[1], dtype=np.int64)
+
+
+@lru_cache
+def _places(dims: int, cell: float | None) -> _Places:
+    return _Scattered(dims) if cell is None else _Grid(dims, cell)

@@ -1,0 +1,247 @@
+"""What is made of games that were played out before their cases run: P(fail), by the record.
+
+Somebody who knows the POVs and has watched the VUT, a *foreteller*, plays cases out and says which
+gap there will be at M. It has experts of several kinds, and of each several members who know
+different things, so that they disagree where they guess. How much is to be made of what they say is
+in the record: what they had said of the cases that have run since.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, ndtr
+
+from merge_sumo.samplers.belief import NO_GAP_M
+from merge_sumo.samplers.greedy import Proposal
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.score import Outcome
+
+Known = Sequence[tuple[Outcome, Foretold]]
+
+WIDTHS: Final = np.array([0.01, 0.03, 0.1, 0.35, 1.2])
+"""How far gaps may be off, as standard deviations on the scale of `compressed`."""
+REACH: Final = 9.0
+"""Length of that scale, on which a gap may be anywhere where nobody knows anything."""
+PRIOR: Final = np.array([0.5, 0.5, 1.0, 1.0, 1.0, 0.5])
+"""Cases that speak for each of the widths, and for anywhere, before there is a record."""
+EM_ROUNDS: Final = 12
+"""Of expectation and maximisation, which learns how often gaps are how far off."""
+HALF_LIFE: Final = 40.0
+"""Cases after which what was foretold counts half: a foreteller learns."""
+OTHER_LEVELS: Final = 0.4
+"""What a case at another level counts: it is the same VUT."""
+TEMPERED: Final = 0.5
+"""What a case counts for one expert against the other: cases of a batch are alike."""
+SURE: Final = 0.005
+"""Chances nearer to 0 or 1 than this are not told apart."""
+TRUSTED_FROM: Final = 100
+"""Cases, the last ones, by which gains are set right."""
+WORTHLESS: Final = 0.05
+JUDGED_FROM: Final = 40
+"""A foreteller with less weight than that, after so many cases, is not asked for candidates."""
+EDGE: Final = float(np.arcsinh(1.0))
+"""The limit of a failure on the scale of `compressed`."""
+
+
+Play = Callable[..., FloatArray]
+"""Plays cases of one level: see `Foreteller.play`."""
+
+
+class Foreteller(Protocol):
+    """Plays cases out; a pure function of what it was told."""
+
+    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
+        """Take outcomes, and their motions, (T + 1, A, 3), by index."""
+
+    def can_play(self, level: int) -> bool:
+        """Return whether it knows enough to play cases of a level."""
+
+    def play(self, level: int, points: FloatArray, screening: int | None = None) -> FloatArray:
+        """Return the gaps at M in m of cases, (n, d), of the unit cube, as (E, G, n).
+
+        NaN where the VUT never arrives. With `screening`, one member of that expert alone plays.
+        """
+
+    def replay(self, level: int, indices: Sequence[int], points: FloatArray) -> FloatArray:
+        """Return the gaps at M in m, (E, n), of cases that it was told, by their indices.
+
+        Of each expert that member plays a case which has not learned from it.
+        """
+
+
+def compressed(gap_m: FloatArray, limit_m: float) -> FloatArray:
+    """Return gaps in units of the limit, on a scale that is logarithmic where they are large."""
+    return np.asarray(np.arcsinh(np.nan_to_num(gap_m, nan=NO_GAP_M) / limit_m))
+
+
+class PredictionSkill:
+    """How well gaps and failures were foretold, and what that makes of the next ones.
+
+    Attributes:
+        experts: weight of each expert, (E,); (1,) for all of them before there is a record.
+        twin: weight of the games against the surrogate where members disagree, and where they
+            agree on the verdict, (2,).
+        trust: what gains are multiplied by. Cases are picked where P(fail) is large, so among them
+            it is too large more often than not; what came of the last picks tells by how much.
+    """
+
+    def __init__(
+        self,
+        outcomes: Sequence[Outcome],
+        level: int,
+        limit_m: float,
+        replayed: Mapping[int, FloatArray] | None = None,
+    ) -> None:
+        """Judge by outcomes in the order of their index; a failure is a gap below the limit.
+
+        `replayed` are gaps, (E,), by the index of a case, of who had not learned from it.
+        """
+        known = [(o, o.foretold) for o in outcomes if o.foretold is not None]
+        self._limit_m = limit_m
+        self._mixture = (PRIOR / PRIOR.sum())[None]
+        self.experts, self.twin, self.trust = np.ones(1), np.array([0.5, 0.5]), 1.0
+        self._cases = len(known)
+        if known:
+            self._learn_weights(known, self._weights([o for o, _ in known], level))
+            last = [one for one in known if one[0].case.level == level][-TRUSTED_FROM:]
+            failed, foretold = (sum(o.failed for o, _ in last), sum(f.p_fail for _, f in last))
+            self.trust = min((failed + 1.0) / (foretold + 1.0), 1.0)
+        self._learn_errors(outcomes, level, replayed or {})
+
+    @property
+    def is_worthless(self) -> bool:
+        """Whether the record says that nothing can be foretold of this VUT."""
+        return self._cases >= JUDGED_FROM and bool((self.twin < WORTHLESS).all())
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether, after many cases, nothing is made of the games where members disagree.
+
+        Then the surrogate decides, which is to be trusted as far as it has earned, and a case that
+        the games would learn most from is one that the search would have used better.
+        """
+        return self._cases >= TRUSTED_FROM and bool(self.twin[0] < WORTHLESS)
+
+    def expert(self, rng: np.random.Generator) -> int:
+        """Return one of the experts by chance, the better ones more often."""
+        return int(rng.choice(len(self.experts), p=self.experts))
+
+    def chance(self, gaps_m: FloatArray, expert: int | None = None) -> FloatArray:
+        """Return P(fail), (n,), of cases with foretold gaps, (E, G, n), of one expert or all."""
+        said = compressed(gaps_m, self._limit_m)[..., None]
+        failing = ndtr((EDGE - said) / WIDTHS) - ndtr((-EDGE - said) / WIDTHS)
+        experts, _, n, _ = said.shape
+        anywhere = np.full((experts, n, 1), 2.0 * EDGE / REACH)
+        by_width = np.concatenate([failing.mean(axis=1), anywhere], axis=-1)
+        of = slice(None) if expert is None or len(self.experts) == 1 else [expert]
+        mixture = np.broadcast_to(self._mixture[of], (experts, len(PRIOR)))
+        weights = np.broadcast_to(self.experts[of], experts)
+        by_expert = np.einsum("enw,ew->en", by_width, mixture)
+        return np.asarray(np.average(by_expert, axis=0, weights=weights), dtype=np.float64)
+
+    def mixed(self, gaps_m: FloatArray, p_twin: FloatArray, p_surrogate: FloatArray) -> FloatArray:
+        """Return P(fail), (n,), by the games and the surrogate together."""
+        weight = self.twin[self._agreed(gaps_m).astype(np.int64)]
+        mixed: FloatArray = weight * p_twin + (1.0 - weight) * p_surrogate
+        return mixed
+
+    def doubt(self, gaps_m: FloatArray) -> FloatArray:
+        """Return how much is to be learned from cases, (n,), by gaps, (E, G, n).
+
+        Members disagree there, on a gap that may be near.
+        """
+        said = compressed(gaps_m, self._limit_m).reshape(-1, gaps_m.shape[-1])
+        return np.asarray(said.std(axis=0) * np.exp(-0.25 * np.square(np.median(said, axis=0))))
+
+    def noted(self, proposal: Proposal, play: Play) -> Proposal:
+        """Return a proposal of the surrogate's with what games say of it: that may change."""
+        gaps_m = play(proposal.points)
+        said = tuple(
+            Foretold.of(gaps_m[..., i], float(p), float(chance), float(chance))
+            for i, (p, chance) in enumerate(
+                zip(self.chance(gaps_m), proposal.probability, strict=True)
+            )
+        )
+        return replace(proposal, foretold=said)
+
+    def _agreed(self, gaps_m: FloatArray) -> NDArray[np.bool_]:
+        """Return where all members foretell the same verdict, (n,), by gaps, (E, G, n)."""
+        gaps = np.abs(np.nan_to_num(gaps_m, nan=NO_GAP_M)).reshape(-1, gaps_m.shape[-1])
+        failing = gaps < self._limit_m
+        return np.asarray(failing.all(axis=0) | ~failing.any(axis=0))
+
+    def _learn_errors(
+        self, outcomes: Sequence[Outcome], level: int, replayed: Mapping[int, FloatArray]
+    ) -> None:
+        """Learn how far experts are off, and which of them is to be believed.
+
+        How far they are off is seen where they foretold; where nobody did, and to tell them from
+        each other, what they now make of cases that they have not learned from has to do.
+        """
+        off, own = [], []
+        for outcome in outcomes:
+            said = replayed.get(outcome.index)
+            if outcome.foretold is not None:
+                off.append((outcome, outcome.foretold.gaps_m))
+            elif said is not None:
+                off.append((outcome, said[:, None]))
+            if said is not None:
+                own.append((outcome, said[:, None]))
+        if off:
+            weight = self._weights([outcome for outcome, _ in off], level)
+            density = np.array([self._density(*one) for one in off])
+            self._mixture = np.array([_mixture(of, weight) for of in density.transpose(1, 0, 2)])
+        judges = own or off
+        if judges:
+            weight = self._weights([outcome for outcome, _ in judges], level)
+            density = np.array([self._density(*one) for one in judges]).transpose(1, 0, 2)
+            evidence = [weight @ np.log(of @ _mixture(of, weight)) for of in density]
+            lead = np.exp(TEMPERED * (np.array(evidence) - max(evidence)))
+            self.experts = lead / lead.sum()
+
+    def _density(self, outcome: Outcome, gaps_m: FloatArray) -> FloatArray:
+        """Return how likely a case's gap was with every width, and anywhere, (E, widths + 1).
+
+        By gaps, (E, G): a member of an expert is as good as any other.
+        """
+        true = compressed(np.array(outcome.signed_gap_m, dtype=np.float64), self._limit_m)
+        off = (true - compressed(gaps_m, self._limit_m))[..., None]
+        density = np.exp(-0.5 * np.square(off / WIDTHS)) / (WIDTHS * np.sqrt(2.0 * np.pi))
+        by_width = density.mean(axis=1)
+        anywhere = np.full((len(by_width), 1), 1.0 / REACH)
+        return np.asarray(np.concatenate([by_width, anywhere], axis=1), dtype=np.float64)
+
+    @staticmethod
+    def _weights(outcomes: Sequence[Outcome], level: int) -> FloatArray:
+        """Return what outcomes count, (N,): the last ones, and those of the level, most."""
+        own = np.array([outcome.case.level == level for outcome in outcomes])
+        age = np.arange(len(outcomes))[::-1]
+        return np.asarray(0.5 ** (age / HALF_LIFE) * np.where(own, 1.0, OTHER_LEVELS))
+
+    def _learn_weights(self, known: Known, weight: FloatArray) -> None:
+        """Learn where the games, and where the surrogate, foretold the verdicts better."""
+        failed = np.array([o.failed for o, _ in known])
+        same = self._agreed(np.stack([told.gaps_m for _, told in known], axis=-1))
+        chances = np.array([(told.p_twin, told.p_surrogate) for _, told in known])
+        right = np.where(failed[:, None], chances, 1.0 - chances)
+        evidence = weight[:, None] * np.log(np.clip(right, SURE, 1.0 - SURE))
+        for place, where in enumerate((~same, same)):
+            twin, surrogate = evidence[where].sum(axis=0)
+            self.twin[place] = expit(np.clip(twin - surrogate, -30.0, 30.0))
+
+
+def _mixture(density: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return how often which width is the right one, by densities, (N, widths + 1)."""
+    mixture: FloatArray = PRIOR / PRIOR.sum()
+    for _ in range(EM_ROUNDS):
+        share = density * mixture
+        share /= share.sum(axis=1, keepdims=True)
+        mixture = PRIOR + weight @ share
+        mixture /= mixture.sum()
+    return mixture

@@ -1,1 +1,0 @@
-"""Scenarios as files, what a road suggests, and how it looks."""

@@ -1,0 +1,1 @@
+"""Questions that take simulations: each leaves a file that reports read."""

@@ -1,0 +1,334 @@
+"""Experiments on samplers: searches with many seeds, and how near they come to the ground truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from heapq import heappop, heapreplace
+from itertools import accumulate
+from typing import Any, Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from merge_sumo.campaigns.campaign import conduct, workers_or_here
+from merge_sumo.campaigns.settings import check_level
+from merge_sumo.engine.simulator import SimulationPlan, run_cases
+from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.samplers.coverage_grid import CoverageGrid
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.studies.truth import Truth
+from merge_sumo.system.workers import Workers
+from merge_sumo.twin.twin import Twin
+from merge_sumo.values.case import FloatArray, Pool, to_unit
+from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.score import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What one sampler did with one seed.
+
+    Attributes:
+        outcomes: what became of every case, in order.
+        fmc: failure mode coverage after each batch, summed over the levels.
+        sampler_s: seconds spent in the sampler, without simulation.
+    """
+
+    outcomes: list[Outcome]
+    fmc: list[float]
+    sampler_s: float
+
+    def failures(self, level: int) -> FloatArray:
+        """Return the failing cases of a level as points, (m, d)."""
+        return to_unit((o.case for o in self.outcomes if o.failed and o.case.level == level), level)
+
+
+ORACLE_STEP: Final = 5
+"""Divides all sizes of batches that samplers choose."""
+COMPARED_BATCH: Final = 20
+"""Cases of a batch where nobody says, of samplers that have no wish of their own."""
+
+Task = tuple[str, tuple[int, ...], int, int | None, int]
+"""A search: sampler, levels, cases, batch, seed."""
+
+
+def _searches(plan: SimulationPlan, tasks: Sequence[Task]) -> list[Search]:
+    return [_search(plan, *task) for task in tasks]
+
+
+def _search(
+    plan: SimulationPlan,
+    name: str,
+    levels: tuple[int, ...],
+    cases: int,
+    batch: int | None,
+    seed: int,
+) -> Search:
+    pool = Pool(levels=levels, scenario=plan.scenario)
+    lines = centre_lines(plan.net)
+    games = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
+    sampler = make_sampler(name, pool, seed, games)
+    spent = _Stopwatch()
+    sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
+    sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
+    search = Search([], [], 0.0)
+    batch = batch or (None if sampler.foresees else COMPARED_BATCH)
+    for ran in conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), cases, batch):
+        search.outcomes.extend(outcome for outcome, _ in ran)
+        search.fmc.append(sum(fmc(search.failures(level)) for level in levels))
+    return replace(search, sampler_s=spent.seconds)
+
+
+class _Stopwatch:
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def timed(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(*arguments: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return function(*arguments)
+            finally:
+                self.seconds += time.perf_counter() - start
+
+        return wrapper
+
+
+@dataclass(frozen=True, slots=True)
+class LevelShare:
+    """What one sampler did at one level, as medians over all seeds."""
+
+    cases_median: float
+    failures_median: float
+    fmc_median: float
+
+
+Quartiles = tuple[float | None, float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One sampler over all seeds, as medians and as quartiles (25 % and 75 %).
+
+    Coverage is summed over the levels. `cases_to_50_percent` and `cases_to_90_percent` are cases
+    until that share of the truth's FMC, None where too few seeds reach it. `fmc_over_truth` is None
+    where the truth has no failure, and `fmc_over_limit` also where no limit was given.
+    """
+
+    fmc_median: float
+    fmc_quartiles: Quartiles
+    fmc_over_truth_median: float | None
+    fmc_over_truth_quartiles: Quartiles
+    fmc_over_limit_median: float | None
+    fmc_over_limit_quartiles: Quartiles
+    failures_median: float
+    failures_quartiles: Quartiles
+    regions_found_median: float
+    regions_found_quartiles: Quartiles
+    seeds_with_all_regions: int
+    cases_to_50_percent_median: float | None
+    cases_to_50_percent_quartiles: Quartiles
+    cases_to_90_percent_median: float | None
+    cases_to_90_percent_quartiles: Quartiles
+    sampler_s_median: float
+    cases_by_batch: list[int]
+    fmc_by_batch_median: list[float]
+    fmc_by_batch_quartiles: tuple[list[float], list[float]]
+    levels: dict[int, LevelShare]
+
+
+def search(
+    plan: SimulationPlan,
+    levels: tuple[int, ...],
+    samplers: Sequence[str],
+    *,
+    seeds: int = 10,
+    cases: int = 400,
+    batch: int | None = None,
+    workers: Workers | None = None,
+    on_search: Callable[[str, int], None] | None = None,
+) -> dict[str, list[Search]]:
+    """Let samplers search the pool of a plan's scenario, with the seeds 0 to `seeds` - 1 each.
+
+    A search runs on one of the `workers`, by default in this process.
+    """
+    tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
+    for level in levels:
+        check_level(level, plan.povs)
+    plan = replace(plan, corridors=min(plan.corridors, batch or COMPARED_BATCH))
+    found: dict[int, Search] = {}
+    with workers_or_here(workers) as there:
+        for place, one in there.run(partial(_searches, plan), tasks, _lost_search, chunk=1):
+            found[place] = one
+            if on_search is not None:
+                name, *_, seed = tasks[place]
+                on_search(name, seed)
+    searches: dict[str, list[Search]] = {name: [] for name in samplers}
+    for place, (name, *_) in enumerate(tasks):
+        searches[name].append(found[place])
+    return searches
+
+
+def _lost_search(task: Task) -> Search:
+    name, *_, seed = task
+    raise UserError(f"the search of {name} with seed {seed} ended its worker process each time")
+
+
+def limit_fmc(
+    searches: Iterable[Search], truths: Mapping[int, Truth], dense: Mapping[int, Truth]
+) -> float:
+    """Return the coverage of all that is known to fail, summed over the levels: no search has more.
+
+    A truth of a few thousand cases misses places that searches find. At each level this is the
+    coverage of what truth and searches found together, or of a `dense` truth, whichever is more.
+    """
+    found = list(searches)
+    total = 0.0
+    for level, truth in truths.items():
+        failing = [truth.failures, *(search.failures(level) for search in found)]
+        together = fmc(np.concatenate([points for points in failing if len(points)] or failing[:1]))
+        total += max(together, fmc(dense[level].failures) if level in dense else 0.0)
+    return total
+
+
+def compare(
+    searches: Sequence[Search], truths: Mapping[int, Truth], limit: float | None = None
+) -> Comparison:
+    """Compare what one sampler found, one search a seed, with the truth at each level.
+
+    `limit` is the coverage of all that is known to fail (`limit_fmc`).
+    """
+    truth_fmc = sum(fmc(truth.failures) for truth in truths.values())
+    real = [(level, region) for level, truth in truths.items() for region in truth.real_regions()]
+    curves = np.array([search.fmc for search in searches])
+    share, of_limit = (
+        curves[:, -1] / whole if whole else np.full(len(curves), np.nan)
+        for whole in (truth_fmc, limit)
+    )
+    failures = np.array([sum(o.failed for o in search.outcomes) for search in searches])
+    found = np.array(
+        [sum(_found(s.failures(level), region) for level, region in real) for s in searches]
+    )
+    after = _cases_by_batch(searches[0])
+    half, most = (_cases_to(part * truth_fmc, curves, after) for part in (0.5, 0.9))
+    by_batch = [np.quantile(curves, part, axis=0).tolist() for part in (0.25, 0.75)]
+    return Comparison(
+        fmc_median=float(np.median(curves[:, -1])),
+        fmc_quartiles=_quartiles(curves[:, -1]),
+        fmc_over_truth_median=_quantile(share, 0.5),
+        fmc_over_truth_quartiles=_quartiles(share),
+        fmc_over_limit_median=_quantile(of_limit, 0.5),
+        fmc_over_limit_quartiles=_quartiles(of_limit),
+        failures_median=float(np.median(failures)),
+        failures_quartiles=_quartiles(failures),
+        regions_found_median=float(np.median(found)),
+        regions_found_quartiles=_quartiles(found),
+        seeds_with_all_regions=int((found == len(real)).sum()),
+        cases_to_50_percent_median=_quantile(half, 0.5),
+        cases_to_50_percent_quartiles=_quartiles(half),
+        cases_to_90_percent_median=_quantile(most, 0.5),
+        cases_to_90_percent_quartiles=_quartiles(most),
+        sampler_s_median=float(np.median([search.sampler_s for search in searches])),
+        cases_by_batch=after,
+        fmc_by_batch_median=np.median(curves, axis=0).tolist(),
+        fmc_by_batch_quartiles=(by_batch[0], by_batch[1]),
+        levels={level: _level_share(searches, level) for level in truths},
+    )
+
+
+def _cases_by_batch(search: Search) -> list[int]:
+    """Return the number of cases that have run after each batch."""
+    sizes = Counter(outcome.batch for outcome in search.outcomes)
+    return list(accumulate(sizes.values()))
+
+
+def _cases_to(target: float, curves: FloatArray, after: list[int]) -> FloatArray:
+    """Return the cases that each search needs to reach a coverage; infinite where it does not."""
+    reached = curves >= target
+    return np.where(reached.any(axis=1), np.array(after)[reached.argmax(axis=1)], np.inf)
+
+
+def _quantile(values: FloatArray, part: float) -> float | None:
+    """Return a quantile, linear between two values; None where one of them is not finite."""
+    ordered = np.sort(values)
+    place = part * (len(ordered) - 1)
+    low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
+    if not np.isfinite(high):
+        return None
+    return float(low + (place - math.floor(place)) * (high - low))
+
+
+def _quartiles(values: FloatArray) -> Quartiles:
+    return _quantile(values, 0.25), _quantile(values, 0.75)
+
+
+def _level_share(searches: Sequence[Search], level: int) -> LevelShare:
+    cases = [sum(o.case.level == level for o in search.outcomes) for search in searches]
+    points = [search.failures(level) for search in searches]
+    return LevelShare(
+        cases_median=float(np.median(cases)),
+        failures_median=float(np.median([len(failing) for failing in points])),
+        fmc_median=float(np.median([fmc(failing) for failing in points])),
+    )
+
+
+def _found(points: FloatArray, region: FloatArray) -> bool:
+    """Return whether some failure that was found lies in a region of the truth."""
+    if not len(points):
+        return False
+    distance, _ = cKDTree(region).query(points)
+    return bool((distance <= radius_for(points.shape[1])).any())
+
+
+def oracle(truths: Mapping[int, Truth], cases: int, batch: int | None) -> dict[int, float]:
+    """Return the coverage of an oracle by number of cases, summed over the levels.
+
+    It knows the failures of the truth and takes, one after the other, the one whose ball adds the
+    most volume: greedy maximum coverage, which no order beats by more than a factor of e / (e - 1)
+    (Nemhauser, Wolsey and Fisher, 1978). A sampler may still pass its end, the truth's FMC: it may
+    fail in places that the truth's cases have missed.
+
+    Returns:
+        FMC after every case of the first batch, and then after every batch, up to `cases`.
+        Without a `batch`, samplers choose, and every ORACLE_STEP cases are shown.
+    """
+    batch = batch or ORACLE_STEP
+    greedy = {level: _greedy(truth.failures, cases) for level, truth in truths.items()}
+    ball = {level: fmc(np.zeros((1, truth.points.shape[1]))) for level, truth in truths.items()}
+    gains = [(-g * ball[level], level) for level, (_, gain) in greedy.items() for g in gain]
+    order = [level for _, level in sorted(gains)]
+    shown = sorted({*range(min(batch, cases) + 1), *range(0, cases, batch), cases})
+    return {
+        n: sum(fmc(points[: order[:n].count(level)]) for level, (points, _) in greedy.items())
+        for n in shown
+    }
+
+
+def _greedy(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """Return at most so many points, (m, d), in greedy order and what each adds, in balls.
+
+    What a point adds never grows. So the best is one that still adds as much as it once did, if no
+    other one ever did more (Minoux, 1978); of points that add the same it is the first.
+    """
+    ground = CoverageGrid(points.shape[1])
+    queue = [(-1.0, place) for place in range(len(points))]
+    order: list[int] = []
+    gains: list[float] = []
+    while queue and len(order) < most:
+        once, place = queue[0]
+        ball = ground.balls(points[[place]])
+        new = float(ground.new(ball)[0])
+        if new < -once:
+            heapreplace(queue, (-new, place))
+            continue
+        heappop(queue)
+        ground.cover(ball[0], 1.0)
+        order.append(place)
+        gains.append(new)
+    return points[order], np.array(gains)

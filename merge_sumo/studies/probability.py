@@ -1,0 +1,161 @@
+"""How likely a VUT is to fail under a stated distribution over the pool, with an interval.
+
+The cases of a campaign were chosen because they were expected to fail, each in the light of those
+before it. No share of them says how likely a failure is, and no binomial interval of theirs is
+valid. So they only shape a proposal (`proposal.py`); the estimate rests on fresh cases, drawn
+independently from it (`interval.py`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.analysis.exposure import Distribution, read_distribution
+from merge_sumo.campaigns.campaign import OnCase, workers_or_here
+from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
+from merge_sumo.engine.simulator import road_for, runs_on
+from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.studies.importance import DEFENSIVE, Draws, Proposal, cells, expected_chance
+from merge_sumo.studies.interval import Estimate, estimate
+from merge_sumo.system.folders import add_to, check_new_file, write_new
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import Case
+from merge_sumo.values.score import Outcome
+
+RESULT: Final = "probability.json"
+LINES: Final = ".jsonl"
+"""End of the name of the file beside it, with a line per fresh case."""
+DEFAULT_CASES: Final = 4000
+STREAM: Final = 7
+"""Key of the random stream, so that it is none of a sampler's."""
+WRITTEN: Final = 500
+"""Cases after which outcomes are written and synced."""
+
+
+def failure_probability(
+    run: Run,
+    out: Path,
+    *,
+    cases: int = DEFAULT_CASES,
+    distribution: Path | None = None,
+    confidence: float = 0.95,
+    seed: int = 0,
+    net: Corridor | None = None,
+    given: Mapping[str, object] | None = None,
+    trust: bool = False,
+    workers: Workers | None = None,
+    on_case: OnCase | None = None,
+) -> Estimate:
+    """Estimate how likely the VUT of a campaign is to fail, with fresh cases in SUMO.
+
+    Writes the estimate with all that decides it to `out`, and the fresh outcomes, each with its
+    weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
+
+    The controller that a folder names runs only where the folder was made here, or with `trust`.
+    What is `given` is taken in the place of what the folder names: policies that are elsewhere, how
+    a VUT is hosted. Cases run on `workers`, by default in this process; the estimate is the same.
+
+    Raises `UserError` for a distribution or numbers that make no sense, a run whose net or policies
+    are not those of today, or files that exist or cannot be written.
+    """
+    if cases < 1:
+        raise UserError(f"--cases is {cases}: it must be 1 or more")
+    if not 0.5 <= confidence < 1.0:
+        raise UserError(f"--confidence is {confidence}: choose 0.5 or more, and below 1")
+    if seed < 0:
+        raise UserError(f"--seed is {seed}: it must be 0 or more")
+    settings = settings_of(run.folder, run.settings, given, trust=trust)
+    net = net or road_for(settings.scenario)
+    _same_system(run, record_of(settings, net))
+    stated = read_distribution(distribution, settings.levels, settings.scenario)
+    check_new_file(out)
+    lines = out.with_suffix(LINES)
+    if lines == out:
+        raise UserError(f"--out is {out}: end it in .json, as cases go to {LINES} beside it")
+    check_new_file(lines)
+    told = make_sampler("uniform", settings.pool, 0)
+    told.tell(run.outcomes)
+    chance = {}
+    for level in stated.levels:
+        history = told.history(level)
+        chance[level] = expected_chance(history, stated.points(level, cells(history.dims)))
+    proposal = Proposal(stated.levels, chance, settings.scenario)
+    draws = proposal.draw(cases, np.random.default_rng([seed, STREAM]))
+    outcomes = _run(settings, net, stated, draws, lines, on_case, workers)
+    failed = np.array([outcome.failed for outcome in outcomes])
+    judged = np.array([outcome.score is not None for outcome in outcomes])
+    result = estimate(draws, failed, judged, proposal.bound, confidence)
+    record = {
+        **asdict(result),
+        "distribution": stated.record(),
+        "defensive_share": DEFENSIVE,
+        "seed": seed,
+        "campaign": record_of(settings, net),
+    }
+    write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
+    return result
+
+
+def _same_system(run: Run, today: Mapping[str, Any]) -> None:
+    for name in ("net_sha256", "policies_sha256"):
+        if run.settings.get(name) != today[name]:
+            what, others = ("net", "another") if name == "net_sha256" else ("policies", "other")
+            raise UserError(
+                f"{run.folder} was run with {others} {what}: name what it was run with, --{what}"
+            )
+
+
+def _run(
+    settings: CampaignSettings,
+    net: Corridor,
+    stated: Distribution,
+    draws: Draws,
+    lines: Path,
+    on_case: OnCase | None,
+    workers: Workers | None,
+) -> list[Outcome]:
+    """Run the draws in order, some at a time; write each outcome with its weight."""
+    by_place: dict[int, Case] = {}
+    for level in stated.levels:
+        places = np.flatnonzero(draws.level == level)
+        dims = len(settings.scenario.dimensions(level))
+        points = stated.points(level, draws.chances[places, :dims])
+        drawn = settings.pool.cases(points, level)
+        by_place.update(zip(places.tolist(), drawn, strict=True))
+    cases = [by_place[place] for place in range(len(by_place))]
+    outcomes: list[Outcome] = []
+    with workers_or_here(workers) as there:
+        run = runs_on(there, plan_of(settings, net, cases=len(cases)))
+        for first in range(0, len(cases), WRITTEN):
+            ran = []
+            for place, done in run(cases[first : first + WRITTEN]):
+                index, case = first + place, cases[first + place]
+                margin = done.margin
+                outcome = Outcome(index, first // WRITTEN, case, done.measures, margin=margin)
+                ran.append(outcome)
+                if on_case is not None:
+                    on_case(outcome)
+            ran.sort(key=lambda outcome: outcome.index)
+            _append(lines, ran, draws)
+            outcomes += ran
+    return outcomes
+
+
+def _append(lines: Path, outcomes: Sequence[Outcome], draws: Draws) -> None:
+    content = ""
+    for o in outcomes:
+        record = o.to_record()
+        record["weight"] = float(draws.weight[o.index])
+        record["plain"] = bool(draws.plain[o.index])
+        content += json.dumps(record, allow_nan=False) + "\n"
+    add_to(lines, content.encode(), new=outcomes[0].index == 0)

@@ -1,0 +1,278 @@
+"""The ground truth of a VUT: thousands of uniform cases, run once and kept in a cache."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from numbers import Integral
+from pathlib import Path
+from typing import Final, cast
+
+import numpy as np
+
+from merge_sumo.campaigns.campaign import workers_or_here
+from merge_sumo.campaigns.settings import check_level
+from merge_sumo.engine.simulator import SimulationPlan, road_for, run_cases
+from merge_sumo.engine.versions import versions
+from merge_sumo.errors import UserError
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
+from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
+from merge_sumo.system.resources import cache_folder
+from merge_sumo.system.signature import CACHE, signed, user_key, verified
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import FloatArray, Pool
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.fmc import fmc, regions
+from merge_sumo.values.scenario import OWN, Scenario
+from merge_sumo.values.score import FAILURE_SCORE
+from merge_sumo.vuts.files import Files, changed
+from merge_sumo.vuts.registry import runs_code
+
+TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
+"""Uniform cases of the ground truth at each level, as in the paper."""
+DENSE_CASES: Final = 1_000_000
+"""Uniform cases of a dense truth: of what the paper's number of them has missed, it shows most."""
+MOST_FILES_BYTES: Final = 1 << 26
+"""Of a truth, besides its numbers: names and hashes of files."""
+PROGRESS_CASES: Final = 100
+"""Cases after which a person is told."""
+REAL_REGION: Final = 0.03
+"""A region of the truth counts when it holds at least this share of its failures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The ground truth of a VUT at a level: n uniform cases and what became of them.
+
+    Attributes:
+        points: cases in the unit cube, (n, d).
+        score: that of the criterion, P for the paper's, (n,), NaN without a verdict.
+    """
+
+    points: FloatArray
+    score: FloatArray
+
+    @property
+    def failures(self) -> FloatArray:
+        """Points of the failing cases, (m, d)."""
+        return self.points[self.score < FAILURE_SCORE]
+
+    def __repr__(self) -> str:
+        """Return in a line what was found."""
+        failures = self.failures
+        return (
+            f"<Truth: {len(failures)} failures in {len(self.points)} cases, "
+            f"FMC {fmc(failures):.4f}>"
+        )
+
+    def real_regions(self) -> list[FloatArray]:
+        """Return the points of each disjoint region with a real share of the failures."""
+        points = self.failures
+        labels = regions(points)
+        groups = [points[labels == label] for label in np.unique(labels)]
+        return [group for group in groups if len(group) >= REAL_REGION * len(points)]
+
+
+DECIDES_OUTCOMES: Final = (
+    "values",
+    "road",
+    "sumo",
+    "drivers",
+    "vuts",
+    "engine",
+)
+"""Sources of this package that decide what becomes of a case."""
+
+
+def sources_sha256() -> str:
+    """Return the hash of the sources of this package that decide what becomes of a case."""
+    package = Path(__file__).resolve().parents[1]
+    sources = hashlib.sha256()
+    for part in DECIDES_OUTCOMES:
+        for source in sorted((package / part).rglob("*.py")):
+            sources.update(source.read_bytes())
+    return sources.hexdigest()
+
+
+OnCases = Callable[[int], None]
+"""Told how many cases have just ended."""
+
+
+def ground_truth(
+    plan: SimulationPlan,
+    level: int,
+    cases: int | None = None,
+    seed: int = 0,
+    *,
+    workers: Workers | None = None,
+    cache: Path | None = None,
+    on_cases: OnCases | None = None,
+) -> Truth:
+    """Return the ground truth of a plan at a level, from the cache where it is there.
+
+    Memory grows by 40 bytes a case and no more, whatever the number of cases.
+
+    The cache's key is a hash of what was asked for and of what is ours to know: VUT, cases, seed,
+    criterion, net, policies, versions, and the sources that decide outcomes. What the VUT itself
+    loaded while it drove is kept with the truth, and a truth is only used while those files are the
+    same. It is signed: what somebody else has put into the cache is not believed. Cases run on
+    `workers`, by default in this process.
+
+    Raises `UserError` where nothing can be kept in the cache, or others can write it.
+    """
+    count = TRUTH_CASES[level] if cases is None else cases
+    for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
+        if not isinstance(number, Integral) or number < least:
+            raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
+    plan = _at_level(plan, level)
+    path = _path(plan, level, count, seed, cache)
+    scenario = plan.scenario
+    found = read_truth(path, level, count, scenario)
+    if found is not None:
+        return found
+    check_place(path.parent, CACHE)
+    check_own(path)
+    key = user_key()
+    points = np.random.default_rng([seed, level]).random((count, len(scenario.dimensions(level))))
+    scores = np.full(count, np.nan)
+    files = (plan.vut.files or {}) | plan.povs.files
+    with workers_or_here(workers) as there:
+        rows = cast("Sequence[FloatArray]", points)
+        scored = there.run(partial(_scores, plan, level), rows, lambda _: (np.nan, {}))
+        for ended, (place, (score, loaded)) in enumerate(scored, start=1):
+            scores[place] = score
+            for name, sha256 in loaded.items():
+                files.setdefault(name, sha256)
+            if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
+                on_cases((ended - 1) % PROGRESS_CASES + 1)
+    truth = Truth(points, scores)
+    arrays = io.BytesIO()
+    np.savez(
+        arrays,
+        points=truth.points,
+        score=truth.score,
+        files=json.dumps(files),
+        of=path.stem,
+    )
+    make_place(path.parent, CACHE)
+    replace_own(path, signed(arrays.getvalue(), path.stem, key))
+    return truth
+
+
+def known_truth(
+    plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
+) -> Truth | None:
+    """Return what `ground_truth` would find in the cache; None where it would have to run cases."""
+    path = _path(_at_level(plan, level), level, cases, seed, cache)
+    return read_truth(path, level, cases, plan.scenario)
+
+
+def _at_level(plan: SimulationPlan, level: int) -> SimulationPlan:
+    """Return a plan without the drivers that no case of a level meets."""
+    check_level(level, plan.povs)
+    return plan if level == OWN else replace(plan, povs=replace(plan.povs, own=None))
+
+
+def _path(plan: SimulationPlan, level: int, cases: int, seed: int, cache: Path | None) -> Path:
+    """Return the file of the cache for the truth of a plan."""
+    own, options = plan.povs.own, plan.vut.options
+    kept = TruthKey(
+        vut=plan.vut.spec,
+        level=level,
+        cases=cases,
+        seed=seed,
+        command=options.command,
+        deadline_s=options.deadline_s,
+        scenario=plan.scenario,
+        policies=plan.povs.sha256(),
+        pov=None if own is None else own.spec,
+        criterion=plan.criterion,
+    )
+    return kept.path(cache)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TruthKey:
+    """What a truth in the cache is of; nothing of the VUT is loaded to look for it.
+
+    Of the learned drivers the hashes count, and not where they are.
+    """
+
+    vut: str
+    level: int
+    cases: int
+    seed: int
+    command: str | None
+    deadline_s: float
+    scenario: Scenario
+    policies: Mapping[str, str]
+    pov: str | None
+    criterion: Criterion
+
+    def path(self, cache: Path | None = None) -> Path:
+        """Return the file of the cache that such a truth is in."""
+        # The same name may be another file in another folder.
+        code = runs_code(self.vut, self.command) or (self.pov and runs_code(self.pov, None))
+        here = str(Path.cwd()) if code else None
+        depends = {
+            **asdict(self),
+            "here": here,
+            "versions": versions(),
+            "sources": sources_sha256(),
+            "net": road_for(self.scenario).sha256,
+        }
+        key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
+        return (cache or cache_folder()) / f"truth-{key}.npz"
+
+
+def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth | None:
+    """Return what a file of the cache holds.
+
+    None where there is none, or it is torn or something else, such as another truth under this
+    name, it was not signed by this user, or a file that the VUT loaded is not what it was.
+    """
+    dims = len(scenario.dimensions(level))
+    try:
+        content = _signed_content(path, most_bytes=8 * cases * (dims + 1) + MOST_FILES_BYTES)
+        if content is None:
+            return None
+        data = read_arrays(io.BytesIO(content), "points", "score", "files", "of")
+        points, score, files = data["points"], data["score"], json.loads(str(data["files"]))
+        if str(data["of"]) != path.stem or not isinstance(files, dict) or changed(files):
+            return None
+    except UNREADABLE_NPZ:
+        return None
+    fits = points.shape == (cases, dims) and score.shape == (cases,)
+    numbers = points.dtype == score.dtype == np.float64
+    if not (fits and numbers):
+        return None
+    inside = bool(((points >= 0.0) & (points <= 1.0)).all())
+    scores = not (np.isinf(score) | (score > 0.0)).any()
+    return Truth(points, score) if inside and scores else None
+
+
+def _signed_content(path: Path, most_bytes: int) -> bytes | None:
+    """Return what a file of the cache holds; None where this user has not signed it.
+
+    Raises OSError where there is no file that can be read, or a giant one.
+    """
+    if regular(path).stat().st_size > most_bytes:
+        raise OSError(errno.EFBIG, "it is no truth, but a giant file", str(path))
+    try:
+        return verified(path.read_bytes(), path.stem, user_key())
+    except UserError:  # without a key of this user's nothing in a cache can be known
+        return None
+
+
+def _scores(
+    plan: SimulationPlan, level: int, points: Sequence[FloatArray]
+) -> Sequence[tuple[float, Files]]:
+    pool = Pool(levels=(level,), scenario=plan.scenario)
+    ran = run_cases(plan, pool.cases(np.asarray(points), level))
+    scores = [np.nan if done.score is None else done.score for done in ran]
+    return [(score, done.files | done.pov_files) for score, done in zip(scores, ran, strict=True)]

@@ -1,0 +1,247 @@
+"""A short drill for a VUT before a campaign: what is wrong with it, and what a step costs."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from time import perf_counter
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.engine.simulator import SimulationPlan, Simulator
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.in_memory import is_here
+from merge_sumo.vuts.registry import VutFactory
+
+CORRIDORS: Final = 4
+CASES: Final = tuple(
+    Case(level=0, x_pov0_m=x, v_pov0_mps=v)
+    for x, v in product((-340.0, -300.0, -260.0, -220.0), (25.0, 28.0, 31.0, 34.0))
+)
+FROM_STAND: Final = Case(level=0, x_pov0_m=-340.0, v_pov0_mps=25.0, v_vut0_mps=0.0)
+LONG_BEGIN_US: Final = 20e3
+"""A campaign of hundreds of cases feels it when an episode takes longer than this to begin."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VutCheck:
+    """What the drill found.
+
+    Attributes:
+        problems: sentences on what makes the VUT's results wrong or worthless.
+        notes: sentences on what its author may want to know.
+        us_per_step_median: cost of one step of one episode, microseconds, without SUMO.
+        us_per_step_worst: cost of the slowest step.
+    """
+
+    problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    us_per_step_median: float
+    us_per_step_worst: float
+
+
+def check_vut(factory: VutFactory) -> VutCheck:
+    """Let a VUT drive a few cases, some of them again, and one from a stand."""
+    with _plan(factory, CORRIDORS).open() as ground:
+        timed = ground.vut = _Timed(ground.vut)
+        first = _run(ground, CASES)
+        problems, differing = _errors(CASES, first), list[_Difference]()
+        if not problems:
+            cases = [*CASES, *_meetings(first)]
+            first += _run(ground, cases[len(CASES) :])
+            backwards = _run(ground, cases[::-1])[::-1]
+            differing += _differences("the same cases in another order", first, backwards)
+            alone = [_run(ground, [case])[0] for case in cases]
+            differing += _differences("each case alone", first, alone)
+            for corridor in range(ground.world.corridors):
+                ground.vut.begin(corridor, FROM_STAND)
+            differing += _differences("a reset too many", first, _run(ground, cases))
+        notes = _limits(first) + timed.long_begin()
+        problems += _from_stand(ground)
+        notes += _not_numbers(ground)
+        if not problems and not differing:
+            after = _run(ground, CASES[:1])
+            differing += _differences("a state that is no number", first[:1], after)
+    if differing:
+        problems += [
+            f"After {d.when} it drives differently from t = {d.at_s:g} s on." for d in differing
+        ]
+        problems.append(_why(factory, differing[0]))
+    return VutCheck(
+        problems=problems,
+        notes=notes,
+        us_per_step_median=statistics.median(timed.us_per_step),
+        us_per_step_worst=max(timed.us_per_step),
+    )
+
+
+def _plan(factory: VutFactory, corridors: int) -> SimulationPlan:
+    scenario = CASES[0].scenario
+    return resolve(factory, scenario=scenario, criterion=Criterion(), corridors=corridors)
+
+
+class _Timed(Driver):
+    """Passes everything on and notes what a step of one corridor costs."""
+
+    def __init__(self, driver: Driver) -> None:
+        super().__init__(driver.corridors)
+        self._driver = driver
+        self.reason, self.close = driver.reason, driver.close  # type: ignore[method-assign]
+        self.us_per_step: list[float] = []
+        self.us_per_begin: list[float] = []
+        self._begun, self._begin_s = 0, 0.0
+
+    def begin(self, corridor: int, case: Case) -> None:
+        start = perf_counter()
+        self._driver.begin(corridor, case)
+        self._begun, self._begin_s = self._begun + 1, self._begin_s + perf_counter() - start
+
+    def act(self, scene: Scene) -> FloatArray:
+        start = perf_counter()
+        answer = self._driver.act(scene)
+        spent = perf_counter() - start
+        self.us_per_step.append(spent * 1e6 / max(int(scene.active.sum()), 1))
+        if self._begun:  # a VUT in a process of its own is told so with the step
+            self.us_per_begin.append((spent + self._begin_s) * 1e6 / self._begun)
+        self._begun, self._begin_s = 0, 0.0
+        return answer
+
+    def long_begin(self) -> list[str]:
+        """Return a sentence where an episode takes long to begin."""
+        us = statistics.median(self.us_per_begin)
+        if us < LONG_BEGIN_US:
+            return []
+        return [
+            f"An episode takes {us / 1e3:.0f} ms to begin: a Python class without `reset` is made "
+            "anew for each; with `reset(self, seen)` one object drives one episode after the other."
+        ]
+
+
+def _run(ground: Simulator, cases: Sequence[Case]) -> list[Trajectory]:
+    return [t for _, t in sorted(ground.run(cases), key=lambda pair: pair[0])]
+
+
+def _meetings(trajectories: Sequence[Trajectory]) -> list[Case]:
+    """Return, for each speed of the POV, the case in which the two would meet at M.
+
+    A controller may keep something of a narrow escape alone.
+    """
+    low_m, high_m = US23.x_pov0_m
+    nearest: dict[float, Trajectory] = {}
+    for one in sorted(trajectories, key=lambda one: -abs(_gap_m(one))):
+        nearest[one.case.v_pov0_mps] = one
+    return [
+        replace(one.case, x_pov0_m=min(max(one.case.x_pov0_m - _gap_m(one), low_m), high_m))
+        for one in nearest.values()
+    ]
+
+
+def _gap_m(trajectory: Trajectory) -> float:
+    return float(trajectory.x_pov_m[-1] - trajectory.x_vut_m[-1])
+
+
+def _errors(cases: Sequence[Case], trajectories: Sequence[Trajectory]) -> list[str]:
+    wrong = [t for t in trajectories if t.error is not None]
+    if not wrong:
+        return []
+    return [
+        f"{len(wrong)} of {len(cases)} ordinary cases end as VUT_ERROR, the first at "
+        f"t = {wrong[0].t_end_s} s: {wrong[0].error}"
+    ]
+
+
+class _Difference(NamedTuple):
+    """A case that went differently when it ran again: after what, and from when on."""
+
+    when: str
+    case: Case
+    at_s: float
+
+
+def _differences(
+    when: str, before: Sequence[Trajectory], after: Sequence[Trajectory]
+) -> list[_Difference]:
+    """Return the first of motions that differ and should be the same, if any."""
+    for one, other in zip(before, after, strict=True):
+        if not np.array_equal(one.motion, other.motion):
+            rows = min(len(one.motion), len(other.motion))
+            steps = np.flatnonzero((one.motion[:rows] != other.motion[:rows]).any(axis=(1, 2)))
+            return [_Difference(when, one.case, float(steps[0] if steps.size else rows) * DT_S)]
+    return []
+
+
+def _why(factory: VutFactory, found: _Difference) -> str:
+    """Return why a VUT drives differently; a case that runs first, twice, tells it."""
+    options, kind = factory.options, factory.spec.partition(":")[0]
+    begins_anew = not (options.in_process or is_here(factory.spec)) and (
+        kind != "traci" or options.command is not None
+    )
+    if not begins_anew:
+        return (
+            "It draws random numbers, reads a clock, or keeps something from earlier episodes, "
+            "perhaps in its module or its class."
+        )
+    motions = []
+    for _ in range(2):
+        with _plan(factory, 1).open() as ground:
+            motions.append(_run(ground, [found.case])[0].motion)
+    if not np.array_equal(motions[0], motions[1]):
+        return (
+            "It draws random numbers, reads a clock, or keeps something outside of its process: as "
+            "the first case of a new process such a case does not repeat either."
+        )
+    return (
+        "It keeps something from earlier episodes, or shares it between those that run at a time: "
+        "in its object (what does `reset` not clear?), its class or its module. As the first case "
+        "of a new process such a case repeats."
+    )
+
+
+def _limits(trajectories: Sequence[Trajectory]) -> list[str]:
+    steps = sum(len(t.motion) - 1 for t in trajectories)
+    clipped = sum(t.clipped_steps for t in trajectories)
+    if not clipped:
+        return []
+    return [
+        f"In {clipped} of {steps} steps it asks for an acceleration outside -4 to 2 m/s2; that is "
+        "clipped, and counted in `clipped_steps`."
+    ]
+
+
+def _from_stand(ground: Simulator) -> list[str]:
+    (trajectory,) = _run(ground, [FROM_STAND])
+    if trajectory.error is not None:
+        return [
+            f"From a stand (v = 0) it ends as VUT_ERROR at t = {trajectory.t_end_s} s: "
+            f"{trajectory.error}"
+        ]
+    if trajectory.end is End.TIMEOUT and not trajectory.v_vut_mps.any():
+        return ["From a stand (v = 0) it never starts, although the road is free at last."]
+    return []
+
+
+def _not_numbers(ground: Simulator) -> list[str]:
+    """Show the VUT a state of NaN; it may answer anything, but must not hang or end us."""
+    corridors = ground.world.corridors
+    if ground.world.vut_type is not None:
+        return []  # SUMO's own drivers see SUMO's state, which is never NaN
+    active = np.zeros(corridors, dtype=bool)
+    active[0] = True
+    nothing = np.full(corridors, np.nan)
+    ground.vut.begin(0, CASES[0])
+    scene = Scene.of_pair(active, np.zeros(corridors, dtype=np.int64), *[nothing] * 4)
+    try:
+        answer = float(ground.vut.act(scene)[0])
+    except VutLostError as lost:
+        return [f"To a state that is not a number it answers nothing, but {lost.reason}."]
+    if np.isfinite(answer):
+        return [f"To a state that is not a number it answers {answer:g} m/s2."]
+    return []

@@ -1,0 +1,173 @@
+"""Games played out by eq. (4), against the very POVs of the levels, without SUMO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.drivers.following import keep_safe
+from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, features
+from merge_sumo.drivers.policies import load_network
+from merge_sumo.engine.povs import POLICIES, Povs
+from merge_sumo.twin.observation import Inputs, Observation
+from merge_sumo.values.bodies import CentreLines
+from merge_sumo.values.case import FloatArray, Pool
+from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
+from merge_sumo.values.trajectory import End, Trajectory
+
+Answer = Callable[[Inputs, int, NDArray[np.int64]], FloatArray]
+"""Gives accelerations of the VUT, (R,), by inputs, (R, inputs), of which some are of the present,
+and the numbers of the rows, (R,), in rising order."""
+STILL: Final = 0.8
+"""Share of rows that still play below which the others are dropped."""
+
+
+class TwinRollout:
+    """Plays cases of a pool out against a VUT that is given as a function."""
+
+    def __init__(
+        self,
+        pool: Pool,
+        povs: Povs,
+        criterion: Criterion = PAPER_CRITERION,
+        lines: CentreLines | None = None,
+    ) -> None:
+        """Take the pool, the POVs, what counts as a failure, and the road's centre lines."""
+        self._pool, self._scenario = pool, pool.scenario
+        self._criterion, self._lines = criterion, lines
+        self._networks = {
+            level: load_network(POLICIES[level], povs.policies)
+            for level in set(povs.levels) & set(POLICIES)
+        }
+
+    def can_play(self, level: int) -> bool:
+        """Return whether the POV of a level is known, and not a program of a person's own.
+
+        A game ends at M, so none can be played where what happens behind it counts.
+        """
+        known = level == 0 or level in self._networks
+        return known and (self._criterion.is_papers or not self._scenario.follow_up_s)
+
+    def _starts(self, points: FloatArray, level: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""
+        scenario = self._scenario
+        values = {
+            d.field: d.low + u * (d.high - d.low)
+            for d, u in zip(scenario.dimensions(level), points.T, strict=True)
+        }
+        fixed_mps = self._pool.v_vut0_mps
+        n, v_vut0_mps = len(points), scenario.bounds("v_vut0_mps")[0]
+        x_m, v_mps = np.zeros((2, scenario.vehicles, n))
+        x_m[POV], v_mps[POV] = values["x_pov0_m"], values["v_pov0_mps"]
+        x_m[VUT] = scenario.x_vut0_m
+        v_mps[VUT] = values.get("v_vut0_mps", v_vut0_mps if fixed_mps is None else fixed_mps)
+        if scenario.vehicles > 2:
+            v_mps[[AHEAD, BEHIND]] = v_mps[POV]
+            x_m[AHEAD] = x_m[POV] + values["headway_ahead_s"] * v_mps[POV]
+            x_m[BEHIND] = x_m[POV] - values["headway_behind_s"] * v_mps[POV]
+        return x_m, v_mps, values.get("svo_rad", np.zeros(n))
+
+    def play(self, points: FloatArray, level: int, answer: Answer) -> FloatArray:
+        """Return the gaps at M to the cars that are nearest there, (R,), of cases, (R, d).
+
+        Cases are points of the unit cube; NaN where the VUT never arrives. Under another criterion
+        than the paper's it is what stands for the gap: see `Outcome.signed_gap_m`.
+        """
+        if not self._criterion.is_papers:
+            return self._judged(points, level, answer)
+        return self._play(points, level, answer)
+
+    def _judged(self, points: FloatArray, level: int, answer: Answer) -> FloatArray:
+        """Return what stands for the gaps at M, (R,)."""
+        played: list[FloatArray] = []
+        gap_m = self._play(points, level, answer, played)
+        motion = np.array(played)
+        found = np.empty(len(points))
+        for row, case in enumerate(self._pool.cases(points, level)):
+            arrived = motion[:, VUT, 0, row] >= 0.0
+            last = int(arrived.argmax()) if arrived.any() else len(motion) - 1
+            of_row = motion[: last + 1, :, :, row].copy()
+            of_row[-1, :, 2] = 0.0
+            end = End.TIMEOUT if np.isnan(gap_m[row]) else End.MERGED
+            judged = self._criterion.judged(Trajectory(case, of_row, end), self._lines)
+            found[row] = judged.signed_gap_m
+        return found
+
+    def _play(
+        self,
+        points: FloatArray,
+        level: int,
+        answer: Answer,
+        played: list[FloatArray] | None = None,
+    ) -> FloatArray:
+        """Return the gaps at M, (R,); add every step, (A, 3, R), to what is `played`."""
+        scenario = self._scenario
+        x_m, v_mps, svo_rad = self._starts(points, level)
+        rows = np.arange(len(points))
+        gap_m = np.full(len(rows), np.nan)
+        cars = [row for row in range(len(x_m)) if row != VUT]
+        a_mps2 = np.zeros_like(x_m)
+        held = np.zeros((len(cars), len(rows)))
+        watcher = Observation(scenario, len(rows))
+        taken_m, decel = scenario.pov_length_m + scenario.min_gap_m, -scenario.a_min_mps2
+        for step in range(scenario.max_steps):
+            inputs = watcher.see(x_m, v_mps, a_mps2[VUT])
+            if level and step % DECISION_STEPS == 0:
+                held = self._decide(x_m[cars], v_mps[cars], x_m[VUT], v_mps[VUT], svo_rad, level)
+            a_mps2[cars] = held
+            if len(cars) > 1:
+                keep_safe(a_mps2, x_m, v_mps, taken_m, decel, scenario.tau_s)
+            a_mps2[VUT] = answer(inputs, watcher.now, rows)
+            a_mps2 = np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2)
+            v_next = np.maximum(v_mps + a_mps2 * DT_S, 0.0)
+            x_before_m, x_m = x_m, x_m + v_mps * DT_S
+            # What is recorded of a vehicle that comes to a stand.
+            a_mps2 = np.maximum(a_mps2, v_mps / -DT_S)
+            if played is not None:
+                played.append(np.stack((x_before_m, v_mps, a_mps2), axis=1))
+            v_mps = v_next
+            arrived = x_m[VUT] >= 0.0
+            if arrived.any():
+                gaps = x_m[cars][:, arrived] - x_m[VUT, arrived]
+                nearest = np.abs(gaps).argmin(axis=0)
+                known = rows[arrived]
+                fresh = np.isnan(gap_m[known])
+                gap_m[known[fresh]] = gaps[nearest, np.arange(gaps.shape[1])][fresh]
+                going = np.isnan(gap_m[rows])
+                if not going.any():
+                    break
+                if played is None and going.mean() < STILL:
+                    rows, svo_rad = rows[going], svo_rad[going]
+                    x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
+                    held = held[:, going]
+                    watcher.keep(going)
+        if played is not None:
+            played.append(np.stack((x_m, v_mps, np.zeros_like(x_m)), axis=1))
+        return gap_m
+
+    def _decide(
+        self,
+        x_m: FloatArray,
+        v_mps: FloatArray,
+        x_vut_m: FloatArray,
+        v_vut_mps: FloatArray,
+        svo_rad: FloatArray,
+        level: int,
+    ) -> FloatArray:
+        """Return what the cars of the mainline choose, (C, R)."""
+        network, cars = self._networks[level], len(x_m)
+        seen = features(
+            x_m.ravel(),
+            v_mps.ravel(),
+            np.tile(x_vut_m, cars),
+            np.tile(v_vut_mps, cars),
+            np.tile(svo_rad, cars) if network.sees_svo else None,
+            self._scenario,
+        )
+        chosen = network.values_at_once(seen).argmax(axis=1)
+        actions: FloatArray = actions_mps2(self._scenario)[chosen].reshape(x_m.shape)
+        return actions

@@ -1,0 +1,379 @@
+"""What all kinds of VUT share: what they see, the deadline, and one controller per corridor."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import threading
+from abc import abstractmethod
+from bdb import BdbQuit
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from numbers import Real
+from pathlib import Path
+from time import perf_counter
+from types import FrameType, TracebackType
+from typing import Any, Final, NamedTuple, Self, TextIO
+
+import numpy as np
+
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.following import car_met
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import World
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT
+from merge_sumo.values.signals import Left, as_signals
+from merge_sumo.values.trajectory import as_reason
+from merge_sumo.vuts.blame_cell import NOBODY, asked
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VutOptions:
+    """How a VUT is hosted; `UserError` for values that make no sense.
+
+    Attributes:
+        command: command line of a controller that is a program of its own, else None.
+        deadline_s: time for one step, and for one reset.
+        connect_s: time for a program to start and connect.
+        in_process: whether a user's code runs in this process instead of one of its own: there a
+            debugger reaches it, and what it does wrong may take this process with it.
+        memory_gib: memory that the process of a user's code may take.
+        log: file to which what a controller prints is added; None is standard error.
+        policies: folder of the networks of the learned VUTs; None for the shipped ones.
+    """
+
+    command: str | None = None
+    deadline_s: float = DEADLINE_S
+    connect_s: float = 60.0
+    in_process: bool = False
+    memory_gib: float = MEMORY_GIB
+    log: Path | None = None
+    policies: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not _is_positive(self.deadline_s):
+            raise UserError(f"--deadline is {self.deadline_s!r}: give seconds, more than 0")
+        if not _is_positive(self.memory_gib):
+            raise UserError(f"--vut-memory is {self.memory_gib!r}: give GiB, more than 0")
+
+
+def _is_positive(value: object) -> bool:
+    return isinstance(value, Real) and math.isfinite(value) and float(value) > 0.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Vut:
+    """A VUT that is ready to be made.
+
+    Attributes:
+        make: makes the driver for a number of corridors in a world.
+        max_corridors: corridors that one driver can serve; None for any number.
+        max_workers: processes that can each have such a driver at a time; None for any number.
+        vut_type: attributes of the SUMO vType with which SUMO itself drives; None if it does not.
+        files: files of the user's that it is made of, as far as they are known.
+        named_only: whether it may be made of more than `files`, which nobody can know.
+    """
+
+    make: Callable[[int, World | None], Driver]
+    max_corridors: int | None = None
+    max_workers: int | None = None
+    vut_type: Mapping[str, str] | None = None
+    files: tuple[Path, ...] = ()
+    named_only: bool = False
+
+
+class Car(NamedTuple):
+    """A car of the mainline.
+
+    Attributes:
+        x_m: distance of its front bumper to M along its lane, negative before M.
+        v_mps: its speed.
+    """
+
+    x_m: float
+    v_mps: float
+
+
+class Seen(NamedTuple):
+    """What a VUT sees at a step: time and state, and nothing about who drives the POV.
+
+    A controller in the POV's seat (`--pov`) is shown itself as the VUT, and the VUT as the POV.
+
+    In traffic the car that the VUT will meet counts as POV: the one that would be nearest to M when
+    the VUT is there, if the car kept its speed and the VUT drove the scenario's level-0 profile
+    (`drivers.following.car_met`). `others` has all cars.
+
+    Attributes:
+        t_s: time since the episode began.
+        x_pov_m: distance of the POV's front bumper to M along its lane, negative before M.
+        v_pov_mps: speed of the POV.
+        x_vut_m: distance of the VUT's front bumper to M along its lane, negative before M.
+        v_vut_mps: speed of the VUT.
+    """
+
+    t_s: float
+    x_pov_m: float
+    v_pov_mps: float
+    x_vut_m: float
+    v_vut_mps: float
+
+    @property
+    def vehicles(self) -> tuple[Car, ...]:
+        """All vehicles in the order of their rows: POV, VUT, and the cars ahead and behind."""
+        return Car(self.x_pov_m, self.v_pov_mps), Car(self.x_vut_m, self.v_vut_mps)
+
+    @property
+    def others(self) -> tuple[Car, ...]:
+        """All cars of the mainline, the one in front first."""
+        cars = (car for row, car in enumerate(self.vehicles) if row != VUT)
+        return tuple(sorted(cars, reverse=True))
+
+
+class SeenInTraffic(Seen):
+    """What a VUT sees where more than one car drives on the mainline."""
+
+    _vehicles: tuple[Car, ...] = ()
+
+    @property
+    def vehicles(self) -> tuple[Car, ...]:
+        """All vehicles in the order of their rows."""
+        return self._vehicles
+
+
+def seen_in(t_s: float, met: int, x_m: Sequence[float], v_mps: Sequence[float]) -> Seen:
+    """Return what a VUT sees of vehicles by their rows; `met` is the row that counts as POV."""
+    state = t_s, x_m[met], v_mps[met], x_m[VUT], v_mps[VUT]
+    if len(x_m) == 2:
+        return Seen(*state)
+    seen = SeenInTraffic(*state)
+    seen._vehicles = tuple(map(Car, x_m, v_mps))
+    return seen
+
+
+def seen_at_start(case: Case) -> Seen:
+    """Return what a VUT sees as an episode begins; level and orientation of the POV are hidden."""
+    x_m, v_mps = zip(*case.starts(), strict=True)
+    met = POV
+    if len(x_m) > 2:
+        x, v = np.array([x_m, v_mps])[..., None]
+        met = int(car_met(x, v, case.scenario.level0_a_mps2, case.scenario.level0_v_mps)[0])
+    return seen_in(0.0, met, x_m, v_mps)
+
+
+class DeadlineExceeded(BaseException):
+    """A call ran into its deadline. Not an Exception, so that a VUT does not catch it by habit."""
+
+
+RING_AFTER: Final = 1.02
+"""Of the deadline: when a timer rings for a call, that is too late beyond doubt."""
+
+
+@dataclass(slots=True)
+class Deadline:
+    """Ends calls to a VUT that take longer than the deadline, and keeps standard output ours.
+
+    While it is entered, a timer rings in the main thread and interrupts a call that is too late.
+    It cannot interrupt native code, nor work in another thread or where there is no such timer
+    (Windows): there a call that is too late is found out when it returns.
+    """
+
+    deadline_s: float
+    _since_s: float = math.inf
+    _stdout: TextIO | None = None
+    _restore: Callable[[], None] | None = field(default=None, repr=False)
+
+    def __enter__(self) -> Self:
+        """Start the timer; what the VUT prints goes to standard error."""
+        self._stdout, sys.stdout = sys.stdout, sys.stderr
+        if hasattr(signal, "setitimer") and (threading.current_thread() is threading.main_thread()):
+            handler = signal.signal(signal.SIGALRM, self._ring)
+            timer = signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+            def restore() -> None:
+                signal.setitimer(signal.ITIMER_REAL, *timer)
+                signal.signal(signal.SIGALRM, handler)
+
+            self._restore = restore
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the timer."""
+        asked.note(NOBODY)
+        if self._restore is not None:
+            self._restore()
+            self._restore = None
+        if self._stdout is not None:
+            sys.stdout = self._stdout
+
+    def _ring(self, _signal: int, _frame: FrameType | None) -> None:
+        if perf_counter() - self._since_s > self.deadline_s:
+            raise DeadlineExceeded
+
+    def call(self, corridor: int, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return function(*arguments), asked for a corridor; `DeadlineExceeded` if late."""
+        asked.note(corridor)
+        if self._restore is not None:
+            # Anew for each call: a ring before its deadline would cut short what waits in C.
+            first_s = RING_AFTER * self.deadline_s
+            signal.setitimer(signal.ITIMER_REAL, first_s, self.deadline_s / 10)
+        self._since_s = start = perf_counter()
+        try:
+            answer = function(*arguments)
+        finally:
+            self._since_s = math.inf
+        if perf_counter() - start > self.deadline_s:
+            raise DeadlineExceeded
+        return answer
+
+    def reason(self, error: BaseException) -> str:
+        """Return what a call did wrong, with the place where it happened.
+
+        Raises the error again where it is no VUT's: a person wants to stop.
+        """
+        if isinstance(error, (Stopped, KeyboardInterrupt)) and not asked.shared:
+            raise error
+        if isinstance(error, DeadlineExceeded):
+            return self.deadline_exceeded
+        if isinstance(error, BdbQuit):
+            return "a debugger was left; breakpoints work with `merge-sumo run --debug`"
+        name = text_of(error, lambda error: type(error).__name__)
+        return f"{name}: {text_of(error)}{text_of(error, _place)}"
+
+    @property
+    def deadline_exceeded(self) -> str:
+        """The reason of a call that was too late."""
+        return f"took longer than the deadline of {self.deadline_s:g} s"
+
+
+MOST_CHARACTERS: Final = 300
+"""Of what a VUT says of itself."""
+
+
+def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
+    """Return what a thing of a VUT says of itself, in a line; it may raise instead, or lie.
+
+    A text that is a VUT's own kind of string is taken as the characters that it has.
+    """
+    try:
+        return as_reason(str.__str__(as_text(thing)))[:MOST_CHARACTERS]
+    except Exception as error:
+        return f"({type(error).__name__} when it was to be shown)"
+
+
+def _place(error: BaseException) -> str:
+    """Return where an error was raised, " (FILE, line N)"; "" where that was not in a VUT."""
+    last: TracebackType | None = error.__traceback__
+    while last is not None and last.tb_next is not None:  # a recursion leaves thousands
+        last = last.tb_next
+    if last is None or last.tb_frame.f_code.co_filename == __file__:
+        return ""
+    return f" ({Path(last.tb_frame.f_code.co_filename).name}, line {last.tb_lineno})"
+
+
+class PerCorridor(Driver):
+    """Asks a controller of its own in each corridor, so that corridors share no state.
+
+    What a controller does wrong is the reason of its corridor alone; it is then made anew.
+    """
+
+    renewal = "made anew"
+    """Begins the reason where that fails."""
+
+    def __init__(self, corridors: int, deadline_s: float) -> None:
+        """Prepare for a number of corridors; a subclass makes the controllers."""
+        super().__init__(corridors)
+        self._watch = Deadline(deadline_s)
+        self._reasons: list[str | None] = [None] * corridors
+        self._renew_first = [False] * corridors
+        self._signals: dict[int, Left] = {}
+
+    @abstractmethod
+    def renew(self, corridor: int) -> None:
+        """Make the controller of a corridor anew."""
+
+    @abstractmethod
+    def reset(self, corridor: int, seen: Seen) -> None:
+        """Tell the controller of a corridor that an episode begins."""
+
+    @abstractmethod
+    def answer(self, corridor: int, seen: Seen) -> float:
+        """Return the acceleration in one corridor, m/s2; raises what the controller raises."""
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Reset the controller of a corridor; an error is kept as the reason of its answer."""
+        self._reasons[corridor] = None
+        doing = self.renewal
+        try:
+            with self._watch as watch:
+                if self._renew_first[corridor]:
+                    watch.call(corridor, self.renew, corridor)
+                    self._renew_first[corridor] = False
+                doing = "reset"
+                watch.call(corridor, self.reset, corridor, seen_at_start(case))
+        except BaseException as error:
+            self._fault(corridor, f"{doing}: {self._watch.reason(error)}")
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the answers of the controllers; NaN where there is a reason."""
+        self._signals = {}
+        answers = [0.0] * self.corridors
+        met = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
+        rows = (scene.active, scene.step, scene.x_m.T, scene.v_mps.T)
+        states = zip(*(row.tolist() for row in rows), met, strict=True)
+        with self._watch as watch:
+            for k, (active, step, x_m, v_mps, row) in enumerate(states):
+                if not active:
+                    continue
+                if self._reasons[k] is not None:
+                    answers[k] = math.nan
+                    continue
+                try:
+                    seen = seen_in(round(step * DT_S, 1), row, x_m, v_mps)
+                    answers[k] = watch.call(k, self._number, k, seen)
+                except BaseException as error:
+                    self._fault(k, watch.reason(error))
+                    answers[k] = math.nan
+        return np.array(answers)
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what the controller of a corridor did wrong."""
+        return self._reasons[corridor]
+
+    def leave(self, corridor: int, left: object) -> None:
+        """Keep what a controller has left with its answer."""
+        self._signals[corridor] = as_signals(left)
+
+    def signals(self) -> Mapping[int, Left]:
+        """Return what the controllers left with their last answers, by corridor."""
+        return self._signals
+
+    def _number(self, corridor: int, seen: Seen) -> float:
+        return as_number(self.answer(corridor, seen))
+
+    def renew_next(self, corridor: int) -> None:
+        """Have the controller of a corridor made anew before the next episode."""
+        self._renew_first[corridor] = True
+
+    def _fault(self, corridor: int, reason: str) -> None:
+        self._reasons[corridor] = reason
+        self.renew_next(corridor)
+
+
+class WrongAnswerError(Exception):
+    """A VUT answered something that is no acceleration."""
+
+
+def as_number(answer: Any) -> float:
+    """Return an answer as a float; raises `WrongAnswerError` for what is not one real number."""
+    if type(answer) is float:
+        return answer
+    if isinstance(answer, (int, float, np.integer, np.floating)) and not isinstance(answer, bool):
+        return float(answer)
+    if isinstance(answer, np.ndarray) and answer.shape == () and answer.dtype.kind in "fiu":
+        return float(answer)
+    said = text_of(answer, repr)[:60]
+    raise WrongAnswerError(f"answered {said} ({type(answer).__name__}) instead of a number")

@@ -1,0 +1,202 @@
+"""A VUT as an FMU: a co-simulation unit by FMI 2.0 or 3.0, such as Simulink exports."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import chdir, suppress
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.drivers.base import Driver
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import World
+from merge_sumo.values.scenario import DT_S
+from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions
+from merge_sumo.vuts.blame_cell import asked
+from merge_sumo.vuts.options import split_options
+
+INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
+OUTPUT: Final = "acceleration_mps2"
+_FLOATS: Final = ("Real", "Float64")
+
+
+def fmu_vut(argument: str, options: VutOptions) -> Vut:
+    """Return the VUT of `fmu:FILE?x_vut_m=NAME&...`; `UserError` for one that cannot be."""
+    spec = f"fmu:{argument}"
+    file, names = split_options(argument, spec)
+    unknown = set(names) - {*INPUTS, OUTPUT}
+    if unknown:
+        raise UserError(
+            f"--vut {spec}: there is no variable {unknown.pop()!r} to name: choose from "
+            f"{', '.join((*INPUTS, OUTPUT))}"
+        )
+    unit = Unit(Path(file), names)
+
+    def make(corridors: int, _world: World | None) -> Driver:
+        return FmuVut(corridors, unit, options.deadline_s)
+
+    return Vut(make=make, max_corridors=1 if unit.only_once else None, files=(Path(file),))
+
+
+class Unit:
+    """The checked description of an FMU; `UserError` when the file is no such unit.
+
+    An input that the unit does not have is not set, if at least one is there and none of the
+    missing ones was named; the output must be there.
+    """
+
+    def __init__(self, path: Path, names: dict[str, str]) -> None:
+        """Read the description and find the variables."""
+        try:
+            import fmpy
+        except ImportError as error:
+            raise UserError("an FMU needs FMPy: run `pip install 'merge-sumo[fmu]'`") from error
+        self._fmpy, self._path = fmpy, path
+        if not path.is_file():
+            raise UserError(f"there is no FMU {path}")
+        try:
+            self.description: Any = fmpy.read_model_description(str(path))
+        except Exception as error:  # of many classes: XML, zip, FMPy's own
+            raise UserError(f"{path} is no readable FMU: {str(error)[:200]}") from error
+        if self.description.coSimulation is None:
+            raise UserError(f"{path} has no co-simulation: export it as an FMU for co-simulation")
+        self.version = str(self.description.fmiVersion)[0]
+        if self.version not in "23":
+            raise UserError(
+                f"{path} is of FMI {self.description.fmiVersion}: export it as FMI 2.0 or 3.0"
+            )
+        if fmpy.platform not in fmpy.supported_platforms(str(path)) and (
+            getattr(fmpy, "platform_tuple", None) not in fmpy.supported_platforms(str(path))
+        ):
+            raise UserError(
+                f"{path} has no binary for {fmpy.platform}, only for "
+                f"{', '.join(fmpy.supported_platforms(str(path))) or 'nothing'}"
+            )
+        variables = {v.name: v for v in self.description.modelVariables}
+        inputs = [
+            (place, variables[name])
+            for place, key in enumerate(INPUTS)
+            if (name := names.get(key, key)) in variables or key in names
+            if self._checked(variables, name)
+        ]
+        if not inputs:
+            raise UserError(
+                f"{path} has none of the inputs {', '.join(INPUTS)}: name its own, as in "
+                f"fmu:{path}?v_vut_mps=NAME"
+            )
+        output = self._checked(variables, names.get(OUTPUT, OUTPUT))
+        self.input_places = [place for place, _ in inputs]
+        self.input_references = [variable.valueReference for _, variable in inputs]
+        self.output_references = [output.valueReference]
+
+    def _checked(self, variables: dict[str, Any], name: str) -> Any:
+        """Return a variable that is one 64-bit float; `UserError` when it is not."""
+        variable = variables.get(name)
+        if variable is None:
+            there = ", ".join(sorted(variables)[:12])
+            raise UserError(f"{self._path} has no variable {name!r}; it has {there}")
+        if variable.type not in _FLOATS:
+            raise UserError(
+                f"the variable {name!r} of {self._path} is a {variable.type}: it must be a Real "
+                "or Float64"
+            )
+        return variable
+
+    @property
+    def only_once(self) -> bool:
+        """Whether one process can have one instance only."""
+        return str(self.description.coSimulation.canBeInstantiatedOnlyOncePerProcess) == "True"
+
+    @cached_property
+    def folder(self) -> str:
+        """The unpacked unit; `remove` takes it away."""
+        return str(self._fmpy.extract(str(self._path)))
+
+    def remove(self) -> None:
+        """Remove the unpacked unit."""
+        if "folder" in self.__dict__:
+            shutil.rmtree(self.__dict__.pop("folder"), ignore_errors=True)
+
+    def instance(self, name: str) -> Any:
+        """Return a new instance of the unit."""
+        if self.version == "2":
+            from fmpy.fmi2 import FMU2Slave as Slave
+        else:
+            from fmpy.fmi3 import FMU3Slave as Slave
+        # FMPy goes to the folder of the binary and, when that cannot be loaded, stays there.
+        with chdir("."):
+            made: Any = Slave(
+                guid=self.description.guid,
+                unzipDirectory=self.folder,
+                modelIdentifier=self.description.coSimulation.modelIdentifier,
+                instanceName=name,
+            )
+        made.instantiate()
+        return made
+
+
+class FmuVut(PerCorridor):
+    """Steps an instance of the unit in each corridor: set the state, step by 0.1 s, read."""
+
+    def __init__(self, corridors: int, unit: Unit, deadline_s: float) -> None:
+        """Make an instance for each corridor; `UserError` when the unit cannot be made."""
+        super().__init__(corridors, deadline_s)
+        self._unit = unit
+        self._instances: list[Any] = [None] * corridors
+        self._ran = [False] * corridors
+        try:
+            for corridor in range(corridors):
+                self.renew(corridor)
+        except Exception as error:  # of FMPy or of the loader of the binary
+            self.close()
+            raise UserError(f"the FMU cannot be made: {error}") from error
+
+    def renew(self, corridor: int) -> None:
+        """Replace the instance of a corridor."""
+        asked.note(corridor)
+        _free(self._instances[corridor])
+        self._instances[corridor] = None
+        self._instances[corridor] = self._unit.instance(f"vut{corridor}")
+        self._ran[corridor] = False
+
+    def reset(self, corridor: int, seen: Seen) -> None:
+        """Initialise the instance at t = 0 with the state at the start."""
+        instance = self._instances[corridor]
+        if self._ran[corridor]:
+            instance.reset()
+        self._ran[corridor] = True
+        if self._unit.version == "2":
+            instance.setupExperiment(startTime=0.0)
+            instance.enterInitializationMode()
+        else:
+            instance.enterInitializationMode(startTime=0.0)
+        self._set(instance, seen)
+        instance.exitInitializationMode()
+
+    def answer(self, corridor: int, seen: Seen) -> float:
+        """Return the output after a step with the state held."""
+        instance, unit = self._instances[corridor], self._unit
+        self._set(instance, seen)
+        instance.doStep(seen.t_s, DT_S)
+        read = instance.getReal if unit.version == "2" else instance.getFloat64
+        return float(read(unit.output_references)[0])
+
+    def close(self) -> None:
+        """Free the instances and remove the unpacked unit."""
+        for instance in self._instances:
+            _free(instance)
+        self._unit.remove()
+
+    def _set(self, instance: Any, seen: Seen) -> None:
+        unit = self._unit
+        values = [seen[1 + place] for place in unit.input_places]
+        write = instance.setReal if unit.version == "2" else instance.setFloat64
+        write(unit.input_references, values)
+
+
+def _free(instance: Any) -> None:
+    if instance is not None:
+        with suppress(Exception):  # a unit that failed cannot be terminated
+            instance.terminate()
+        instance.freeInstance()

@@ -1,0 +1,401 @@
+"""A user's VUT in a process of its own, so that it can take down nothing but itself.
+
+Each step is a question to that process and its answer. When the process dies, or answers nothing
+for longer than the deadline, it is killed and started again: whose doing it was is in memory that
+both share, and the episodes of the other corridors begin anew.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import mmap
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import World
+from merge_sumo.system.blame import how_it_ended
+from merge_sumo.system.pulse import AwakeClock
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.signals import Left
+from merge_sumo.vuts.base import Deadline, Vut, VutOptions
+from merge_sumo.vuts.blame_cell import BlameCell
+from merge_sumo.vuts.host import wire
+from merge_sumo.vuts.host.wire import About, Frame, WireError
+from merge_sumo.vuts.output import Output
+
+BOOT: Final = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1])['path']; "
+    "from merge_sumo.vuts.host.process import main; main()"
+)
+"""With `python -P -c`: modules are found where the other process finds them, and nowhere else."""
+SUPPORTED: Final = os.name == "posix"
+"""Elsewhere descriptors do not pass to another process, and a VUT runs in this one."""
+GRACE: Final = 1.5
+"""Of the deadline: by then the other process should have ended the call by itself."""
+GRACE_S: Final = 1.0
+"""More of it, for a busy machine."""
+LOOK_S: Final = 0.25
+"""A dead process may have left its end of the channel to another: look for its death, too."""
+ENDING_S: Final = 2.0
+
+
+def hosted_vut(spec: str, options: VutOptions) -> Vut:
+    """Return a VUT whose code runs in a process of its own; `UserError` for one that cannot be."""
+    facts = _facts(spec, options)
+
+    def make(corridors: int, _world: World | None) -> Driver:
+        return HostedVut(corridors, spec, options)
+
+    return Vut(
+        make=make,
+        max_corridors=facts.max_corridors,
+        max_workers=facts.max_workers,
+        files=tuple(Path(file) for file, _ in facts.stamps),
+    )
+
+
+Stamp = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class _Facts:
+    """What a VUT said of itself, and the state of its files then."""
+
+    max_corridors: int | None
+    max_workers: int | None
+    stamps: tuple[tuple[str, Stamp | None], ...]
+
+
+_known: dict[tuple[str, str, float], _Facts] = {}
+"""By spec, working folder and memory: a process is not started again where no file has changed."""
+
+
+def _facts(spec: str, options: VutOptions) -> _Facts:
+    key = spec, str(Path.cwd()), options.memory_gib
+    known = _known.get(key)
+    if known is None or any(_stamp(file) != stamp for file, stamp in known.stamps):
+        host = _first(lambda: Host(spec, options))
+        try:
+            said = host.said
+        finally:
+            host.kill()
+        stamps = tuple((file, _stamp(file)) for file in said["files"])
+        known = _known[key] = _Facts(said["max_corridors"], said["max_workers"], stamps)
+    return known
+
+
+def _first(opened: Callable[[], Host]) -> Host:
+    """Return what opens a VUT for the first time; where its process dies, it is opened again."""
+    try:
+        return opened()
+    except OpeningDiedError:
+        return opened()
+
+
+def _stamp(file: str) -> Stamp | None:
+    try:
+        found = Path(file).stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+class HostDiedError(Exception):
+    """The process is gone, or was killed because it hung.
+
+    Attributes:
+        reason: how that happened.
+        corridor: whose controller was being asked; None where nobody knows.
+        hung: whether it was killed because it hung.
+        killed: whether somebody else killed it, or it itself.
+    """
+
+    def __init__(
+        self, reason: str, corridor: int | None, *, hung: bool = False, killed: bool = False
+    ) -> None:
+        """Take what is known."""
+        super().__init__(reason)
+        self.reason, self.corridor, self.hung, self.killed = reason, corridor, hung, killed
+
+
+class OpeningDiedError(UserError):
+    """The process died while the VUT was opened; its cause is a `HostDiedError`."""
+
+
+class Host:
+    """The process of a VUT, with the VUT opened in it.
+
+    `said` is what the VUT said of itself: "max_corridors", "max_workers" and "files".
+    """
+
+    def __init__(self, spec: str, options: VutOptions) -> None:
+        """Start the process and open the VUT; `UserError` when that cannot be."""
+        self._options = options
+        self._number = 0
+        self.alive = True
+        """Whether it can be asked; a process that once gave no answer is killed."""
+        self._buffer = bytearray()
+        self._start()
+        try:
+            told = {"spec": spec, "deadline_s": options.deadline_s}
+            self.said: Mapping[str, Any] = wire.from_json(
+                self._opened(spec, About.OPEN, wire.to_json(told)), dict
+            )
+        except BaseException:
+            self.kill()
+            raise
+
+    def make(self, spec: str, corridors: int) -> None:
+        """Have the VUT's driver made; `UserError` when that cannot be."""
+        try:
+            self._opened(spec, About.MAKE, wire.to_json(corridors))
+        except BaseException:
+            self.kill()
+            raise
+
+    def ask(self, about: About, content: bytes = b"", *, patience_s: float | None = None) -> Frame:
+        """Ask and return the answer; raises `HostDiedError` when there is none.
+
+        The process is killed when one controller is asked for longer than `patience_s`, by default
+        that of a step.
+        """
+        if patience_s is None:
+            patience_s = GRACE * self._options.deadline_s + GRACE_S
+        self._number += 1
+        self._waits = True
+        try:
+            rest = memoryview(wire.frame(self._number, about, content))
+            while rest:
+                rest = rest[os.write(self._to, rest) :]
+            return self._answer(patience_s)
+        except (OSError, EOFError):
+            raise self._died() from None
+        except WireError:
+            corridor = self._corridor()
+            self.kill()
+            raise HostDiedError(how_it_ended(None), corridor) from None
+        except BaseException:  # a person stops: nobody waits for the answer any more
+            self.kill()
+            raise
+
+    def kill(self) -> None:
+        """End the process, and what it started."""
+        if not self.alive:
+            return  # what its descriptors were may be others' by now
+        self.alive = False
+        for descriptor in (self._to, self._from, self._lifeline):
+            os.close(descriptor)
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        _end_strays(f"TMPDIR={self._scratch.name}")
+        self._output.close()
+        self._scratch.cleanup()
+
+    def close(self) -> None:
+        """Let the VUT close, then end the process."""
+        if self.alive:
+            with suppress(HostDiedError, subprocess.TimeoutExpired):
+                self.ask(About.CLOSE)
+                self._process.wait(ENDING_S)
+        self.kill()
+
+    def _start(self) -> None:
+        # What is killed leaves its temporary files behind: they are in a folder of ours.
+        self._scratch = tempfile.TemporaryDirectory(
+            prefix="merge-sumo-", ignore_cleanup_errors=True
+        )
+        their_in, self._to = os.pipe()
+        self._from, their_out = os.pipe()
+        their_lifeline, self._lifeline = os.pipe()
+        with tempfile.TemporaryFile() as memory:
+            memory.truncate(BlameCell.FORMAT.size)
+            settings = {
+                "path": sys.path,
+                "memory_gib": self._options.memory_gib,
+                "lifeline": their_lifeline,
+                "asked": memory.fileno(),
+            }
+            try:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-c", BOOT, json.dumps(settings)],
+                    stdin=their_in,
+                    stdout=their_out,
+                    stderr=subprocess.PIPE,
+                    pass_fds=(their_lifeline, memory.fileno()),
+                    # The order of sets must not be another one in each run.
+                    env={**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": self._scratch.name},
+                    start_new_session=True,
+                )
+            except OSError as error:
+                for descriptor in (self._to, self._from, self._lifeline):
+                    os.close(descriptor)
+                self._scratch.cleanup()
+                raise UserError(f"cannot start a process for the VUT: {error.strerror}") from error
+            finally:
+                for descriptor in (their_in, their_out, their_lifeline):
+                    os.close(descriptor)
+            self._asked = mmap.mmap(memory.fileno(), BlameCell.FORMAT.size)
+        # A question fits into the pipe, unless the process has stopped to listen.
+        os.set_blocking(self._to, False)
+        assert self._process.stderr is not None, "piped"  # noqa: S101
+        self._output = Output(self._process.stderr, self._options.log)
+        self._poll = select.poll()
+        self._poll.register(self._from, select.POLLIN)
+
+    def _opened(self, spec: str, about: About, content: bytes) -> bytes:
+        """Ask for a VUT to be opened or made; `UserError` when that cannot be."""
+        try:
+            answer = self.ask(about, content, patience_s=self._options.connect_s)
+        except HostDiedError as died:
+            line = self._output.last_line()
+            printed = f" (it printed: {line})" if line else ""
+            raise OpeningDiedError(
+                f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
+            ) from died
+        if answer.about is About.REFUSED:
+            raise UserError(wire.from_json(answer.content, str))
+        return answer.content
+
+    def _answer(self, patience_s: float) -> Frame:
+        noted, clock = BlameCell.read(self._asked)[0], AwakeClock(2.0 * LOOK_S)
+        while True:
+            answer = wire.take(self._buffer)
+            if answer is not None and answer.number == self._number:
+                return answer
+            now = BlameCell.read(self._asked)[0]
+            if now != noted:
+                noted = now
+                clock.restart()
+            elif clock.elapsed_s() > patience_s:
+                corridor = self._corridor()
+                self.kill()
+                late = f"took longer than {patience_s:g} s"
+                if patience_s != self._options.connect_s:
+                    late = Deadline(self._options.deadline_s).deadline_exceeded
+                raise HostDiedError(late, corridor, hung=True)
+            if answer is not None:
+                continue  # of a child that the VUT forked
+            if self._poll.poll(1e3 * min(LOOK_S, patience_s)):
+                part = os.read(self._from, 1 << 16)
+                if not part:
+                    raise EOFError
+                self._buffer += part
+            elif self._process.poll() is not None:
+                raise EOFError
+
+    def _died(self) -> HostDiedError:
+        corridor = self._corridor()
+        try:
+            code = self._process.wait(ENDING_S)
+        except subprocess.TimeoutExpired:
+            code = None  # it closed the channel and goes on
+        self.kill()
+        return HostDiedError(how_it_ended(code), corridor, killed=code == -signal.SIGKILL)
+
+    def _corridor(self) -> int | None:
+        corridor = BlameCell.read(self._asked)[1]
+        return corridor if corridor >= 0 else None
+
+
+def _end_strays(inherited: str) -> None:
+    """End what the VUT started in a session of its own, by what it inherited (Linux only)."""
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it is another user's, or just ended
+            if inherited.encode() in (process / "environ").read_bytes().split(b"\0"):
+                os.kill(int(process.name), signal.SIGKILL)
+
+
+class HostedVut(Driver):
+    """Passes every step on to the process of the VUT."""
+
+    def __init__(self, corridors: int, spec: str, options: VutOptions) -> None:
+        """Start the process and make the VUT's driver there; `UserError` when that cannot be."""
+        super().__init__(corridors)
+        self._spec, self._options = spec, options
+        self._begun: list[tuple[int, Case]] = []
+        self._reasons: dict[int, str] = {}
+        self._signals: dict[int, Left] = {}
+        self._files: set[Path] = set()
+        self._host = _first(self._started)
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Note that an episode begins; the VUT is told with the next scene."""
+        self._begun.append((corridor, case))
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the VUT's answers; NaN where it has a reason. Raises `VutLostError`."""
+        if not self._host.alive:
+            try:
+                self._host = self._started()
+            except OpeningDiedError as error:
+                died = error.__cause__
+                killed = isinstance(died, HostDiedError) and died.killed
+                raise VutLostError(str(error), killed=killed) from error
+            except UserError as error:
+                self._begun.clear()
+                self._reasons = dict.fromkeys(range(self.corridors), f"started anew: {error}")
+                return np.full(self.corridors, math.nan)
+        content = wire.pack_scene(self._begun, scene)
+        self._begun.clear()
+        try:
+            answer = self._host.ask(About.ACT, content)
+            if answer.about is About.LOST:
+                told = wire.from_json(answer.content, dict)
+                raise VutLostError(told["reason"], told["corridor"], final=told["final"])
+            if answer.about is not About.DONE:
+                # Not its driver, but what surrounds it failed: the VUT has changed that.
+                self._host.kill()
+                raise VutLostError(str(wire.from_json(answer.content, str)), final=True)
+            said = wire.unpack_answers(answer.content, self.corridors)
+            self._reasons, self._signals = said.reasons, said.signals
+        except HostDiedError as died:
+            own, how = self._own(died.corridor), {"final": died.hung, "killed": died.killed}
+            raise VutLostError(died.reason, own, **how) from None
+        except (WireError, KeyError, ValueError, AttributeError):
+            self._host.kill()
+            raise VutLostError(how_it_ended(None)) from None
+        return said.a_mps2
+
+    def signals(self) -> Mapping[int, Left]:
+        """Return what the VUT left with its last answers."""
+        return self._signals
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what the VUT did wrong in a corridor."""
+        return self._reasons.get(corridor)
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the files that the VUT has loaded so far."""
+        if self._host.alive:
+            with suppress(HostDiedError, WireError):
+                listed = wire.from_json(self._host.ask(About.FILES).content, list)
+                self._files |= {Path(str(file)) for file in listed}
+        return tuple(sorted(self._files))
+
+    def close(self) -> None:
+        """Let the VUT close and end its process."""
+        self._host.close()
+
+    def _started(self) -> Host:
+        host = Host(self._spec, self._options)
+        self._files |= {Path(file) for file in host.said["files"]}
+        host.make(self._spec, self.corridors)
+        return host
+
+    def _own(self, corridor: int | None) -> int | None:
+        return corridor if corridor is not None and corridor < self.corridors else None

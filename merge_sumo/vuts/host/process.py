@@ -1,0 +1,163 @@
+"""The process that hosts a user's VUT: what the VUT does to its process, it does to this one.
+
+It is started by `HostedVut` and answers its questions. Standard input and output belong to the
+channel at first and are then given to the VUT as nothing and as its log.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import signal
+import sys
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from merge_sumo.drivers.base import Driver, VutLostError
+from merge_sumo.errors import UserError
+from merge_sumo.system.lifeline import end_with
+from merge_sumo.vuts.base import Vut, VutOptions, text_of
+from merge_sumo.vuts.blame_cell import BlameCell, asked
+from merge_sumo.vuts.host import wire
+from merge_sumo.vuts.host.file_audit import LoadedFiles
+from merge_sumo.vuts.host.wire import About, Frame
+
+
+def main() -> None:
+    """Host a VUT until the channel ends."""
+    settings = json.loads(sys.argv[1])
+    sys.argv[1:] = []
+    channel = _Channel()
+    _hear_signals()
+    _limit(settings["memory_gib"])
+    end_with(settings["lifeline"])
+    asked.share(mmap.mmap(settings["asked"], BlameCell.FORMAT.size))
+    _Hosting(channel).serve()
+
+
+class _Channel:
+    """The frames of the other process."""
+
+    def __init__(self) -> None:
+        """Take standard input and output, and put nothing and the log in their places."""
+        self._in, self._out = os.dup(0), os.dup(1)
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(nothing, 0)
+        os.close(nothing)
+        os.dup2(2, 1)
+        # What is printed shortly before a crash must not be lost in a buffer.
+        sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+        self._buffer = bytearray()
+        self._process = os.getpid()
+
+    def receive(self) -> Frame | None:
+        """Return the next question; None when the other process is gone."""
+        while (found := wire.take(self._buffer)) is None:
+            part = os.read(self._in, 1 << 16)
+            if not part:
+                return None
+            self._buffer += part
+        return found
+
+    def send(self, number: int, about: About, content: bytes = b"") -> None:
+        """Answer."""
+        if os.getpid() != self._process:
+            os._exit(0)  # the VUT forked, and its child came back here
+        rest = memoryview(wire.frame(number, about, content))
+        while rest:
+            rest = rest[os.write(self._out, rest) :]
+
+
+class _Hosting:
+    """A VUT and its driver, by the questions that are asked."""
+
+    def __init__(self, channel: _Channel) -> None:
+        self._channel = channel
+        self._loaded: LoadedFiles | None = None
+        self._vut: Vut | None = None
+        self._driver: Driver | None = None
+
+    def serve(self) -> None:
+        """Answer question by question."""
+        while (question := self._channel.receive()) is not None:
+            try:
+                about, content = self._answer(question)
+            except UserError as error:
+                about, content = About.REFUSED, wire.to_json(str(error))
+            except VutLostError as lost:
+                told = {"reason": lost.reason, "corridor": lost.corridor, "final": lost.final}
+                about, content = About.LOST, wire.to_json(told)
+            except Exception as error:
+                said = f"{type(error).__name__}: {text_of(error)}"
+                about, content = About.REFUSED, wire.to_json(said)
+            self._channel.send(question.number, about, content)
+            if question.about is About.CLOSE:
+                return
+
+    def _answer(self, question: Frame) -> tuple[About, bytes]:
+        if question.about is About.OPEN:
+            return About.DONE, wire.to_json(self._open(wire.from_json(question.content, dict)))
+        if question.about is About.MAKE:
+            assert self._vut is not None, "opened first"  # noqa: S101
+            self._driver = self._vut.make(wire.from_json(question.content, int), None)
+            return About.DONE, b""
+        if question.about is About.FILES:
+            return About.DONE, wire.to_json(self._files())
+        assert self._driver is not None, "made first"  # noqa: S101
+        if question.about is About.CLOSE:
+            self._driver.close()
+            return About.DONE, b""
+        return About.DONE, self._act(self._driver, question.content)
+
+    def _open(self, told: dict[str, Any]) -> dict[str, Any]:
+        # Only here: what is above starts this process, and imports this module.
+        from merge_sumo.vuts.registry import find_vut
+
+        options = VutOptions(deadline_s=told["deadline_s"], in_process=True)
+        self._loaded = LoadedFiles()
+        self._vut = find_vut(told["spec"], options)
+        return {
+            "max_corridors": self._vut.max_corridors,
+            "max_workers": self._vut.max_workers,
+            "files": self._files(),
+        }
+
+    def _files(self) -> list[str]:
+        assert self._vut is not None, "opened first"  # noqa: S101
+        assert self._loaded is not None, "opened first"  # noqa: S101
+        return sorted({str(file.resolve()) for file in self._vut.files} | self._loaded.files())
+
+    def _act(self, driver: Driver, content: bytes) -> bytes:
+        begun, scene = wire.unpack_scene(content)
+        for corridor, case in begun:
+            driver.begin(corridor, case)
+        answers = driver.act(scene)
+        wrong = np.flatnonzero(~np.isfinite(answers) & scene.active).tolist()
+        reasons = {k: reason for k in wrong if (reason := driver.reason(k)) is not None}
+        return wire.pack_answers(answers, reasons, driver.signals())
+
+
+def _hear_signals() -> None:
+    """Take signals as a program does that a person starts; a worker does not, and hands that on."""
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    # Python itself ignores these two.
+    for number in signal.valid_signals() - {signal.SIGPIPE, signal.SIGXFSZ}:
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _limit(memory_gib: float) -> None:
+    """Let memory run out here before it runs out for everybody, and leave no core dump behind."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    most = int(memory_gib * 2**30)
+    with suppress(ValueError, OSError):  # a limit of the system may be lower
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    with suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

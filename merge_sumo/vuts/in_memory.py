@@ -1,0 +1,206 @@
+"""VUTs that are objects of this Python process: a class of a notebook, a lambda, an instance.
+
+What can be imported is named, `module:Name`, and hosted as on the command line. The rest is kept
+here under a name of its own, `here:Name`, and drives in the process that runs the cases.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
+from typing import Any, Final, Protocol, SupportsFloat
+
+from merge_sumo.drivers.base import Driver
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import World
+from merge_sumo.system.workers import workers_or_cores
+from merge_sumo.vuts.base import Seen, Vut, VutOptions, text_of
+from merge_sumo.vuts.python import (
+    BatchedVut,
+    CallableVut,
+    PythonVut,
+    SeenBatch,
+    takes_one,
+    vut_of,
+)
+from merge_sumo.vuts.signatures import check_methods
+
+
+class Acts(Protocol):
+    """A controller of one corridor."""
+
+    def act(self, seen: Seen, /) -> SupportsFloat:
+        """Return the acceleration for the next 0.1 s, in m/s2."""
+
+
+class ActsInBatches(Protocol):
+    """A controller of all K corridors at once."""
+
+    def act_batch(self, seen: SeenBatch, /) -> Any:
+        """Return the accelerations for the next 0.1 s, in m/s2, (K,)."""
+
+
+AnyVut = str | type[Any] | Callable[[Seen], SupportsFloat] | Acts | ActsInBatches
+"""A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
+HERE: Final = "here"
+"""The part of their specs before the colon."""
+MAINS: Final = ("__main__", "__mp_main__")
+
+_objects: dict[str, Any] = {}
+"""By the part of their specs behind the colon."""
+
+
+def spec_of(vut: Any) -> str:
+    """Return what names a VUT in this process and in those that it starts: a spec as it is.
+
+    Raises `UserError` for what is no VUT.
+    """
+    if isinstance(vut, str):
+        return vut
+    if isinstance(vut, type) or inspect.isroutine(vut):
+        importable = _importable(vut)
+        if importable is not None:
+            return importable
+    name = str(getattr(vut, "__qualname__", type(vut).__qualname__)).rpartition(".")[2]
+    name = "lambda" if name == "<lambda>" else name
+    vut_of_object(vut, name, VutOptions())
+    number, unique = 1, name
+    while _objects.get(unique, vut) is not vut:
+        number += 1
+        unique = f"{name}-{number}"
+    _objects[unique] = vut
+    return f"{HERE}:{unique}"
+
+
+def is_here(spec: str) -> bool:
+    """Return whether a spec names an object of this process."""
+    return spec.partition(":")[0] == HERE
+
+
+def object_of(spec: str) -> Any:
+    """Return the object that a spec names; None for a spec that is a text for everybody."""
+    return _objects.get(spec.partition(":")[2]) if is_here(spec) else None
+
+
+def keep(spec: str, vut: Any) -> None:
+    """Keep an object that came from another process, under the name that it has there."""
+    _objects[spec.partition(":")[2]] = vut
+
+
+def travels(spec: str) -> bool:
+    """Return whether other processes can be given a VUT: by name, or as a copy of the object.
+
+    What the main module defines cannot be found there.
+    """
+    if not is_here(spec):
+        return True
+    try:
+        content = bytes(ForkingPickler.dumps(object_of(spec)))
+    except Exception:  # whatever an object does when it is asked for a copy of itself
+        return False
+    return not any(name.encode() in content for name in MAINS)
+
+
+def drivers_of(
+    vut: Any, pov: Any, workers: int | None, *, stacklevel: int = 3
+) -> tuple[str, str | None, int | None]:
+    """Return the specs of what drives, and how many workers can have it; None is one a core.
+
+    Says in a sentence where something drives in this process that could do it harm.
+    """
+    count = workers_or_cores(workers)
+    specs = spec_of(vut), None if pov is None else spec_of(pov)
+    for spec in specs:
+        if spec is None or object_of(spec) is None:
+            continue
+        name = spec.partition(":")[2]
+        if travels(spec):
+            where = "the processes of the workers" if count > 1 else "this process"
+            why = f"{name} is an object, so it drives in {where}, which what it does wrong may end"
+        else:
+            alone = ", and without workers," if count > 1 else ""
+            workers = 1
+            why = (
+                f"{name} is known to this process alone, so it drives here{alone} where what it "
+                "does wrong may end everything; put its class or function into a module for a "
+                "process of its own"
+            )
+        warnings.warn(why, stacklevel=stacklevel)
+    return *specs, workers
+
+
+def here_vut(argument: str, options: VutOptions) -> Vut:
+    """Return the VUT of `here:NAME`; `UserError` where that is an object of another process."""
+    if argument not in _objects:
+        raise UserError(
+            f"{HERE}:{argument} was an object of a Python process: name a VUT with --vut, or give "
+            "the object again"
+        )
+    return vut_of_object(_objects[argument], f"{HERE}:{argument}", options)
+
+
+def vut_of_object(vut: Any, name: str, options: VutOptions) -> Vut:
+    """Return the VUT that an object is; `UserError` for one that is none."""
+    made: Vut
+    check_methods(vut)
+    if isinstance(vut, type) or inspect.isroutine(vut):
+        made = vut_of(vut, name, options)
+    elif callable(getattr(vut, "act_batch", None)):
+
+        def make_batched(corridors: int, _world: World | None) -> Driver:
+            return BatchedVut(corridors, lambda: vut, options.deadline_s)
+
+        made = Vut(make=make_batched)
+    elif callable(getattr(vut, "act", None)) or (callable(vut) and takes_one(vut)):
+        kind = PythonVut if callable(getattr(vut, "act", None)) else CallableVut
+
+        def make(corridors: int, _world: World | None) -> Driver:
+            return kind(corridors, lambda: _copy(vut, name), options.deadline_s)
+
+        made = Vut(make=make)
+    else:
+        raise UserError(
+            f"{text_of(vut, repr)[:80]} is no VUT: give a spec as after --vut, a class or an "
+            "object with `act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
+        )
+    return replace(made, files=_files(vut), named_only=True)
+
+
+def _copy(vut: Any, name: str) -> Any:
+    """Return a copy of an object as it was given: none that drives is what another episode left."""
+    try:
+        return copy.deepcopy(vut)
+    except Exception as error:
+        raise UserError(
+            f"{name} cannot be copied for the episodes that run at a time ({text_of(error)}): give "
+            "its class, or a function that makes no difference between them"
+        ) from error
+
+
+def _importable(target: Any) -> str | None:
+    """Return MODULE:NAME of a class or a function; None where no other process finds it so."""
+    module, name = getattr(target, "__module__", None), getattr(target, "__qualname__", "")
+    if module in (None, *MAINS) or "<" in name:
+        return None
+    found: Any = sys.modules.get(str(module))
+    if getattr(found, "__spec__", None) is None or getattr(found, "__file__", None) is None:
+        return None
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return f"{module}:{name}" if found is target else None
+
+
+def _files(vut: Any) -> tuple[Path, ...]:
+    try:
+        file = inspect.getsourcefile(
+            vut if isinstance(vut, type) or inspect.isroutine(vut) else type(vut)
+        )
+    except (TypeError, OSError):
+        return ()
+    return (Path(file),) if file is not None and Path(file).is_file() else ()

@@ -1,0 +1,173 @@
+"""A VUT as an ONNX network: the state goes in, an acceleration or action values come out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.drivers.base import Driver
+from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions
+from merge_sumo.vuts.options import split_options
+
+PERIOD: Final = "decision_period_s"
+"""Metadata of a network, or option: it decides this often and holds its acceleration."""
+STATE: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
+"""The columns of a network's one input, (1, 4)."""
+WEIGHTED: Final = ("Gemm", "MatMul", "Conv", "ConvTranspose", "LSTM", "GRU", "RNN")
+"""Nodes whose constant inputs are weights."""
+_DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+
+
+def onnx_vut(argument: str, options: VutOptions) -> Vut:
+    """Return the VUT of `onnx:FILE?decision_period_s=...`; `UserError` for one that cannot be."""
+    spec = f"onnx:{argument}"
+    file, given = split_options(argument, spec)
+    unknown = set(given) - {PERIOD}
+    if unknown:
+        raise UserError(f"--vut {spec}: there is no option {unknown.pop()!r}, only {PERIOD}")
+    network = Network(Path(file), given.get(PERIOD))
+
+    def make(corridors: int, _world: World | None) -> Driver:
+        return OnnxVut(corridors, network, options.deadline_s)
+
+    return Vut(make=make, files=(Path(file), *network.weights))
+
+
+class Network:
+    """A checked network; `UserError` when the file is missing or is no such network."""
+
+    def __init__(self, path: Path, period_s: str | None) -> None:
+        """Load the file with one thread, so that answers do not depend on the machine's cores."""
+        try:
+            import onnx
+            import onnxruntime as ort
+        except ImportError as error:
+            raise UserError(
+                "an ONNX network needs onnx and onnxruntime: run `pip install 'merge-sumo[onnx]'`"
+            ) from error
+        if not path.is_file():
+            raise UserError(f"there is no ONNX file {path}")
+        settings = ort.SessionOptions()
+        settings.intra_op_num_threads = settings.inter_op_num_threads = 1
+        settings.log_severity_level = 4
+        try:
+            self._session: Any = ort.InferenceSession(
+                str(path), settings, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # onnxruntime has a class of its own for every failure
+            raise UserError(f"{path} is no ONNX network that can be run: {error}") from error
+        tensors = onnx.external_data_helper
+        model = onnx.load(path, load_external_data=False)
+        self.weights = {
+            path.parent / tensors.ExternalDataInfo(tensor).location
+            for tensor in tensors._get_all_tensors(model)
+            if tensors.uses_external_data(tensor)
+        }
+        """Files beside it; native code opens them."""
+        _check_weights(path)
+        inputs = self._session.get_inputs()
+        if len(inputs) != 1 or inputs[0].type not in _DTYPES or list(inputs[0].shape)[-1:] != [4]:
+            said = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+            raise UserError(
+                f"{path} has the inputs {said}: a VUT has one of floats, (1, 4), with "
+                f"{', '.join(STATE)}"
+            )
+        self._input, self._dtype = inputs[0].name, _DTYPES[inputs[0].type]
+        outputs = self.run((0.0, 0.0, 0.0, 0.0))
+        if outputs.size not in (1, ACTIONS):
+            raise UserError(
+                f"{path} gives {outputs.size} numbers: a VUT gives one acceleration, or "
+                f"{ACTIONS} values of actions, from the hardest braking to the hardest acceleration"
+            )
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        text = period_s or metadata.get(PERIOD) or str(DT_S)
+        try:
+            self.period_steps = round(float(text) / DT_S)
+        except (ValueError, OverflowError):
+            self.period_steps = 0
+        if self.period_steps < 1:
+            raise UserError(f"{path}: {PERIOD} is {text!r}: give seconds, {DT_S} or more")
+
+    def run(self, state: tuple[float, ...]) -> np.ndarray[Any, Any]:
+        """Return the flat output for one state."""
+        fed = np.array([state], dtype=self._dtype)
+        return np.asarray(self._session.run(None, {self._input: fed})[0]).ravel()
+
+    def acceleration_mps2(self, state: tuple[float, ...], of_actions: FloatArray) -> float:
+        """Return the acceleration, or that of the action of the highest value."""
+        output = self.run(state)
+        if output.size == 1:
+            return float(output[0])
+        if not np.isfinite(output).all():
+            return float("nan")
+        return float(of_actions[int(output.argmax())])
+
+
+def _check_weights(path: Path) -> None:
+    """Raise `UserError` for a network with a constant that is NaN, or an infinite weight.
+
+    Infinity is a number like any other as a limit or in a mask, so only what nodes of `WEIGHTED`
+    multiply by counts as a weight. Constants of types that numpy does not know are not looked at.
+    """
+    import onnx
+
+    try:
+        model = onnx.load(path)
+    except Exception as error:  # onnx has a class of its own for every failure
+        raise UserError(f"{path} is no ONNX network that can be read: {error}") from error
+    nodes = [node for node in model.graph.node if node.op_type in WEIGHTED]
+    weights = {name for node in nodes for name in node.input}
+    constants = [(tensor.name, tensor) for tensor in model.graph.initializer]
+    constants += [
+        (node.output[0], attribute.t)
+        for node in model.graph.node
+        if node.op_type == "Constant"
+        for attribute in node.attribute
+        if attribute.name == "value"
+    ]
+    for name, tensor in constants:
+        values = onnx.numpy_helper.to_array(tensor)
+        if values.dtype.kind != "f":
+            continue
+        if np.isnan(values).any() or (name in weights and np.isinf(values).any()):
+            raise UserError(
+                f"{path} has weights that are not finite, in {name!r}: train it again, or export "
+                "an earlier state"
+            )
+
+
+class OnnxVut(PerCorridor):
+    """Asks the network when a decision is due, corridor by corridor, and holds in between."""
+
+    def __init__(self, corridors: int, network: Network, deadline_s: float) -> None:
+        """Take the network; it remembers nothing, so one serves all corridors."""
+        super().__init__(corridors, deadline_s)
+        self._network = network
+        self._held = [0.0] * corridors
+        self._of_actions = [actions_mps2(US23)] * corridors
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Take what the actions are in the scenario of the case."""
+        self._of_actions[corridor] = actions_mps2(case.scenario)
+        super().begin(corridor, case)
+
+    def renew(self, corridor: int) -> None:
+        """Do nothing."""
+
+    def reset(self, corridor: int, seen: Seen) -> None:
+        """Do nothing: the first step is a decision."""
+
+    def answer(self, corridor: int, seen: Seen) -> float:
+        """Return the held acceleration, decided anew where a decision is due."""
+        if round(seen.t_s / DT_S) % self._network.period_steps == 0:
+            self._held[corridor] = self._network.acceleration_mps2(
+                seen[1:], self._of_actions[corridor]
+            )
+        return self._held[corridor]

@@ -1,0 +1,347 @@
+"""A VUT in Python: a class, a plain function, or a class that acts in all corridors at once."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S, VUT
+from merge_sumo.vuts.base import (
+    Deadline,
+    PerCorridor,
+    Seen,
+    Vut,
+    VutOptions,
+    WrongAnswerError,
+    seen_at_start,
+    text_of,
+)
+from merge_sumo.vuts.blame_cell import EVERYBODY, NOBODY, asked
+from merge_sumo.vuts.signatures import check_call, check_methods
+
+GROUP: Final = "merge_sumo.vuts"
+"""Entry points of this group are VUTs by their name."""
+
+
+def installed_vuts() -> dict[str, EntryPoint]:
+    """Return the VUTs that installed packages register, by name."""
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def installed_vut(name: str, options: VutOptions) -> Vut:
+    """Return the VUT that an installed package registers; `UserError` when it cannot be loaded."""
+    try:
+        target = installed_vuts()[name].load()
+    except (Exception, SystemExit) as error:
+        raise UserError(_cannot_load(name, error)) from error
+    file = getattr(sys.modules.get(getattr(target, "__module__", "")), "__file__", None)
+    return replace(vut_of(target, name, options), files=(Path(file),) if file else ())
+
+
+def python_vut(spec: str, options: VutOptions) -> Vut:
+    """Return the VUT `module:Name` or `file.py:Name`; `UserError` when there is none."""
+    source, _, name = spec.rpartition(":")
+    module = _load_file(Path(source)) if source.endswith(".py") else _load_module(source)
+    target: Any = module
+    for part in name.split("."):
+        target = getattr(target, part, None)
+    if target is None:
+        raise UserError(f"{source} has no {name!r}: name a class or a function of it")
+    file = getattr(module, "__file__", None)
+    return replace(vut_of(target, spec, options), files=(Path(file),) if file else ())
+
+
+def vut_of(target: Any, spec: str, options: VutOptions) -> Vut:
+    """Return the VUT that a class or a function makes; `UserError` for anything else.
+
+    Also where it cannot be called as VUTs are.
+    """
+    if isinstance(target, type):
+        check_methods(target)
+    elif inspect.isroutine(target):
+        check_call(target, ("seen",))
+    if isinstance(target, type) and callable(getattr(target, "act_batch", None)):
+
+        def make_batched(corridors: int, _world: World | None) -> Driver:
+            return BatchedVut(corridors, lambda: _made(target, spec, corridors), options.deadline_s)
+
+        return Vut(make=make_batched)
+    if isinstance(target, type) and callable(getattr(target, "act", None)):
+
+        def make(corridors: int, _world: World | None) -> Driver:
+            return PythonVut(corridors, lambda: _made(target, spec), options.deadline_s)
+
+        return Vut(make=make)
+    if inspect.isroutine(target) and takes_one(target):
+
+        def make_function(corridors: int, _world: World | None) -> Driver:
+            return FunctionVut(corridors, target, options.deadline_s)
+
+        return Vut(make=make_function)
+    raise UserError(
+        f"{spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)`, a class "
+        "with `act_batch(self, seen)`, or a function `f(seen)`"
+    )
+
+
+class PythonVut(PerCorridor):
+    """Drives by objects with `act(seen)`, and `reset(seen)` and `close()` where they have them.
+
+    An object with `reset` drives one episode after the other in its corridor. One without is never
+    told that an episode begins, so each episode has a new one.
+    """
+
+    def __init__(self, corridors: int, make: Callable[[], Any], deadline_s: float) -> None:
+        """Make an object for each corridor."""
+        super().__init__(corridors, deadline_s)
+        self._make = make
+        self._objects: list[Any] = [None] * corridors
+        for corridor in range(corridors):
+            self.renew(corridor)
+
+    def renew(self, corridor: int) -> None:
+        """Replace the object of a corridor."""
+        _close(self._objects[corridor], self._watch.deadline_s)
+        self._objects[corridor] = self._make()
+
+    def reset(self, corridor: int, seen: Seen) -> None:
+        """Call `reset`; where there is none, have the next episode begin with a new object."""
+        vut = self._objects[corridor]
+        if _has(vut, "reset"):
+            vut.reset(seen)
+        else:
+            self.renewal = "made anew for this episode, as it has no `reset`"
+            self.renew_next(corridor)
+
+    def answer(self, corridor: int, seen: Seen) -> Any:
+        """Call `act`, and keep the `signals` that it leaves."""
+        vut = self._objects[corridor]
+        answer = vut.act(seen)
+        left = getattr(vut, "signals", None)
+        if left is not None:
+            self.leave(corridor, left)
+        return answer
+
+    def close(self) -> None:
+        """Call `close`, if there is one; what it raises comes too late to matter."""
+        for vut in self._objects:
+            _close(vut, self._watch.deadline_s)
+
+
+class CallableVut(PythonVut):
+    """Drives by objects that are called with what is seen."""
+
+    def answer(self, corridor: int, seen: Seen) -> Any:
+        """Call the object."""
+        return self._objects[corridor](seen)
+
+
+class FunctionVut(PerCorridor):
+    """Drives by a function of what is seen, which has nothing to begin anew with an episode."""
+
+    def __init__(self, corridors: int, function: Callable[[Seen], Any], deadline_s: float) -> None:
+        """Take the function."""
+        super().__init__(corridors, deadline_s)
+        self._function = function
+
+    def renew(self, corridor: int) -> None:
+        """Do nothing."""
+
+    def reset(self, corridor: int, seen: Seen) -> None:
+        """Do nothing."""
+
+    def answer(self, corridor: int, seen: Seen) -> Any:
+        """Call the function, and keep the `signals` that it leaves as its attribute."""
+        answer = self._function(seen)
+        left = getattr(self._function, "signals", None)
+        if left is not None:
+            self.leave(corridor, left)
+        return answer
+
+
+class BatchedVut(Driver):
+    """Drives by one object that acts in all corridors at once.
+
+    It is made with the number of corridors K, has `act_batch(scene)`, which returns K
+    accelerations, and perhaps `reset(corridor, seen)` and `close()`.
+    """
+
+    def __init__(self, corridors: int, make: Callable[[], Any], deadline_s: float) -> None:
+        """Make the object."""
+        super().__init__(corridors)
+        self._watch = Deadline(deadline_s)
+        self._make = make
+        self._object = make()
+        self._renew_first = False
+        self._raised: str | None = None
+        self._reset_raised: dict[int, str] = {}
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Call `reset`, if there is one; an error is kept as the reason of the answer.
+
+        After an act that failed all episodes begin, and the object is made anew for the first.
+        """
+        self._reset_raised.pop(corridor, None)
+        try:
+            with self._watch as watch:
+                if self._renew_first:
+                    self._object = watch.call(corridor, self._make)
+                    self._renew_first = False
+                reset = getattr(self._object, "reset", None)
+                if reset is not None:
+                    watch.call(corridor, reset, corridor, seen_at_start(case))
+        except BaseException as error:
+            self._reset_raised[corridor] = f"reset: {self._watch.reason(error)}"
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Call `act_batch` on a copy of the scene.
+
+        Raises `VutLostError` when it fails and several episodes run: nobody knows whose it is.
+        """
+        self._raised = None
+        try:
+            with self._watch as watch:
+                answer = np.asarray(watch.call(EVERYBODY, self._object.act_batch, _batch(scene)))
+            if answer.shape != (self.corridors,) or answer.dtype.kind not in "fiu":
+                raise WrongAnswerError(
+                    f"answered shape {answer.shape} of {answer.dtype} instead of "
+                    f"{self.corridors} numbers"
+                )
+        except BaseException as error:
+            self._raised = self._watch.reason(error)
+            self._renew_first = True
+            if scene.active.sum() > 1:
+                raise VutLostError(self._raised, final=True) from None
+            return np.full(self.corridors, np.nan)
+        answer = answer.astype(np.float64)
+        answer[list(self._reset_raised)] = np.nan
+        return answer
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what went wrong in a corridor."""
+        return self._reset_raised.get(corridor) or self._raised
+
+    def close(self) -> None:
+        """Call `close`, if there is one."""
+        _close(self._object, self._watch.deadline_s)
+
+
+@dataclass(frozen=True, slots=True)
+class SeenBatch:
+    """What a batched VUT sees: like `Seen`, with arrays over the K corridors, (K,).
+
+    In a corridor that is not `active` the numbers mean nothing. The arrays are copies. Of all cars
+    of the mainline, the one in front first, `x_others_m` and `v_others_mps` are (cars, K).
+    """
+
+    active: NDArray[np.bool_]
+    t_s: FloatArray
+    x_pov_m: FloatArray
+    v_pov_mps: FloatArray
+    x_vut_m: FloatArray
+    v_vut_mps: FloatArray
+    x_others_m: FloatArray
+    v_others_mps: FloatArray
+
+
+def _batch(scene: Scene) -> SeenBatch:
+    columns = (scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps)
+    t_s = np.round(scene.step * DT_S, 1)
+    x_m, v_mps = np.delete(scene.x_m, VUT, axis=0), np.delete(scene.v_mps, VUT, axis=0)
+    order = np.argsort(-x_m, axis=0, kind="stable")
+    others = (np.take_along_axis(values, order, axis=0) for values in (x_m, v_mps))
+    return SeenBatch(scene.active.copy(), t_s, *(column.copy() for column in columns), *others)
+
+
+def _made(target: type, spec: str, *arguments: int) -> Any:
+    asked.note(NOBODY)  # it goes on: each object may take its time
+    try:
+        return target(*arguments)
+    except (Exception, SystemExit) as error:
+        given = f" with {arguments[0]} corridors" if arguments else " without arguments"
+        what = f"{type(error).__name__}: {text_of(error)}"
+        raise UserError(f"{spec} cannot be made{given}: {what}") from error
+
+
+def _has(vut: Any, name: str) -> bool:
+    return getattr(vut, name, None) is not None
+
+
+def _close(vut: Any, deadline_s: float) -> None:
+    """Call `close`, if there is one; what it raises comes too late to matter, and is printed."""
+    if vut is None:
+        return
+    watch = Deadline(deadline_s)  # of its own: this may be part of another call
+    try:
+        with watch:
+            if _has(vut, "close"):
+                watch.call(NOBODY, vut.close)
+    except BaseException as error:
+        sys.stderr.write(f"closing the VUT: {watch.reason(error)}\n")
+
+
+_VARIABLE: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def takes_one(function: Callable[..., Any]) -> bool:
+    """Return whether something can be called with one positional argument."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return False
+    needed = [p for p in parameters if p.default is p.empty and p.kind not in _VARIABLE]
+    positional = [p for p in parameters if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD)]
+    return bool(positional) and len(needed) <= 1 and all(p in positional for p in needed)
+
+
+def _load_module(name: str) -> ModuleType:
+    # A program does not look for modules in the folder where it is started; a person does.
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    try:
+        return importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        raise UserError(_cannot_load(name, error)) from error
+
+
+def _load_file(path: Path) -> ModuleType:
+    try:
+        return _execute(path.resolve(), path.stat().st_mtime_ns)
+    except OSError as error:
+        raise UserError(f"cannot read the VUT {path}: {error.strerror}") from error
+    except (Exception, SystemExit) as error:
+        raise UserError(_cannot_load(str(path), error)) from error
+
+
+@cache
+def _execute(path: Path, _changed_ns: int) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"merge_sumo_vut_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise ImportError("it is no Python file")
+    module = importlib.util.module_from_spec(spec)
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # for the modules beside it
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _cannot_load(what: str, error: BaseException) -> str:
+    return f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}"

@@ -1,0 +1,207 @@
+"""The VUT: from what a person writes after `--vut` to a driver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.drivers.base import Driver
+from merge_sumo.drivers.gap_acceptance import GapAcceptanceVut
+from merge_sumo.drivers.level0 import Level0Vut
+from merge_sumo.drivers.policies import load_driver
+from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import World
+from merge_sumo.system.suggestions import meant
+from merge_sumo.system.workers import workers_or_cores
+from merge_sumo.vuts.base import Vut, VutOptions
+from merge_sumo.vuts.files import Files, hashed
+from merge_sumo.vuts.fmu import fmu_vut
+from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
+from merge_sumo.vuts.in_memory import here_vut, is_here, keep, object_of
+from merge_sumo.vuts.onnx import onnx_vut
+from merge_sumo.vuts.python import installed_vut, installed_vuts, python_vut
+from merge_sumo.vuts.sumo_model import sumo_vut
+from merge_sumo.vuts.traci.vut import traci_vut
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Kind:
+    """A kind of VUT: what a person writes for it, what it is, and what prepares it."""
+
+    form: str
+    what: str
+    example: str
+    prepare: Callable[[str, VutOptions], Vut]
+    hosted: bool = False
+    """Whether it runs a user's code in this process, unless that is hosted in one of its own."""
+
+
+PYTHON: Final = Kind(
+    form="MODULE:NAME or FILE.py:NAME",
+    what="a class with act(seen), a function of seen, or a batched class",
+    example="--vut my_vut.py:MyVut",
+    prepare=python_vut,
+    hosted=True,
+)
+INSTALLED: Final = replace(PYTHON, prepare=installed_vut)
+KINDS: Final[dict[str, Kind]] = {
+    "traci": Kind(
+        form="traci[:PORT]",
+        what="a program in any language that drives `vut` by TraCI, started by --vut-command",
+        example='--vut traci --vut-command "python my_controller.py {port}"',
+        prepare=traci_vut,
+    ),
+    "sumo": Kind(
+        form="sumo:MODEL[?OPTION=VALUE&...]",
+        what="SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic",
+        example='--vut "sumo:IDM?tau=1.2"',
+        prepare=sumo_vut,
+    ),
+    "onnx": Kind(
+        form="onnx:FILE[?decision_period_s=SECONDS]",
+        what="a network from the state to an acceleration, or to values of the 7 actions",
+        example="--vut onnx:policy.onnx",
+        prepare=onnx_vut,
+        hosted=True,
+    ),
+    "fmu": Kind(
+        form="fmu:FILE[?VARIABLE=NAME&...]",
+        what="an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables",
+        example='--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"',
+        prepare=fmu_vut,
+        hosted=True,
+    ),
+}
+"""The kinds that have a name of their own before the colon."""
+
+
+LEARNED: Final = {"level1": "vut1", "level2": "vut2"}
+"""The network of each learned VUT."""
+
+
+def built_in_vuts(policies: Path | None = None) -> dict[str, Callable[[int], Driver]]:
+    """Return the VUTs that the package brings, by name; the learned ones act by `policies`."""
+    designs = {name: partial(RuleBasedVut, design=design) for name, design in DESIGNS.items()}
+    learned = {vut: partial(load_driver, name, folder=policies) for vut, name in LEARNED.items()}
+    rules: dict[str, Callable[[int], Driver]] = {"roundabout": GapAcceptanceVut, **REFERENCES}
+    return {"level0": Level0Vut, **learned, **designs, **rules}
+
+
+@dataclass(frozen=True)
+class VutFactory:
+    """Makes the driver that `spec` names; made of plain values, so that a process can be told it.
+
+    `files` are the user's files that the VUT is made of, with their hashes, as far as they are
+    known before it drives; they are found unless they are given.
+
+    Raises `UserError` for a spec that names no VUT, or one that cannot be loaded.
+    """
+
+    spec: str
+    options: VutOptions
+    files: Files | None = field(default=None, hash=False)
+
+    def __post_init__(self) -> None:
+        """Find the VUT."""
+        if self.files is None:
+            object.__setattr__(self, "files", hashed(self.vut.files))
+
+    @cached_property
+    def vut(self) -> Vut:
+        """What the spec names."""
+        return find_vut(self.spec, self.options)
+
+    def with_log(self, log: Path) -> VutFactory:
+        """Return what makes the same VUT, with what it prints added to a file."""
+        return VutFactory(self.spec, replace(self.options, log=log), self.files)
+
+    def workers(self, asked: int | None) -> int:
+        """Return in how many processes it is tested: as many as asked, or one a core.
+
+        Raises `UserError` when more are asked for than it can serve, or less than one.
+        """
+        count, most = workers_or_cores(asked), self.vut.max_workers
+        if most is None or count <= most:
+            return count
+        if asked is None:
+            return most
+        raise UserError(f"--workers is {asked}: {self.spec} serves at most {most} at a time")
+
+    def __call__(self, corridors: int, world: World | None = None) -> Driver:
+        """Return a driver for corridors 0 to `corridors` - 1 of a world.
+
+        Raises `UserError` where the VUT is not made of the same files as when it was found.
+        """
+        then, now = self.files or {}, hashed(self.vut.files)
+        if set(then.values()) != set(now.values()):
+            raise UserError(
+                f"the files of the VUT {self.spec} are not those with which this began: let them "
+                "be while it runs, and let all workers have the same"
+            )
+        return self.vut.make(corridors, world)
+
+    def __reduce__(self) -> tuple[Callable[..., VutFactory], tuple[Any, ...]]:
+        """Travel as plain values; the VUT is found again on arrival.
+
+        An object that nobody else can find goes along.
+        """
+        return (_arrived, (self.spec, self.options, self.files, object_of(self.spec)))
+
+
+def _arrived(spec: str, options: VutOptions, files: Files | None, vut: Any) -> VutFactory:
+    if vut is not None:
+        keep(spec, vut)
+    return VutFactory(spec, options, files)
+
+
+def runs_code(spec: str, command: str | None) -> bool:
+    """Return whether to test a VUT is to run code that is not of this package or of SUMO."""
+    prefix = spec.partition(":")[0]
+    if prefix == "traci":
+        return command is not None
+    return prefix != "sumo" and spec not in built_in_vuts()
+
+
+def vut_factory(spec: str, options: VutOptions | None = None) -> VutFactory:
+    """Return what makes the VUT that `spec` names; `UserError` for a name nobody knows."""
+    return VutFactory(spec, options or VutOptions())
+
+
+def find_vut(spec: str, options: VutOptions) -> Vut:
+    """Return the VUT that a spec names; `UserError` for a name nobody knows."""
+    prefix, colon, argument = spec.partition(":")
+    if prefix in KINDS:
+        return _prepared(KINDS[prefix], argument, spec, options)
+    if is_here(spec):
+        return here_vut(argument, options)
+    if options.command is not None:
+        raise UserError(f"--vut-command goes with --vut traci, not with {spec}")
+    built_in = built_in_vuts(options.policies)
+    if spec in built_in:
+        make = built_in[spec]
+        return Vut(make=lambda corridors, _world: make(corridors))
+    if colon:
+        return _prepared(PYTHON, spec, spec, options)
+    installed = installed_vuts()
+    if spec in installed:
+        return _prepared(INSTALLED, spec, spec, options)
+    if spec.endswith(".py"):
+        raise UserError(f"{spec} is a file: name a class or a function of it, {spec}:NAME")
+    names = [*built_in, *installed]
+    choice = f"{', '.join(names)}, or bring your own (`merge-sumo vuts` lists the kinds)"
+    if not spec:
+        raise UserError(f"name the vehicle under test, as in --vut design2: {choice}")
+    raise UserError(
+        f"there is no VUT {spec!r}: {meant(spec, (*names, *KINDS))}choose one of {choice}"
+    )
+
+
+def _prepared(kind: Kind, argument: str, spec: str, options: VutOptions) -> Vut:
+    if kind.hosted and not options.in_process and SUPPORTED:
+        return hosted_vut(spec, options)
+    return kind.prepare(argument, options)

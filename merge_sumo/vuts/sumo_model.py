@@ -1,0 +1,112 @@
+"""SUMO's own drivers as VUT: a car-following model with SUMO's junction logic.
+
+At every step the model decides on a speed from the state, as it does in any SUMO simulation; the
+POV is a vehicle on the road for it, before M by the right of way of the zipper junction and behind
+M as a leader. That speed is the VUT's answer: the acceleration to it is clipped and counted like
+any other, and eq. (4) moves the car.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import DT_S, VUT
+from merge_sumo.vuts.base import Vut, VutOptions
+from merge_sumo.vuts.options import split_options
+
+SHARED_OPTIONS: Final = {
+    *("maxSpeed", "accel", "decel", "emergencyDecel"),
+    *("apparentDecel", "tau", "minGap", "speedFactor", "impatience", "jmIgnoreFoeProb"),
+    *("jmIgnoreFoeSpeed", "jmSigmaMinor", "jmStoplineGap", "jmTimegapMinor", "jmExtraGap"),
+    *("jmAdvance",),
+}
+ACC_OPTIONS: Final = {
+    *("speedControlGain", "gapClosingControlGainSpeed", "gapClosingControlGainSpace"),
+    *("gapControlGainSpeed", "gapControlGainSpace", "collisionAvoidanceGainSpeed"),
+    *("collisionAvoidanceGainSpace", "collisionAvoidanceOverride"),
+}
+NO_NOISE: Final = {"sigmaleader": 0.0, "sigmagap": 0.0, "sigmaerror": 0.0}
+MODELS: Final[dict[str, tuple[set[str], dict[str, float]]]] = {
+    "Krauss": ({"sigma", "sigmaStep"}, {"sigma": 0.0}),
+    "IDM": ({"delta", "stepping"}, {}),
+    "EIDM": (
+        {
+            *("delta", "stepping", "tpreview", "tPersDrive", "treaction", "tPersEstimate"),
+            *("ccoolness", "jerkmax", "epsilonacc", "taccmax", "Mflatness", "Mbegin"),
+            *("maxvehpreview", *NO_NOISE),
+        },
+        NO_NOISE,
+    ),
+    "ACC": (ACC_OPTIONS, {}),
+    "CACC": (
+        {
+            *ACC_OPTIONS,
+            *("speedControlGainCACC", "gapClosingControlGainGap", "gapClosingControlGainGapDot"),
+            *("gapControlGainGap", "gapControlGainGapDot", "collisionAvoidanceGainGap"),
+            "collisionAvoidanceGainGapDot",
+        },
+        {},
+    ),
+}
+"""Options of each model besides the shared ones, and its defaults that are not SUMO's: without
+noise all are deterministic."""
+
+
+def sumo_vut(argument: str, _options: VutOptions) -> Vut:
+    """Return the VUT of `sumo:MODEL?NAME=VALUE&...`; `UserError` for what SUMO does not have."""
+    spec = f"sumo:{argument}"
+    model, given = split_options(argument, spec)
+    if model not in MODELS:
+        raise UserError(f"--vut {spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
+    own, defaults = MODELS[model]
+    known = SHARED_OPTIONS | own
+    values = dict(defaults)
+    for name, text in given.items():
+        if name not in known:
+            raise UserError(
+                f"--vut {spec}: {model} has no option {name!r}: choose from "
+                f"{', '.join(sorted(known))}"
+            )
+        values[name] = _number(text, name, spec)
+
+    def make(corridors: int, world: World | None) -> Driver:
+        if world is None:
+            raise UserError(f"--vut {spec} drives in a SUMO world only")
+        return SumoVut(corridors, world)
+
+    vut_type = {name: f"{value:.12g}" for name, value in values.items()}
+    return Vut(make=make, vut_type={"carFollowModel": model, **vut_type})
+
+
+def _number(text: str, name: str, spec: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0.0):
+        raise UserError(f"--vut {spec}: {name} is {text!r}: give a number from 0 up")
+    return value
+
+
+class SumoVut(Driver):
+    """Answers what SUMO decided in its step."""
+
+    def __init__(self, corridors: int, world: World, rows: Sequence[int] = (VUT,)) -> None:
+        """Drive the vehicles in rows of a world that was opened with a vType for them.
+
+        These are the VUTs, or the cars of the mainline: then `corridors` are those of all cars.
+        """
+        super().__init__(corridors)
+        self.world, self._rows = world, list(rows)
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the accelerations to the speeds that SUMO decided on."""
+        v_mps = self.world.v_mps[self._rows].ravel()
+        acceleration: FloatArray = (self.world.wanted_v_mps(self._rows) - v_mps) / DT_S
+        return acceleration

@@ -1,0 +1,315 @@
+"""The process that serves a TraCI client, with the shadow SUMO that answers it and decides.
+
+It is handed the client's connection and told, step by step, where the vehicles are; it answers with
+the speed that SUMO gives the VUT by what the client commanded, or with what the client did wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import sys
+import sysconfig
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from time import monotonic
+from typing import Any, Final, TypeVar
+
+import merge_sumo
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.binding import sumo_program
+from merge_sumo.sumo.child import Channel, opened
+from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, ShadowRoad, ShadowSumo, State
+from merge_sumo.sumo.traci_names import named
+from merge_sumo.system.landlock import lock_in
+from merge_sumo.vuts.process import GRACE_S
+from merge_sumo.vuts.traci import protocol as tp
+from merge_sumo.vuts.traci.calls import NotFiniteError
+from merge_sumo.vuts.traci.protocol import Command, ProtocolError, Reader
+from merge_sumo.vuts.traci.session import CLOSE, SIMULATION_STEP, Session
+
+T = TypeVar("T")
+
+BOOT: Final = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[-1])['path']; "
+    "from merge_sumo.vuts.traci.server import main; main()"
+)
+INSTALLED: Final = ("site-packages", "dist-packages")
+FAREWELL_STEPS: Final = 10
+"""Steps on an empty road, with no vehicle to come, in which a client may end by itself."""
+MOST_MEMORY_BYTES: Final = 4 << 30
+MOST_FILE_BYTES: Final = 16 << 20
+
+
+class FaultError(Exception):
+    """What the client did wrong.
+
+    Attributes:
+        gone: whether its connection is gone, so that its program may say why.
+        late: whether it made no step in time.
+    """
+
+    def __init__(self, text: str, *, gone: bool = False, late: bool = False) -> None:
+        """Take the sentence, and which kind it is of."""
+        super().__init__(text)
+        self.gone, self.late = gone, late
+
+
+class ClosedError(Exception):
+    """The client said goodbye while no vehicle was on the road."""
+
+
+def main() -> None:
+    """Serve clients, one after the other, until the channel ends."""
+    channel, settings = opened()
+    folder, road = Path(settings["folder"]), ShadowRoad.from_record(settings["road"])
+    _limit()
+    try:
+        sumo = ShadowSumo(folder, road, settings["vehicles"])
+        sumo.load()
+    except UserError as error:
+        channel.send({"refused": str(error)})
+        return
+    named()
+    locked = lock_in([folder], _folders_to_read())
+    channel.send({"ready": True, "locked": locked})
+    with suppress(EOFError, OSError):
+        _Server(channel, sumo).serve()
+
+
+def _folders_to_read() -> list[Path]:
+    """Return where modules and SUMO's data are, which may be loaded late."""
+    paths = sysconfig.get_paths()
+    modules = {Path(paths[name]) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    modules |= {Path(folder) for folder in sys.path if Path(folder).name in INSTALLED}
+    return [*modules, Path(sumo_program("sumo")).parents[1], Path(merge_sumo.__file__).parent]
+
+
+def _limit() -> None:
+    """Let memory and files run out here before they run out for everybody."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    for limit, most in (
+        (resource.RLIMIT_DATA, MOST_MEMORY_BYTES),
+        (resource.RLIMIT_FSIZE, MOST_FILE_BYTES),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        with suppress(ValueError, OSError):  # a limit of the system may be lower
+            resource.setrlimit(limit, (most, most))
+
+
+class _Server:
+    """What the parent asks for, and the client that is served."""
+
+    def __init__(self, channel: Channel, sumo: ShadowSumo) -> None:
+        self._channel, self._sumo = channel, sumo
+        self._client: Client | None = None
+
+    def serve(self) -> None:
+        """Answer what the parent asks until its end of the channel closes."""
+        while True:
+            message = self._channel.receive()
+            self._channel.send(self._answer(message))
+
+    def _answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        if message["do"] == "connect":
+            self._drop()
+            connection = self._channel.take()
+            self._sumo.load()
+            self._client = Client(connection, Session(self._sumo), message["deadline_s"])
+            return {}
+        if message["do"] == "drop" or self._client is None:
+            self._drop()
+            return {}
+        answer: dict[str, Any]
+        try:
+            answer = _DO[message["do"]](self._client, message)
+        except FaultError as fault:
+            answer = {"fault": str(fault), "gone": fault.gone, "late": fault.late}
+        except ClosedError:
+            answer = {"closed": True}
+        notes = self._client.session.notes
+        return {**answer, "notes": notes}
+
+    def _drop(self) -> None:
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+
+class Client:
+    """A connected client: its socket, its session, and the commands that it has not been told."""
+
+    def __init__(self, connection: socket.socket, session: Session, deadline_s: float) -> None:
+        """Take a connection, and what answers it."""
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket, self.session = connection, session
+        self._deadline_s = deadline_s
+        self._commands: deque[Command] = deque()
+        self._reply = bytearray()
+        self._until_step_s: float | None = None
+        """Time up to which the client asked to step, if it waits for a step; 0 for one step."""
+
+    def leave(self) -> None:
+        """End the episode that was, if there was one: its vehicles arrive."""
+        if self.session.driving:
+            # The step in which they arrive was made when the client asked for it.
+            self.session.clear()
+            self._answer_step()
+        if self._until_step_s is None:
+            self._serve()
+
+    def show(self, states: Mapping[str, State], *, first: bool) -> float | None:
+        """Show the next state, and serve the client until it makes its next step.
+
+        Returns the speed that SUMO gives the VUT in that step; None where it is beyond the net.
+        """
+        if first:
+            self.session.enter(states)
+        else:
+            self.session.put(states)
+        self._answer_step()
+        if self._until_step_s is None:
+            self._serve()
+        return self.session.step()
+
+    def farewell(self) -> None:
+        """Show the last arrival, with no vehicle to come, and give the client time to close."""
+        session = self.session
+        session.expected = False
+        with suppress(FaultError):
+            for _ in range(FAREWELL_STEPS):
+                if session.driving:
+                    session.clear()
+                else:
+                    session.step()
+                if self._until_step_s is not None:
+                    self._until_step_s = 0.0  # the time that it asked for will not come
+                self._answer_step()
+                self._serve(GRACE_S)
+
+    def close(self) -> None:
+        """Drop it."""
+        self._socket.close()
+
+    def _answer_step(self) -> None:
+        """Answer the step that the client waits for, unless it asked to step on further."""
+        until_s = self._until_step_s
+        if until_s is None or until_s > self.session.time_s + 1e-9:
+            return
+        self._until_step_s = None
+        self._reply += tp.status(SIMULATION_STEP) + self.session.results()
+        self._flush()
+
+    def _serve(self, patience_s: float = math.inf) -> None:
+        """Answer commands until the client makes a step."""
+        until = monotonic() + min(self._deadline_s, patience_s)
+        session = self.session
+        while True:
+            while self._commands:
+                command = self._commands.popleft()
+                if command.identifier == SIMULATION_STEP:
+                    target = self._checked(lambda c: Reader(c.payload).double(), command)
+                    session.answered()
+                    if target == 0.0 or target > session.time_s + 1e-9:
+                        self._until_step_s = target
+                        return
+                    if math.isnan(target):
+                        raise FaultError("the controller stepped to time nan")
+                    self._reply += tp.status(SIMULATION_STEP) + session.results()
+                elif command.identifier == CLOSE:
+                    self._reply += tp.status(CLOSE)
+                    self._commands.clear()
+                    self._flush()
+                    if NAME_OF_VUT in session.sumo.at_m:
+                        raise FaultError(
+                            "the controller closed the connection during the episode", gone=True
+                        )
+                    raise ClosedError
+                else:
+                    before_s = monotonic()
+                    self._reply += self._checked(session.handle, command)
+                    until += monotonic() - before_s  # it waits for us, and not we for it
+                self._flush()
+            self._commands.extend(self._receive(until))
+
+    def _checked(self, function: Callable[[Command], T], command: Command) -> T:
+        """Return what a function makes of a command."""
+        try:
+            return function(command)
+        except ProtocolError as error:
+            raise FaultError(
+                f"the controller sent command 0x{command.identifier:02x} that is no TraCI: {error}"
+            ) from error
+        except NotFiniteError as error:
+            raise FaultError(f"the controller commanded {error}") from error
+
+    def _flush(self) -> None:
+        """Send the reply once all commands of its message have been answered."""
+        if self._commands or not self._reply:
+            return
+        content = tp.message(bytes(self._reply))
+        self._reply.clear()
+        try:
+            self._socket.settimeout(self._deadline_s)
+            self._socket.sendall(content)
+        except TimeoutError as error:
+            raise FaultError(
+                f"the controller took no answer within {self._deadline_s:g} s"
+            ) from error
+        except OSError as error:
+            raise FaultError("the controller closed the connection", gone=True) from error
+
+    def _receive(self, until: float) -> list[Command]:
+        head = self._read(4, until, begun=False)
+        try:
+            return tp.commands_of(self._read(tp.message_length(head), until, begun=True))
+        except ProtocolError as error:
+            raise FaultError(f"the controller sent bytes that are no TraCI: {error}") from error
+
+    def _read(self, count: int, until: float, *, begun: bool) -> bytes:
+        """Return `count` bytes that come before a time; `begun` tells a half message from none."""
+        parts = bytearray()
+        while len(parts) < count:
+            left_s = until - monotonic()
+            half = begun or bool(parts)
+            try:
+                if left_s <= 0.0:
+                    raise TimeoutError
+                self._socket.settimeout(left_s)
+                part = self._socket.recv(count - len(parts))
+            except TimeoutError as error:
+                what = "sent half a message and no more" if half else "made no step"
+                raise FaultError(
+                    f"the controller {what} within the deadline of {self._deadline_s:g} s",
+                    late=not half,
+                ) from error
+            except OSError as error:
+                raise FaultError("the controller broke the connection", gone=True) from error
+            if not part:
+                what = "closed the connection in a message" if half else "closed the connection"
+                raise FaultError(f"the controller {what}", gone=True)
+            parts += part
+        return bytes(parts)
+
+
+def _leave(client: Client, _: Mapping[str, Any]) -> dict[str, Any]:
+    client.leave()
+    return {}
+
+
+def _show(client: Client, message: Mapping[str, Any]) -> dict[str, Any]:
+    return {"v_mps": client.show(message["states"], first=message["first"])}
+
+
+def _farewell(client: Client, _: Mapping[str, Any]) -> dict[str, Any]:
+    client.farewell()
+    return {}
+
+
+_DO: Final = {"leave": _leave, "show": _show, "farewell": _farewell}
+"""What the parent asks for, besides a client to be served or dropped."""

@@ -1,0 +1,381 @@
+"""A VUT behind TraCI: a controller written for SUMO, in any language, drives the vehicle `vut`.
+
+This process is the server's door: it listens, and looks whose a connection is. Who is served is
+handed to a process of its own with a shadow SUMO (`traci_server.py`), in which the client's
+commands mean what they mean in SUMO. A client makes a step by `simulationStep`, so client and
+rollout go in lockstep: the speed that SUMO gives the VUT in that step becomes the acceleration of
+eq. (4), and the step is answered when ours has been made. Between two episodes the road is empty
+for one step.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from time import monotonic
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import road_of
+from merge_sumo.sumo.binding import scratch_folder
+from merge_sumo.sumo.child import ChildDiedError, SumoChild
+from merge_sumo.sumo.shadow_sumo import ShadowRoad, write_files
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DT_S, POV, US23, VEHICLES, Scenario
+from merge_sumo.vuts.base import Seen, Vut, VutOptions, seen_in
+from merge_sumo.vuts.process import TOKEN_VARIABLE, Program, split_command
+from merge_sumo.vuts.traci.door import HOST, Door, Peer
+from merge_sumo.vuts.traci.server import BOOT
+
+DEFAULT_PORT: Final = 8813
+"""Where TraCI clients connect when they are not told otherwise."""
+START_S: Final = 60.0
+"""Time that SUMO has to start, on whatever machine."""
+WORK_S: Final = 10.0
+"""Time that SUMO has for what a controller asks of it in a step, besides the deadline."""
+
+
+def traci_vut(argument: str, options: VutOptions) -> Vut:
+    """Return the VUT of `traci` or `traci:PORT`; `UserError` for a port or command that is none."""
+    if argument and not (argument.isdecimal() and 1 <= int(argument) <= 65535):
+        raise UserError(f"--vut traci:{argument}: the port is a number from 1 to 65535")
+    # A command is told its port, so that any free one does and several can run at a time.
+    port = int(argument) if argument else (0 if options.command else DEFAULT_PORT)
+    command = None if options.command is None else split_command(options.command)
+
+    def make(corridors: int, world: World | None) -> Driver:
+        road, scenario = (road_of(), US23) if world is None else (world.road, world.scenario)
+        return TraciVut(corridors, road, scenario, port, command, options)
+
+    files = [Path(word) for word in command or () if Path(word).is_file()]
+    return Vut(
+        make=make,
+        max_corridors=1,
+        max_workers=None if port == 0 else 1,
+        files=tuple(files),
+        named_only=True,
+    )
+
+
+class FaultError(Exception):
+    """What the client did wrong."""
+
+
+class TraciVut(Driver):
+    """Drives as a TraCI client commands; one client has one vehicle `vut`, so one corridor."""
+
+    def __init__(
+        self,
+        corridors: int,
+        road: Corridor,
+        scenario: Scenario,
+        port: int,
+        command: list[str] | None,
+        options: VutOptions,
+    ) -> None:
+        """Start the command, or wait for a client; `UserError` when none connects in time."""
+        if corridors != 1:
+            raise ValueError("a TraCI client drives in one corridor")
+        super().__init__(corridors)
+        self._port, self._command, self._options = port, command, options
+        self._shadow = Shadow(road, scenario)
+        self._door: Door | None = None
+        self._program: Program | None = None
+        self._client: socket.socket | None = None
+        self._reason: str | None = None
+        self._noted: set[str] = set()
+        self._before_mps: dict[str, float] = {}
+        """Speeds of the vehicles a step ago."""
+        self._starting = True
+        self._patience_s = options.connect_s
+        try:
+            self._connect()
+        except (FaultError, VutLostError) as error:
+            self.close()
+            raise UserError(str(error)) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Note that the next scene is the first of an episode."""
+        self._reason = None
+        self._starting = True
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the acceleration that follows from what the client commanded, or NaN."""
+        if self._reason is None:
+            try:
+                x_m, v_mps = scene.x_m[:, 0].tolist(), scene.v_mps[:, 0].tolist()
+                seen = seen_in(float(scene.step[0]) * DT_S, POV, x_m, v_mps)
+                return np.array([self._acceleration_mps2(seen)])
+            except FaultError as error:
+                self._reason = str(error)
+                self._disconnect()
+        return np.array([math.nan])
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what the client did wrong."""
+        return self._reason
+
+    def close(self) -> None:
+        """Let the client see the last arrival and end; then end it."""
+        ends = True
+        if self._client is not None and self._shadow.listens:
+            with suppress(FaultError, VutLostError):
+                answer = self._ask({"do": "farewell"})
+                ends = bool(answer.get("closed") or answer.get("gone"))
+        self._disconnect(grace=ends)
+        self._shadow.close()
+
+    def _acceleration_mps2(self, seen: Seen) -> float:
+        """Show the vehicles, and return what the client commands for the coming step."""
+        if self._starting:
+            self._before_mps.clear()
+        states = {
+            name: (x_m, v_mps, (v_mps - self._before_mps.get(name, v_mps)) / DT_S)
+            for name, (x_m, v_mps) in zip(VEHICLES, seen.vehicles, strict=False)
+        }
+        self._before_mps = {name: v_mps for name, (_, v_mps, _) in states.items()}
+        message = {"do": "show", "states": states, "first": self._starting}
+        answer = self._enter(message) if self._starting else self._ask(message)
+        self._starting = False
+        if self._program is not None and (ended := self._program.ended(0.0)):
+            raise FaultError(f"{ended}, and its connection goes on")
+        v_mps = answer["v_mps"]
+        if v_mps is None:  # it is beyond the end of the net: it keeps its speed
+            return 0.0
+        acceleration_mps2 = (v_mps - seen.v_vut_mps) / DT_S
+        if not math.isfinite(acceleration_mps2):
+            raise FaultError(f"the controller asked for an acceleration of {acceleration_mps2}")
+        return float(acceleration_mps2)
+
+    def _enter(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Let the vehicles depart, for the client that is there or for one that comes anew.
+
+        A controller may run once per episode: a goodbye on an empty road is no fault.
+        """
+        for _ in range(2):
+            if self._client is None:
+                self._connect()
+            for part in ({"do": "leave"}, message):
+                answer = self._ask(part)
+                if answer.get("closed"):
+                    # The door stays open: the next client may be waiting already.
+                    self._drop_client()
+                    break
+            else:
+                return answer
+        raise FaultError("the controller closed the connection before the vehicles departed")
+
+    def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the serving process answers; raises `FaultError`."""
+        try:
+            answer = self._shadow.ask(message, self._options.deadline_s + WORK_S)
+        except ChildDiedError as died:
+            # Killed from outside, or by what the client asked: the case runs again, and tells.
+            self._disconnect()
+            raise VutLostError(
+                f"the SUMO that answers the controller {died}", killed=died.killed
+            ) from died
+        except TimeoutError as error:
+            self._shadow.close()
+            raise FaultError(
+                "the SUMO that answers the controller did not come to an end with what it asked"
+            ) from error
+        for note in answer.get("notes", ()):
+            self._note(note)
+        if "fault" not in answer:
+            return answer
+        text = str(answer["fault"])
+        if answer["gone"] and self._program is not None and (ended := self._program.ended(0.5)):
+            text += f"; {ended}"
+        if answer["late"] and self._door is not None and self._door.another_waits(self._peer()):
+            text += "; another client waits, but one at a time is served"
+        raise FaultError(text)
+
+    def _peer(self) -> Peer:
+        """Return who is served."""
+        if self._program is None:
+            return Peer(None, os.environ.get(TOKEN_VARIABLE) or None)
+        return Peer(self._program.process, self._program.token)
+
+    def _connect(self) -> None:
+        """Wait for a client, with a program started anew if there is a command.
+
+        A program that closed its connection may connect again, and has as long as for a step.
+        """
+        patience_s = self._patience_s
+        # Who did not come once is not waited for as long again.
+        self._patience_s = min(patience_s, self._options.deadline_s)
+        if self._door is None:
+            self._door = Door(self._port, self._note)
+        connection = None
+        if self._program is not None:
+            connection = self._accept(self._door, self._options.deadline_s)
+            if connection is None:
+                self._stop_program(grace=True)
+        self._shadow.start()
+        if connection is None:
+            port = self._door.port
+            if self._command is not None:
+                self._program = Program(self._command, port, self._options.log)
+            else:
+                sys.stderr.write(
+                    f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
+                )
+            connection = self._accept(self._door, patience_s)
+        if connection is None:
+            raise FaultError(self._why_none_came(self._door.port, patience_s))
+        self._patience_s = self._options.connect_s
+        self._client = connection
+        try:
+            self._shadow.serve(connection, self._options.deadline_s)
+        except (ChildDiedError, TimeoutError) as error:
+            self._shadow.close()
+            self._disconnect()
+            raise FaultError(f"the SUMO that answers the controller failed: {error}") from error
+
+    def _why_none_came(self, port: int, patience_s: float) -> str:
+        ended = self._program.ended(0.0) if self._program else ""
+        refused = self._door.refused if self._door else ""
+        self._disconnect()
+        if ended:
+            return f"{ended} (before it connected)"
+        late = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
+        if refused:
+            late += f" but {refused}"
+        if self._command is not None:
+            late += (
+                ": --vut-command is told the port as {port} and in MERGE_SUMO_PORT, "
+                "for traci.init(PORT) or traci.start(..., port=PORT)"
+            )
+        return late
+
+    def _accept(self, door: Door, patience_s: float) -> socket.socket | None:
+        """Return the connection to serve; None when none comes, or the program has ended."""
+        until, peer = monotonic() + patience_s, self._peer()
+        while True:
+            # A program that ended will not connect any more: look every now and then.
+            connection = door.accept(peer, max(min(0.1, until - monotonic()), 0.001))
+            if connection is not None:
+                return connection
+            if monotonic() > until or (self._program and self._program.ended(0.0)):
+                return None
+
+    def _note(self, sentence: str) -> None:
+        """Add a sentence to what the controller printed, once for all the times it is started."""
+        if sentence in self._noted:
+            return
+        self._noted.add(sentence)
+        log = self._options.log
+        if log is None:
+            sys.stderr.write(f"note: {sentence}\n")
+            return
+        with suppress(OSError), log.open("a", encoding="utf-8") as file:
+            file.write(f"note: {sentence}\n")
+
+    def _disconnect(self, *, grace: bool = False) -> None:
+        """Close the door, end the program and drop the client; nobody of it is left."""
+        if self._door is not None:
+            self._door.close()
+            self._door = None
+        # The connection closes last: a client that is ended while it waits says nothing of it.
+        self._stop_program(grace=grace)
+        self._drop_client()
+
+    def _stop_program(self, *, grace: bool) -> None:
+        if self._program is not None:
+            self._program.stop(**({} if grace else {"grace_s": 0.0}))
+            self._program = None
+
+    def _drop_client(self) -> None:
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+            if self._shadow.listens:
+                with suppress(ChildDiedError, TimeoutError):
+                    self._shadow.ask({"do": "drop"}, WORK_S)
+            else:
+                self._shadow.close()
+
+
+class Shadow:
+    """The process with the shadow SUMO that serves clients; started anew when it has died."""
+
+    def __init__(self, road: Corridor, scenario: Scenario) -> None:
+        """Take what it shows; `start` starts it."""
+        self._road, self._scenario = road, scenario
+        self._opened = ExitStack()
+        self._child: SumoChild | None = None
+        self._ready = False
+        self.listens = False
+        """Whether it has answered all that it was asked: a person may stop us before."""
+
+    def start(self) -> None:
+        """Have it started, if it does not run; `UserError` where SUMO cannot use the net.
+
+        It gets ready while the controller starts.
+        """
+        if self._child is not None:
+            return
+        with ExitStack() as opened:
+            folder = opened.enter_context(scratch_folder())
+            write_files(folder, self._road, self._scenario)
+            settings = {
+                "road": ShadowRoad.of(self._road).to_record(),
+                "vehicles": VEHICLES[: self._scenario.vehicles],
+            }
+            child = SumoChild(BOOT, folder, settings)
+            opened.callback(child.kill)
+            self._opened = opened.pop_all()
+        self._child, self._ready = child, False
+
+    def serve(self, connection: socket.socket, deadline_s: float) -> None:
+        """Hand a connection over to it; raises as `ask` does, and `UserError`."""
+        if not self._ready:
+            try:
+                self._get_ready()
+            except ChildDiedError:  # whoever ended it, not the client: it has not been heard
+                self.close()
+                self.start()
+                self._get_ready()
+        assert self._child is not None, "started"  # noqa: S101
+        self._child.ask({"do": "connect", "deadline_s": deadline_s}, WORK_S, connection)
+        self.listens = True
+
+    def _get_ready(self) -> None:
+        assert self._child is not None, "started"  # noqa: S101
+        said = self._child.receive(START_S)
+        if "refused" in said:
+            why = self._child.said() or said["refused"]
+            raise UserError(f"SUMO cannot use the net {self._road.path}: {why}")
+        self._ready = True
+
+    def ask(self, message: Mapping[str, Any], patience_s: float) -> dict[str, Any]:
+        """Return its answer; raises `ChildDiedError`, or TimeoutError where there is none."""
+        if self._child is None:
+            raise ChildDiedError("is not there")
+        self.listens = False
+        try:
+            answer = self._child.ask(message, patience_s)
+        except ChildDiedError:
+            self.close()
+            raise
+        self.listens = True
+        return answer
+
+    def close(self) -> None:
+        """End it."""
+        self._child, self.listens = None, False
+        self._opened.close()

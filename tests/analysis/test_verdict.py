@@ -1,0 +1,521 @@
+"""The verdict on a campaign: what was not tested, gates, JUnit, and the exit codes."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+from handmade import write_run
+from lxml import etree
+from typer.testing import CliRunner, Result
+
+import merge_sumo as ms
+from merge_sumo import cli
+from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
+from merge_sumo.analysis.verdict import Gate, judge, parse_gates
+from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.run import Run, failures, read_settings
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.reports.junit import check_junit, junit, write_junit
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.printable import printable
+from merge_sumo.values.trajectory import End
+
+HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
+VUTS = {
+    "raises": "raise RuntimeError('boom')",
+    "stops": "return -4.0",
+    "mixed": "assert seen.v_pov_mps < 33, 'fast'; return 1.0 if seen.v_pov_mps < 30 else -4.0",
+}
+
+
+@pytest.fixture(scope="module")
+def vuts(tmp_path_factory) -> dict[str, str]:
+    """Return by name what goes behind --vut: one raises, one stops, one does both at times."""
+    folder = tmp_path_factory.mktemp("vuts")
+    specs = {}
+    for name, body in VUTS.items():
+        (folder / f"{name}.py").write_text(f"def act(seen):\n    {body}\n")
+        specs[name] = f"{folder / name}.py:act"
+    return specs
+
+
+def invoke(*words: object) -> Result:
+    return CliRunner().invoke(cli.app, [str(word) for word in words])
+
+
+def campaign(vut: str, folder: Path, *options: object) -> Result:
+    small = ("--level", 0, "--cases", 20, "--batch", 10, "--seed", 1, "--sampler", "uniform", "-q")
+    return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)
+
+
+class TestErrorsAndTimeouts:
+    def test_are_grouped_by_message_errors_first_then_the_most_frequent(self, tmp_path):
+        errors = {2: "boom", 5: "other", 6: "other"}
+        timeouts = (0, 1, 3, 4)
+        run = write_run(tmp_path / "run", 10, levels=(0,), errors=errors, timeouts=timeouts)
+        found = judge(run.outcomes)
+        assert [(t.end, t.message, t.cases) for t in found.troubles] == [
+            (End.VUT_ERROR, "other", (5, 6)),
+            (End.VUT_ERROR, "boom", (2,)),
+            (End.TIMEOUT, "the VUT did not reach the merge point in 12 s", (0, 1, 3, 4)),
+        ]
+        assert (found.cases, found.errors, found.timeouts, found.tested) == (10, 3, 4, 3)
+        number = len(failures(run.outcomes))
+        word = "failure" if number == 1 else "failures"
+        contacts = f"{found.contacts} contact{'' if found.contacts == 1 else 's'}"
+        assert 0 <= found.contacts <= number
+        assert found.counts == f"3 errors, 4 timeouts and {number} {word} ({contacts}) in 10 cases"
+
+    def test_that_differ_in_a_measured_value_or_an_address_are_one(self, tmp_path):
+        errors = {
+            0: "gap 1.25 at <f 0x7f00>",
+            1: "gap -3.5 at <f 0x7fff>",
+            2: "gap 1e-07 (line 3)",
+            3: "gap 2.5e-07 (line 3)",
+            4: "gap 2.5e-07 (line 4)",
+        }
+        found = judge(write_run(tmp_path / "run", 10, levels=(0,), errors=errors).outcomes)
+        assert [t.cases for t in found.troubles] == [(0, 1), (2, 3), (4,)]
+
+    def test_show_nothing_that_does_not_print_and_no_more_than_a_line(self, tmp_path):
+        errors = {0: "a\nb\x1b[31mc\x00d\u202ee", 1: "x" * 10**6}
+        found = judge(write_run(tmp_path / "run", 10, levels=(0,), errors=errors).outcomes)
+        assert found.troubles[0].message == "a\\nb\\x1b[31mc\\x00d\\u202ee"
+        assert found.troubles[1].message == "x" * 297 + "..."
+
+    def test_are_absent_from_the_words_where_there_are_none(self, tmp_path):
+        found = judge(write_run(tmp_path / "run", 10, levels=(0,), error=None).outcomes)
+        assert found.sentences == []
+        assert "error" not in found.counts
+
+    def test_of_a_single_case_are_told_in_the_singular(self, tmp_path):
+        run = write_run(tmp_path / "run", 2, levels=(0,), timeouts=(0,))
+        assert judge(run.outcomes[:1]).sentences == [
+            "The only case timed out: the VUT never reached the merge point.",
+            "Nothing was tested.",
+        ]
+
+
+def summary_of(fmc: float, level: int = 1) -> Summary:
+    levels = {0: LevelSummary(10, 10, 0, {}, 0.0, 0), level: LevelSummary(10, 10, 1, {}, fmc, 1)}
+    return Summary(20, 1, {"MERGED": 20}, {}, levels)
+
+
+class TestAGate:
+    def test_has_a_name_however_it_is_written_and_is_there_once(self):
+        gates = parse_gates(["errors", "fmc>0.05", "fmc > 0.050", "errors", "timeouts"])
+        assert [gate.name for gate in gates] == ["errors", "fmc>0.05", "timeouts"]
+
+    @pytest.mark.parametrize(
+        "text", ["", "fmc", "error", "FMC>0.1", "failures>3", "fmc<0.1", "\x1b"]
+    )
+    def test_that_is_none_is_refused(self, text):
+        with pytest.raises(UserError, match="choose failures, errors, timeouts or"):
+            parse_gates([text])
+
+    @pytest.mark.parametrize("text", ["fmc>", "fmc>x", "fmc>nan", "fmc>-0.1", "fmc>1", "fmc>inf"])
+    def test_that_can_never_be_told_is_refused(self, text):
+        with pytest.raises(UserError, match="from 0 to below 1"):
+            parse_gates([text])
+
+    @pytest.mark.parametrize(("fmc", "met"), [(0.05, False), (0.0501, True), (0.0, False)])
+    def test_on_coverage_is_met_beyond_its_bound_at_some_level(self, tmp_path, fmc, met):
+        found = Gate("fmc", 0.05).check(judge([]), summary_of(fmc))
+        assert found.met is met
+        level = 1 if fmc else 0
+        assert found.sentence == (
+            f"gate fmc>0.05: {'met' if met else 'not met'} (FMC {fmc:.4f} at level {level})"
+        )
+
+    @pytest.mark.parametrize("name", ["failures", "errors", "timeouts"])
+    def test_on_cases_is_met_by_one_of_them(self, tmp_path, name):
+        run = write_run(tmp_path / "run", 20, levels=(0,), errors={0: "x"}, timeouts=(1,))
+        summary = summarise(run.outcomes, (0,))
+        assert Gate(name).check(judge(run.outcomes), summary).met
+        of = {
+            "failures": lambda o: o.failed,
+            "errors": lambda o: o.measures.end.is_error,
+            "timeouts": lambda o: o.measures.end is End.TIMEOUT,
+        }[name]
+        rest = judge(o for o in run.outcomes if not of(o))
+        assert not Gate(name).check(rest, summary).met
+
+
+# The shape that Jenkins (xunit plugin), GitLab and others read, in the attributes that count.
+SHAPE = """
+<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema">
+  <xs:attributeGroup name="counts">
+    <xs:attribute name="name" type="xs:string" use="required"/>
+    <xs:attribute name="tests" type="xs:nonNegativeInteger" use="required"/>
+    <xs:attribute name="failures" type="xs:nonNegativeInteger" use="required"/>
+    <xs:attribute name="errors" type="xs:nonNegativeInteger" use="required"/>
+    <xs:attribute name="time" type="xs:decimal" use="required"/>
+  </xs:attributeGroup>
+  <xs:complexType name="wrong"><xs:simpleContent><xs:extension base="xs:string">
+    <xs:attribute name="type" type="xs:string" use="required"/>
+    <xs:attribute name="message" type="xs:string"/>
+  </xs:extension></xs:simpleContent></xs:complexType>
+  <xs:element name="testsuites"><xs:complexType>
+    <xs:sequence><xs:element name="testsuite" maxOccurs="unbounded"><xs:complexType>
+      <xs:sequence><xs:element name="testcase" minOccurs="0" maxOccurs="unbounded"><xs:complexType>
+        <xs:choice minOccurs="0">
+          <xs:element name="failure" type="wrong"/>
+          <xs:element name="error" type="wrong"/>
+        </xs:choice>
+        <xs:attribute name="name" type="xs:string" use="required"/>
+        <xs:attribute name="classname" type="xs:string" use="required"/>
+        <xs:attribute name="time" type="xs:decimal" use="required"/>
+      </xs:complexType></xs:element></xs:sequence>
+      <xs:attributeGroup ref="counts"/>
+      <xs:attribute name="skipped" type="xs:nonNegativeInteger"/>
+    </xs:complexType></xs:element></xs:sequence>
+    <xs:attributeGroup ref="counts"/>
+  </xs:complexType></xs:element>
+</xs:schema>
+"""
+
+
+def read_junit(file: Path) -> etree._Element:
+    root = etree.parse(file).getroot()
+    etree.XMLSchema(etree.fromstring(SHAPE)).assertValid(root)
+    return root
+
+
+class TestJUnit:
+    @pytest.fixture
+    def root(self, tmp_path) -> etree._Element:
+        run = write_run(
+            *(tmp_path / "run", 20, (0, 2)),
+            vut=HOSTILE.replace("\ud800", ""),
+            errors={3: HOSTILE},
+            timeouts=(4, 6),
+        )
+        verdict = judge(run.outcomes)
+        gates = [
+            Gate(name).check(verdict, summarise(run.outcomes, (0, 2))) for name in ("errors", "fmc")
+        ]
+        write_junit(tmp_path / "junit.xml", run, (0, 2), verdict, gates)
+        self.run = run
+        return read_junit(tmp_path / "junit.xml")
+
+    def test_has_a_suite_per_level_with_every_case_and_one_of_gates(self, root):
+        assert [suite.get("name") for suite in root] == ["gates", "POV level 0", "POV level 2"]
+        names = root.xpath("//testcase/@name")
+        assert len(set(names)) == len(names) == 3 + 40
+        found = judge(self.run.outcomes)
+        for suite, level in zip(root[1:], (0, 2), strict=True):
+            at = [o for o in self.run.outcomes if o.case.level == level]
+            assert suite.get("tests") == "20"
+            errors = sum(o.measures.end.is_error for o in at)
+            wrong = sum(o.failed or o.measures.end is End.TIMEOUT for o in at)
+            assert (suite.get("errors"), suite.get("failures")) == (str(errors), str(wrong))
+            assert float(suite.get("time")) == pytest.approx(sum(o.measures.t_end_s for o in at))
+        assert root.get("errors") == "1"
+        assert root.get("failures") == str(found.failures + 2 + 2), "and both gates are met"
+
+    def test_has_the_message_of_an_error_as_xml_can_hold_it(self, root):
+        (error,) = root.xpath("//error")
+        assert error.get("type") == "VUT_ERROR"
+        said = "</failure><x>\\x00\\x1b[2J\\ud800\\uffff\\u202e\\n&\"'"
+        assert error.get("message") == error.text == said
+
+    def test_tells_severities_timeouts_and_gates_apart(self, root):
+        kinds = set(root.xpath("//failure/@type"))
+        assert {"contact", "TIMEOUT", "GATE"} <= kinds <= {"contact", "conflict", "TIMEOUT", "GATE"}
+        (gate,) = root.xpath("//testcase[@name='errors']/failure")
+        assert gate.text == "gate errors: met (1 error)"
+
+    def test_fails_where_nothing_was_tested(self, tmp_path):
+        run = write_run(tmp_path / "run", 4, levels=(0,), timeouts=range(4))
+        root = junit(run, (0,), judge(run.outcomes), [])
+        (tested,) = root[0]
+        assert tested[0].tag == "failure"
+        assert tested[0].text.startswith("nothing was tested")
+
+    def test_is_refused_where_something_is_or_nothing_can_be(self, tmp_path):
+        folder = tmp_path / "run"
+        (tmp_path / "file").write_text("mine")
+        (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+        for name in ("file", "link", "."):
+            with pytest.raises(UserError, match="exists"):
+                check_junit(tmp_path / name, folder)
+        with pytest.raises(UserError, match="the folder of the campaign"):
+            check_junit(folder, folder)
+        with pytest.raises(UserError, match="there is no folder"):
+            check_junit(tmp_path / "no" / "junit.xml", folder)
+        check_junit(folder / "junit.xml", folder)  # the campaign makes that folder
+        check_junit(tmp_path / "junit.xml", folder)
+
+    def test_overwrites_nothing_that_came_in_between(self, tmp_path):
+        run = write_run(tmp_path / "run", 4, levels=(0,))
+        (tmp_path / "junit.xml").write_text("mine")
+        with pytest.raises(UserError, match="exists"):
+            write_junit(tmp_path / "junit.xml", run, (0,), judge(run.outcomes), [])
+        assert (tmp_path / "junit.xml").read_text() == "mine"
+
+
+class TestACampaignThatTestedNothing:
+    @pytest.mark.parametrize(
+        ("name", "counts", "message"),
+        [
+            ("raises", "20 errors and 0 failures in 20 cases", "20 VUT_ERROR, the first in case 0"),
+            ("stops", "20 timeouts and 0 failures in 20 cases", "20 TIMEOUT, the first in case 0"),
+        ],
+    )
+    def test_exits_with_1_and_says_why_first(self, vuts, tmp_path, name, counts, message):
+        said = campaign(vuts[name], tmp_path / "run")
+        assert said.exit_code == 1
+        first, second, third, *_ = said.stdout.splitlines()
+        assert first == counts
+        assert second.strip().startswith(message)
+        assert third.strip() == "level 0: nothing was tested in 20 cases"
+        assert said.stderr.endswith("the VUT reached the merge point in no case\n")
+        page = (tmp_path / "run" / "report.html").read_text()
+        assert "Nothing was tested." in page
+        assert "No failure" not in page.split("<section", 1)[0]
+
+    def test_has_not_passed_in_json(self, vuts, tmp_path):
+        said = campaign(vuts["stops"], tmp_path / "run", "--json", "--gate", "errors")
+        found = json.loads(said.stdout)
+        assert (found["passed"], found["gates"], found["timeouts"]) == (
+            False,
+            {"errors": False},
+            20,
+        )
+        assert found["troubles"] == [
+            {
+                "end": "TIMEOUT",
+                "message": "the VUT did not reach the merge point in 30 s",
+                "cases": 20,
+                "example": 0,
+            }
+        ]
+
+
+@pytest.fixture(scope="module")
+def mixed(vuts, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("mixed") / "run"
+    settings = CampaignSettings(
+        vut=vuts["mixed"], levels=(0,), sampler="uniform", cases=20, batch=10, seed=1
+    )
+    found = judge(run_campaign(settings, folder).outcomes)
+    assert min(found.errors, found.timeouts, found.tested) > 0
+    return folder
+
+
+class TestACampaignWithGates:
+    @pytest.mark.parametrize(
+        ("gates", "code"),
+        [
+            ((), 0),
+            (("errors",), 1),
+            (("timeouts",), 1),
+            (("fmc>0.99",), 0),
+            (("fmc>0.99", "timeouts"), 1),
+        ],
+    )
+    def test_exits_with_1_when_one_is_met_also_when_it_is_resumed(self, mixed, gates, code):
+        before = (mixed / "campaign.json").read_bytes()
+        options = [word for gate in gates for word in ("--gate", gate)]
+        said = invoke("campaign", "--resume", mixed, "-q", "--json", *options)
+        assert said.exit_code == code
+        found = json.loads(said.stdout)
+        assert found["passed"] is (code == 0)
+        assert found["gates"] == {gate: gate in ("errors", "timeouts") for gate in gates}
+        assert said.stderr.count("gate ") == len(gates)
+        assert (mixed / "campaign.json").read_bytes() == before
+
+    @pytest.mark.parametrize("gate", ["fmc", "errors>1", "fmc>2"])
+    def test_that_are_none_is_refused_before_the_first_case(self, tmp_path, gate):
+        said = campaign("design2", tmp_path / "run", "--gate", gate)
+        assert isinstance(said.exception, UserError)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_writes_junit_and_never_over_a_file(self, vuts, tmp_path, mixed):
+        file = tmp_path / "junit.xml"
+        options = ("--junit", file, "--gate", "errors")
+        assert campaign(vuts["mixed"], tmp_path / "run", *options).exit_code == 1
+        root = read_junit(file)
+        assert root.get("tests") == "22"
+        before = file.read_bytes()
+        for words in (
+            ("--vut", "design2", "--level", 0, "--cases", 4, "--out", tmp_path / "other"),
+            ("--resume", mixed),
+        ):
+            said = invoke("campaign", *words, "--junit", file)
+            assert isinstance(said.exception, UserError)
+            assert "choose another name with --junit" in str(said.exception)
+        assert not (tmp_path / "other").exists()
+        assert file.read_bytes() == before
+        again = invoke("campaign", "--resume", mixed, "--junit", mixed / "junit.xml", *options[2:])
+        assert again.exit_code == 1
+        assert [t.get("name") for t in read_junit(mixed / "junit.xml").iter("testcase")] == [
+            t.get("name") for t in root.iter("testcase")
+        ]
+        (mixed / "junit.xml").unlink()
+
+    def test_that_is_stopped_says_them_in_the_command_that_goes_on(self, tmp_path, monkeypatch):
+        def stop(self) -> None:
+            raise Stopped(signal.SIGINT)
+
+        monkeypatch.setattr("merge_sumo.system.interrupt.Interrupt.check", stop)
+        said: list = []
+        monkeypatch.setattr("merge_sumo.commands.campaign.say", said.append)
+        file = tmp_path / "a file.xml"
+        with pytest.raises(Stopped):
+            campaign("design2", tmp_path / "run", "--gate", "fmc>0.5", "--junit", file)
+        assert said[-1].endswith(f"--gate 'fmc>0.5' --junit '{file}'")
+        assert not file.exists()
+
+
+class TestACampaignOfFewCasesThatIsResumed:
+    @pytest.fixture
+    def stopped(self, tmp_path) -> Path:
+        def check() -> None:
+            raise Stopped(signal.SIGINT)
+
+        settings = CampaignSettings(
+            vut="design2", levels=(0,), sampler="annealing", cases=20, batch=10, seed=1
+        )
+        with pytest.raises(Stopped):
+            run_campaign(settings, tmp_path / "run", check=check)
+        assert len(Run(tmp_path / "run").outcomes) == 10
+        return tmp_path / "run"
+
+    def test_ends_by_its_own_settings(self, stopped):
+        said = invoke("campaign", "--resume", stopped, "-q")
+        assert said.exit_code == 0, said.exception
+        assert said.stdout.startswith("0 failures in 20 cases")
+        assert "expected to add less" not in said.stdout
+
+    def test_says_in_json_that_it_ended_by_its_cases(self, stopped):
+        said = invoke("campaign", "--resume", stopped, "-q", "--json")
+        assert json.loads(said.stdout)["stopped"] == "cases"
+
+    def test_that_converged_says_so_with_its_own_share(self, stopped, monkeypatch):
+        settings = read_settings(stopped)
+        settings |= {"sampler": "coverage", "stop_after_converged": 0.25}
+        (stopped / "campaign.json").write_text(json.dumps(settings))
+        rule = "merge_sumo.campaigns.settings.StoppingRule.__call__"
+        monkeypatch.setattr(rule, lambda self, outcomes: True)
+        text = invoke("campaign", "--resume", stopped, "-q")
+        assert text.exit_code == 0, text.exception
+        assert text.stdout.startswith("stopped after 10 of 20 cases")
+        assert "less than 25.00%" in text.stdout
+        found = json.loads(invoke("campaign", "--resume", stopped, "-q", "--json").stdout)
+        assert found["stopped"] == "converged"
+
+
+@pytest.fixture(scope="module")
+def folders(vuts, tmp_path_factory) -> dict[str, Path]:
+    """Return campaigns of a good VUT and of broken ones, by name."""
+    place = tmp_path_factory.mktemp("versions")
+    for name, vut in {"good": "design2", **vuts}.items():
+        settings = CampaignSettings(
+            vut=vut, levels=(0,), sampler="uniform", cases=20, batch=10, seed=1
+        )
+        run_campaign(settings, place / name)
+    return {path.name: path for path in place.iterdir()}
+
+
+class TestTwoVersions:
+    @pytest.mark.parametrize("broken", list(VUTS))
+    @pytest.mark.parametrize("rerun", ["--rerun", "--no-rerun"])
+    def test_of_which_the_second_is_broken_are_worse_and_not_the_other_way_round(
+        self, folders, broken, rerun
+    ):
+        worse = invoke("compare-runs", folders["good"], folders[broken], rerun)
+        assert worse.exit_code == 1
+        assert "B is worse than A" in worse.stdout
+        assert "at POV level 0 B " in worse.stdout
+        better = invoke("compare-runs", folders[broken], folders["good"], rerun)
+        assert better.exit_code == 0
+        assert "B is not worse than A" in better.stdout
+        head, _ = better.stdout.split("\nB: ")
+        counts = judge(Run(folders[broken]).outcomes)
+        assert head.splitlines()[0].endswith(counts.counts)
+        assert [line.split()[1].strip(",") for line in head.splitlines()[1:]] == [
+            trouble.end for trouble in counts.troubles
+        ]
+
+    def test_of_which_both_tested_nothing_are_worse(self, folders):
+        for other in ("raises", "stops"):
+            said = invoke("compare-runs", folders["stops"], folders[other], "--tolerance", 1)
+            assert said.exit_code == 1
+            assert "B reached the merge point in no case of its campaign" in said.stdout
+
+    def test_are_told_in_json(self, folders):
+        said = invoke("compare-runs", folders["good"], folders["raises"], "--json")
+        found = json.loads(said.stdout)
+        assert found["worse"] is True
+        assert found["why"][0].startswith("at POV level 0 B reached the merge point in no case")
+        assert found["b"]["errors"] == 20
+        assert found["a"] == {
+            "contacts": 0,
+            "errors": 0,
+            "timeouts": 0,
+            "troubles": [],
+            "careful": None,
+        }
+        level = found["levels"]["0"]
+        assert level["untested_b"] == {
+            "cases": 40,
+            "errors": 20,
+            "timeouts": 0,
+            "nothing_tested": True,
+        }
+        assert level["changes"]["no verdict of B"] == 20
+
+    def test_that_stop_where_the_first_collided_have_fixed_nothing(self, run, folders):
+        found = invoke("compare-runs", run.folder, folders["stops"], "--json")
+        level = json.loads(found.stdout)["levels"]["0"]
+        assert level["fmc_a"] > 0.0
+        assert level["fmc_fixed"] == 0.0
+        assert level["changes"]["fixed"] == 0
+        assert level["changes"]["no verdict of B"] == 20 + len(failures(run.outcomes))
+
+    def test_that_are_the_same_with_other_seeds_are_not_worse(self, vuts, folders, tmp_path):
+        settings = CampaignSettings(
+            vut=vuts["mixed"], levels=(0,), sampler="uniform", cases=24, batch=8, seed=5
+        )
+        run_campaign(settings, tmp_path / "run")
+        for a, b in ((folders["mixed"], tmp_path / "run"), (tmp_path / "run", folders["mixed"])):
+            said = invoke("compare-runs", a, b)
+            assert said.exit_code == 0, said.stdout
+
+
+class TestFromPython:
+    def test_errors_and_timeouts_are_tables_and_come_first(self, tmp_path):
+        made = write_run(*(tmp_path / "run", 10, (0,)), errors={1: "<b>x</b>\x1b"}, timeouts=(2, 3))
+        opened = ms.open_run(made.folder)
+        assert [row["index"] for row in opened.errors] == [1]
+        assert [row["index"] for row in opened.timeouts] == [2, 3]
+        assert repr(opened).startswith(f"<campaign {made.folder}: 1 error, 2 timeouts and ")
+        shown = opened._repr_html_()
+        assert "1 of 10 cases ended in a VUT error" in shown
+        assert shown.index("timed out") < shown.index("<table>")
+        assert "<b>x</b>" not in shown + opened.errors._repr_html_()
+        assert "&lt;b&gt;x&lt;/b&gt;" in opened.errors._repr_html_()
+        assert opened.verdict.tested == 7
+
+
+def test_what_prints_is_left_as_it_is():
+    assert printable("straße 一 <&>") == "straße 一 <&>"
+    assert printable("\r\t\x7f\u2028") == "\\r\\t\\x7f\\u2028"
+
+
+def test_a_resumed_campaign_that_was_broken_and_is_forced_on_is_judged_as_a_whole(vuts, tmp_path):
+    settings = CampaignSettings(
+        vut=vuts["stops"], levels=(0,), sampler="uniform", cases=10, batch=5, seed=1
+    )
+    run_campaign(settings, tmp_path / "run")
+    shutil.copytree(tmp_path / "run", tmp_path / "longer")
+    resumed = resume_campaign(tmp_path / "longer", given={"cases": 15}, force=True, trust=True)
+    assert judge(resumed.outcomes).timeouts == 15

@@ -1,0 +1,173 @@
+"""merge-sumo from Python."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+from handmade import write_run
+from lxml import html
+
+import merge_sumo as ms
+from merge_sumo.analysis.summary import summarise
+from merge_sumo.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return write_run(tmp_path_factory.mktemp("api") / "run", vut="<b>x</b>")
+
+
+@pytest.fixture
+def opened(made) -> ms.CampaignRun:
+    return ms.open_run(made.folder)
+
+
+class TestARun:
+    def test_gives_its_failures_to_pandas_as_they_are(self, opened, made):
+        frame = pandas.DataFrame(opened.failures)
+        assert len(frame) == summarise(made.outcomes, (0, 1, 2)).failures
+        assert frame["score"].is_monotonic_increasing
+        assert (frame["score"] < -500).all()
+
+    def test_gives_the_rows_of_its_file(self, opened, made):
+        lines = (made.folder / "outcomes.jsonl").read_text().splitlines()
+        assert list(opened.cases) == [json.loads(line) for line in lines]
+
+    def test_writes_its_report(self, opened, made):
+        path = opened.report()
+        assert path == made.folder / "report.html"
+        assert path.is_file()
+
+    def test_gives_a_trajectory(self, opened, made):
+        assert (opened.trajectory(3).motion == made.trajectory(3).motion).all()
+
+    @pytest.mark.parametrize("of", [lambda run: run, lambda run: run.failures])
+    def test_shows_itself_as_a_table_and_its_names_as_text(self, opened, of):
+        root = html.fragment_fromstring(of(opened)._repr_html_(), create_parent="div")
+        assert len(root.xpath(".//tr")) > 3
+        assert root.xpath(".//b/b") == []
+
+    def test_shows_at_most_20_rows_and_says_how_many_there_are(self, opened):
+        shown = opened.cases._repr_html_()
+        assert shown.count("<tr>") == 21
+        assert "160 more rows" in shown
+
+    def test_has_a_line_for_a_terminal(self, opened, made):
+        assert repr(opened).startswith(f"<campaign {made.folder}: ")
+
+    def test_of_a_folder_that_is_none_is_refused(self, tmp_path):
+        with pytest.raises(ms.UserError, match="not a campaign"):
+            ms.open_run(tmp_path)
+
+
+class TestACampaign:
+    def test_is_the_one_of_the_command_line(self, tmp_path, run):
+        seen: list = []
+        again = ms.campaign(
+            "design1", level=0, cases=60, batch=20, seed=1, out=tmp_path / "r", on_case=seen.append
+        )
+        assert len(seen) == 60
+        first, second = (folder / "outcomes.jsonl" for folder in (run.folder, again.folder))
+        assert first.read_bytes() == second.read_bytes()
+        assert (again.folder / "report.html").is_file()
+
+    def test_goes_into_a_folder_named_after_the_vut(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        made = ms.campaign("level0", level=0, cases=2)
+        assert made.folder.parts[0] == "runs"
+        assert made.folder.name.startswith("level0-")
+
+    def test_with_values_that_make_none_is_refused(self, tmp_path):
+        with pytest.raises(ms.UserError, match="--cases"):
+            ms.campaign("level0", level=0, cases=0, out=tmp_path / "r")
+        assert not (tmp_path / "r").exists()
+
+
+def test_the_import_costs_nothing():
+    script = "import sys, merge_sumo as ms; dir(ms); print('numpy' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["False"]
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="nothing_like_it"):
+        getattr(ms, "nothing_like" + "_it")
+
+
+class TestWrongValues:
+    """One sentence, and nothing is left behind."""
+
+    @pytest.mark.parametrize(
+        ("values", "sentence"),
+        [
+            ({"seed": 1.5}, "seed is 1.5: it must be a whole number"),
+            ({"cases": "40"}, "cases is '40': it must be a whole number"),
+            ({"batch": 2.5}, "batch is 2.5: it must be a whole number"),
+            ({"v_vut0_mps": "x"}, "v_vut0_mps is 'x': it must be a number"),
+            ({"in_process": 1}, "in_process is 1: it must be True or False"),
+            ({"fail_when": 3}, "fail_when is 3: it must be a text"),
+            ({"deadline_s": "x"}, "--deadline is 'x': give seconds"),
+            ({"workers": "2"}, "--workers is '2': it must be a whole number, 1 or more"),
+            ({"workers": 0}, "--workers is 0: it must be a whole number, 1 or more"),
+        ],
+    )
+    def test_of_a_campaign(self, values, sentence, tmp_path):
+        with pytest.raises(UserError) as refused:
+            ms.campaign("design2", **{"cases": 4, "out": tmp_path / "run", **values})
+        assert sentence in str(refused.value)
+        assert not (tmp_path / "run").exists()
+
+    def test_of_a_case(self):
+        with pytest.raises(UserError, match="x_pov0_m is 'a': it must be a number"):
+            ms.run_case("design2", {"x_pov0_m": "a"}, v_pov0_mps=30.0)
+
+    @pytest.mark.parametrize("values", [{"cases": 2.5}, {"cases": 0}, {"cases": "x"}, {"seed": -1}])
+    def test_of_a_truth(self, values):
+        with pytest.raises(UserError, match="it must be a whole number"):
+            ms.truth("design2", 0, **values)
+
+    def test_of_a_history(self, run):
+        with pytest.raises(UserError, match="give several campaigns in a list"):
+            ms.history(str(run.folder))
+
+
+def test_numbers_of_arrays_are_numbers(tmp_path):
+    numbers: dict[str, Any] = {
+        "cases": np.int64(4),
+        "seed": np.int32(1),
+        "v_vut0_mps": np.float32(18.0),
+    }
+    of_numpy = ms.campaign("design2", level=0, out=tmp_path / "numpy", **numbers)
+    plain = {name: number.item() for name, number in numbers.items()}
+    of_python = ms.campaign("design2", level=0, out=tmp_path / "python", **plain)
+    assert of_numpy.cases == of_python.cases
+
+
+def test_one_index_is_as_good_as_a_list(run, tmp_path):
+    assert len(ms.rerun(run.folder, 3).before) == 1
+    (path,) = ms.export(run.folder, 3, out=tmp_path / "scenarios")
+    assert path.is_file()
+
+
+def test_the_example_of_the_tutorial_runs(tmp_path, monkeypatch):
+    page = Path(__file__).parents[2] / "docs" / "tutorials" / "python.md"
+    code = page.read_text(encoding="utf-8").split("```python", 1)[1].split("```", 1)[0]
+    assert "cases=400" in code
+    monkeypatch.chdir(tmp_path)
+    script = tmp_path / "example.py"
+    script.write_text(code.replace("cases=400", "cases=40"), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    folder = tmp_path / "runs" / "latest"
+    assert (folder / "report.html").is_file()

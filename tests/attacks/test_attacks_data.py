@@ -1,0 +1,586 @@
+"""Spoilt, foreign and hostile data: found out and named, or without effect; never believed.
+
+`pytest -m long -s tests/attacks/test_attacks_data.py` prints what was seen.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import os
+import re
+import shutil
+import sys
+import zipfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from attacks import tell
+from handmade import write_run
+from lxml import etree
+from plans import key_of, plan_for
+
+from merge_sumo import cli
+from merge_sumo.api import open_run
+from merge_sumo.campaigns.campaign import SCENARIOS
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
+from merge_sumo.errors import UserError
+from merge_sumo.reports.junit import write_junit
+from merge_sumo.reports.report import REPORT
+from merge_sumo.studies.probability import LINES
+from merge_sumo.studies.truth import Truth, ground_truth, read_truth
+from merge_sumo.system.signature import signed, user_key
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.severity import Severity
+from merge_sumo.vuts.output import LOG
+
+FLIPS = 300
+SHOWN_SETTING = rb'<tr><th scope="row">[^\n]*</tr>\n'
+
+
+def call(*arguments: object) -> tuple[int, str, str]:
+    """Run the command line in this process; return its exit code, its output and its errors."""
+    before, out, err = sys.argv, io.StringIO(), io.StringIO()
+    sys.argv = ["merge-sumo", *map(str, arguments)]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            cli.main()
+    except SystemExit as end:
+        return int(end.code or 0), out.getvalue(), err.getvalue()
+    finally:
+        sys.argv = before
+    return 0, out.getvalue(), err.getvalue()
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Return the files below a folder with their bytes."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+# ------------------------------------------------------------------------------ bits that flip
+
+
+class Disk:
+    """A folder with a run of which a bit may flip, and another run to compare it with."""
+
+    def __init__(self, root: Path, run: Run) -> None:
+        self.root, self.folder, self.pristine = root, root / "run", root / "pristine"
+        shutil.copytree(run.folder, self.pristine)
+        assert call("report", self.pristine)[0] == 0
+        assert call("probability", self.pristine, "--cases", 4)[0] == 0
+        (self.pristine / LOG).write_text("what the controller printed\n" * 30)
+        self.other = root / "other"
+        shutil.copytree(run.folder, self.other)
+        self.kinds: dict[str, list[str]] = {}
+        for name in tree(self.pristine):
+            self.kinds.setdefault(name.split("/")[0], []).append(name)
+
+    def flipped(self, name: str | None, bit: int = 0) -> None:
+        """Put the run there anew, with one bit of a file changed."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        shutil.copytree(self.pristine, self.folder)
+        for made in ("new", "tables", "p.json", f"p{LINES}", "junit.xml"):
+            path = self.root / made
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        if name is not None:
+            content = bytearray((self.folder / name).read_bytes())
+            content[bit // 8] ^= 1 << bit % 8
+            (self.folder / name).write_bytes(content)
+
+    def results(self, command: str) -> tuple[int, str, dict[str, bytes]]:
+        """Run a command on the run; return its code, what it said, and all that counts of it."""
+        arguments: dict[str, tuple[object, ...]] = {
+            "report": ("report", self.folder),
+            "resume": ("campaign", "--resume", self.folder, "--json", "-q"),
+            "export": ("export", self.folder, 0, 7, 59, "--out", self.root / "new"),
+            "export csv": ("export", self.folder, *("--format", "csv", "--out"), self.root / "new"),
+            "compare-runs": ("compare-runs", self.folder, self.other, "--no-rerun", "--json"),
+            "probability": (
+                *("probability", self.folder, "--cases", 3, "--json", "--out"),
+                self.root / "p.json",
+            ),
+        }
+        code, out, err = call(*arguments[command])
+        found = {"said": out.encode()}
+        for name, content in tree(self.root).items():
+            if name.startswith(("new/", "p.")) or name in (f"run/{REPORT}", f"run/{OUTCOMES}"):
+                found[name] = content
+        return code, err, found
+
+
+COMMANDS = ("report", "resume", "export", "export csv", "compare-runs", "probability")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("half", [0, 1])
+def test_a_bit_that_flips_anywhere_in_a_run_is_harmless_or_named(half, run, tmp_path):
+    disk = Disk(tmp_path, run)
+    expected = {}
+    for command in COMMANDS:
+        disk.flipped(None)
+        code, err, expected[command] = disk.results(command)
+        assert code in (0, 1), err
+    rng = np.random.default_rng([11, half])
+    seen: Counter[str] = Counter()
+    kinds = sorted(disk.kinds)
+    for number in range(FLIPS // 2):
+        kind = kinds[number % len(kinds)]
+        name = str(rng.choice(disk.kinds[kind]))
+        bit = int(rng.integers((disk.pristine / name).stat().st_size * 8))
+        named = False
+        for command in COMMANDS:
+            disk.flipped(name, bit)
+            where = (command, name, bit)
+            code, err, found = disk.results(command)
+            if code == 2:
+                named = True
+                assert err.startswith("merge-sumo: "), where
+                assert err.count("\n") == 1, where
+                continue
+            assert "Traceback" not in err, where
+            if name == SETTINGS and f"run/{REPORT}" in found:
+                # Of the checksum, another name or none is left, which is shown as a setting.
+                assert b'"sha256"' not in (disk.folder / name).read_bytes(), where
+                shown = [found, expected[command]]
+                without = [re.sub(SHOWN_SETTING, b"", each[f"run/{REPORT}"]) for each in shown]
+                assert without[0] == without[1], where
+                del found[f"run/{REPORT}"]
+            if name == LOG:  # the report quotes it
+                found.pop(f"run/{REPORT}", None)
+            if b"are missing or cannot be read" in found.get(f"run/{REPORT}", b""):
+                named = True  # by the report, which goes without
+                del found[f"run/{REPORT}"]
+            same = {n: expected[command][n] for n in found if n != f"run/{name}"}
+            differs = [n for n in same if found[n] != same[n]]
+            assert not differs, (*where, differs)
+        seen[f"{kind}: {'named' if named else 'harmless'}"] += 1
+    tell(seen)
+    assert sum(seen.values()) == FLIPS // 2
+
+
+@pytest.fixture
+def copied(run, tmp_path) -> Path:
+    return Path(shutil.copytree(run.folder, tmp_path / "run"))
+
+
+def replaced(path: Path, old: bytes, new: bytes) -> None:
+    content = path.read_bytes()
+    assert content.count(old) >= 1
+    path.write_bytes(content.replace(old, new, 1))
+
+
+class TestWhatWasChanged:
+    def test_among_the_outcomes_is_named_with_its_lines(self, copied):
+        lines = (copied / OUTCOMES).read_bytes().splitlines(keepends=True)
+        record = json.loads(lines[25])
+        record["score"] = 0.0 if record["score"] is None else record["score"] / 2.0
+        lines[25] = json.dumps(record).encode() + b"\n"
+        (copied / OUTCOMES).write_bytes(b"".join(lines))
+        with pytest.raises(UserError, match=r"lines 21 to 40 of .*outcomes\.jsonl .*00001\.npz"):
+            Run(copied)
+
+    @pytest.mark.parametrize("bit", range(8))
+    def test_of_the_last_end_of_a_line_is_named(self, copied, bit):
+        content = bytearray((copied / OUTCOMES).read_bytes())
+        content[-1] ^= 1 << bit
+        (copied / OUTCOMES).write_bytes(content)
+        with pytest.raises(UserError, match=r"line 60 of .* does not end as it was written"):
+            Run(copied)
+
+    def test_among_the_settings_is_named(self, copied):
+        replaced(copied / SETTINGS, b'"seed": 1', b'"seed": 3')
+        with pytest.raises(UserError, match=r"campaign\.json is not as it was written"):
+            Run(copied)
+
+    def test_by_a_person_who_removes_the_checksum_is_taken(self, copied):
+        settings = read_settings(copied) | {"seed": 3}
+        (copied / SETTINGS).write_text(json.dumps(settings))
+        assert Run(copied).settings["seed"] == 3
+
+    def test_cannot_be_told_in_a_folder_of_an_older_version_which_is_read(self, run, copied):
+        settings = read_settings(copied)
+        (copied / SETTINGS).write_text(json.dumps(settings))
+        without_hashes(copied)
+        assert Run(copied).outcomes == Run(run.folder).outcomes
+        assert Run(copied).trajectory(30).motion.tobytes() == run.trajectory(30).motion.tobytes()
+
+    def test_is_no_batch_that_was_being_written(self, copied):
+        lines = (copied / OUTCOMES).read_bytes().splitlines(keepends=True)
+        for kept in (0, 20, 33, 59):
+            (copied / OUTCOMES).write_bytes(b"".join(lines[:kept]) + lines[kept][:50])
+            assert len(Run(copied).outcomes) == kept
+            assert Run(copied).torn
+
+    @pytest.mark.parametrize("name", [SETTINGS, OUTCOMES, f"{TRAJECTORIES}/00000.npz"])
+    def test_into_a_pipe_is_not_waited_for(self, copied, name):
+        (copied / name).unlink()
+        os.mkfifo(copied / name)
+        code, _, err = call("export", copied, 0)
+        assert code == 2
+        assert "it is no file" in err
+
+
+def without_hashes(folder: Path) -> None:
+    """Make the files of the batches those of an older version."""
+    for path in (folder / TRAJECTORIES).iterdir():
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files if name != "lines_sha256"}
+        np.savez(path, **arrays)
+
+
+# ------------------------------------------------------------------------------ a cache
+
+CASES = 30
+
+
+KEPT = key_of(cases=CASES)
+
+
+def saved(**changes: Any) -> bytes:
+    """Return a file of the cache with some arrays replaced, or left out where they are None."""
+    rng = np.random.default_rng(5)
+    arrays = {
+        "points": rng.random((CASES, 2)),
+        "score": -1000.0 * rng.random(CASES),
+        "files": "{}",
+        "of": KEPT.path().stem,
+        **changes,
+    }
+    content = io.BytesIO()
+    np.savez(content, **{name: array for name, array in arrays.items() if array is not None})
+    return content.getvalue()
+
+
+def compressed(size: int) -> bytes:
+    content = io.BytesIO()
+    np.savez_compressed(content, points=np.zeros(size), score=np.zeros(1), files="{}", of="x")
+    return content.getvalue()
+
+
+def claiming(shape: tuple[int, ...]) -> bytes:
+    """Return an archive whose array says that it has a shape, and has no data."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name in ("points", "score", "files", "of"):
+            header = io.BytesIO()
+            np.lib.format.write_array_header_1_0(
+                header, {"descr": "<f8", "fortran_order": False, "shape": shape}
+            )
+            archive.writestr(f"{name}.npy", header.getvalue())
+    return content.getvalue()
+
+
+def plain(array: Any) -> bytes:
+    content = io.BytesIO()
+    np.save(content, array, allow_pickle=True)
+    return content.getvalue()
+
+
+SPOILT = {
+    "empty": b"",
+    "text": b"points and scores",
+    "html": b"<html>404</html>",
+    "a zip of nothing": b"PK\5\6" + bytes(18),
+    "one array": plain(np.zeros((CASES, 2))),
+    "a pickle": plain(np.array([{"a": 1}], dtype=object)),
+    "of another truth": saved(of="truth-0123456789abcdef01234567"),
+    "of nothing": saved(of=None),
+    "of a number": saved(of=7),
+    "no score": saved(score=None),
+    "no points": saved(points=None),
+    "no files": saved(files=None),
+    "too many points": saved(points=np.zeros((CASES + 1, 2))),
+    "points of level 2": saved(points=np.zeros((CASES, 3))),
+    "flat points": saved(points=np.zeros(2 * CASES)),
+    "points of 32 bits": saved(points=np.zeros((CASES, 2), dtype=np.float32)),
+    "whole points": saved(points=np.zeros((CASES, 2), dtype=np.int64)),
+    "complex points": saved(points=np.zeros((CASES, 2), dtype=complex)),
+    "points of text": saved(points=np.full((CASES, 2), "0.5")),
+    "points of objects": saved(points=np.full((CASES, 2), None)),
+    "points that are none": saved(points=np.full((CASES, 2), np.nan)),
+    "points far away": saved(points=np.full((CASES, 2), 1e9)),
+    "points below": saved(points=np.full((CASES, 2), -1e-9)),
+    "bytes in the other order": saved(points=np.zeros((CASES, 2), dtype=">f8")),
+    "scores of 32 bits": saved(score=np.zeros(CASES, dtype=np.float32)),
+    "scores of objects": saved(score=np.full(CASES, None)),
+    "scores in two columns": saved(score=np.zeros((CASES, 2))),
+    "scores that are too few": saved(score=np.zeros(CASES - 1)),
+    "scores above 0": saved(score=np.full(CASES, 1.0)),
+    "infinite scores": saved(score=np.full(CASES, -np.inf)),
+    "records": saved(points=np.zeros(CASES, dtype=[("x", "f8"), ("y", "f8")])),
+    "compressed": compressed(10),
+    "a bomb of 800 MB": compressed(10**8),
+    "an array that says that it is large": claiming((10**12,)),
+    "an array that says that it is larger": claiming((2**62, 2**62)),
+    "an array that says that it is negative": claiming((-1, 2)),
+    **{
+        f"files that are {text[:30]!r}": saved(files=text)
+        for text in (
+            *("", "{", "[]", "null", "7", '"text"', "[1, 2]", '{"/etc/passwd": null}'),
+            *(
+                '{"\\u0000": "x"}',
+                '{"gone": "0"}',
+                '{"gone": 7}',
+                '{"/": {}}',
+                '{"/dev/zero": "0"}',
+            ),
+            *(
+                '{"' + "x" * 5000 + '": "0"}',
+                "[" * 100_000,
+                '{"a":' * 100_000,
+                "NaN",
+                '{"\\ud800": "0"}',
+            ),
+        )
+    },
+    "files of numbers": saved(files=np.zeros(3)),
+}
+
+
+@pytest.fixture(scope="module")
+def true(tmp_path_factory) -> tuple[Truth, bytes]:
+    """Return what is true of design 1 at level 0 in a few cases, and its file in the cache."""
+    folder = tmp_path_factory.mktemp("true")
+    return ground_truth(plan_for("design1"), 0, CASES, cache=folder), KEPT.path(folder).read_bytes()
+
+
+def of_this_user(content: bytes) -> bytes:
+    return signed(content, KEPT.path(Path()).stem, user_key())
+
+
+class TestACache:
+    def assert_not_believed(self, content: bytes, folder: Path) -> None:
+        path = KEPT.path(folder)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        assert read_truth(path, 0, CASES, US23) is None
+
+    @pytest.mark.parametrize("name", SPOILT)
+    def test_that_is_spoilt_is_not_believed(self, name, tmp_path):
+        self.assert_not_believed(of_this_user(SPOILT[name]), tmp_path)
+
+    def test_as_these_would_be_believed_is_what_the_test_spoils(self, tmp_path):
+        path = KEPT.path(tmp_path)
+        path.write_bytes(of_this_user(saved()))
+        assert read_truth(path, 0, CASES, US23) is not None
+
+    @pytest.mark.parametrize("by", ["nobody", "another user", "this user for another truth"])
+    def test_with_no_failures_that_somebody_planted_runs_again(self, by, true, tmp_path):
+        """As a shared cache was overwritten with "no failures"."""
+        content = saved(points=true[0].points, score=np.full(CASES, -1.0))
+        if by == "another user":
+            content = signed(content, KEPT.path(tmp_path).stem, b"k" * 32)
+        elif by != "nobody":
+            content = signed(content, "truth-0123456789abcdef01234567", user_key())
+        KEPT.path(tmp_path).write_bytes(content)
+        assert len(true[0].failures)
+        again = ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path)
+        assert np.array_equal(again.score, true[0].score)
+        assert KEPT.path(tmp_path).read_bytes() == true[1]
+
+    @pytest.mark.parametrize("bits", [100, pytest.param(400, marks=pytest.mark.long)])
+    def test_with_any_bit_flipped_or_cut_off_anywhere_is_not_believed(self, true, tmp_path, bits):
+        found, content = true
+        rng = np.random.default_rng(3)
+        harmless = 0
+        path = KEPT.path(tmp_path)
+        for bit in rng.integers(len(content) * 8, size=bits).tolist():
+            spoilt = bytearray(content)
+            spoilt[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(spoilt)
+            read = read_truth(path, 0, CASES, US23)
+            if read is not None:  # in a date, or a number that nobody reads
+                harmless += 1
+                assert np.array_equal(read.points, found.points)
+                assert np.array_equal(read.score, found.score)
+        assert harmless < bits / 2
+        for end in rng.integers(len(content), size=bits // 4).tolist():
+            self.assert_not_believed(content[:end], tmp_path)
+
+    @pytest.mark.parametrize(
+        "other",
+        [
+            key_of(cases=CASES, vut="design2"),
+            key_of(cases=CASES, level=1),
+            key_of(cases=CASES, seed=1),
+        ],
+        ids=["another VUT", "another level", "another seed"],
+    )
+    def test_with_a_file_of_the_same_shape_under_another_name_runs_again(
+        self, true, other, tmp_path
+    ):
+        ground_truth(plan_for(other.vut), other.level, CASES, other.seed, cache=tmp_path)
+        other.path(tmp_path).rename(KEPT.path(tmp_path))
+        counted: list[int] = []
+        again = ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path, on_cases=counted.append)
+        assert sum(counted) == CASES
+        assert np.array_equal(again.score, true[0].score)
+        assert KEPT.path(tmp_path).read_bytes() == true[1]
+
+    @pytest.mark.parametrize("kind", ["pipe", "folder", "link", "loop", "device"])
+    def test_with_no_file_there_is_refused_in_a_sentence(self, kind, tmp_path):
+        path = KEPT.path(tmp_path)
+        (tmp_path / "theirs").write_text("theirs")
+        if kind == "pipe":
+            os.mkfifo(path)
+        elif kind == "folder":
+            path.mkdir()
+        else:
+            target = {"link": "theirs", "loop": path.name, "device": "/dev/zero"}[kind]
+            path.symlink_to(target)
+        assert read_truth(path, 0, CASES, US23) is None
+        with pytest.raises(UserError, match="cannot write"):
+            ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path)
+        assert (tmp_path / "theirs").read_text() == "theirs"
+
+
+# ------------------------------------------------------------------------------ texts
+
+MARKUP = "<script>alert(1)</script></script><!--<img src=x onerror=alert(1)>]]>&amp;"
+TEXTS = {
+    "markup": MARKUP,
+    "ANSI": "\x1b[2J\x1b[31mred\x1b]0;title\x07\x9b5n\r\b\n\n",
+    "NUL": "\0a\0",
+    "every control": "".join(map(chr, [*range(32), *range(127, 160), 0x202E, 0x2028, 0xFEFF])),
+    "a formula": "=cmd|'/c calc'!A1",
+    "formulas": '+1+1,-1,@SUM(A1)\t"=1"',
+    "10 MB": "x" * 10_000_000,
+    "10 MB of markup": MARKUP * 130_000,
+    "a template": "{{ 7 * 7 }} {% include '/etc/passwd' %} ${7*7} %s %n",
+    "no characters": "\uffff\ufffe\U0010ffff",
+    "nothing": "",
+}
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory) -> Path:
+    """Return a folder of 40 cases with an error, as an older version wrote it."""
+    folder = tmp_path_factory.mktemp("honest") / "run"
+    write_run(folder, per_level=20, levels=(0, 2), errors={7: "answered nan", 39: "answered nan"})
+    without_hashes(folder)
+    return folder
+
+
+def received(honest: Path, folder: Path, text: str) -> Path:
+    """Return a run of a stranger's who says something in errors and as the name of the VUT."""
+    shutil.copytree(honest, folder)
+    lines = (folder / OUTCOMES).read_text().splitlines()
+    for index in (7, 39):
+        lines[index] = json.dumps(json.loads(lines[index]) | {"error": text})
+    (folder / OUTCOMES).write_text("\n".join(lines) + "\n")
+    (folder / SETTINGS).write_text(json.dumps(read_settings(folder) | {"vut": text}))
+    (folder / LOG).write_text(text[:100_000])
+    return folder
+
+
+def assert_fit_for_a_terminal(said: str) -> None:
+    assert "Traceback" not in said
+    assert len(said) < 100_000
+    assert all(letter.isprintable() or letter in " \n\u3000" for letter in said), said[:500]
+
+
+SOME_TEXTS = [
+    name
+    if name in ("every control", "10 MB of markup")
+    else pytest.param(name, marks=pytest.mark.long)
+    for name in TEXTS
+]
+"""In the default run what is odd, and what is markup and long."""
+
+
+@pytest.fixture(scope="module")
+def usual(honest, tmp_path_factory) -> bytes:
+    """Return the report of a run in which nobody says anything odd."""
+    folder = received(honest, tmp_path_factory.mktemp("usual") / "run", "answered nan")
+    assert call("report", folder)[0] == 0
+    return (folder / REPORT).read_bytes()
+
+
+@pytest.mark.parametrize("name", SOME_TEXTS)
+class TestATextOfAStranger:
+    def test_stays_a_text_in_the_report_and_on_the_terminal(self, name, honest, usual, tmp_path):
+        folder = received(honest, tmp_path / "run", TEXTS[name])
+        code, out, err = call("report", folder)
+        assert code == 0, err
+        assert_fit_for_a_terminal(out + err)
+        page = (folder / REPORT).read_bytes()
+        assert len(page) < len(usual) + 1_000_000
+        for tag in (b"<script", b"</script", b"<img", b"<!--", b"\0", b"\x1b"):
+            assert page.count(tag) == usual.count(tag), tag
+        assert b"49 {%" not in page
+
+    def test_is_escaped_by_every_command(self, name, honest, tmp_path):
+        folder = received(honest, tmp_path / "run", TEXTS[name])
+        ended = {}
+        for arguments in (
+            ("compare-runs", folder, honest, "--no-rerun"),
+            ("compare-runs", folder, honest, "--no-rerun", "--json"),
+            ("compare-runs", honest, folder),
+            ("campaign", "--resume", folder, "-q", "--junit", tmp_path / "junit.xml"),
+            ("campaign", "--resume", folder, "--trust-vut", "-q"),
+            ("probability", folder, "--cases", 4),
+            ("probability", folder, "--cases", 4, "--trust-vut"),
+            ("export", folder, 7),
+            ("replay", folder / SCENARIOS / "case-00007"),
+        ):
+            code, out, err = call(*arguments)
+            assert code in (0, 1, 2), err
+            assert_fit_for_a_terminal(out + err)
+            ended[arguments[0]] = code
+        assert ended["export"] == 0
+
+    def test_is_in_no_table_and_leaves_xml_readable(self, name, honest, tmp_path):
+        folder = received(honest, tmp_path / "run", TEXTS[name])
+        for file_format in ("csv", "parquet"):
+            code, _, err = call("export", folder, "--format", file_format, "--out", tmp_path / "t")
+            assert code == 0, err
+        with (tmp_path / "t" / "trajectories.csv").open(newline="") as file:
+            header, *rows = csv.reader(file)
+        assert all(name.replace("_", "").isalnum() for name in header)
+        assert len(rows) > 40
+        assert header[-1] == "severity"
+        assert {row[-1] for row in rows} <= {"", *Severity}
+        assert all(math.isfinite(float(cell or 0)) for row in rows for cell in row[:-1])
+        code, _, err = call(
+            "export", folder, 7, "--format", "openscenario", "--out", tmp_path / "xosc"
+        )
+        assert code == 0, err
+        written = [*(tmp_path / "xosc").rglob("*.xosc")]
+        assert len(written) == 2, "as recorded, and with a free ego"
+        assert {etree.parse(xosc).getroot().tag for xosc in written} == {"OpenSCENARIO"}
+        verdict = open_run(folder).verdict
+        found = Run(folder)
+        write_junit(tmp_path / "junit.xml", found, (0, 2), verdict, [])
+        assert etree.parse(tmp_path / "junit.xml").getroot().tag == "testsuites"
+        notebook = open_run(folder)._repr_html_() + open_run(folder).errors._repr_html_()
+        assert "<script" not in notebook
+        assert len(notebook) < 100_000
+
+
+@pytest.mark.parametrize(
+    "half",
+    ["\\ud800", *(pytest.param(h, marks=pytest.mark.long) for h in ("\\udfff x", "x \\ud83d"))],
+)
+def test_half_a_character_is_refused_in_a_sentence(half, honest, tmp_path):
+    folder = received(honest, tmp_path / "run", "MARKED")
+    for file in (OUTCOMES, SETTINGS):
+        content = (folder / file).read_bytes()
+        (folder / file).write_bytes(content.replace(b"MARKED", half.encode()))
+        for command in ("report", "campaign", "export", "compare-runs", "probability"):
+            first = ("--resume",) if command == "campaign" else ()
+            more = {"export": (7,), "compare-runs": (honest, "--no-rerun")}.get(command, ())
+            code, _, err = call(command, *first, folder, *more)
+            assert code == 2, err
+            assert file in err or command == "campaign", "which asks for trust first"
+            assert err.count("\n") == 1
+        (folder / file).write_bytes(content)

@@ -1,0 +1,376 @@
+"""Disks that are full, folders that are read-only or gone, two writers, clocks that run back.
+
+`pytest -m long -s tests/attacks/test_attacks_disk.py` prints what was seen.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from attacks import World, tell
+from conftest import require
+from plans import plan_for
+
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import OUTCOMES, Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.studies.truth import ground_truth
+from merge_sumo.system.folders import TEMPORARY
+
+CAMPAIGN = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "uniform", "-q")
+SMALL = (*CAMPAIGN, "--cases", "60", "--batch", "20", "--seed", "1")
+TRUTH = ("truth", "--vut", "design1", "--level", "0", "--cases", "300", "--workers", "1")
+COMPARE = (
+    "compare",
+    *("--vut", "design1", "--level", "0", "--samplers", "uniform", "--seeds", "1"),
+    *("--cases", "40", "--truth-cases", "300", "--workers", "1"),
+)
+
+
+def world_with(run, root: Path, **changes) -> World:
+    world = World(root, **changes)
+    shutil.copytree(run.folder, root / "run")
+    world.cache.mkdir()
+    return world
+
+
+def assert_refused(ended: tuple[int, str, str], *parts: str) -> None:
+    code, _, err = ended
+    assert code == 2, (code, err[-2000:])
+    last = err.splitlines()[-1]
+    assert last.startswith("merge-sumo: "), err
+    assert "Traceback" not in err
+    for part in parts:
+        assert part in last
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+WRITERS = {
+    "campaign": (*SMALL, "--out", "{disk}/new"),
+    "resume": ("campaign", "--resume", "{disk}/stopped", "-q"),
+    "truth": TRUTH,
+    "compare": (*COMPARE, "--figure", "{disk}/curves.png"),
+    "reproduce": (
+        "reproduce",
+        "--quick",
+        "--seeds",
+        "1",
+        "--workers",
+        "1",
+        "--out",
+        "{disk}/paper",
+    ),
+    "probability": ("probability", "run", "--cases", "40", "--out", "{disk}/p.json"),
+    "export": ("export", "run", "0", "1", "--out", "{disk}/new"),
+    "export csv": ("export", "run", "--format", "csv", "--out", "{disk}/new"),
+    "export parquet": ("export", "run", "--format", "parquet", "--out", "{disk}/new"),
+    "openscenario": ("export", "run", "0", "--format", "openscenario", "--out", "{disk}/new"),
+    "report": ("report", "{disk}/stopped"),
+    "junit": (*SMALL, "--out", "new", "--junit", "{disk}/junit.xml"),
+    "policy": ("policies", "export", "vut1", "--out", "{disk}/vut1.onnx"),
+    "train": ("train", "--only", "pov1", "--out", "{disk}/policies"),
+}
+"""Every command that writes, and where it does so on the disk."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("left", [0, 4096])
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_disk_that_is_full_ends_every_writer_in_a_sentence(name, left, run, small_disk, tmp_path):
+    world = world_with(run, tmp_path / "world")
+    stopped = small_disk / "stopped"
+    (stopped / "trajectories").mkdir(parents=True)
+    for part in ("campaign.json", OUTCOMES, "trajectories/00000.npz"):
+        shutil.copy(run.folder / part, stopped / part)
+    lines = (run.folder / OUTCOMES).read_bytes().splitlines(keepends=True)
+    (stopped / OUTCOMES).write_bytes(b"".join(lines[:20]))
+    if name == "truth":
+        shutil.rmtree(world.cache)
+        world.cache.symlink_to(small_disk / "cache")
+        (small_disk / "cache").mkdir()
+    (small_disk / "filler").write_bytes(b"")
+    with (small_disk / "filler").open("wb", buffering=0) as filler:
+        free = shutil.disk_usage(small_disk).free
+        filler.write(bytes(max(free - left, 0)))
+    before = tree(small_disk)
+    arguments = [part.format(disk=small_disk) for part in WRITERS[name]]
+    ended = world.run(*arguments)
+    if name == "policy" and "needs" in ended[2]:
+        pytest.skip(ended[2])
+    assert_refused(ended, "No space left on device")
+    after = tree(small_disk)
+    assert {n: after.get(n) for n in before} == before
+    news = set(after) - set(before)
+    begun = ("policies/", "paper/", "new/", "p.jsonl", "stopped/trajectories/", "cache/key")
+    assert not [n for n in news if not n.startswith(begun)]
+    assert not {n for n in news if n.endswith((".csv", ".parquet", ".onnx", ".html", "p.json"))}
+    for campaign, cases in (("new", 0), ("stopped", 20)):
+        if f"{campaign}/{OUTCOMES}" in after:
+            assert len(Run(small_disk / campaign).outcomes) == cases
+
+
+@pytest.mark.long
+def test_a_full_folder_for_temporary_files_is_not_used(run, small_disk, tmp_path):
+    (small_disk / "filler").write_bytes(bytes(shutil.disk_usage(small_disk).free))
+    world = world_with(run, tmp_path / "world")
+    world.environment["TMPDIR"] = str(small_disk)
+    code, _, err = world.run(*SMALL, "--out", "new")
+    assert code == 0, err
+    assert sorted(path.name for path in small_disk.iterdir()) == ["filler"]
+
+
+SETPRIV = shutil.which("setpriv")
+WITHOUT_RIGHTS = (str(SETPRIV), "--bounding-set=-all", "--inh-caps=-all", "--no-new-privs")
+"""So root is a user like any other: permissions hold for it, too."""
+
+
+@pytest.fixture
+def as_nobody(run, tmp_path):
+    """Return a world, and what runs our command there without the rights of root."""
+    root = os.geteuid() == 0
+    require(not root or SETPRIV is not None, "as root it needs setpriv of util-linux")
+    world = world_with(run, tmp_path / "world", prefix=WITHOUT_RIGHTS if root else ())
+    (world.root / "closed").mkdir(mode=0o555)
+    code, _, _ = world.run(script="open('closed/file', 'w')")
+    require(code != 0, "permissions do not hold here")
+    yield world, world.run
+    for path in [world.root, *world.root.rglob("*")]:
+        if path.is_dir():
+            path.chmod(0o755)
+
+
+def locked(folder: Path) -> None:
+    for path in [folder, *folder.rglob("*")]:
+        path.chmod(0o555 if path.is_dir() else 0o444)
+
+
+@pytest.mark.long
+class TestAFolderThatIsReadOnly:
+    def test_of_a_run_is_read_and_never_written(self, as_nobody):
+        world, ended = as_nobody
+        locked(world.root / "run")
+        before = tree(world.root / "run")
+        for arguments in (
+            ("report", "run"),
+            ("campaign", "--resume", "run", "-q"),
+            ("export", "run", "59"),
+            ("export", "run", "--format", "csv"),
+            ("probability", "run", "--cases", "4"),
+        ):
+            assert_refused(ended(*arguments), "cannot write")
+        for allowed in (
+            ("compare-runs", "run", "run", "--no-rerun"),
+            ("export", "run", "59", "--out", "elsewhere"),
+            ("probability", "run", "--cases", "4", "--out", "p.json"),
+        ):
+            code, _, err = ended(*allowed)
+            assert code == 0, err
+        assert tree(world.root / "run") == before
+
+    def test_to_write_to_is_named_before_the_first_case(self, as_nobody):
+        world, ended = as_nobody
+        (world.root / "locked").mkdir(mode=0o555)
+        for arguments in (
+            (*SMALL, "--out", "locked/new"),
+            (*SMALL, "--out", "new", "--junit", "locked/junit.xml"),
+            (*COMPARE, "--figure", "locked/curves.svg"),
+            ("reproduce", "--quick", "--out", "locked/paper"),
+            ("train", "--only", "pov1", "--out", "locked/policies"),
+            ("export", "run", "0", "--out", "locked/new"),
+            ("probability", "run", "--out", "locked/p.json"),
+        ):
+            assert_refused(ended(*arguments), "cannot write", "Permission denied")
+        assert not (world.root / "new").exists()
+
+    def test_for_the_cache_costs_the_truth_and_no_campaign(self, as_nobody):
+        world, ended = as_nobody
+        locked(world.cache)
+        assert_refused(ended(*TRUTH), "cannot write")
+        code, _, err = ended(*SMALL, "--out", "new")
+        assert code == 0, err
+
+    def test_for_temporary_files_is_named(self, as_nobody):
+        world, ended = as_nobody
+        world.temporary.chmod(0o555)
+        code, _, err = ended(*SMALL, "--out", "new")
+        assert "Traceback" not in err
+        assert (code == 2 and "TMPDIR" in err) or code == 0, err
+
+
+class Vanishing:
+    """Told of cases; has a folder vanish at one of them."""
+
+    def __init__(self, folder: Path, at: int = 5) -> None:
+        self.folder, self.left = folder, at
+
+    def __call__(self, *_: object) -> None:
+        self.left -= 1
+        if self.left == 0:
+            shutil.rmtree(self.folder)
+
+
+class TestAFolderThatVanishes:
+    SETTINGS = CampaignSettings(
+        vut="design1", levels=(0,), sampler="uniform", cases=40, batch=20, seed=1
+    )
+
+    def test_under_a_campaign_ends_it_in_a_sentence(self, tmp_path):
+        with pytest.raises(UserError, match=r"cannot write .*No such file or directory"):
+            run_campaign(self.SETTINGS, tmp_path / "run", on_case=Vanishing(tmp_path / "run"))
+        assert list(tmp_path.iterdir()) == []
+
+    def test_above_a_campaign_does_so_too(self, tmp_path):
+        (tmp_path / "above").mkdir()
+        with pytest.raises(UserError, match=r"cannot write .*No such file or directory"):
+            run_campaign(
+                self.SETTINGS, tmp_path / "above" / "run", on_case=Vanishing(tmp_path / "above")
+            )
+
+    def test_with_trajectories_ends_it_and_keeps_the_outcomes(self, tmp_path):
+        # Not uniform: its batches run ahead, and those that end together are written together.
+        settings = replace(self.SETTINGS, sampler="annealing")
+        gone = Vanishing(tmp_path / "run" / "trajectories", at=25)
+        with pytest.raises(UserError, match=r"cannot write .*No such file or directory"):
+            run_campaign(settings, tmp_path / "run", on_case=gone)
+        assert len(Run(tmp_path / "run").outcomes) == 20
+
+    def test_with_the_cache_is_made_again(self, tmp_path):
+        (tmp_path / "cache").mkdir()
+        gone = Vanishing(tmp_path / "cache", at=1)
+        truth = ground_truth(plan_for("design1"), 0, 200, cache=tmp_path / "cache", on_cases=gone)
+        again = ground_truth(plan_for("design1"), 0, 200, cache=tmp_path / "cache")
+        assert again.score.tobytes() == truth.score.tobytes()
+        assert len(list((tmp_path / "cache").iterdir())) == 1
+
+    def test_with_temporary_files_is_not_missed(self, tmp_path, monkeypatch):
+        (tmp_path / "tmp").mkdir()
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+        gone = Vanishing(tmp_path / "tmp", at=5)
+        try:
+            run = run_campaign(self.SETTINGS, tmp_path / "run", on_case=gone)
+        except UserError:
+            return
+        assert len(run.outcomes) == 40
+
+    def test_where_one_works_is_named(self, run, tmp_path):
+        world = world_with(run, tmp_path / "world")
+        world.cache.rename(tmp_path / "cache")
+        world.environment["MERGE_SUMO_CACHE"] = str(tmp_path / "cache")
+        script = (
+            "import os, sys; os.mkdir('here'); os.chdir('here'); os.rmdir('../here');"
+            "from merge_sumo.cli import main; sys.argv[0] = 'merge-sumo'; main()"
+        )
+        for arguments in ((*SMALL, "--out", "new"), ("export", "run", "0"), ("report", "run")):
+            code, _, err = world.run(*arguments, script=script)
+            assert code == 2, err
+            assert "Traceback" not in err, err
+
+
+@pytest.mark.long
+class TestTwoWriters:
+    def both(self, world: World, *arguments: object) -> list[tuple[int, str]]:
+        started = [world.start(*arguments) for _ in range(2)]
+        return [(p.communicate(timeout=300)[1], p.returncode)[::-1] for p in started]
+
+    def test_of_one_name_are_a_first_and_a_second(self, run, tmp_path):
+        makes = {
+            "new": (*SMALL, "--out", "new"),
+            "paper": ("export", "run", "0", "--out", "paper"),
+            "tables": ("export", "run", "--format", "csv", "--out", "tables"),
+            "p.json": ("probability", "run", "--cases", "20", "--out", "p.json"),
+            "curves.svg": (*COMPARE, "--figure", "curves.svg"),
+        }
+        seen: Counter[str] = Counter()
+        for name, arguments in makes.items():
+            for number in range(4):
+                world = world_with(run, tmp_path / f"{name}-{number}")
+                ended = self.both(world, *arguments)
+                assert "Traceback" not in "".join(err for _, err in ended), ended
+                codes = sorted(code for code, _ in ended)
+                assert codes in ([0, 2], [0, 0]) if name == "curves.svg" else codes == [0, 2], ended
+                assert "xists" in "".join(err for _, err in ended) or codes == [0, 0]
+                assert (world.root / name).exists()
+                assert not [n for n in tree(world.root) if TEMPORARY in n]
+                seen["pairs"] += 1
+        tell(seen)
+
+    def test_of_one_report_or_one_truth_leave_a_whole_one(self, run, tmp_path):
+        world = world_with(run, tmp_path / "world")
+        assert world.run("report", "run")[0] == 0
+        page = (world.root / "run" / "report.html").read_bytes()
+        for _ in range(6):
+            assert [code for code, _ in self.both(world, "report", "run")] == [0, 0]
+            assert (world.root / "run" / "report.html").read_bytes() == page
+        for _ in range(3):
+            for truth in world.cache.glob("truth-*"):
+                truth.unlink()
+            assert [code for code, _ in self.both(world, *TRUTH)] == [0, 0]
+            assert len(list(world.cache.glob("truth-*"))) == 1
+        assert not [n for n in tree(world.root) if TEMPORARY in n]
+
+
+CLOCK = """
+import itertools, time
+_real, _steps = time.time, itertools.count()
+def back():
+    return {start} - 1000.0 * next(_steps)
+time.time = back
+time.time_ns = lambda: int(back() * 1e9)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("start", [1e6, 1e9, 1.9e9, 5e9], ids=["1970", "2001", "2030", "2128"])
+def test_a_clock_that_runs_backwards_decides_nothing(start, run, tmp_path):
+    (tmp_path / "clock").mkdir()
+    (tmp_path / "clock" / "sitecustomize.py").write_text(CLOCK.format(start=start))
+    path = os.pathsep.join([str(tmp_path / "clock"), os.environ.get("PYTHONPATH", "")])
+    usual, odd = (world_with(run, tmp_path / name) for name in ("usual", "odd"))
+    odd.environment["PYTHONPATH"] = path
+    assert "back" in odd.run(script="import time; print(time.time)")[1]
+    found = []
+    for world in (usual, odd):
+        said = []
+        for arguments in (
+            SMALL,
+            (*SMALL, "--workers", "2", "--out", "two", "--json"),
+            (*TRUTH, "--json"),
+            (*TRUTH, "--json"),
+            (*COMPARE, "--figure", "curves.svg"),
+            ("report", "run"),
+            ("export", "run", "--format", "csv", "--out", "tables"),
+            ("export", "run", "3", "--out", "folders"),
+            ("probability", "run", "--cases", "20", "--out", "p.json", "--json"),
+            ("campaign", "--resume", "run", "-q", "--json"),
+        ):
+            code, out, err = world.run(*arguments)
+            assert code == 0, err
+            said.append(out if "--json" in arguments and arguments[0] == "truth" else "")
+        (world.root / "runs" / "latest").unlink()
+        (dated,) = (world.root / "runs").iterdir()
+        dated.rename(world.root / "dated")
+        # A report has the name of its folder.
+        made = {
+            name: content
+            for name, content in tree(world.root).items()
+            if name.startswith(("dated", "two", "tables", "folders", "p.json", "curves"))
+            and not name.endswith("report.html")
+        }
+        found.append((said, made))
+    assert found[0] == found[1]
+    assert json.loads(found[0][0][2])["cases"] == 300

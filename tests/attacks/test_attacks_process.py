@@ -1,0 +1,154 @@
+"""One process that goes on for long, threads, and all that must not decide an outcome.
+
+`pytest -m long -s tests/attacks/test_attacks_process.py` prints what was seen.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import Counter
+
+import pytest
+from attacks import World, tell
+from test_workers import cluster, workers_at
+
+import merge_sumo as ms
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import OUTCOMES
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.system.workers import dask_workers
+
+__all__ = ["cluster", "workers_at"]
+
+MANY = """
+import gc, json, os, sys, tempfile, threading
+from pathlib import Path
+import merge_sumo as ms
+
+def used():
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return {
+        "descriptors": len(os.listdir("/proc/self/fd")),
+        "threads": len(os.listdir("/proc/self/task")),
+        "MB": pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+        "temporary": len(os.listdir(tempfile.gettempdir())),
+        "children": len(Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()),
+    }
+
+vut, count = sys.argv[1], int(sys.argv[2])
+seen = []
+for number in range(count):
+    run = ms.campaign(vut, level=number % 3, cases=1, seed=number, out=f"run-{number}")
+    assert len(run.cases) == 1, number
+    assert not run.errors, run.errors
+    if number in (count // 10, count // 2, count - 1):
+        seen.append(used())
+print(json.dumps(seen))
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("vut", "count"), [("design1", 200), ("steady.py:drive", 60)])
+def test_campaigns_in_one_process_keep_nothing(vut, count, tmp_path):
+    world = World(tmp_path / "world")
+    (world.root / "steady.py").write_text("def drive(seen):\n    return 1.0\n")
+    script = f"import sys; sys.argv[1:] = {[vut, str(count)]!r}\n{MANY}"
+    code, out, err = world.run(script=script)
+    assert code == 0, err
+    first, _, last = found = json.loads(out.splitlines()[-1])
+    tell(Counter(), f"{vut}, {count} campaigns: {found}")
+    for name in ("descriptors", "threads", "temporary", "children"):
+        assert last[name] <= first[name], name
+    assert last["MB"] < first["MB"] + 0.25 * count, "a quarter of a megabyte for each at most"
+    assert not world.processes()
+    assert world.left_in_temporary() == []
+
+
+SETTINGS = {
+    name: CampaignSettings(vut="design1", levels=(0,), sampler=name, cases=40, batch=20, seed=4)
+    for name in ("uniform", "gpr")
+}
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("alone")
+    for name, settings in SETTINGS.items():
+        run_campaign(settings, folder / name)
+    return {name: (folder / name / OUTCOMES).read_bytes() for name in SETTINGS}
+
+
+class TestThreads:
+    def test_other_than_the_first_may_run_a_campaign(self, tmp_path):
+        found = []
+        thread = threading.Thread(
+            target=lambda: found.append(
+                ms.campaign("design1", level=0, cases=2, out=tmp_path / "r")
+            )
+        )
+        thread.start()
+        thread.join()
+        assert len(found[0].cases) == 2
+
+    def test_at_the_same_time_do_not_disturb_each_other(self, alone, tmp_path):
+        wrong: list[BaseException] = []
+
+        def work(name: str, number: int) -> None:
+            try:
+                run_campaign(SETTINGS[name], tmp_path / f"{name}-{number}")
+            except BaseException as error:
+                wrong.append(error)
+
+        threads = [
+            threading.Thread(target=work, args=(name, number))
+            for name in SETTINGS
+            for number in range(2)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert wrong == []
+        for path in tmp_path.iterdir():
+            assert (path / OUTCOMES).read_bytes() == alone[path.name.split("-")[0]]
+
+
+SAMPLERS = ("uniform", "gpr", "coverage")
+BLAS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+WAYS: dict[str, tuple[tuple[str, ...], tuple[str, ...], dict[str, str]]] = {
+    "2 workers": ((), ("--workers", "2"), {}),
+    "3 workers": ((), ("--workers", "3"), {}),
+    "python -O": (("-O",), (), {}),
+    "python -OO": (("-OO",), (), {}),
+    **{f"{n} BLAS threads": ((), (), dict.fromkeys(BLAS, n)) for n in ("1", "2", "4")},
+    **{f"hash seed {n}": ((), (), {"PYTHONHASHSEED": n}) for n in ("0", "1", "4294967295")},
+    "another locale": ((), (), {"LC_ALL": "C", "PYTHONUTF8": "0", "TZ": "Asia/Kolkata"}),
+}
+"""By name: options of the interpreter, of the campaign, and environment."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_nothing_but_the_settings_decides_outcomes(sampler, cluster, tmp_path):
+    options = ("--vut", "design2", "--sampler", sampler, "--cases", 60, "--batch", 20, "-q")
+    found = {}
+    for name, (python, more, environment) in {"usual": ((), (), {}), **WAYS}.items():
+        world = World(tmp_path / name.replace(" ", "-"), python, environment)
+        code, _, err = world.run("campaign", *options, *more, "--seed", 5, "--out", "run")
+        assert code == 0, (name, err)
+        found[name] = (world.root / "run" / OUTCOMES).read_bytes()
+    address, _ = cluster
+    settings = CampaignSettings(
+        vut="design2", levels=(0, 1, 2), sampler=sampler, cases=60, batch=20, seed=5
+    )
+    with dask_workers(address) as workers:
+        run_campaign(settings, tmp_path / "dask", workers=workers)
+    found["Dask"] = (tmp_path / "dask" / OUTCOMES).read_bytes()
+    tell(
+        Counter({"ways": len(found), "different bytes": len(set(found.values())) - 1}),
+        sampler + ": ",
+    )
+    assert found["usual"].count(b"\n") == 60
+    assert [name for name in found if found[name] != found["usual"]] == []

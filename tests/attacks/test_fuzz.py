@@ -1,0 +1,344 @@
+"""Whatever the bytes of a file or the words of a command, the answer is a value or a sentence.
+
+Every reader of what comes from outside is given files that it wrote itself with a few bytes
+changed, and files of anything at all. A `UserError` of one line is the only exception allowed.
+`pytest -m long tests/attacks/test_fuzz.py` looks for more, and uses atheris where it is installed.
+"""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import (
+    OUTCOMES,
+    SETTINGS,
+    TRAJECTORIES,
+    Run,
+    read_outcomes,
+    read_settings,
+    to_line,
+)
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
+from merge_sumo.drivers.policies import load_network, read_manifest
+from merge_sumo.errors import UserError
+from merge_sumo.reports.report import write_report
+from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.sumo import replay, replay_folder
+from merge_sumo.sumo.hosting import hosted_net
+from merge_sumo.system.resources import resource
+
+here = settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@st.composite
+def spoilt(draw, original: bytes) -> bytes:
+    """Return bytes with a few places replaced, removed, doubled, or cut off."""
+    text = bytearray(original)
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(text)))
+        length = draw(st.integers(0, 12))
+        kind = draw(st.sampled_from(["replace", "insert", "double", "cut"]))
+        if kind == "cut":
+            del text[at:]
+        elif kind == "double":
+            text[at:at] = text[at : at + 40 * length]
+        else:
+            end = at + (length if kind == "replace" else 0)
+            text[at:end] = draw(st.binary(max_size=12) | st.sampled_from(NASTY))
+    return bytes(text)
+
+
+NASTY = [
+    *(b"null", b"NaN", b"-Infinity", b"1e999", b"true", b"[]", b"{}", b'"\\ud800"', b"-0", b"\n"),
+    *(
+        b"[" * 100_000,
+        b'{"a":' * 100_000,
+        b"9" * 5000,
+        b"\xff\xfe",
+        b"\x00",
+        b"</",
+        b"&x;",
+        b"<!--",
+    ),
+]
+
+any_json = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+
+
+T = TypeVar("T")
+
+
+def answer(read: Callable[[], T]) -> T | None:
+    """Return what a reader gives, or None where it refuses in a sentence."""
+    try:
+        return read()
+    except UserError as error:
+        sentence = str(error)
+    assert sentence
+    assert "\n" not in sentence
+    return None
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Run:
+    """Return a small campaign of which nothing was foretold: its report takes little time."""
+    settings = CampaignSettings(vut="design1", levels=(0,), sampler="uniform", cases=60, seed=4)
+    return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
+
+
+@pytest.fixture(scope="module")
+def lines(run) -> bytes:
+    """Return the first outcomes of a campaign."""
+    return b"".join((run.folder / OUTCOMES).read_bytes().splitlines(keepends=True)[:4])
+
+
+@pytest.fixture(scope="module")
+def folder(run, tmp_path_factory) -> Path:
+    return Path(shutil.copytree(run.folder, tmp_path_factory.mktemp("fuzz") / "run"))
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory) -> Path:
+    return Path(shutil.copytree(resource("policies"), tmp_path_factory.mktemp("fuzz") / "policies"))
+
+
+@pytest.fixture(scope="module")
+def scenario(run, tmp_path_factory) -> Path:
+    first, *_ = sorted((run.folder / "scenarios").iterdir())
+    return Path(shutil.copytree(first, tmp_path_factory.mktemp("fuzz") / "scenario"))
+
+
+def some(*examples: bytes) -> st.SearchStrategy[bytes]:
+    """Return examples that are spoilt, and bytes of any kind."""
+    return st.one_of(*map(spoilt, examples)) | st.binary(max_size=200)
+
+
+class TestOutcomes:
+    def read(self, text: bytes) -> None:
+        found = answer(lambda: read_outcomes(text, OUTCOMES))
+        if found is not None:
+            outcomes, _ = found
+            again, torn = read_outcomes("".join(map(to_line, outcomes)).encode(), OUTCOMES)
+            assert (again, torn) == (outcomes, False), "what was read can be written"
+
+    @here
+    @given(data=st.data())
+    def test_of_spoilt_bytes(self, lines, data):
+        self.read(data.draw(some(lines)))
+
+    @here
+    @given(data=st.data())
+    def test_of_a_record_with_a_field_of_any_value(self, lines, data):
+        record = json.loads(lines.splitlines()[0])
+        field = data.draw(st.sampled_from(sorted(record)) | st.text(max_size=5))
+        record[field] = data.draw(any_json)
+        self.read(json.dumps(record).encode() + b"\n")
+
+
+class TestACampaign:
+    def read(self, folder: Path) -> None:
+        run = answer(lambda: Run(folder))
+        if run is not None:
+            answer(lambda: settings_of(folder, run.settings))
+            answer(lambda: write_report(run))
+
+    @here
+    @given(data=st.data())
+    def test_of_spoilt_settings(self, run, folder, data):
+        original = (run.folder / SETTINGS).read_bytes()
+        if data.draw(st.booleans()):  # without the checksum, which finds most of what is spoilt
+            original = json.dumps(read_settings(run.folder), indent=2).encode()
+        (folder / SETTINGS).write_bytes(data.draw(some(original)))
+        self.read(folder)
+
+    @here
+    @given(data=st.data())
+    def test_of_a_setting_of_any_value(self, run, folder, data):
+        record = read_settings(run.folder)
+        record[data.draw(st.sampled_from(sorted(record)))] = data.draw(any_json)
+        (folder / SETTINGS).write_text(json.dumps(record))
+        self.read(folder)
+
+    @here
+    @given(data=st.data())
+    def test_of_spoilt_outcomes(self, run, folder, lines, data):
+        (folder / SETTINGS).write_bytes((run.folder / SETTINGS).read_bytes())
+        (folder / OUTCOMES).write_bytes(data.draw(some(lines)))
+        self.read(folder)
+
+    @here
+    @given(data=st.data())
+    def test_of_spoilt_trajectories(self, run, folder, lines, data):
+        (folder / SETTINGS).write_bytes((run.folder / SETTINGS).read_bytes())
+        (folder / OUTCOMES).write_bytes(lines)
+        name = f"{TRAJECTORIES}/00000.npz"
+        (folder / name).write_bytes(data.draw(some((run.folder / name).read_bytes())))
+        answer(lambda: Run(folder).trajectory(0))
+        assert Run(folder).whole_batches() in (0, 4)
+
+    def test_as_it_was_written_is_read(self, run):
+        road = road_of()
+        values = settings_of(run.folder, run.settings)
+        assert isinstance(values, CampaignSettings)
+        assert json.loads(json.dumps(record_of(values, road))) == run.settings
+
+
+class TestPolicies:
+    @here
+    @given(data=st.data())
+    def test_with_a_spoilt_manifest(self, policies, data):
+        original = (resource("policies") / "manifest.json").read_bytes()
+        (policies / "manifest.json").write_bytes(data.draw(some(original)))
+        if answer(lambda: read_manifest(policies)) is not None:
+            answer(lambda: load_network("pov1", policies))
+
+    @here
+    @given(data=st.data())
+    def test_of_spoilt_tensors_that_the_manifest_vouches_for(self, policies, data):
+        original = (resource("policies") / "pov1.safetensors").read_bytes()
+        header = original[:400]
+        content = data.draw(spoilt(header)) + original[400:] if data.draw(st.booleans()) else None
+        content = content if content is not None else data.draw(st.binary(max_size=300))
+        manifest = {"networks": {"pov1": {"sha256": hashlib.sha256(content).hexdigest()}}}
+        (policies / "manifest.json").write_text(json.dumps(manifest))
+        (policies / "pov1.safetensors").write_bytes(content)
+        answer(lambda: load_network("pov1", policies))
+
+
+class TestAScenario:
+    @here
+    @given(data=st.data())
+    def test_with_a_spoilt_record(self, scenario, data):
+        head = (scenario / replay_folder.RECORD).read_bytes()[:1500]
+        whole = (scenario / replay_folder.RECORD).read_bytes()
+        record = data.draw(some(head, head + b"</timestep></fcd-export>", whole))
+        (scenario / replay_folder.RECORD).write_bytes(record)
+        try:
+            found = answer(lambda: replay._received(scenario))
+        finally:
+            (scenario / replay_folder.RECORD).write_bytes(whole)
+        if found is not None:
+            replay._fault_of_record(found)
+
+    @here
+    @given(data=st.data())
+    def test_with_spoilt_types(self, scenario, data):
+        types = data.draw(some((scenario / replay_folder.TYPES).read_bytes()))
+        answer(lambda: replay._checked_types(types, Path(replay_folder.TYPES)))
+
+    @here
+    @given(data=st.data())
+    def test_with_a_spoilt_net(self, tmp_path, data):
+        path = tmp_path / "spoilt.net.xml"
+        path.write_bytes(data.draw(some(default_net_path().read_bytes())))
+        road = answer(lambda: road_of(path))
+        if road is not None:
+            answer(lambda: hosted_net(road, 2))
+            answer(lambda: road.speed_limit_mps)
+
+    def test_that_is_an_entity_bomb_is_refused_quickly(self, tmp_path):
+        bomb = '<!DOCTYPE l [<!ENTITY a0 "ha">'
+        bomb += "".join(f'<!ENTITY a{n} "{f"&a{n - 1};" * 10}">' for n in range(1, 12))
+        path = tmp_path / "bomb.xml"
+        path.write_text(f"{bomb}]><net><edge id='&a11;'/></net>")
+        with pytest.raises(UserError):
+            road_of(path)
+        assert (
+            answer(lambda: replay._checked_record(path.read_bytes(), path, ("pov", "vut"))) is None
+        )
+        assert answer(lambda: replay._checked_types(path.read_bytes(), path)) is None
+
+
+words = st.text(max_size=12) | st.integers().map(str) | st.floats().map(str)
+awkward = st.sampled_from(["", "-", "--", "nan", "1e9", "all", "0", "level0", "."])
+OPTIONS = ["vut", "level", "sampler", "batch", "seed", "v-vut0", "workers", "net", "resume", "out"]
+
+
+@here
+@given(option=st.sampled_from(OPTIONS), value=words | awkward)
+def test_a_command_with_an_option_of_any_value_says_what_is_wrong(option, value, tmp_path):
+    # No campaign has 0 cases, so that nothing ever runs.
+    given = {"vut": "level0", "level": "0", "out": str(tmp_path / "run"), option: value}
+    arguments = [f"--{name}={text}" for name, text in given.items()]
+    result = CliRunner().invoke(cli.app, ["campaign", "--cases", "0", *arguments])
+    assert result.exit_code == 2 or isinstance(result.exception, UserError), result.exception
+    assert list(tmp_path.iterdir()) == []
+
+
+@here
+@given(
+    values=st.fixed_dictionaries(
+        {
+            "vut": st.sampled_from(["level0", "design1"]) | st.text(max_size=5),
+            "levels": st.lists(st.integers(-1, 4), max_size=4).map(tuple),
+            "sampler": st.sampled_from(["gpr", "uniform"]) | st.text(max_size=5),
+            "cases": st.integers(),
+            "batch": st.integers(),
+            "seed": st.integers(),
+            "v_vut0_mps": st.floats(),
+        }
+    )
+)
+def test_settings_of_any_value_are_settings_or_a_sentence(values):
+    found = answer(lambda: CampaignSettings(**values))
+    if found is not None:
+        assert 1 <= found.batch <= found.cases
+        assert found.seed >= 0
+        assert 0.0 <= found.v_vut0_mps <= 45.0
+        assert set(found.levels) <= {0, 1, 2}
+
+
+ATHERIS = """
+import sys, atheris
+with atheris.instrument_imports(include=["merge_sumo", "json"]):
+    from merge_sumo.errors import UserError
+    from merge_sumo.campaigns.run import read_outcomes, to_line
+
+def one(data):
+    try:
+        outcomes, _ = read_outcomes(data, "outcomes.jsonl")
+    except UserError:
+        return
+    assert read_outcomes("".join(map(to_line, outcomes)).encode(), "again")[0] == outcomes
+
+atheris.Setup(sys.argv, one)
+atheris.Fuzz()
+"""
+
+
+@pytest.mark.long
+def test_a_coverage_guided_fuzzer_finds_no_other_exception(lines, tmp_path):
+    pytest.importorskip("atheris", reason="pip install atheris")
+    (tmp_path / "fuzz.py").write_text(ATHERIS)
+    (tmp_path / "corpus").mkdir()
+    (tmp_path / "corpus" / "lines").write_bytes(lines)
+    command = [sys.executable, "fuzz.py", "corpus", "-max_total_time=120", "-max_len=4096"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "DONE" in done.stderr

@@ -1,0 +1,863 @@
+"""A scenario folder or a net that somebody sent is data, whatever it holds.
+
+Each hostile folder is an honest one in which one thing asks for more: a file to be written or
+read, an address to be called, memory or time without end. For each, the whole tree of the test is
+compared before and after, with the files that the attack names in it; a server listens where it
+asks SUMO to call; and every program that is started is looked at: what it is told, and what lies
+in the folder where it runs. SUMO itself is real.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import require
+from processes import cpu_s
+
+from merge_sumo.errors import UserError
+from merge_sumo.road import received
+from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.sumo import allowed
+from merge_sumo.sumo import opendrive as opendrive_module
+from merge_sumo.sumo import replay as replay_module
+from merge_sumo.sumo.binding import run_program, sumo_program
+from merge_sumo.sumo.hosting import hosted_net
+from merge_sumo.sumo.opendrive import opendrive
+from merge_sumo.sumo.replay import Replay, open_gui, replay
+from merge_sumo.sumo.replay_folder import CASE, CONFIG, LABELS, NET, RECORD, TYPES, VIEW
+from merge_sumo.sumo.world import World
+
+HONEST = Path(__file__).resolve().parents[2] / "scenarios" / "no-reaction"
+LIMIT_S = 20.0
+"""Of CPU time."""
+HANG_S = 600.0
+SECRET = "what-only-the-user-knows"  # noqa: S105 (of nobody)
+RUNNABLE = {CONFIG, NET, TYPES, LABELS, RECORD, VIEW}
+READ = (NET, TYPES, LABELS, RECORD)
+"""The files that a replay reads."""
+
+
+@dataclass
+class Scene:
+    """Where an attack happens: the folder that was sent, and what of the user's it aims at."""
+
+    root: Path
+    listener: socket.socket
+    started: list[list[str]] = field(default_factory=list)
+
+    @property
+    def folder(self) -> Path:
+        return self.root / "sent"
+
+    @property
+    def victim(self) -> Path:
+        """A file of the user's that must stay as it is."""
+        return self.root / "home" / "thesis.txt"
+
+    @property
+    def secret(self) -> Path:
+        """A file of the user's that must not be shown."""
+        return self.root / "home" / "secret.xml"
+
+    @property
+    def address(self) -> str:
+        return f"127.0.0.1:{self.listener.getsockname()[1]}"
+
+    def filled(self, text: str) -> str:
+        """Put the names of this scene into the text of an attack."""
+        names = {"VICTIM": str(self.victim), "SECRET": str(self.secret), "HOST": self.address}
+        names |= {"NEW": str(self.root / "home" / "new.xml"), "UP": "../home/thesis.txt"}
+        return re.sub(r"\{([A-Z]+)\}", lambda found: names[found[1]], text)
+
+    def tree(self) -> dict[str, tuple[int, int, int, str]]:
+        """Return kind, size, time and content of everything below, links not followed.
+
+        The folder for temporary ones is left out: it must be empty, which is looked at by itself.
+        """
+        found = {}
+        for path in sorted(set(self.root.rglob("*")) - {self.root / "tmp"}):
+            status = path.lstat()
+            plain = path.is_file() and not path.is_symlink() and status.st_size < 10**7
+            content = path.read_bytes().hex() if plain else ""
+            found[str(path)] = (status.st_mode, status.st_size, status.st_mtime_ns, content)
+        return found
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch) -> Iterator[Scene]:
+    """Plant the files of a user, listen on an address, and look at every program started."""
+    (tmp_path / "home").mkdir()
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.setblocking(False)
+        scene = Scene(tmp_path, listener)
+        scene.victim.write_text("ten years of work")
+        scene.secret.write_text(f"<{SECRET}>{SECRET}</{SECRET}>")
+        shutil.copytree(HONEST, scene.folder)
+        (scene.folder / "motion.png").unlink()
+
+        def looked_at(name: str, arguments: list[str], stage: Path, **options: Any) -> object:
+            assert stage.parent == tmp_path / "tmp"
+            if name == "netconvert":
+                assert {path.name for path in stage.iterdir()} == {opendrive_module.NET}
+            else:
+                assert {path.name for path in stage.iterdir()} == RUNNABLE
+            assert all(path.is_file() and not path.is_symlink() for path in stage.iterdir())
+            for path in stage.iterdir():
+                assert_harmless(path.read_text(encoding="utf-8"))
+            assert not any("/" in argument or ":" in argument for argument in arguments)
+            scene.started.append([name, *arguments])
+            return run_program(name, arguments, stage, **options)
+
+        monkeypatch.setattr(replay_module, "run_program", looked_at)
+        monkeypatch.setattr(opendrive_module, "run_program", looked_at)
+        yield scene
+
+
+ELEMENTS = {
+    *("configuration", "input", "net-file", "additional-files", "time", "begin", "end"),
+    *(
+        "step-length",
+        "processing",
+        "collision.action",
+        "insertion-checks",
+        "time-to-teleport",
+        "default.speeddev",
+    ),
+    *("fcd_replay_device", "device.fcd-replay.files", "report", "no-warnings", "xml-validation"),
+    *("gui_only", "gui-settings-file", "start", "delay", "window-size", "breakpoints"),
+    *("viewsettings", "scheme", "vehicles", "pois", "background", "viewport", "poi", "param"),
+    *("net", "location", "edge", "lane", "junction", "request", "connection"),
+    *("additional", "vType", "fcd-export", "timestep", "vehicle"),
+}
+ATTRIBUTES = re.compile(r'([\w:.-]+)="([^"]*)"')
+RAMP = "-420.000000,-65.000000 0.000000,0.000000"
+SCHEMA = "http://sumo.dlr.de/xsd/net_file.xsd"
+
+
+def assert_harmless(text: str) -> None:
+    """Look at what SUMO reads, by other means than the code that wrote it."""
+    body = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    assert set(re.findall(r"<([\w:.-]+)", body)) <= ELEMENTS
+    assert "<!" not in body
+    assert body.count("<?") == body.startswith("<?xml ")
+    for name, value in ATTRIBUTES.findall(body):
+        if name in ("xmlns:xsi", "xsi:noNamespaceSchemaLocation"):
+            continue
+        own = set(value.split(",")) <= RUNNABLE or name == "guiShape"
+        shown = value.replace("m/s", "")
+        assert own or not re.search(r"[/\\&$%|<>]|\.\.|\.xml|://", shown), (name, value)
+    assert SECRET not in text
+
+
+def assert_nothing_happens(scene: Scene, act: Callable[[], object]) -> object:
+    """Return what an attack came to: what `act` returns, or the sentence that refuses it."""
+    before, before_s = scene.tree(), cpu_s()
+    try:
+        result = act()
+    except UserError as error:
+        result = str(error)
+        assert result
+        assert result.isprintable()
+        assert len(result) < 1000
+        assert SECRET not in result
+    assert cpu_s() - before_s < LIMIT_S
+    assert scene.tree() == before
+    assert list((scene.root / "tmp").iterdir()) == []
+    with pytest.raises(BlockingIOError):
+        scene.listener.accept()
+    return result
+
+
+# --- What a hostile folder may do: a name, the file, and what becomes of its text ---------------
+
+Edit = Callable[[str], str]
+IDENTICAL, DIVERGED = "identical", "diverged"
+REFUSED, UNPLAYABLE = "refused before SUMO is started", "refused by SUMO"
+
+
+def instead(old: str, new: str) -> Edit:
+    def edit(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return edit
+
+
+def added(text: str) -> Edit:
+    """Put text before the end tag of the root."""
+
+    def edit(old: str) -> str:
+        body, _, end = old.rpartition("</")
+        return f"{body}{text}</{end}"
+
+    return edit
+
+
+def first(text: str) -> Edit:
+    """Put text behind the start tag of the root."""
+    return lambda old: re.sub(r"(<(?!\?)[\w-]+[^>]*>)", lambda found: found[0] + text, old, count=1)
+
+
+def within(section: str, option: str, value: str) -> Edit:
+    return instead(f"</{section}>", f'<{option} value="{value}"/></{section}>')
+
+
+OUTPUTS = [
+    *("log", "message-log", "error-log"),
+    *("tripinfo-output", "fcd-output", "netstate-dump"),
+    *("summary-output", "queue-output", "emission-output"),
+    *("full-output", "battery-output", "elechybrid-output"),
+    *("chargingstations-output", "overheadwiresegments-output", "statistic-output"),
+    *("collision-output", "railsignal-block-output", "railsignal-vehicle-output"),
+    *("lanechange-output", "stop-output", "vehroute-output"),
+    *("link-output", "bt-output", "edgedata-output"),
+    *("lanedata-output", "person-summary-output", "personinfo-output"),
+    *("personroute-output", "substations-output", "deadlock-output"),
+    *("save-configuration", "save-template", "save-schema"),
+    *("save-commented", "device.toc.file", "save-state.files"),
+    *("summary", "tripinfo", "fcd"),
+    *("emissions", "netstate"),
+]
+ADDITIONAL = {
+    "edgeData": '<edgeData id="a" file="{VICTIM}" freq="1"/>',
+    "laneData": '<laneData id="a" file="{VICTIM}" freq="1"/>',
+    "a socket of edgeData": '<edgeData id="a" file="{HOST}" freq="1"/>',
+    "edgeData with a path upwards": '<edgeData id="a" file="{UP}"/>',
+    "an e1 detector": '<e1Detector id="a" lane="ramp_0" pos="1" period="1" file="{VICTIM}"/>',
+    "an induction loop": '<inductionLoop id="a" lane="ramp_0" pos="1" freq="1" file="{NEW}"/>',
+    "an instant detector": '<instantInductionLoop id="a" lane="ramp_0" pos="1" file="{VICTIM}"/>',
+    "an e2 detector": '<e2Detector id="a" lane="ramp_0" pos="1" endPos="9" file="{VICTIM}"/>',
+    "a lane area detector": '<laneAreaDetector id="a" lane="ramp_0" pos="1" file="{VICTIM}"/>',
+    "an e3 detector": '<e3Detector id="a" file="{VICTIM}" freq="1">'
+    '<detEntry lane="ramp_0" pos="1"/>'
+    '<detExit lane="ramp_0" pos="9"/></e3Detector>',
+    "a route probe": '<routeProbe id="a" edge="ramp" freq="1" file="{VICTIM}"/>',
+    "a vType probe": '<vTypeProbe id="a" freq="1" file="{VICTIM}"/>',
+    "a calibrator": '<calibrator id="a" edge="ramp" pos="1" output="{VICTIM}" freq="1"/>',
+    "a rerouter": '<rerouter id="a" edges="ramp" file="{SECRET}"/>',
+    "a variable speed sign": '<variableSpeedSign id="a" lanes="ramp_0" file="{SECRET}"/>',
+    "an include": '<include href="{SECRET}"/>',
+    "an include upwards": '<include href="../home/secret.xml"/>',
+    "an include of an address": '<include href="http://{HOST}/a.xml"/>',
+    "a timed event": '<timedEvent type="SaveTLSStates" source="M" dest="{VICTIM}"/>',
+    "switch times": '<timedEvent type="SaveTLSSwitchTimes" source="M" dest="{NEW}"/>',
+    "a traffic light with a file": '<tlLogic id="M" type="actuated" programID="0" offset="0">'
+    '<param key="file" value="{VICTIM}"/><phase duration="9" state="GGG"/></tlLogic>',
+    "a parameter": '<param key="device.toc.file" value="{VICTIM}"/>',
+    "a polygon with a picture": '<poly id="a" imgFile="{SECRET}" shape="0,0 9,9" layer="1"/>',
+    "a point with a picture": '<poi id="a" x="0" y="0" imgFile="{SECRET}"/>',
+    "a charging station": '<chargingStation id="a" lane="ramp_0" startPos="1" endPos="9"/>',
+    "a route and a vehicle": '<route id="r" edges="ramp main_out"/>'
+    '<vehicle id="pov" route="r" depart="0"/>',
+    "a flow without end": '<flow id="f" from="ramp" to="main_out" begin="0" end="1e9" '
+    'period="0.001"/>',
+    "a vType distribution of a file": '<vTypeDistribution id="d" vTypes="{SECRET}"/>',
+    "python": '<python script="{SECRET}"/>',
+    "a namespace": '<x:include xmlns:x="http://www.w3.org/2001/XInclude" href="{SECRET}"/>',
+    "text": "{SECRET}",
+    "hidden text": '<![CDATA[<edgeData file="{VICTIM}"/>]]>',
+    "an instruction": '<?include href="{SECRET}"?>',
+}
+"""What an additional file, and so a net, may hold beside what is allowed: all of it is dropped."""
+
+DEVICES = {
+    "ssm": '<param key="has.ssm.device" value="true"/><param key="device.toc.file" '
+    'value="{VICTIM}"/>',
+    "fcd": '<param key="has.fcd.device" value="true"/>',
+    "toc": '<param key="has.toc.device" value="true"/><param key="device.toc.file" '
+    'value="{VICTIM}"/>',
+    "replay": '<param key="device.fcd-replay.files" value="{SECRET}"/>',
+    "python": '<param key="device.python" value="{SECRET}"/>',
+}
+
+BOMBS = {
+    "billion laughs": "<!DOCTYPE l [<!ENTITY a0 'ha'>"
+    + "".join(f"<!ENTITY a{n} '{f'&a{n - 1};' * 10}'>" for n in range(1, 12))
+    + "]>",
+    "quadratic": f"<!DOCTYPE l [<!ENTITY a11 '{'x' * 50_000}'>]>",
+    "an external file": '<!DOCTYPE l [<!ENTITY a11 SYSTEM "file://{SECRET}">]>',
+    "the password file": '<!DOCTYPE l [<!ENTITY a11 SYSTEM "file:///etc/passwd">]>',
+    "an address": '<!DOCTYPE l [<!ENTITY a11 SYSTEM "http://{HOST}/x">]>',
+    "a parameter entity": '<!DOCTYPE l [<!ENTITY % p SYSTEM "http://{HOST}/x.dtd"> %p;]>',
+    "an external type": '<!DOCTYPE l SYSTEM "http://{HOST}/x.dtd">',
+}
+
+
+def bomb(declaration: str) -> Edit:
+    def edit(text: str) -> str:
+        (head, body), *_ = re.findall(r"^(<\?xml.*?\?>)?(.*)", text, re.DOTALL)
+        use = "&a11;" if "a11" in declaration else ""
+        return (head or "") + declaration + first(use * 50)(body)
+
+    return edit
+
+
+TEXTS: dict[str, tuple[str, Edit, str]] = {
+    **{
+        f"{option} in the configuration": (
+            CONFIG,
+            within("report", option, ("{VICTIM}", "{UP}", "{HOST}", "{NEW}")[index % 4]),
+            IDENTICAL,
+        )
+        for index, option in enumerate(OUTPUTS)
+    },
+    "a remote port": (CONFIG, within("time", "remote-port", "48173"), IDENTICAL),
+    "more clients": (CONFIG, within("time", "num-clients", "2"), IDENTICAL),
+    "a script of python": (CONFIG, within("time", "python-script", "{SECRET}"), IDENTICAL),
+    "an additional file upwards": (
+        CONFIG,
+        instead('"vehicles.add.xml,labels.add.xml"', '"../home/secret.xml"'),
+        IDENTICAL,
+    ),
+    "a net elsewhere": (CONFIG, instead('"us23.net.xml"', '"{SECRET}"'), IDENTICAL),
+    "a net at an address": (CONFIG, instead('"us23.net.xml"', '"http://{HOST}/n"'), IDENTICAL),
+    "a record elsewhere": (CONFIG, instead('"episode.fcd.xml"', '"{SECRET}"'), IDENTICAL),
+    "a state to load": (CONFIG, within("input", "load-state", "{SECRET}"), IDENTICAL),
+    "no end": (CONFIG, instead('<end value="9.9"/>', '<end value="1e15"/>'), IDENTICAL),
+    "tiny steps": (CONFIG, instead('"0.1"', '"1e-9"'), IDENTICAL),
+    **{
+        f"{name} in the {kind}": (file, added(text), IDENTICAL)
+        for name, text in ADDITIONAL.items()
+        for kind, file in (("types", TYPES), ("net", NET))
+    },
+    **{
+        f"the device {name} of a type": (
+            TYPES,
+            instead('emergencyDecel="1000"/>', f'emergencyDecel="1000">{text}</vType>'),
+            IDENTICAL,
+        )
+        for name, text in DEVICES.items()
+    },
+    **{
+        f"{name} of a type": (TYPES, instead('minGap="0"', f'minGap="0" {text}'), expected)
+        for name, text, expected in [
+            ("a picture", 'imgFile="{SECRET}"', IDENTICAL),
+            ("a model of osg", 'osgFile="{SECRET}"', IDENTICAL),
+            ("a file of emissions", 'emissionClass="PHEMlight/{SECRET}"', IDENTICAL),
+            ("a model", 'carFollowModel="CC"', IDENTICAL),
+        ]
+    },
+    **{
+        f"a length {value:.5} of a type": (
+            TYPES,
+            instead('length="5"', f'length="{value}"'),
+            REFUSED,
+        )
+        for value in ("nan", "inf", "-5", "0", "1e300", "9" * 5000, "1e-400", "{SECRET}", "")
+    },
+    "a gigantic decel": (TYPES, instead('decel="1000"', 'decel="1e308"'), REFUSED),
+    "a colour that is a path": (TYPES, instead("0.90,0.62,0", "{SECRET}"), REFUSED),
+    "a shape that is a path": (TYPES, instead("passenger/sedan", "../../secret"), REFUSED),
+    "a third type": (TYPES, added('<vType id="third" imgFile="{SECRET}"/>'), REFUSED),
+    "a type twice": (TYPES, added('<vType id="pov"/>'), REFUSED),
+    "no types": (TYPES, lambda _: "<additional/>", REFUSED),
+    "another root of types": (TYPES, lambda _: '<configuration file="{VICTIM}"/>', REFUSED),
+    "a million types": (TYPES, added("<a/>" * 900_000), REFUSED),
+    "deeply nested types": (TYPES, added("<a>" * 5000 + "</a>" * 5000), REFUSED),
+    "a long attribute of types": (TYPES, added(f'<a b="{"x" * 10**7}"/>'), REFUSED),
+    "a long colour": (TYPES, instead("0.90,0.62,0", "1" * 10**6), REFUSED),
+    "a picture in the labels": (
+        LABELS,
+        added('<poi id="a" x="0" y="0" imgFile="{SECRET}"/>'),
+        REFUSED,
+    ),
+    "a label that is a path": (
+        LABELS,
+        added('<poi id="a" x="0" y="0"><param key="text" value="{SECRET}"/></poi>'),
+        REFUSED,
+    ),
+    "another file in the labels": (LABELS, added('<include href="{SECRET}"/>'), REFUSED),
+    "a vehicle in the labels": (
+        LABELS,
+        added('<vehicle id="third" route="r" depart="0"/>'),
+        REFUSED,
+    ),
+    "a picture in the view": (VIEW, added('<decal file="{SECRET}"/>'), IDENTICAL),
+    "a snapshot in the view": (VIEW, added('<snapshot file="{VICTIM}" time="1"/>'), IDENTICAL),
+    "breakpoints in the view": (VIEW, added('<breakpoints-file value="{SECRET}"/>'), IDENTICAL),
+    "a case that is no JSON": (CASE, lambda _: "[" * 100_000, IDENTICAL),
+    **{
+        f"{name} in {file}": (
+            file,
+            bomb(text),
+            REFUSED if file in READ else IDENTICAL,
+        )
+        for name, text in BOMBS.items()
+        for file in (CONFIG, *READ)
+    },
+    "an XInclude in the record": (
+        RECORD,
+        first('<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="{SECRET}"/>'),
+        IDENTICAL,
+    ),
+    "an include in the record": (RECORD, first('<include href="{SECRET}"/>'), IDENTICAL),
+    "a person in the record": (
+        RECORD,
+        instead("</timestep>", '<person id="p" file="{VICTIM}"/></timestep>'),
+        IDENTICAL,
+    ),
+    "an unknown attribute in the record": (
+        RECORD,
+        instead('type="pov"', 'type="pov" file="{VICTIM}"'),
+        IDENTICAL,
+    ),
+    "a third vehicle": (RECORD, instead('id="vut"', 'id="third"'), REFUSED),
+    "a vehicle twice": (RECORD, instead('id="vut"', 'id="pov"'), REFUSED),
+    "another type": (RECORD, instead('type="vut"', 'type="{SECRET}"'), REFUSED),
+    "the other type": (RECORD, instead('type="vut"', 'type="pov"'), DIVERGED),
+    "another lane": (RECORD, instead('lane="ramp_0"', 'lane="i75_0"'), REFUSED),
+    "a lane that is a path": (RECORD, instead('lane="ramp_0"', 'lane="{SECRET}"'), REFUSED),
+    "a lane in the other place": (
+        RECORD,
+        instead('lane="ramp_0"', 'lane="main_out_0"'),
+        UNPLAYABLE,
+    ),
+    **{
+        f"{column} {value:.5} in the record": (
+            RECORD,
+            partial(re.sub, rf' {column}="[^"]*"', f' {column}="{value}"', count=1),
+            REFUSED,
+        )
+        for column in ("x", "y", "pos", "speed", "angle")
+        for value in ("nan", "-inf", "1e300", "9" * 400)
+    },
+    "a negative speed": (RECORD, instead('speed="31.0', 'speed="-31.0'), REFUSED),
+    "a time in the far future": (RECORD, instead('time="0.10"', 'time="9e99"'), REFUSED),
+    "times off the grid": (RECORD, instead('time="0.10"', 'time="0.15"'), REFUSED),
+    "no vehicle in a row": (
+        RECORD,
+        lambda text: re.sub(r'(time="2.00">).*?(</timestep>)', r"\1\2", text, flags=re.DOTALL),
+        REFUSED,
+    ),
+    "a row twice": (RECORD, instead('time="0.10"', 'time="0.00"'), REFUSED),
+    "a million rows": (RECORD, added('<timestep time="99"/>' * 190_000), REFUSED),
+    "ten thousand rows": (RECORD, added('<timestep time="99"/>' * 10_000), REFUSED),
+    "a deeply nested record": (RECORD, added("<timestep>" * 5000), REFUSED),
+    "a net of a million edges": (NET, added('<edge id="e"/>' * 250_000), REFUSED),
+    "a deeply nested net": (NET, added("<edge>" * 1000 + "</edge>" * 1000), REFUSED),
+    "a net with a long shape": (
+        NET,
+        added(f'<edge id="e"><lane id="e_0" shape="{"1,1 " * 50_000}"/></edge>'),
+        REFUSED,
+    ),
+    **{
+        f"a net with {what}": (NET, edit, REFUSED)
+        for what, edit in {
+            "coordinates that are none": instead('x="2000.000000"', 'x="nan"'),
+            "coordinates far out": instead('x="2000.000000"', 'x="1e300"'),
+            "a length that is infinite": instead(' length="2000.000000"', ' length="inf"'),
+            "a negative length": instead('length="425.000000" shape="-4', 'length="-1" shape="-4'),
+            "a projection of a file": instead('"!"', '"+proj=utm +nadgrids={SECRET}"'),
+            "a projection of a pipeline": instead('"!"', '"+proj=pipeline +file={SECRET}"'),
+            "a projection of an address": instead('"!"', '"+init=http://{HOST}/epsg:1"'),
+            "a schema of its own": instead(SCHEMA, "http://{HOST}/net.xsd"),
+            "a schema in a file": instead(SCHEMA, "{SECRET}"),
+            "an id that is a path": instead('id="main_end"', 'id="../{SECRET}"'),
+            "an endless list of ids": instead('incLanes=""', f'incLanes="{"a" * 60_000}|"'),
+            "a long number": instead('x="2000.000000"', f'x="{"1" * 60_000}x"'),
+            "a name in several lines": instead('name="US-23 ', 'name="US-23&#10;'),
+            "a state that is a word": instead('state="Z"', 'state="{SECRET}"'),
+            "an index of a billion": instead(
+                '<lane id="main_in_1" index="1"', '<lane id="main_in_1" index="1000000000"'
+            ),
+        }.items()
+    },
+    "a net with a controlled link": (
+        NET,
+        instead('dir="s" state="Z"', 'dir="s" state="Z" tl="M" linkIndex="0" via="{SECRET}"'),
+        IDENTICAL,
+    ),
+    "a net with a parameter of a lane": (
+        NET,
+        instead(
+            f'shape="{RAMP}"/>',
+            f'shape="{RAMP}"><param key="file" value="{{VICTIM}}"/></lane>',
+        ),
+        IDENTICAL,
+    ),
+    "a net declared as UTF-7": (
+        NET,
+        lambda text: instead('encoding="UTF-8"', 'encoding="UTF-7"')(
+            added("+ADw-include href='{SECRET}'/+AD4-")(text)
+        ),
+        IDENTICAL,
+    ),
+    "a net of XML 1.1": (NET, instead('version="1.0"', 'version="1.1"'), IDENTICAL),
+}
+"""Attacks that are a text: the file, the change, and what must come of it."""
+
+
+def as_bytes(name: str, make: Callable[[str], bytes]) -> Callable[[Scene], None]:
+    def attack(scene: Scene) -> None:
+        path = scene.folder / name
+        path.write_bytes(make(path.read_text(encoding="utf-8")))
+
+    return attack
+
+
+def as_link(name: str, target: str) -> Callable[[Scene], None]:
+    def attack(scene: Scene) -> None:
+        (scene.folder / name).unlink()
+        (scene.folder / name).symlink_to(scene.filled(target))
+
+    return attack
+
+
+def as_special(name: str, make: Callable[[Path], object]) -> Callable[[Scene], None]:
+    def attack(scene: Scene) -> None:
+        (scene.folder / name).unlink()
+        make(scene.folder / name)
+
+    return attack
+
+
+def listening(path: Path) -> None:
+    """Put a socket there; it is bound by a relative name, as such names must be short."""
+    here = Path.cwd()
+    os.chdir(path.parent)
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(path.name)
+    os.chdir(here)
+
+
+def sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(2**40)
+
+
+FILES: dict[str, tuple[Callable[[Scene], None], str]] = {
+    f"{what} in the place of {name}": (make(name), REFUSED if name in READ else IDENTICAL)
+    for what, make in {
+        "a FIFO": lambda name: as_special(name, os.mkfifo),
+        "a folder": lambda name: as_special(name, Path.mkdir),
+        "a socket": lambda name: as_special(name, listening),
+        "a file of a terabyte": lambda name: as_special(name, sparse),
+        "a link to a secret": lambda name: as_link(name, "{SECRET}"),
+        "a link to zeroes": lambda name: as_link(name, "/dev/zero"),
+        "a link to the terminal": lambda name: as_link(name, "/dev/tty"),
+        "a link to standard input": lambda name: as_link(name, "/dev/stdin"),
+        "a link to nothing": lambda name: as_link(name, "{NEW}"),
+        "a link to itself": lambda name: as_link(name, name),
+        "UTF-16": lambda name: as_bytes(name, lambda text: text.encode("utf-16")),
+        "UTF-16 without a mark": lambda name: as_bytes(name, lambda text: text.encode("utf-16-le")),
+        "UTF-32": lambda name: as_bytes(name, lambda text: text.encode("utf-32")),
+        "NUL bytes": lambda name: as_bytes(name, lambda text: text.encode() + b"\0" * 1000),
+        "NUL in the middle": lambda name: as_bytes(
+            name, lambda text: text.encode().replace(b"><", b">\0<").replace(b">\n", b">\0\n")
+        ),
+        "bytes of no text": lambda name: as_bytes(name, lambda _: bytes(range(256)) * 100),
+        "Latin-1": lambda name: as_bytes(name, lambda text: text.encode() + b"<!-- \xe4 -->"),
+        "nothing": lambda name: as_bytes(name, lambda _: b""),
+        "half": lambda name: as_bytes(name, lambda text: text[: len(text) // 2].encode()),
+    }.items()
+    for name in (CONFIG, VIEW, CASE, *READ)
+}
+"""Attacks that are no text."""
+
+
+def attack_of(name: str) -> tuple[Callable[[Scene], None], str]:
+    if name in FILES:
+        return FILES[name]
+    file, edit, expected = TEXTS[name]
+
+    def attack(scene: Scene) -> None:
+        path = scene.folder / file
+        text = edit(path.read_text(encoding="utf-8"))
+        path.write_text(scene.filled(text), encoding="utf-8")
+
+    return attack, expected
+
+
+ATTACKS = [*TEXTS, *FILES]
+
+
+def verdict(result: object) -> str:
+    if isinstance(result, Replay):
+        return IDENTICAL if result.diverged_at_s is None else DIVERGED
+    return UNPLAYABLE if str(result).startswith("SUMO cannot") else REFUSED
+
+
+def test_there_are_more_than_sixty_attacks_and_each_has_a_name_of_its_own():
+    assert len(ATTACKS) == len(set(ATTACKS)) > 60
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"{option} in the configuration" for option in ("log", "tripinfo-output", "save-schema")),
+        *(f"{element} in the types" for element in ("edgeData", "a route probe", "a calibrator")),
+        *("edgeData in the net", "an e2 detector in the net", "the device ssm of a type"),
+        *("error-log in the configuration", "a socket of edgeData in the types"),
+    ],
+)
+def test_plain_sumo_does_what_the_attack_wants(scene, name):
+    """That is: these attacks are none that would fail anyhow."""
+    attack_of(name)[0](scene)
+    before = scene.tree()
+    command = [sumo_program("sumo"), "-c", str(scene.folder / CONFIG)]
+    subprocess.run(command, cwd=scene.root, capture_output=True, check=False, timeout=HANG_S)
+    if scene.tree() == before:
+        scene.listener.accept()[0].close()
+
+
+SOME = [
+    name if number % 6 == 0 or name in FILES else pytest.param(name, marks=pytest.mark.long)
+    for number, name in enumerate(ATTACKS)
+]
+"""Each sixth text, and all files: attacks of a kind stand beside each other."""
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_a_hostile_folder_does_nothing_and_gets_a_sentence_or_a_true_verdict(scene, name):
+    attack, expected = attack_of(name)
+    attack(scene)
+    result = assert_nothing_happens(scene, lambda: replay(scene.folder))
+    assert verdict(result) == expected, result
+    if expected in (REFUSED, UNPLAYABLE):
+        assert str(scene.folder) in str(result)
+    assert len(scene.started) == (expected != REFUSED)
+
+
+@pytest.mark.parametrize("name", [name for name, (file, *_) in TEXTS.items() if file == NET])
+def test_a_hostile_net_does_nothing_on_its_way_to_a_world_and_to_opendrive(scene, name):
+    """As `--net` takes it: nothing of it reaches libsumo, netconvert or an export."""
+    attack, expected = attack_of(name)
+    attack(scene)
+    path = scene.folder / NET
+
+    def use() -> str:
+        road = road_of(path)
+        assert_harmless(hosted_net(road, 2).decode())
+        with World(2, road) as world:
+            world.advance()
+        assert len(opendrive(road)) > 1000
+        return IDENTICAL
+
+    result = assert_nothing_happens(scene, use)
+    # A replay goes without what a link leads over; a merge that needs it is none without.
+    refused = expected != IDENTICAL or name == "a net with a controlled link"
+    assert (result != IDENTICAL) == refused, result
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name.endswith(NET)])
+def test_a_net_that_is_no_plain_file_is_refused_without_waiting(scene, name):
+    attack, _ = attack_of(name)
+    attack(scene)
+    assert isinstance(assert_nothing_happens(scene, lambda: road_of(scene.folder / NET)), str)
+
+
+def test_a_net_may_be_a_link_where_the_user_names_it(tmp_path):
+    (tmp_path / "link.net.xml").symlink_to(default_net_path())
+    assert road_of(tmp_path / "link.net.xml").sha256 == road_of().sha256
+
+
+def cleaned(net: bytes) -> bytes:
+    return received.cleaned(net, allowed.NET, "it")
+
+
+class TestAnHonestNet:
+    def test_is_passed_on_as_the_very_bytes_of_the_file(self):
+        text = default_net_path().read_bytes()
+        assert cleaned(text) == text
+
+    def test_keeps_its_bytes_with_comments_in_them(self):
+        text = default_net_path().read_bytes().replace(b"<edge", b"<!-- surveyed -->\n<edge")
+        assert cleaned(text) == text
+
+    def test_loses_what_is_not_allowed(self):
+        text = added('<param key="a" value="b"/>')(default_net_path().read_text()).encode()
+        assert b"param" not in cleaned(text)
+        assert cleaned(cleaned(text)) == cleaned(text)
+
+    @pytest.mark.parametrize(
+        "projection",
+        ["!", "-", "+proj=utm +zone=17 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"],
+    )
+    def test_may_lie_somewhere_on_earth(self, projection):
+        text = instead('projParameter="!"', f'projParameter="{projection}"')(
+            default_net_path().read_text()
+        )
+        assert cleaned(text.encode()) == text.encode()
+
+    def test_of_another_make_of_netconvert_is_taken(self, tmp_path):
+        """With roads, types and attributes that the shipped net has not."""
+        home = Path(__file__).resolve().parents[2] / "sumo_net"
+        for name in ("us23.nod.xml", "us23.con.xml"):
+            shutil.copy(home / name, tmp_path)
+        edges = (home / "us23.edg.xml").read_text()
+        far = '<node id="a" x="500" y="900" type="traffic_light"/><node id="b" x="900" y="900"/>'
+        nodes = (tmp_path / "us23.nod.xml").read_text()
+        (tmp_path / "us23.nod.xml").write_text(nodes.replace("</nodes>", far + "</nodes>"))
+        lane = '<edge id="there#1" from="a" to="b" numLanes="2" type="highway.primary" width="3"/>'
+        back = '<edge id="-there#1" from="b" to="a" numLanes="1" allow="bus bicycle"/>'
+        (tmp_path / "us23.edg.xml").write_text(edges.replace("</edges>", f"{lane}{back}</edges>"))
+        options = (home / "us23.netccfg").read_text()
+        (tmp_path / "us23.netccfg").write_text(options)
+        ended = run_program("netconvert", ["-c", "us23.netccfg"], tmp_path)
+        assert ended.code == 0, ended.reason
+        path = tmp_path / "us23.net.xml"
+        assert b"there#1" in cleaned(path.read_bytes())
+        with World(2, road_of(path)) as world:
+            world.advance()
+
+    @pytest.mark.parametrize(
+        "kind", ["--grid", "--spider --sidewalks.guess", "--rand --rand.iterations 30 --tls.guess"]
+    )
+    def test_has_no_value_that_is_refused_whatever_made_it(self, kind, tmp_path):
+        arguments = [*kind.split(), "--seed", "1", "--output-file", "made.net.xml"]
+        ended = run_program("netgenerate", arguments, tmp_path)
+        assert ended.code == 0, ended.reason
+        content = (tmp_path / "made.net.xml").read_bytes()
+        root, intact = received.parse(content, allowed.NET, "it")
+        assert len(root.findall("edge")) == content.count(b"<edge ")
+        assert not intact, "internal links go, and traffic lights"
+
+
+class TestTheProgramsThatAreStarted:
+    def test_get_no_option_from_the_environment(self, scene, monkeypatch):
+        for name in ("SUMO_HOME", "SUMO_LOGO", "SUMO_OPTIONS"):
+            monkeypatch.setenv(name, str(scene.victim))
+        result = assert_nothing_happens(scene, lambda: replay(scene.folder))
+        assert verdict(result) == IDENTICAL
+
+    def test_are_killed_with_what_they_started_when_their_time_is_up(self, tmp_path, monkeypatch):
+        script = tmp_path / "sumo"
+        script.write_text("#!/bin/sh\nsleep 600 &\necho $! > child\necho $$ > self\nwait\n")
+        script.chmod(0o755)
+        binding = importlib.import_module("merge_sumo.sumo.binding")
+        monkeypatch.setattr(binding, "sumo_program", lambda _: str(script))
+        ended = run_program("sumo", [], tmp_path, limit_s=1.0)
+        assert (ended.code, ended.reason) == (-1, "it did not end within 1 s")
+        started = [int((tmp_path / name).read_text()) for name in ("self", "child")]
+        for _ in range(100):
+            if not any(map(runs, started)):
+                break
+            time.sleep(0.1)  # the system takes its time, on a busy machine
+        assert not any(map(runs, started))
+
+    def test_of_the_gui_run_on_the_same_files_in_a_folder_of_ours(self, scene, monkeypatch):
+        monkeypatch.setenv("DISPLAY", "127.0.0.1:0")
+        shown = []
+
+        def show(name: str, arguments: list[str], stage: Path, *, limit_s: float | None) -> object:
+            assert {path.name for path in stage.iterdir()} == RUNNABLE
+            for path in stage.iterdir():
+                assert_harmless(path.read_text(encoding="utf-8"))
+            shown.append((name, arguments, limit_s))
+            return run_program("sumo", ["-c", CONFIG], stage)
+
+        monkeypatch.setattr(replay_module, "run_program", show)
+        for name in (
+            "a snapshot in the view",
+            "a picture in the view",
+            "edgeData in the types",
+            "log in the configuration",
+        ):
+            attack_of(name)[0](scene)
+        assert assert_nothing_happens(scene, lambda: open_gui(scene.folder)) == 0
+        assert shown == [("sumo-gui", ["-c", CONFIG], None)]
+
+
+def runs(pid: int) -> bool:
+    """Return whether a process runs; one that ended and that nobody asked for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(") ", 1)[1][0] not in "ZX"
+    except FileNotFoundError:
+        return False
+
+
+def test_what_is_read_is_bounded_in_elements_and_in_bytes(tmp_path):
+    most = b"<net>" + b"<a/>" * (received.MAX_ELEMENTS - 1) + b"</net>"
+    root, intact = received.parse(most, allowed.NET, "it")
+    assert (len(root), intact) == (0, False)
+    with pytest.raises(UserError, match="more than 5000 elements"):
+        received.parse(most.replace(b"</net>", b"<a/></net>"), allowed.NET, "it")
+    file = tmp_path / "file"
+    file.write_bytes(b"x" * received.MAX_BYTES)
+    assert len(received.read_bytes(file, "it", follow_links=False)) == received.MAX_BYTES
+    file.write_bytes(b"x" * (received.MAX_BYTES + 1))
+    with pytest.raises(UserError, match="larger than 4 MiB"):
+        received.read_bytes(file, "it", follow_links=False)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ATTACKS)
+def test_the_command_line_answers_a_hostile_folder_with_an_exit_code(scene, name):
+    attack, expected = attack_of(name)
+    attack(scene)
+    command = [sys.executable, "-m", "merge_sumo.cli", "replay", str(scene.folder), "--json"]
+    environment = {**os.environ, "TMPDIR": str(scene.root / "tmp")}
+
+    def use() -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            command,
+            cwd=scene.root / "home",
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=HANG_S,
+            check=False,
+        )
+
+    done = assert_nothing_happens(scene, use)
+    assert isinstance(done, subprocess.CompletedProcess)
+    assert done.returncode == {IDENTICAL: 0, DIVERGED: 1}.get(expected, 2), done.stderr
+    assert SECRET not in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    if done.returncode == 2:
+        assert done.stdout == ""
+    else:
+        assert json.loads(done.stdout)["identical"] == (expected == IDENTICAL)
+
+
+TOUCHING = (
+    "openat,open,creat,connect,bind,listen,unlink,unlinkat,rename,renameat,mkdir,link,symlink"
+)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "name", [n for n in ATTACKS if attack_of(n)[1] != REFUSED and n not in FILES]
+)
+def test_sumo_opens_nothing_of_a_hostile_folder_or_of_the_user(scene, name):
+    """Asks the kernel: what SUMO opened to write lies in our folder, and it calls nobody."""
+    strace = shutil.which("strace")
+    require(strace is not None, "strace is not on the PATH")
+    attack, _ = attack_of(name)
+    attack(scene)
+    trace = scene.root.parent / f"{scene.root.name}.strace"
+    command = [str(strace), "-f", "-o", str(trace), "-e", f"trace={TOUCHING},execve"]
+    command += [sys.executable, "-m", "merge_sumo.cli", "replay", str(scene.folder)]
+    environment = {**os.environ, "TMPDIR": str(scene.root / "tmp")}
+    assert_nothing_happens(
+        scene, lambda: subprocess.run(command, env=environment, capture_output=True, check=False)
+    )
+    lines = trace.read_text(errors="replace").splitlines()
+    (start,) = (n for n, line in enumerate(lines) if re.search(r'execve\(".*/bin/sumo"', line))
+    sumo = lines[start].split()[0]
+    calls = [line.split(maxsplit=1)[1] for line in lines[start + 1 :] if line.startswith(sumo)]
+    assert any(RECORD in call for call in calls), "the trace is that of SUMO"
+    for call in calls:
+        assert not re.match("connect|bind|listen|unlink|rename|mkdir|link|symlink", call), call
+        assert str(scene.folder) not in call
+        assert str(scene.root / "home") not in call
+        if "O_WRONLY" in call or "O_RDWR" in call or "O_CREAT" in call:
+            assert f'"{replay_module.REPLAYED}"' in call, call

@@ -1,0 +1,222 @@
+"""Odd names of VUT files and folders, and terminals that cannot show them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import some
+from handmade import write_run
+from plans import plan_for
+
+from merge_sumo.campaigns import campaign as conductor
+from merge_sumo.campaigns.campaign import export_case, run_campaign
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.reports.progress import Bars
+from merge_sumo.reports.report import write_report
+from merge_sumo.sumo.binding import sumo_program
+from merge_sumo.system.printable import printable, quoted
+
+VUT = "def drive(seen):\n    return 1.0\n"
+NOT_UTF8 = os.fsdecode(b"vut-\xff\xfe")
+NASTY = "a%41 b,c\n$(id)'\"\\ \x1b[31m日é" + os.fsdecode(b"\xff")
+TERMINALS = {
+    "C": {"LC_ALL": "C"},
+    "POSIX without UTF-8 mode": {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    "Latin-1": {"PYTHONIOENCODING": "latin-1"},
+    "ASCII, strictly": {"PYTHONIOENCODING": "ascii:strict"},
+}
+SOME_TERMINALS = [
+    name if name == "C" else pytest.param(name, marks=pytest.mark.long) for name in TERMINALS
+]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    return write_run(tmp_path_factory.mktemp("made") / "run", per_level=20)
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path, command_line):
+    """Return what runs the command line, from a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    return command_line
+
+
+def in_a_process(terminal: dict[str, str], *arguments: object) -> tuple[int, str, str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "merge_sumo.cli", *map(str, arguments)],
+        capture_output=True,
+        check=False,
+        env={**os.environ, **terminal},
+    )
+    return done.returncode, done.stdout.decode("latin-1"), done.stderr.decode("latin-1")
+
+
+class TestAVutFile:
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "my vut%41, ${HOME}",
+            pytest.param("日本 'é' [red]", marks=pytest.mark.long),
+            pytest.param("a\nb:\x1b[31m", marks=pytest.mark.long),
+        ],
+    )
+    def test_with_an_odd_name_is_tested(self, call, tmp_path, name):
+        (tmp_path / f"{name}.py").write_text(VUT)
+        options = ("--level", 0, "--cases", 2, "--sampler", "uniform", "--workers", 1)
+        code, out, err = call("campaign", "--vut", f"{name}.py:drive", *options, "--json")
+        assert code == 0, err
+        assert "\x1b" not in out + err
+        assert Path(json.loads(out)["report"]).is_file()
+        (folder,) = (tmp_path / "runs").glob("*-*")
+        assert folder.name.isascii()
+        assert Run(folder).settings["vut"] == f"{name}.py:drive"
+        code, out, err = call("check-vut", f"{name}.py:drive")
+        assert code == 0, out + err
+
+    def test_with_a_long_name_has_a_folder_with_a_shorter_one(self, call, tmp_path):
+        (tmp_path / ("x" * 250 + ".py")).write_text(VUT)
+        options = ("--level", 0, "--cases", 1, "--sampler", "uniform", "-q")
+        code, _, err = call("campaign", "--vut", f"{'x' * 250}.py:drive", *options)
+        assert code == 0, err
+
+    @pytest.mark.parametrize("given", ["--vut", "--vut-command"])
+    def test_with_a_name_that_is_no_text_is_refused_before_it_is_loaded(
+        self, call, tmp_path, given
+    ):
+        (tmp_path / f"{NOT_UTF8}.py").write_text("raise SystemExit('it was loaded')")
+        vut = f"{NOT_UTF8}.py:drive" if given == "--vut" else "traci"
+        options = () if given == "--vut" else ("--vut-command", f"{NOT_UTF8} {{port}}")
+        code, out, err = call("campaign", "--vut", vut, *options, "--cases", 2)
+        assert (code, out) == (2, "")
+        assert f"merge-sumo: {given} is " in err
+        assert "it is not UTF-8" in err
+        assert err.count("\n") == 1
+        assert [path.suffix for path in tmp_path.iterdir()] == [".py"]
+
+    def test_in_a_command_that_is_no_text_is_refused_from_python_too(self):
+        with pytest.raises(UserError, match="not UTF-8"):
+            CampaignSettings(vut="half\ud800.py:drive", levels=(0,))
+
+
+class TestATerminal:
+    @pytest.mark.parametrize("name", SOME_TERMINALS)
+    def test_of_any_encoding_shows_results_in_folders_of_any_name(self, made, tmp_path, name):
+        folder = Path(shutil.copytree(made.folder, tmp_path / NASTY))
+        code, out, err = in_a_process(TERMINALS[name], "compare-runs", folder, folder, "--no-rerun")
+        assert code == 0, err
+        assert out.startswith("A: ")
+        assert err == ""
+        assert "\x1b" not in out
+        assert "\\x1b[31m" in out
+        code, out, err = in_a_process(TERMINALS[name], "export", folder, 0)
+        assert (code, err) == (0, "")
+        assert out.count("\n") == 1
+        assert (folder / "scenarios" / "case-00000" / "replay.sumocfg").is_file()
+
+    @pytest.mark.parametrize("name", SOME_TERMINALS)
+    def test_of_any_encoding_shows_a_sentence_on_any_name(self, tmp_path, name):
+        code, out, err = in_a_process(TERMINALS[name], "report", tmp_path / NASTY)
+        assert (code, out) == (2, "")
+        assert err.startswith("merge-sumo: ")
+        assert err.count("\n") == 1
+        assert "\x1b" not in err
+
+    def test_gets_json_that_says_any_name(self, call, run, tmp_path):
+        folder = Path(shutil.copytree(run.folder, tmp_path / NASTY))
+        code, out, err = call("campaign", "--resume", folder, "--cases", 60, "--json", "-q")
+        assert code == 0, err
+        assert json.loads(out)["run"] == str(folder)
+        assert out.isascii()
+        code, out, err = call("campaign", "--resume", folder, "--cases", 60, "-q")
+        assert code == 0, err
+        assert f"merge-sumo replay {quoted(folder)[:-1]}" in out, "a command that a shell reads"
+
+    def test_shows_a_title_as_it_is(self, capsys):
+        with Bars() as bars:
+            bars.show("a [/red] \x1b[31m\udcff", 1, 1, "[/bold]")
+        said = capsys.readouterr().err
+        assert "[/red] \\x1b[31m\\udcff" in said
+
+
+def test_what_is_printed_moves_no_cursor_and_keeps_letters_of_all_languages():
+    assert printable("日本 é\xa0Ω😀") == "日本 é\xa0Ω😀"
+    assert printable("a\nb\r\x1b[2J\x9b\u202e\u2028\ud800\0") == (
+        "a\\nb\\r\\x1b[2J\\x9b\\u202e\\u2028\\ud800\\x00"
+    )
+
+
+SUMO_NAMES = ["a b", "a,b", "a%41b", "100%s", "${HOME}", "$HOME", "a\nb", "a:b", "日本"]
+
+
+class TestSumo:
+    @pytest.mark.parametrize("name", some(SUMO_NAMES, "a,b", "${HOME}", "日本"))
+    def test_plays_an_exported_folder_of_any_name_where_it_is(self, made, tmp_path, name):
+        export_case(made, 0, tmp_path / name)
+        done = subprocess.run(
+            [sumo_program("sumo"), "-c", "replay.sumocfg", "--no-step-log", "true"],
+            cwd=tmp_path / name,
+            capture_output=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+
+    @pytest.mark.parametrize("name", some(["a b", "$HOME", "a\nb", "日本"], "$HOME", "日本"))
+    def test_starts_with_temporary_files_in_a_folder_of_an_odd_name(
+        self, tmp_path, monkeypatch, name
+    ):
+        (tmp_path / name).mkdir()
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
+        with plan_for("design1", corridors=1).open():
+            pass
+        assert list((tmp_path / name).iterdir()) == []
+
+    @pytest.mark.parametrize(
+        "name", some(["a,b", "a%41b", "${HOME}", "a:b", NOT_UTF8], "a%41b", NOT_UTF8)
+    )
+    def test_says_so_where_it_cannot_use_the_folder_for_temporary_files(
+        self, tmp_path, monkeypatch, name
+    ):
+        (tmp_path / name).mkdir()
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
+        with pytest.raises(UserError, match="set TMPDIR to one without"):
+            plan_for("design1", corridors=1).open()
+
+    def test_says_so_where_there_is_no_folder_for_temporary_files(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))
+        with pytest.raises(UserError, match="set TMPDIR to a folder"):
+            plan_for("design1", corridors=1).open()
+
+
+SIZES = [3990, 4000, *range(4004, 4016), 4030, 4060, 4090, 4095, 4096]
+
+
+@pytest.mark.parametrize("size", some(SIZES, 3990, 4007, 4008, 4096))
+def test_a_path_works_or_is_too_long_before_the_first_case(tmp_path, monkeypatch, size):
+    folder = tmp_path
+    while size - len(os.fsencode(folder)) > 400:
+        folder /= "d" * 200
+    left = size - len(os.fsencode(folder)) - 2
+    folder = folder / ("r" * (left // 2)) / ("r" * (left - left // 2))
+    assert len(os.fsencode(folder)) == size
+    monkeypatch.setattr(conductor, "runs_on", lambda *_: 1 / 0)
+    settings = CampaignSettings(vut="design1", levels=(0,), cases=99_999)
+    with pytest.raises((UserError, ZeroDivisionError)) as error:
+        run_campaign(settings, folder)
+    assert list(tmp_path.iterdir()) == []
+    if error.type is ZeroDivisionError:
+        assert size < 4020
+        written = write_run(folder, per_level=10)
+        export_case(written, 0, folder / "scenarios" / "case-99999")
+        assert write_report(written).is_file()
+    else:
+        assert "File name too long" in str(error.value)
+        assert size > 4000

@@ -1,0 +1,558 @@
+"""Whatever name an output gets: nothing that was there is gone, changed or followed elsewhere."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from unicodedata import category
+
+import numpy as np
+import pytest
+from handmade import write_run
+from matplotlib.figure import Figure
+from typer.testing import CliRunner
+
+import merge_sumo as ms
+from merge_sumo import cli
+from merge_sumo.campaigns import campaign as conductor
+from merge_sumo.campaigns.campaign import SCENARIOS, case_name, resume_campaign
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures, read_settings
+from merge_sumo.errors import UserError
+from merge_sumo.reports import figures
+from merge_sumo.reports import reproduction as reproduce
+from merge_sumo.reports.report import REPORT, write_report
+from merge_sumo.studies import probability
+from merge_sumo.system import folders
+from merge_sumo.system.printable import printable, quoted
+from merge_sumo.training import helix
+
+NAMELESS = [
+    *("", ".", "./", ".//", "./.", "..", "../", "../.", "./..", "../..", "../../."),
+    *("full/..", "full/../", "full/inner/..", "missing/..", "missing/../..", "./full/./.."),
+]
+THERE = [
+    *("file.txt", "empty", "empty/", "full", "full/", "full/.", "./full", "full/notes.txt"),
+    *("full/inner", "full/../empty", "dangling", "to-full", "to-file", "loop", "pipe"),
+    *("../beside", "../beside/kept", "to-full/inner", "vut1.onnx", "figure.svg", "table.json"),
+]
+FOLDERS = [
+    *("empty", "empty/", "full", "full/", "full/.", "./full", "full/inner", "full/../empty"),
+    *("to-full", "../beside", "../beside/kept", "to-full/inner"),
+]
+NOWHERE = [
+    *("file.txt/new", "file.txt/a/b", "to-file/new", "dangling/new", "loop/new", "pipe/new"),
+    *("x" * 256, "é" * 128, "x" * 5000, "a/" + "y" * 256, "/".join(["d" * 200] * 30)),
+]
+NO_ARGUMENTS = ["nul\0byte", "half\ud800", "\0"]
+"""What only Python can say."""
+ODD = [
+    *("x" * 255, "é" * 127, " ", "a b", " lead", "trail ", "a%b", "%41", "100%s", "${HOME}"),
+    *("$HOME", "$(id)", "`id`", ";ls", "a&b", "|", ">x", "<x>", "*", "?", "[a]", "{a,b}", "a:b"),
+    *("a=b", "#a", "!a", "~", "~root", "-", "--", "-rf", "--help", "a'b", 'a"b', "a\\b", "\\"),
+    *("\n", "a\nb", "\r", "\t", "\x1b[31mred", "\x07", "\x7f", "日本", "é", "e\u0301", "\u202eabc"),
+    *("\u200b", "\xa0", "😀", "...", ". .", ".hidden", "..a", "a..", os.fsdecode(b"\xff\xfe")),
+    *("new/sub", "new/deep/er", "./new3", "full/new4", "empty/new5", "to-full/new6"),
+    *("../beside/new7", "missing/../new8", "report.html", "campaign.json", "scenarios"),
+]
+NAMES = [*NAMELESS, *THERE, *NOWHERE, *ODD]
+
+
+def tree(root: Path) -> dict[str, tuple[str, object]]:
+    """Return everything below a folder by its kind and content; links are not followed."""
+    found: dict[str, tuple[str, object]] = {}
+    for path in [root, *root.rglob("*")]:
+        mode = path.lstat().st_mode
+        if stat.S_ISLNK(mode):
+            found[str(path)] = "link", str(path.readlink())
+        elif stat.S_ISREG(mode):
+            found[str(path)] = "file", path.read_bytes()
+        else:
+            found[str(path)] = "other", stat.S_IFMT(mode)
+    return found
+
+
+@pytest.fixture
+def world(tmp_path, monkeypatch) -> Path:
+    """Return a folder with planted files and links, and start in a folder inside of it."""
+    here = tmp_path / "world" / "deep" / "cwd"
+    for folder in (here / "full" / "inner", here / "empty", here.parent / "beside" / "kept"):
+        folder.mkdir(parents=True)
+    for name in ("file.txt", "full/notes.txt", "full/manifest.json", "full/inner/a", "vut1.onnx"):
+        (here / name).write_text(f"mine: {name}")
+    for name in ("figure.svg", "table.json", "../beside/kept/pov1.training.jsonl", "../../top"):
+        (here / name).write_text(f"mine: {name}")
+    for name, target in {"dangling": "nowhere", "to-full": "full", "to-file": "file.txt"}.items():
+        (here / name).symlink_to(target)
+    (here / "loop").symlink_to("loop")
+    os.mkfifo(here / "pipe")
+    monkeypatch.chdir(here)
+    return tmp_path / "world"
+
+
+@pytest.fixture
+def guarded(world, monkeypatch):
+    """Let what removes or renames tell first; what was planted is not touched, even for real."""
+    planted = [Path(name) for name in tree(world)]
+
+    def guard(name: str, module) -> None:
+        real = getattr(module, name)
+
+        def checked(path, *rest, **options):
+            if options.get("dir_fd") is None and not isinstance(path, int):
+                place = Path(os.path.abspath(os.fsdecode(path)))  # noqa: PTH100 (links stay)
+                for other in planted:
+                    assert not other.is_relative_to(place), f"{name} of {place}"
+                for target in rest[:1] if name in ("rename", "replace") else ():
+                    assert Path(os.path.abspath(target)) not in planted  # noqa: PTH100
+            return real(path, *rest, **options)
+
+        monkeypatch.setattr(module, name, checked)
+
+    for name in ("unlink", "remove", "rmdir", "rename", "replace", "truncate"):
+        guard(name, os)
+    guard("rmtree", shutil)
+
+
+@pytest.fixture
+def call(guarded, command_line):
+    """Return a function that runs the command line; it returns the exit code and the errors."""
+
+    def main(*arguments: object) -> tuple[int, str]:
+        code, _, err = command_line(*arguments)
+        return code, err
+
+    return main
+
+
+BASH = shutil.which("bash") or "bash"
+STOP = "this test runs no cases"
+
+
+@pytest.fixture
+def no_cases(monkeypatch) -> None:
+    """Stop campaigns and reproductions where their first case would run."""
+
+    class Stop:
+        """What runs cases, ahead or when it is asked to."""
+
+        def __call__(self, *_: object) -> None:
+            raise UserError(STOP)
+
+        def chunks(self, _: object) -> Iterator:
+            yield from ()
+
+    stop = Stop()
+    monkeypatch.setattr(conductor, "runs_on", lambda *_: stop)
+    monkeypatch.setattr(reproduce._Work, "column", stop)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    return write_run(tmp_path_factory.mktemp("made") / "run", per_level=20)
+
+
+def assert_nothing_was_touched(world: Path, write, names=NAMES) -> list[str]:
+    """Write to every name; return those at which something new appeared, or in which it did.
+
+    What appeared is removed before the next name.
+    """
+    appeared, before = [], tree(world)
+    for name in names:
+        code, said = write(name)
+        after = tree(world)
+        assert before.items() <= after.items(), repr(name)
+        assert code in (0, 2), (name, said)
+        if after != before:
+            appeared.append(name)
+        elif code == 2 and STOP not in said:
+            assert said.startswith("merge-sumo: "), repr(name)
+            assert said.count("\n") == 1, said
+            assert not any(category(letter)[0] == "C" for letter in said[:-1]), said
+        assert not [path for path in after if folders.TEMPORARY in path]
+        for path in sorted(after.keys() - before.keys(), reverse=True):
+            (Path(path).rmdir if Path(path).is_dir() else Path(path).unlink)()
+    assert not set(appeared) & {*NAMELESS, *NOWHERE, *NO_ARGUMENTS}
+    return appeared
+
+
+def test_there_are_a_hundred_names_and_more():
+    assert len(NAMES) == len(set(NAMES)) > 100
+
+
+@pytest.fixture(params=["some", pytest.param("all", marks=pytest.mark.long)])
+def names(request) -> list[str]:
+    """Return every name, or each sixth one of a kind: all writers ask `folders`."""
+    kinds = (NAMELESS, THERE, NOWHERE, ODD)
+    return [name for kind in kinds for name in kind[:: 6 if request.param == "some" else 1]]
+
+
+class TestAHundredNames:
+    def test_of_a_campaign_touch_nothing(self, world, call, no_cases, names):
+        options = ("--vut", "design1", "--level", 0, "--cases", 2, "--sampler", "uniform", "-q")
+        appeared = assert_nothing_was_touched(
+            world, lambda name: call("campaign", *options, f"--out={name}"), names
+        )
+        assert set(appeared) == {*ODD} & {*names}
+
+    def test_of_a_campaign_from_python_touch_nothing(self, world, guarded, no_cases, names):
+        def write(name: str) -> tuple[int, str]:
+            with pytest.raises(UserError) as error:
+                ms.campaign("design1", level=0, cases=2, sampler="uniform", out=name)
+            return 2, f"merge-sumo: {printable(str(error.value))}\n"
+
+        appeared = assert_nothing_was_touched(world, write, [*names, *NO_ARGUMENTS])
+        assert set(appeared) == {*ODD} & {*names}
+
+    def test_of_an_export_touch_nothing(self, world, call, made, names):
+        appeared = assert_nothing_was_touched(
+            world, lambda name: call("export", made.folder, 1, f"--out={name}"), names
+        )
+        assert set(appeared) == {*ODD, *FOLDERS} & {*names}
+
+    @pytest.mark.parametrize(("file_format", "odd"), [("csv", ODD), ("parquet", ODD[:6])])
+    def test_of_a_table_touch_nothing(self, world, call, made, file_format, odd, names):
+        arguments = ("export", made.folder, 1, "--format", file_format)
+        names = [name for name in names if name not in ODD or name in odd]
+        appeared = assert_nothing_was_touched(
+            world, lambda name: call(*arguments, f"--out={name}"), names
+        )
+        assert set(appeared) >= {*odd} & {*names}
+
+    def test_of_openscenario_touch_nothing(self, world, call, made, names):
+        names = [*(name for name in names if name not in ODD), "a:b", "${HOME}", "a%b", "a,b"]
+        arguments = ("export", made.folder, 1, "--format", "openscenario")
+        appeared = assert_nothing_was_touched(
+            world, lambda name: call(*arguments, f"--out={name}"), names
+        )
+        assert {"a:b", "${HOME}", "a%b", "a,b"} <= set(appeared)
+
+    def test_of_a_reproduction_touch_nothing(self, world, call, no_cases, names):
+        arguments = ("reproduce", "--quick", "--workers=1")
+        appeared = assert_nothing_was_touched(
+            world, lambda name: call(*arguments, f"--out={name}"), names
+        )
+        assert set(appeared) == {*ODD} & {*names}
+
+    def test_of_a_figure_touch_nothing(self, world, guarded):
+        figure = Figure(figsize=(0.1, 0.1))
+
+        def write(name: str) -> tuple[int, str]:
+            try:
+                figures.check_figure(Path(name))
+                figures.save(figure, Path(name))
+            except UserError as error:
+                return 2, f"merge-sumo: {printable(str(error))}\n"
+            return 0, ""
+
+        assert assert_nothing_was_touched(world, write) == ["report.html"]
+        named = [f"{name}.{kind}" for name in NAMES for kind in ("svg", "html")]
+        appeared = assert_nothing_was_touched(world, write, named)
+        assert {"a b.svg", "-rf.html", "日本.svg"} <= set(appeared)
+
+    def test_of_a_figure_are_refused_before_anything_runs(self, world, call, monkeypatch):
+        monkeypatch.setattr("merge_sumo.studies.truth.ground_truth", lambda *_, **__: 1 / 0)
+        options = ("compare", "--vut", "design1", "--level", 0, "--workers", 1)
+        for name in ("", ".", "..", "full/..", "figure.svg", "loop.svg/x.svg", "x" * 300 + ".svg"):
+            code, said = call(*options, f"--figure={name}")
+            assert (code, said.count("\n")) == (2, 1), name
+
+    def test_of_a_probability_touch_nothing(self, world, call, run, monkeypatch, names):
+        def ran(_settings, _net, _stated, draws, lines, _on_case, _workers):
+            chosen = run.outcomes[: len(draws.level)]
+            probability._append(lines, chosen, draws)
+            return chosen
+
+        monkeypatch.setattr(probability, "_run", ran)
+        monkeypatch.setattr(probability, "expected_chance", lambda _, cells: np.ones(len(cells)))
+        arguments = ("probability", run.folder, "--cases", 4)
+        appeared = assert_nothing_was_touched(
+            world, lambda name: call(*arguments, f"--out={name}"), names
+        )
+        assert {"a b", "-rf", "日本", "full/new4"} & {*names} <= set(appeared)
+        assert not {"table.json", "new/sub", "x" * 255} & set(appeared)
+
+    def test_of_a_training_touch_nothing(self, world, call, monkeypatch, names):
+        monkeypatch.setattr(helix, "_train_beside", lambda *_: [])
+        appeared = assert_nothing_was_touched(
+            world, lambda name: call("train", "--only", "pov1", f"--out={name}"), names
+        )
+        assert set(appeared) == {*ODD, "empty", "empty/", "full/../empty"} & {*names}
+
+    def test_of_a_policy_touch_nothing(self, world, call, names):
+        arguments = ("policies", "export", "vut1")
+        appeared = assert_nothing_was_touched(
+            world, lambda name: call(*arguments, f"--out={name}"), names
+        )
+        assert set(appeared) == {*ODD} & {*names} - {"new/sub", "new/deep/er", "missing/../new8"}
+
+
+class TestANameOfNothing:
+    @pytest.mark.parametrize("name", [*NAMELESS, "/", "//", "///", "/.", "/..", "/../.."])
+    def test_is_refused_by_its_looks(self, name):
+        with pytest.raises(UserError, match="write the name of what is to be made"):
+            folders.check_new(Path(name))
+
+    def test_is_refused_before_the_vut_is_opened(self, world, guarded, monkeypatch):
+        monkeypatch.setattr(conductor, "runs_on", lambda *_: 1 / 0)
+        for name in NAMELESS:
+            with pytest.raises(UserError, match="--out is"):
+                ms.campaign("design1", level=0, cases=2, out=name)
+
+
+def fails_in(new: Path, *theirs: Path) -> None:
+    for path in (new / "ours", *theirs):
+        path.write_text("something")
+    raise RuntimeError
+
+
+class TestANewFolder:
+    def test_is_not_there_before_it_is_whole(self, tmp_path):
+        with folders.new_folder(tmp_path / "a" / "b") as new:
+            (new / "file").write_text("ours")
+            assert not (tmp_path / "a" / "b").exists()
+        assert (tmp_path / "a" / "b" / "file").read_text() == "ours"
+        assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
+
+    def test_goes_with_the_folders_above_it_when_it_fails(self, tmp_path):
+        (tmp_path / "mine").mkdir()
+        with pytest.raises(RuntimeError), folders.new_folder(tmp_path / "mine" / "a" / "b") as new:
+            fails_in(new)
+        assert list((tmp_path / "mine").iterdir()) == []
+
+    def test_leaves_a_folder_above_it_that_somebody_uses_by_then(self, tmp_path):
+        with pytest.raises(RuntimeError), folders.new_folder(tmp_path / "a" / "b") as new:
+            fails_in(new, (tmp_path / "a" / "theirs"))
+        assert [path.name for path in (tmp_path / "a").iterdir()] == ["theirs"]
+
+    @pytest.mark.parametrize("what", ["empty", "full", "file", "link"])
+    def test_does_not_replace_what_came_there_meanwhile(self, tmp_path, what, monkeypatch):
+        path = tmp_path / "out"
+        take_name = folders._take_name
+
+        def overtaken(*arguments) -> None:
+            if what == "file":
+                path.write_text("theirs")
+            elif what == "link":
+                path.symlink_to("nowhere")
+            else:
+                path.mkdir()
+            if what == "full":
+                (path / "file").write_text("theirs")
+            before.update(tree(tmp_path))
+            take_name(*arguments)
+
+        before: dict[str, tuple[str, object]] = {}
+        monkeypatch.setattr(folders, "_take_name", overtaken)
+        with pytest.raises(UserError, match="out exists"), folders.new_folder(path):
+            pass
+        theirs = {name: kind for name, kind in before.items() if folders.TEMPORARY not in name}
+        assert tree(tmp_path) == theirs
+
+    def test_takes_a_name_of_255_bytes(self, tmp_path):
+        with folders.new_folder(tmp_path / ("x" * 255)):
+            pass
+        assert (tmp_path / ("x" * 255)).is_dir()
+
+
+class TestAFileOfOurs:
+    def test_is_whole_or_as_it_was(self, tmp_path, monkeypatch):
+        (tmp_path / "report").write_text("old")
+
+        def fail(_: int) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", fail)
+        with pytest.raises(UserError, match="No space left"):
+            folders.replace_own(tmp_path / "report", b"new")
+        assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"report": "old"}
+
+    @pytest.mark.parametrize("kind", ["link", "dangling link", "pipe"])
+    def test_is_not_written_where_something_else_is(self, tmp_path, kind):
+        (tmp_path / "theirs").write_text("theirs")
+        if kind == "pipe":
+            os.mkfifo(tmp_path / "report")
+        else:
+            (tmp_path / "report").symlink_to("theirs" if kind == "link" else "nowhere")
+        before = tree(tmp_path)
+        with pytest.raises(UserError, match="not of our making"):
+            folders.replace_own(tmp_path / "report", b"new")
+        assert tree(tmp_path) == before
+
+
+@pytest.fixture
+def received(run, tmp_path) -> Path:
+    """Return a finished campaign that somebody sent, beside a folder of ours with a file."""
+    (tmp_path / "ours").mkdir()
+    (tmp_path / "ours" / "bashrc").write_text("ours")
+    return Path(shutil.copytree(run.folder, tmp_path / "received"))
+
+
+def cut_to_one_batch(folder: Path) -> None:
+    lines = (folder / OUTCOMES).read_bytes().splitlines(keepends=True)
+    (folder / OUTCOMES).write_bytes(b"".join(lines[:20]))
+
+
+def moved_behind_a_link(path: Path, elsewhere: Path) -> None:
+    path.rename(elsewhere / path.name)
+    path.symlink_to(elsewhere / path.name)
+
+
+class TestAReceivedFolder:
+    @pytest.mark.parametrize("name", [SETTINGS, OUTCOMES, TRAJECTORIES, SCENARIOS])
+    def test_with_a_link_is_not_gone_on_with(self, received, tmp_path, name, monkeypatch):
+        monkeypatch.setattr(conductor, "runs_on", lambda *_: 1 / 0)
+        cut_to_one_batch(received)
+        moved_behind_a_link(received / name, tmp_path / "ours")
+        before = tree(tmp_path)
+        with pytest.raises(UserError, match=f"{name}: it is a link"):
+            resume_campaign(received)
+        assert tree(tmp_path) == before
+
+    @pytest.mark.parametrize("target", ["../../ours/bashrc", "../../ours/new"])
+    def test_with_a_link_among_its_trajectories_is_not_gone_on_with(
+        self, received, tmp_path, monkeypatch, target
+    ):
+        monkeypatch.setattr(conductor, "runs_on", lambda *_: 1 / 0)
+        cut_to_one_batch(received)
+        (received / TRAJECTORIES / "00002.npz").unlink()
+        (received / TRAJECTORIES / "00002.npz").symlink_to(target)
+        before = tree(tmp_path)
+        with pytest.raises(UserError, match=r"00002\.npz: it is a link"):
+            resume_campaign(received)
+        assert tree(tmp_path) == before
+
+    def test_with_a_link_that_waits_for_new_settings_writes_nowhere_else(self, received, tmp_path):
+        (received / f".{SETTINGS}").symlink_to("../ours/bashrc")
+        with Journal.reopen(received)[0] as journal:
+            journal.rewrite_settings({"vut": "design1"})
+        assert (tmp_path / "ours" / "bashrc").read_text() == "ours"
+        assert read_settings(received) == {"vut": "design1"}
+
+    @pytest.mark.parametrize("target", ["../ours/bashrc", "../ours/new", "../ours"])
+    def test_with_a_link_for_a_report_gets_none(self, received, tmp_path, target):
+        (received / REPORT).unlink(missing_ok=True)
+        (received / REPORT).symlink_to(target)
+        before = tree(tmp_path)
+        with pytest.raises(UserError, match=r"report\.html: it is a link"):
+            write_report(Run(received))
+        assert tree(tmp_path) == before
+
+    def test_with_a_page_of_somebodys_keeps_it(self, received, tmp_path):
+        (received / REPORT).write_text("<!doctype html><title>my notes on merge-sumo</title>")
+        before = tree(tmp_path)
+        with pytest.raises(UserError, match=r"report\.html is no report of merge-sumo"):
+            write_report(Run(received))
+        assert tree(tmp_path) == before
+        (received / REPORT).unlink()
+        first = write_report(Run(received)).read_bytes()
+        assert write_report(Run(received)).read_bytes() == first, "ours is replaced"
+
+    @pytest.mark.parametrize("name", [SCENARIOS, "exports"])
+    @pytest.mark.parametrize("file_format", ["sumo", "openscenario", "csv"])
+    def test_with_a_link_for_exports_gets_none(self, received, tmp_path, name, file_format):
+        if (received / name).exists():
+            shutil.rmtree(received / name)
+        (received / name).symlink_to("../ours")
+        before = tree(tmp_path)
+        said = CliRunner().invoke(cli.app, ["export", str(received), "59", "--format", file_format])
+        assert isinstance(said.exception, UserError)
+        assert "it is a link" in str(said.exception)
+        assert tree(tmp_path) == before
+
+    @pytest.mark.parametrize("name", ["probability.json", "probability.jsonl"])
+    def test_with_a_link_for_a_probability_gets_none(self, received, tmp_path, name, monkeypatch):
+        monkeypatch.setattr(probability, "_run", lambda *_: 1 / 0)
+        (received / name).symlink_to("../ours/new")
+        before = tree(tmp_path)
+        with pytest.raises(UserError, match=f"{name} exists"):
+            probability.failure_probability(Run(received), received / probability.RESULT, cases=4)
+        assert tree(tmp_path) == before
+
+    def test_keeps_a_folder_of_somebodys_in_the_place_of_a_scenario(self, received, tmp_path):
+        worst, second, *_ = failures(Run(received).outcomes)
+        shutil.rmtree(received / SCENARIOS)
+        theirs = received / SCENARIOS / case_name(worst.index)
+        theirs.mkdir(parents=True)
+        (theirs / "thesis.tex").write_text("theirs")
+        resume_campaign(received)
+        assert tree(theirs)[str(theirs / "thesis.tex")] == ("file", b"theirs")
+        assert [path.name for path in theirs.iterdir()] == ["thesis.tex"]
+        assert (received / SCENARIOS / case_name(second.index) / "replay.sumocfg").is_file()
+
+
+class TestAFolderOfPolicies:
+    def test_that_holds_other_things_is_not_trained_into(self, tmp_path):
+        (tmp_path / "pov1.training.jsonl").write_text("theirs")
+        with pytest.raises(UserError, match="holds other things than policies"):
+            helix.train_library(tmp_path, ("pov1",))
+        assert [path.name for path in tmp_path.iterdir()] == ["pov1.training.jsonl"]
+
+    def test_whose_log_is_a_link_is_not_trained_into(self, tmp_path):
+        (tmp_path / "manifest.json").write_text('{"networks": {}}')
+        (tmp_path / "pov1.training.jsonl").symlink_to("elsewhere")
+        with pytest.raises(UserError, match="it is a link"):
+            helix.train_library(tmp_path, ("pov1",))
+        assert not (tmp_path / "elsewhere").exists()
+
+    def test_that_was_begun_is_gone_on_with(self, tmp_path, monkeypatch):
+        asked: list[Path] = []
+
+        def train(folder: Path, *_: object) -> list:
+            asked.append(folder)
+            return []
+
+        monkeypatch.setattr(helix, "_train_beside", train)
+        for _ in range(2):
+            helix.train_library(tmp_path / "new", ("pov1",))
+            (tmp_path / "new" / "pov1.training.jsonl").write_text("{}\n")
+        assert asked == [tmp_path / "new"] * 4, "two levels, twice"
+
+
+@pytest.mark.parametrize("name", [name for name in ODD if name.isprintable() or "\x1b" in name])
+def test_a_name_in_a_command_is_read_by_a_shell_as_it_is(name):
+    done = subprocess.run(
+        [BASH, "-c", f"printf '%s|' {quoted(name)} end"], capture_output=True, check=True
+    )
+    assert done.stdout == os.fsencode(name) + b"|end|"
+    assert printable(quoted(name)) == quoted(name)
+
+
+class TestTheLinkToTheNewestRun:
+    @pytest.fixture
+    def runs(self, tmp_path, monkeypatch) -> Path:
+        monkeypatch.chdir(tmp_path)
+        for name in ("a-20260101-000000", "b-20260101-000001", "mine"):
+            (tmp_path / "runs" / name).mkdir(parents=True)
+        return Path("runs")
+
+    def test_is_made_and_moves_on_to_newer_ones_only(self, runs):
+        for newest in ("a-20260101-000000", "b-20260101-000001"):
+            folders.link_latest(runs / newest)
+            assert str((runs / "latest").readlink()) == newest
+        folders.link_latest(runs / "a-20260101-000000")
+        assert str((runs / "latest").readlink()) == "b-20260101-000001"
+        assert len(list(runs.iterdir())) == 4, "nothing of ours is left beside it"
+
+    @pytest.mark.parametrize("target", ["mine", "../elsewhere", "/", "a-20260101-000000/x"])
+    def test_of_somebody_else_stays(self, runs, target):
+        (runs / "latest").symlink_to(target)
+        folders.link_latest(runs / "b-20260101-000001")
+        assert str((runs / "latest").readlink()) == target
+
+    @pytest.mark.parametrize("make", [Path.mkdir, lambda path: path.write_text("mine")])
+    def test_does_not_take_the_place_of_a_file_or_a_folder(self, runs, make):
+        make(runs / "latest")
+        folders.link_latest(runs / "b-20260101-000001")
+        assert not (runs / "latest").is_symlink()
+
+    @pytest.mark.parametrize(
+        "folder", ["runs/mine", "elsewhere/a-20260101-000000", "runs/c-20260101-000009"]
+    )
+    def test_is_not_made_for_what_has_a_name_of_its_own_or_is_not_there(self, runs, folder):
+        folders.link_latest(Path(folder))
+        assert not os.path.lexists(runs / "latest")

@@ -1,0 +1,468 @@
+"""What a campaign remembers survives exactly, and what cannot be read is named."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import resource
+import shutil
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import Run, failures, read_outcomes, to_line
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
+from merge_sumo.values.severity import Severity
+from merge_sumo.values.trajectory import End, Trajectory
+
+SPEC_FIELDS = [
+    *("index", "batch", "level", "x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad", "end"),
+    *("score", "dx_m", "dv_mps", "ttc_s", "pet_s", "t_end_s"),
+]
+"""The record of SPEC 10 up to its dots; "error" closes it."""
+
+examples = settings(max_examples=50, deadline=None)
+number = st.floats(allow_nan=False, allow_infinity=False)
+maybe = st.none() | number
+
+
+@st.composite
+def cases(draw) -> Case:
+    level = draw(st.sampled_from([0, 1, 2]))
+    svo = st.floats(0.0, math.nextafter(math.pi / 2, 0.0)) if level == 2 else st.none()
+    return Case(
+        level=level,
+        x_pov0_m=draw(st.floats(-900.0, 0.0)),
+        v_pov0_mps=draw(st.floats(0.0, 45.0)),
+        svo_rad=draw(svo),
+        v_vut0_mps=draw(st.floats(0.0, 45.0)),
+    )
+
+
+any_measures = st.builds(
+    Measures,
+    end=st.sampled_from(End),
+    score=maybe,
+    dx_m=maybe,
+    dv_mps=maybe,
+    ttc_s=maybe,
+    pet_s=maybe,
+    t_end_s=number,
+    severity=st.sampled_from([None, *(s.value for s in Severity)]),
+    bumper_gap_m=maybe,
+    clearance_m=maybe,
+    before_clearance_m=maybe,
+    drac_mps2=maybe,
+    brake_after_mps2=maybe,
+    vut_max_brake_mps2=number,
+    pov_max_brake_mps2=number,
+    impact_speed_mps=maybe,
+    merged_first=st.sampled_from([None, "VUT", "POV"]),
+    last_avoidable_s=maybe,
+    avoidable=st.none() | st.booleans(),
+    clipped_steps=st.integers(0, 300),
+    error=st.none() | st.text(),
+)
+any_outcome = st.builds(
+    Outcome,
+    index=st.integers(0, 10**6),
+    batch=st.integers(0, 10**5),
+    case=cases(),
+    measures=any_measures,
+)
+
+
+def episode(index: int, batch: int = 0, steps: int = 60) -> tuple[Outcome, Trajectory]:
+    """Return an episode with numbers that no short decimal holds, and its outcome."""
+    rng = np.random.default_rng(index)
+    case = Case(level=0, x_pov0_m=-200.0 - index / 3.0, v_pov0_mps=30.0 + 1.0 / (index + 3.0))
+    motion = rng.normal(size=(steps + 1, 2, 3))
+    motion[:, :, 0] = np.linspace(-180.0, -1.0, steps + 1)[:, None]
+    motion[-1, :, 0] = rng.uniform(0.0, 2.0, 2)
+    trajectory = Trajectory(case, motion, End.MERGED)
+    return Outcome(index, batch, case, measure(trajectory)), trajectory
+
+
+def lines_of(count: int) -> list[bytes]:
+    return [to_line(episode(index)[0]).encode() for index in range(count)]
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    """Return every file below a folder with its bytes."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def assert_sentence(error: pytest.ExceptionInfo[UserError], *parts: str) -> None:
+    message = str(error.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+class TestARecord:
+    @examples
+    @given(any_outcome)
+    def test_survives_to_the_last_bit(self, outcome):
+        assert Outcome.from_record(outcome.to_record()) == outcome
+        line = to_line(outcome)
+        again = Outcome.from_record(json.loads(line))
+        assert again == outcome
+        assert to_line(again) == line, "repr tells floats apart that == does not: -0.0 and 0.0"
+
+    @examples
+    @given(any_outcome)
+    def test_is_one_flat_line_whatever_the_error_says(self, outcome):
+        line = to_line(outcome)
+        assert line.endswith("\n")
+        assert line.count("\n") == 1
+        values = json.loads(line).values()
+        assert all(value is None or isinstance(value, int | float | str) for value in values)
+
+    def test_has_the_fields_of_the_specification_in_their_order(self):
+        names = list(episode(0)[0].to_record())
+        assert names[: len(SPEC_FIELDS)] == SPEC_FIELDS
+        assert names[-1] == "error"
+
+    def test_has_no_orientation_below_level_2(self):
+        outcome, _ = episode(0)
+        social = Case(level=2, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=0.25)
+        assert json.loads(to_line(outcome))["svo_rad"] is None
+        assert json.loads(to_line(replace(outcome, case=social)))["svo_rad"] == 0.25
+
+    def test_has_no_number_that_json_does_not_know(self):
+        outcome, _ = episode(0)
+        infinite = replace(outcome, measures=replace(outcome.measures, ttc_s=math.inf))
+        with pytest.raises(ValueError, match="JSON"):
+            to_line(infinite)
+
+    @pytest.mark.parametrize("end", End)
+    def test_names_the_end_of_the_episode(self, end):
+        outcome, _ = episode(0)
+        outcome = replace(outcome, measures=replace(outcome.measures, end=end))
+        assert f'"end": "{end.name}"' in to_line(outcome)
+
+
+class TestReading:
+    def test_gives_the_outcomes_in_order(self):
+        outcomes, torn = read_outcomes(b"".join(lines_of(4)), "outcomes.jsonl")
+        assert outcomes == [episode(index)[0] for index in range(4)]
+        assert not torn
+
+    def test_of_nothing_gives_nothing(self):
+        assert read_outcomes(b"", "outcomes.jsonl") == ([], False)
+
+    def test_drops_a_last_line_that_is_torn_at_any_byte(self):
+        whole, last = b"".join(lines_of(2)), lines_of(3)[2]
+        before = [episode(0)[0], episode(1)[0]]
+        for cut in range(1, len(last)):
+            assert read_outcomes(whole + last[:cut], "outcomes.jsonl") == (before, True)
+        assert len(read_outcomes(whole + last, "outcomes.jsonl")[0]) == 3
+
+    @pytest.mark.parametrize("cut", [0, 1, 2, 20, 200, -2])
+    def test_names_a_line_in_the_middle_that_is_torn(self, cut):
+        lines = lines_of(3)
+        lines[1] = lines[1][:cut] + b"\n"
+        with pytest.raises(UserError) as error:
+            read_outcomes(b"".join(lines), "outcomes.jsonl")
+        assert_sentence(error, "line 2", "outcomes.jsonl")
+
+    def test_names_a_line_that_lost_its_end(self):
+        lines = lines_of(3)
+        lines[1] = lines[1].rstrip()
+        with pytest.raises(UserError) as error:
+            read_outcomes(b"".join(lines), "outcomes.jsonl")
+        assert_sentence(error, "line 2")
+
+    @pytest.mark.parametrize(
+        ("order", "line"),
+        [([1, 0, 2], 1), ([0, 2, 1], 2), ([0, 0, 1], 2), ([0, 2], 2), ([0, 1, 1], 3)],
+    )
+    def test_names_the_first_line_that_is_not_in_its_place(self, order, line):
+        lines = lines_of(3)
+        with pytest.raises(UserError) as error:
+            read_outcomes(b"".join(lines[index] for index in order), "outcomes.jsonl")
+        assert_sentence(error, f"line {line} ")
+
+    @pytest.mark.parametrize(
+        "line", [b"{}", b"[]", b"null", b"7", b'"text"', b"\xff\xfe", b"[[1, 2]]", b"{]"]
+    )
+    def test_refuses_a_line_that_is_no_record(self, line):
+        with pytest.raises(UserError) as error:
+            read_outcomes(lines_of(1)[0] + line + b"\n", "outcomes.jsonl")
+        assert_sentence(error, "line 2")
+
+    @pytest.mark.parametrize("field", [*SPEC_FIELDS, "error"])
+    def test_refuses_a_record_without_one_of_its_fields(self, field):
+        record = episode(0)[0].to_record()
+        del record[field]
+        with pytest.raises(UserError) as error:
+            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl")
+        assert_sentence(error, "line 1", field)
+
+    def test_refuses_a_record_with_a_field_that_nobody_knows(self):
+        record = {**episode(0)[0].to_record(), "scroe": -1.0}
+        with pytest.raises(UserError) as error:
+            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl")
+        assert_sentence(error, "line 1", "scroe")
+
+    @pytest.mark.parametrize(
+        ("field", "value"),
+        [
+            ("index", True),
+            ("index", "0"),
+            ("index", 0.0),
+            ("batch", None),
+            ("batch", 1.0),
+            ("level", "0"),
+            ("level", 4),
+            ("level", None),
+            ("x_pov0_m", "-200"),
+            ("x_pov0_m", None),
+            ("v_pov0_mps", [30.0]),
+            ("v_vut0_mps", None),
+            ("svo_rad", 0.3),
+            ("end", "ARRIVED"),
+            ("end", None),
+            ("score", "-600"),
+            ("score", math.nan),
+            ("dx_m", "near"),
+            ("t_end_s", None),
+            ("clipped_steps", 1.5),
+            ("error", 3),
+        ],
+    )
+    def test_refuses_a_value_of_the_wrong_type(self, field, value):
+        record = {**episode(0)[0].to_record(), field: value}
+        with pytest.raises(UserError) as error:
+            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl")
+        assert_sentence(error, "line 1")
+
+
+class TestAJournal:
+    def test_gives_back_settings_outcomes_and_trajectories_to_the_last_bit(self, tmp_path):
+        settings = {"vut": "design1", "levels": [0], "seed": 3, "v_vut0_mps": 0.1 + 0.2}
+        journal = Journal.create(tmp_path / "run", settings)
+        ran = [episode(index, batch=index // 2, steps=20 + 7 * index) for index in range(5)]
+        for batch in range(3):
+            journal.append([pair for pair in ran if pair[0].batch == batch])
+        run = Run(tmp_path / "run")
+        assert run.settings == settings
+        assert run.outcomes == [outcome for outcome, _ in ran]
+        for index in (4, 0, 3, 1, 2):
+            again = run.trajectory(index)
+            assert again.motion.dtype == np.float64
+            assert again.motion.shape == ran[index][1].motion.shape
+            assert again.motion.tobytes() == ran[index][1].motion.tobytes()
+            assert again.case == ran[index][1].case
+
+    def test_has_on_disk_what_was_appended_so_far(self, tmp_path):
+        journal = Journal.create(tmp_path / "run", {})
+        assert Run(tmp_path / "run").outcomes == []
+        for batch in range(2):
+            journal.append([episode(batch, batch)])
+            assert len(Run(tmp_path / "run").outcomes) == batch + 1
+
+    def test_syncs_the_trajectories_before_the_outcomes(self, tmp_path, monkeypatch):
+        journal = Journal.create(tmp_path / "run", {})
+        synced, fsync = [], os.fsync
+
+        def note(file: int) -> None:
+            synced.append(os.fstat(file).st_ino)
+            fsync(file)
+
+        monkeypatch.setattr(os, "fsync", note)
+        journal.append([episode(0)])
+        (trajectories,) = (tmp_path / "run" / "trajectories").iterdir()
+        outcomes = tmp_path / "run" / "outcomes.jsonl"
+        files = [trajectories, trajectories.parent, outcomes]
+        assert synced == [file.stat().st_ino for file in files]
+
+    @pytest.mark.parametrize("kept", [(), ("notes.txt",), ("campaign.json", "outcomes.jsonl")])
+    def test_refuses_a_folder_that_exists_and_leaves_it_alone(self, tmp_path, kept):
+        folder = tmp_path / "run"
+        folder.mkdir()
+        for name in kept:
+            (folder / name).write_text("mine")
+        before = contents(tmp_path)
+        with pytest.raises(UserError) as error:
+            Journal.create(folder, {"vut": "design1"})
+        assert_sentence(error, "run exists", "--out")
+        assert contents(tmp_path) == before
+        assert sorted(path.name for path in folder.iterdir()) == sorted(kept)
+
+    def test_refuses_a_file_in_place_of_the_folder(self, tmp_path):
+        (tmp_path / "run").write_text("mine")
+        with pytest.raises(UserError) as error:
+            Journal.create(tmp_path / "run", {})
+        assert_sentence(error, "run exists")
+        assert (tmp_path / "run").read_text() == "mine"
+
+    def test_says_when_the_folder_cannot_be_made(self, tmp_path):
+        (tmp_path / "runs").write_text("mine")
+        with pytest.raises(UserError) as error:
+            Journal.create(tmp_path / "runs" / "first", {})
+        assert_sentence(error, "cannot write")
+        assert (tmp_path / "runs").read_text() == "mine"
+
+    def test_says_when_the_folder_cannot_be_written_any_more(self, tmp_path):
+        journal = Journal.create(tmp_path / "run", {})
+        journal.append([episode(0, 0)])
+        shutil.rmtree(tmp_path / "run" / "trajectories")
+        with pytest.raises(UserError) as error:
+            journal.append([episode(1, 1)])
+        assert_sentence(error, "cannot write")
+        assert len(Run(tmp_path / "run").outcomes) == 1, "no outcome without its trajectory"
+
+    @pytest.mark.parametrize("most", [1_000, 12_000], ids=["trajectories", "outcomes"])
+    def test_takes_back_what_it_wrote_when_the_rest_does_not_fit(self, tmp_path, most):
+        with Journal.create(tmp_path / "run", {}) as journal:
+            journal.append([episode(0, 0, steps=2)])
+            before = (tmp_path / "run" / "outcomes.jsonl").read_bytes()
+            batch = [episode(index, 1, steps=2) for index in range(1, 41)]
+            # Python ignores SIGXFSZ: beyond the limit a write fails as on a full disk.
+            limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
+            try:
+                with pytest.raises(UserError) as error:
+                    journal.append(batch)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+            assert_sentence(error, "cannot write", "File too large", "--resume")
+            written = (tmp_path / "run" / "trajectories" / "00001.npz").stat().st_size
+            assert (written < most) == (most == 12_000), "the outcomes are the larger file"
+            assert (tmp_path / "run" / "outcomes.jsonl").read_bytes() == before
+            journal.append(batch)
+        assert len(Run(tmp_path / "run").outcomes) == 41
+
+
+class TestARun:
+    @pytest.fixture
+    def folder(self, tmp_path):
+        journal = Journal.create(tmp_path / "run", {"levels": [0]})
+        journal.append([episode(0), episode(1)])
+        journal.append([episode(2, 1)])
+        return tmp_path / "run"
+
+    def test_knows_what_its_folder_says(self, run):
+        read = Run(run.folder)
+        assert [o.to_record() for o in run.outcomes] == [o.to_record() for o in read.outcomes]
+        assert run.outcomes == read.outcomes
+        assert any(o.foretold for o in run.outcomes)
+
+    def test_scores_its_trajectories_as_it_scored_them_when_they_ran(self, run):
+        assert len(run.outcomes) == 60
+        lines = centre_lines(road_for(US23))
+        for outcome in run.outcomes:
+            assert measure(run.trajectory(outcome.index), lines) == outcome.measures
+
+    def test_lists_its_failures_with_the_worst_first(self, run):
+        worst = failures(run.outcomes)
+        scores = [outcome.measures.score for outcome in worst]
+        assert scores == sorted(scores)
+        assert all(score < -500.0 for score in scores)
+        assert len(worst) == sum(o.measures.is_close for o in run.outcomes) > 0
+
+    def test_that_was_interrupted_between_trajectories_and_outcomes_is_read(self, folder):
+        outcomes = folder / "outcomes.jsonl"
+        lines = outcomes.read_bytes().splitlines(keepends=True)
+        outcomes.write_bytes(b"".join(lines[:2]))
+        run = Run(folder)
+        assert len(run.outcomes) == 2
+        assert not run.torn
+
+    def test_knows_that_its_last_line_was_torn(self, folder):
+        outcomes = folder / "outcomes.jsonl"
+        outcomes.write_bytes(outcomes.read_bytes()[:-9])
+        run = Run(folder)
+        assert len(run.outcomes) == 2
+        assert run.torn
+
+    @pytest.mark.parametrize("index", [-1, 3, 10**9])
+    def test_has_no_case_beyond_its_last(self, folder, index):
+        with pytest.raises(UserError) as error:
+            Run(folder).trajectory(index)
+        assert_sentence(error, f"no case {index}", "0 to 2")
+
+    @pytest.mark.parametrize("name", ["campaign.json", "outcomes.jsonl"])
+    def test_without_one_of_its_files_is_no_campaign(self, folder, name):
+        (folder / name).unlink()
+        with pytest.raises(UserError) as error:
+            Run(folder)
+        assert_sentence(error, "not a campaign", name)
+
+    def test_that_does_not_exist_is_no_campaign(self, tmp_path):
+        with pytest.raises(UserError) as error:
+            Run(tmp_path / "nowhere")
+        assert_sentence(error, "not a campaign")
+
+    @pytest.mark.parametrize("text", [b"", b"{", b"\xff", b'["a", "list"]', b"7"])
+    def test_refuses_settings_that_are_no_json_object(self, folder, text):
+        (folder / "campaign.json").write_bytes(text)
+        with pytest.raises(UserError) as error:
+            Run(folder)
+        assert_sentence(error, "campaign.json")
+
+    def test_says_when_the_trajectories_of_a_case_are_missing(self, folder):
+        (folder / "trajectories" / "00001.npz").unlink()
+        run = Run(folder)
+        assert len(run.trajectory(0).motion) == 61
+        with pytest.raises(UserError) as error:
+            run.trajectory(2)
+        assert_sentence(error, "00001.npz")
+
+    def test_says_when_a_batch_lacks_a_case(self, folder):
+        batches = folder / "trajectories"
+        (batches / "00000.npz").replace(batches / "00001.npz")
+        with pytest.raises(UserError) as error:
+            Run(folder).trajectory(2)
+        assert_sentence(error, "no trajectory of case 2")
+
+    @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
+    def test_refuses_trajectories_that_are_cut_off(self, folder, share):
+        path = folder / "trajectories" / "00000.npz"
+        whole = path.read_bytes()
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(UserError) as error:
+            Run(folder).trajectory(0)
+        assert_sentence(error, "00000.npz")
+
+    def test_refuses_trajectories_with_a_flipped_bit(self, folder):
+        path = folder / "trajectories" / "00000.npz"
+        spoilt = bytearray(path.read_bytes())
+        spoilt[len(spoilt) // 2] ^= 1
+        path.write_bytes(spoilt)
+        with pytest.raises(UserError) as error:
+            Run(folder).trajectory(0)
+        assert_sentence(error, "00000.npz")
+
+    def test_runs_no_code_that_hides_in_trajectories(self, folder):
+        class Trap:
+            def __reduce__(self):
+                return (os.mkdir, (str(folder / "trapped"),))
+
+        hidden = np.array([Trap()], dtype=object)
+        path = folder / "trajectories" / "00000.npz"
+        np.savez(path, index=np.array([0, 1]), rows=np.array([1, 1]), motion=hidden)
+        with pytest.raises(UserError) as error:
+            Run(folder).trajectory(0)
+        assert_sentence(error, "00000.npz")
+        assert not (folder / "trapped").exists()
+
+
+def test_every_measure_is_in_the_record():
+    record = episode(0)[0].to_record()
+    elsewhere = {"nearest", *FOLLOWED_UP}  # in traffic, and where there is a follow-up
+    assert {field.name for field in fields(Measures)} - elsewhere <= set(record)

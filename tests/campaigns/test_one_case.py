@@ -1,0 +1,204 @@
+"""One case on its own: on the command line, from Python, and live in sumo-gui."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plans import plan_for
+from processes import ports_of
+
+from merge_sumo.campaigns.one_case import case_of, run_one
+from merge_sumo.errors import UserError
+from merge_sumo.reports.motion import lines_of, motion_lines
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.sumo.live import LABEL, Window
+from merge_sumo.sumo.replay_labels import TEXT, case_line, verdict_line
+from merge_sumo.values.case import Case
+
+STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
+SAFE = ("--level", "0", "--x", "-300", "--v", "34")
+COLLIDES = Case(level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6)
+
+
+class TestTheCommand:
+    def test_shows_the_stalemate_of_the_shipped_folder(self, command_line):
+        code, out, _ = command_line("run", "--vut", "design2", *STALEMATE)
+        assert code == 1
+        assert "MERGED at 9.3 s, contact at a relative speed of" in out
+        assert "stalemate" in out
+        assert "impact speed" in out
+
+    def test_has_a_row_for_each_second_and_one_for_the_end(self, command_line):
+        _, out, _ = command_line("run", "--vut", "design2", *STALEMATE)
+        table = out[out.index("  t s") :].splitlines()
+        assert [row.split()[0] for row in table[1:]] == [f"{t}.0" for t in range(10)] + ["9.3"]
+        assert {row.rindex("|") for row in table[1:-2]} == {table[0].index("M", 60)}
+
+    def test_ends_with_0_when_the_vut_merges(self, command_line):
+        code, out, _ = command_line("run", "--vut", "design2", *SAFE)
+        assert (code, "MERGED" in out) == (0, True)
+
+    def test_says_what_is_outside_of_the_pool(self, command_line):
+        case = ("--vut", "design2", "--level", "0", "--v", "34", "--x")
+        said = "note: x_POV0 -900.0 m is outside of the pool, -340 to -180 m: "
+        assert said in command_line("run", *case, "-900")[2]
+        assert command_line("run", *case, "-340")[2] == ""
+
+    def test_keeps_the_case_as_a_folder_that_replays(self, command_line, tmp_path):
+        command_line("run", "--vut", "design2", *SAFE, "--out", tmp_path / "kept")
+        assert command_line("replay", tmp_path / "kept")[:2] == (
+            0,
+            f"identical: {_rows(tmp_path / 'kept')} rows of x, y, position and speed\n",
+        )
+
+    def test_of_a_campaign_is_replayed_by_its_index_as_often_as_one_likes(
+        self, command_line, run, tmp_path
+    ):
+        folder = shutil.copytree(run.folder, tmp_path / "run")
+        index = next(o.index for o in run.outcomes if not o.failed)  # which is not exported yet
+        for _ in range(2):
+            code, out, _ = command_line("replay", folder, index)
+            assert (code, out.startswith("identical: ")) == (0, True)
+        assert (folder / "scenarios" / f"case-{index:05d}" / "replay.sumocfg").is_file()
+        code, _, said = command_line("replay", folder)
+        assert (code, f"{folder} is a campaign: say which case" in said) == (2, True)
+        assert command_line("replay", folder, 60)[0] == 2
+
+    def test_that_is_no_campaigns_has_no_index(self, command_line):
+        code, _, said = command_line("replay", "scenarios/stalemate", 3)
+        assert (code, "is no campaign, so it has no case 3" in said) == (2, True)
+
+    def test_says_the_same_of_a_recorded_case_as_its_campaign(self, command_line, run):
+        code, out, _ = command_line("run", "--case", run.folder, "7", "--json")
+        told = json.loads(out)
+        was = run.outcome(7)
+        assert told["score"] == was.measures.score
+        assert (np.array(told["motion"]) == run.trajectory(7).motion).all()
+        assert code == (1 if was.failed else 0)
+
+    def test_puts_another_vut_and_other_numbers_into_a_recorded_case(self, command_line, run):
+        _, out, _ = command_line("run", "--case", run.folder, "7", "--vut", "level0", "--v", "30")
+        assert f"x_POV0 {run.outcome(7).case.x_pov0_m:.1f} m, v_POV0 30.00 m/s" in out
+
+    def test_runs_a_vut_in_this_process_for_a_debugger(self, command_line, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        Path("mine.py").write_text("import os\ndef f(seen):\n    raise ValueError(os.getpid())\n")
+        _, out, _ = command_line("run", "--vut", "mine.py:f", *SAFE, "--debug")
+        assert f"ValueError: {os.getpid()}" in out
+        _, out, _ = command_line("run", "--vut", "mine.py:f", *SAFE)
+        assert "ValueError: " in out
+        assert f"ValueError: {os.getpid()}" not in out
+
+    @pytest.mark.parametrize(
+        ("arguments", "part"),
+        [
+            (SAFE, "say with --vut who drives"),
+            (("--vut", "my_vut.py", *SAFE), "my_vut.py:NAME"),
+            (("--vut", "design2", "--x", "-300"), "--v (v_pov0_mps) is missing"),
+            (("--vut", "design2", *SAFE, "--psi", "0.2"), "--psi (svo_rad) is none of"),
+            (("--vut", "design2", *SAFE, "--headway-ahead", "2"), "--headway-ahead"),
+            (("--vut", "design2", "--level", "2", "--x", "-300", "--v", "34"), "--psi"),
+            (("--vut", "design9", *SAFE), "design9"),
+            (("--vut", "design2", "--x", "-300", "--v", "34", "--level", "all"), "--level all"),
+            (("--case", "nowhere", "3"), "not a campaign"),
+        ],
+    )
+    def test_is_refused_in_a_sentence(self, command_line, arguments, part):
+        code, out, err = command_line("run", *arguments)
+        assert (code, out) == (2, "")
+        assert part in err
+
+    def test_without_a_display_no_window_opens(self, command_line, monkeypatch):
+        monkeypatch.delenv("DISPLAY", raising=False)
+        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+        code, _, err = command_line("run", "--vut", "design2", *SAFE, "--gui")
+        assert (code, "needs a display" in err) == (2, True)
+
+
+def _rows(folder: Path) -> int:
+    return (folder / "episode.fcd.xml").read_text().count("<vehicle ")
+
+
+def test_in_traffic_the_table_has_all_cars():
+    where = named_scenario("us23-traffic")
+    values = {"x_pov0_m": -300, "v_pov0_mps": 30, "headway_ahead_s": 2, "headway_behind_s": 2}
+    case = case_of(where, 0, values)
+    ended = run_one(plan_for("design2", scenario=where), case)
+    head, first, *_ = motion_lines(ended.trajectory)
+    assert all(name in head for name in ("x POV", "x VUT", "x AHEAD", "x BEHIND"))
+    assert [letter for letter in first[-48:] if letter.isalpha()] == ["b", "P", "a", "V"]
+    assert lines_of(ended.outcome, ended.trajectory)[0].endswith("headway behind 2.00 s")
+
+
+class TestInSumoGui:
+    @pytest.fixture
+    def window(self, display, monkeypatch):
+        """Let windows open on a display of the test, without waiting for anybody."""
+        monkeypatch.setenv("DISPLAY", display)
+        monkeypatch.setattr(Window, "wait", lambda _: None)
+        monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
+        return monkeypatch
+
+    def test_a_case_is_run_live_and_moves_as_without_a_window(self, window):
+        slept: list[float] = []
+        window.setattr(Window, "__init__", _with_sleep(Window.__init__, slept.append))
+        plan = plan_for("design2", corridors=1)
+        live = run_one(plan, COLLIDES, live=True)
+        without = run_one(plan, COLLIDES)
+        assert (live.trajectory.motion == without.trajectory.motion).all()
+        assert live.outcome == without.outcome
+        assert len(slept) == len(live.trajectory.motion) - 1, "every step waits for its time"
+
+    def test_the_window_says_the_case_and_the_verdict_and_labels_keep_apart(self, window):
+        lines: list[str] = []
+        labels: list[str] = []
+
+        def look(this: Window) -> None:
+            this._look()
+            lines.extend(this._poi.getParameter(name, TEXT) for name in this._poi.getIDList())
+            names = this.vehicle.getIDList()
+            labels.extend(this.vehicle.getParameter(name, LABEL) for name in names)
+
+        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
+        window.setattr(Window, "wait", look)
+        live = run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
+        assert lines == [case_line(COLLIDES), verdict_line(live.outcome)]
+        first, second = sorted(labels)  # a space is before any letter
+        assert first.startswith(" ")
+        assert second.endswith(" ")
+        assert {label.split()[0] for label in labels} == {"POV", "VUT"}
+
+    def test_opens_no_port(self, window):
+        ports: list[list[str]] = []
+
+        def look(this: Window) -> None:
+            ports.append(ports_of(this._child.process.pid))
+            step(this)
+
+        step = Window.step
+        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
+        window.setattr(Window, "step", look)
+        run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
+        assert len(ports) > 20
+        assert not any(ports)
+
+    def test_a_window_that_is_closed_is_said_in_a_sentence(self, window):
+        def close_window(this: Window) -> None:
+            if this._shown == 20:
+                this._child.process.kill()
+            step(this)
+
+        step = Window.step
+        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
+        window.setattr(Window, "step", close_window)
+        with pytest.raises(UserError, match="the window was closed before the case had ended"):
+            run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
+
+
+def _with_sleep(init, sleep):
+    return lambda this: init(this, sleep)

@@ -1,0 +1,284 @@
+"""A result depends on its case alone: controllers that remember or draw lots are found out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from conftest import some
+from typer.testing import CliRunner
+
+import merge_sumo as ms
+from merge_sumo import cli
+from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.repeats import (
+    REPEATS,
+    Repeat,
+    chosen_again,
+    read_repeats,
+    spread_places,
+    unrepeatable,
+)
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.errors import UserError
+from merge_sumo.reports.report import write_report
+from merge_sumo.studies.certificate import certify
+from merge_sumo.studies.certificate_runs import runs_points_on
+from merge_sumo.studies.rerun import rerun, settings_today
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.trajectory import End
+
+SHY = """
+    def act(self, seen):
+        gap_m = seen.x_pov_m - seen.x_vut_m
+        if seen.x_vut_m > -60.0 and abs(gap_m) < 15.0:
+            {remember}
+        return -2.0 if {remembered} and seen.v_vut_mps > 10.0 else 1.0
+"""
+OWN = SHY.format(remember="self.shy = True", remembered="self.shy")
+WITHOUT_RESET = "class Vut:\n    def __init__(self):\n        self.shy = False\n" + OWN
+WITH_RESET = "class Vut:\n    def reset(self, seen):\n        self.shy = False\n" + OWN
+FORGETS = "class Vut:\n    shy = False\n    def reset(self, seen):\n        pass\n" + OWN
+IN_ITS_CLASS = "class Vut:\n    shy = False\n" + SHY.format(
+    remember="Vut.shy = True", remembered="Vut.shy"
+)
+IN_ITS_MODULE = "import collections\nSEEN = collections.Counter()\nclass Vut:\n" + SHY.format(
+    remember="SEEN['near'] += 1", remembered="SEEN['near'] % 7 == 3"
+)
+ATTRIBUTE = """
+def Vut(seen):
+    Vut.steps = getattr(Vut, "steps", 0) + 1
+    return 1.0 - 1e-6 * (Vut.steps > 3000)
+"""
+RANDOM = "import random\ndef Vut(seen):\n    return 1.0 + random.random() / 100.0\n"
+REMEMBERING = {
+    "forgets": FORGETS,
+    "class": IN_ITS_CLASS,
+    "module": IN_ITS_MODULE,
+    "attribute": ATTRIBUTE,
+}
+
+
+@pytest.fixture
+def vut(tmp_path):
+    def write(source: str) -> str:
+        path = tmp_path / f"vut{len(list(tmp_path.glob('*.py')))}.py"
+        path.write_text(source, encoding="utf-8")
+        return f"{path}:Vut"
+
+    return write
+
+
+def campaign(spec: str, folder: Path, workers: int = 1, **settings) -> Run:
+    given = {"vut": spec, "levels": (0,), "cases": 60, "sampler": "uniform", **settings}
+    with open_workers(workers) as there:
+        return run_campaign(CampaignSettings(**given), folder, workers=there)
+
+
+def test_a_class_without_reset_drives_as_one_with_it(vut, tmp_path):
+    lines = []
+    for number, (source, workers) in enumerate([(WITH_RESET, 1), (WITHOUT_RESET, 2)]):
+        run = campaign(vut(source), tmp_path / f"run{number}", workers)
+        lines.append((run.folder / "outcomes.jsonl").read_bytes())
+        repeats = read_repeats(run)
+        assert len(repeats) == 8
+        assert all(one.same for one in repeats)
+    assert lines[0] == lines[1]
+
+
+def test_an_object_without_reset_is_closed_before_the_next_one_is_made(vut, tmp_path):
+    log = tmp_path / "log"
+    source = f"""
+class Vut:
+    def __init__(self):
+        self.note("made")
+    def close(self):
+        self.note("closed")
+    def note(self, what):
+        with open({str(log)!r}, "a") as file:
+            print(what, file=file)
+    def act(self, seen):
+        return 1.0
+"""
+    CliRunner().invoke(
+        cli.app, ["run", "--vut", vut(source), "--x", "-300", "--v", "30"], catch_exceptions=False
+    )
+    assert log.read_text().split() == ["made", "closed"]
+    log.unlink()
+    campaign(vut(source), tmp_path / "run", cases=8)
+    noted = log.read_text().split()
+    assert noted.count("made") == noted.count("closed") > 8
+
+
+def test_a_constructor_that_takes_too_long_says_what_would_help(vut, tmp_path):
+    source = """
+import time
+class Vut:
+    made = 0
+    def __init__(self):
+        Vut.made += 1
+        time.sleep(30.0 if Vut.made > 32 else 0.0)
+    def act(self, seen):
+        return 1.0
+"""
+    run = campaign(vut(source), tmp_path / "run", cases=33, deadline_s=0.3)
+    errors = {o.measures.error for o in run.outcomes if o.measures.end is End.VUT_ERROR}
+    assert errors == {
+        "made anew for this episode, as it has no `reset`: took longer than the deadline of 0.3 s"
+    }
+
+
+@pytest.mark.filterwarnings("ignore:.*drives:UserWarning")
+def test_a_callable_object_of_python_begins_every_episode_as_it_was_given(tmp_path):
+    class Counts:
+        asked = 0
+
+        def __call__(self, _seen):
+            self.asked += 1
+            return 0.001 * self.asked
+
+    vut = Counts()
+    run = ms.campaign(vut, level=0, cases=40, batch=20, out=tmp_path / "run")
+    assert vut.asked == 0
+    assert {run.trajectory(k).a_vut_mps2[0] for k in range(40)} == {0.001}
+    assert all(one.same for one in run.repeats)
+
+
+@pytest.mark.parametrize("name", some(REMEMBERING, "module"))
+def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, name):
+    spec, folder = vut(REMEMBERING[name]), tmp_path / "run"
+    arguments = ["campaign", "--vut", spec, "--level", "0", "--cases", "60", "--sampler"]
+    arguments += ["uniform"]
+    done = CliRunner().invoke(cli.app, [*arguments, "--out", str(folder), "-q"])
+    assert done.stdout.startswith("Not repeatable: ")
+    run = Run(folder)
+    assert len(run.outcomes) == 60
+    repeats = read_repeats(run)
+    assert len(repeats) == 8
+    assert [one.index for one in repeats[:4]] == list(range(4))
+    differing = [one for one in repeats if not one.same]
+    assert differing
+    assert {one.first for one in differing} == {"vut"}
+    said = unrepeatable(repeats)
+    assert said is not None
+    assert f"{len(differing)} of 8 cases" in said
+    assert said.split(" (case")[0] in write_report(run).read_text()
+    assert said.split(" (case")[0] in ms.open_run(folder)._repr_html_()
+    # check-vut tells that it is no randomness, and rerun that no file has changed.
+    checked = CliRunner().invoke(cli.app, ["check-vut", spec])
+    assert checked.exit_code == 1
+    assert "It keeps something from earlier episodes" in checked.stdout
+    again = rerun(run, settings_today(run, trust=True))
+    assert again.unrepeated
+    assert "no file of the VUT has changed" in str(again)
+
+
+def test_a_random_controller_is_found_and_told_from_one_that_remembers(vut, tmp_path):
+    run = campaign(vut(RANDOM), tmp_path / "run", cases=40)
+    repeats = read_repeats(run)
+    assert {one.differs_from_s for one in repeats} == {0.0}
+    checked = CliRunner().invoke(cli.app, ["check-vut", run.settings["vut"]])
+    assert "It draws random numbers, reads a clock" in checked.stdout
+
+
+def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path):
+    run = campaign("design2", tmp_path / "run", pov=vut(IN_ITS_MODULE), levels=(0, 3), cases=80)
+    repeats = read_repeats(run)
+    assert {run.outcome(one.index).case.level for one in repeats} == {3}
+    differing = [one for one in repeats if not one.same]
+    assert {one.first for one in differing} == {"pov"}
+    assert "the POV draws random numbers" in str(unrepeatable(repeats))
+
+
+def test_a_certificate_of_what_remembers_is_none(vut, tmp_path):
+    settings = CampaignSettings(vut=vut(IN_ITS_CLASS), levels=(0,))
+    net = road_for(settings.scenario)
+    with open_workers(1) as there:
+        run = runs_points_on(there, settings, net, tmp_path)
+        done = certify(settings, 0.08, tmp_path / "certificate", net, run)
+    assert done.levels[0].otherwise > 0
+    assert not done.certain
+    assert "nothing is certain" in done.sentence
+
+
+def test_an_error_of_the_second_time_says_nothing(vut, tmp_path):
+    source = """
+EPISODES = []
+def Vut(seen):
+    EPISODES.append(None) if seen.t_s == 0.0 else None
+    return 1.0 if len(EPISODES) <= 60 else None
+"""
+    run = campaign(vut(source), tmp_path / "run")
+    assert not any(outcome.measures.end.is_error for outcome in run.outcomes)
+    assert read_repeats(run) == []
+
+
+def test_a_client_that_nobody_starts_is_not_waited_for_again(run):
+    settings = CampaignSettings(vut="traci", levels=(0,))
+    assert chosen_again(run.outcomes, settings) == []
+    started = CampaignSettings(vut="traci", vut_command="python3 client.py {port}", levels=(0,))
+    assert len(chosen_again(run.outcomes, started)) == 8
+
+
+def test_drivers_of_the_package_run_once(run, tmp_path):
+    assert read_repeats(run) == []
+    assert not (run.folder / REPEATS).exists()
+    assert chosen_again(run.outcomes, CampaignSettings(vut="design1", levels=(0,))) == []
+
+
+def test_a_campaign_that_went_on_says_the_same_as_one_that_never_stopped(vut, tmp_path):
+    spec = vut(WITH_RESET)
+    whole = campaign(spec, tmp_path / "whole", cases=40, batch=10)
+    folder = tmp_path / "run"
+    campaign(spec, folder, cases=20, batch=10)
+    resume_campaign(folder, given={"cases": 40}, trust=True)
+    assert (folder / REPEATS).read_bytes() == (whole.folder / REPEATS).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("cases", "count", "places"),
+    [(1, 1, [0]), (2, 1, [0]), (8, 1, [0]), (10, 4, [9, 2, 1, 0]), (3, 3, [2, 1, 0]), (0, 0, [])],
+)
+def test_the_first_cases_run_again_and_others_of_the_whole_campaign(cases, count, places):
+    assert spread_places(cases, count) == places
+
+
+@pytest.mark.parametrize("cases", [7, 40, 160, 1000])
+def test_no_case_runs_three_times(cases):
+    places = spread_places(cases, min(20, -(-cases // 8)))
+    assert len(set(places)) == len(places)
+    assert places == sorted(places, reverse=True)
+    assert set(places) <= set(range(cases))
+
+
+HONEST = Repeat(3, 1.5, "vut", End.MERGED, failed=False, other_verdict=True).to_record()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"index": 60},
+        {"index": "3"},
+        {"index": True},
+        {"differs_from_s": "1"},
+        {"differs_from_s": 1e300},
+        {"first": "<script>"},
+        {"end": "GONE"},
+        {"failed": None},
+        {"more": 1},
+    ],
+)
+def test_a_file_that_somebody_changed_is_refused_by_its_line(run, tmp_path, change):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("campaign.json", "outcomes.jsonl"):
+        (folder / name).write_bytes((run.folder / name).read_bytes())
+    opened = Run(folder)
+    (folder / REPEATS).write_text(json.dumps(HONEST) + "\n")
+    assert read_repeats(opened) == [Repeat(3, 1.5, "vut", End.MERGED, False, True)]
+    (folder / REPEATS).write_text(json.dumps(HONEST) + "\n" + json.dumps({**HONEST, **change}))
+    with pytest.raises(UserError, match=r"line 2 of .*repeats.jsonl is of no case"):
+        read_repeats(opened)

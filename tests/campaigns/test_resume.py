@@ -1,0 +1,468 @@
+"""A campaign that was stopped, however it was, goes on as if it had not been."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import some
+from processes import wait_for
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.campaigns.campaign import SCENARIOS, resume_campaign, run_campaign
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.versions import differences
+from merge_sumo.errors import UserError
+from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.system import folders, interrupt
+from merge_sumo.system.interrupt import Interrupt, Stopped
+
+BATCH = 8
+MOUNT = shutil.which("mount")
+KILLER = Path(__file__).resolve().parents[2] / "tools" / "kill_campaigns.py"
+
+
+def settings(sampler: str = "annealing", **changes) -> CampaignSettings:
+    values = {"vut": "design1", "levels": (0,), "cases": 28, "batch": BATCH, "seed": 2}
+    return CampaignSettings(sampler=sampler, **{**values, **changes})
+
+
+class StopAfter:
+    """A check that stops a campaign after some batches."""
+
+    def __init__(self, batches: int) -> None:
+        self.left = batches
+
+    def __call__(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise Stopped(signal.SIGINT)
+
+
+def stopped_after(batches: int, folder: Path, sampler: str = "annealing") -> Path:
+    with pytest.raises(Stopped):
+        run_campaign(settings(sampler), folder, check=StopAfter(batches))
+    return folder
+
+
+def outcomes(folder: Path) -> bytes:
+    return (folder / OUTCOMES).read_bytes()
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """Return the folder of a campaign that nobody disturbed."""
+    return run_campaign(settings(), tmp_path_factory.mktemp("whole") / "run").folder
+
+
+@pytest.fixture(scope="module")
+def two_batches(tmp_path_factory) -> Path:
+    return stopped_after(2, tmp_path_factory.mktemp("stopped") / "run")
+
+
+@pytest.fixture
+def folder(two_batches, tmp_path) -> Path:
+    """Return a copy of a campaign that was stopped after two batches of four."""
+    return Path(shutil.copytree(two_batches, tmp_path / "run"))
+
+
+class TestResuming:
+    def test_gives_the_same_bytes_and_files(self, whole, folder):
+        assert outcomes(whole).startswith(outcomes(folder))
+        assert len(Run(folder).outcomes) == 2 * BATCH
+        run = resume_campaign(folder)
+        assert outcomes(folder) == outcomes(whole)
+        assert len(run.outcomes) == 28
+        names = {path.relative_to(folder) for path in folder.rglob("*")}
+        assert names == {path.relative_to(whole) for path in whole.rglob("*")}
+        assert (folder / SETTINGS).read_bytes() == (whole / SETTINGS).read_bytes()
+        assert run.trajectory(27).motion.tobytes() == Run(whole).trajectory(27).motion.tobytes()
+
+    @pytest.mark.parametrize("sampler", some(sorted(SAMPLERS.keys() - {"uniform"}), "coverage"))
+    def test_gives_the_same_bytes_whatever_the_sampler(self, sampler, tmp_path):
+        run_campaign(settings(sampler), tmp_path / "whole")
+        stopped = stopped_after(2, tmp_path / "stopped", sampler)
+        resume_campaign(stopped)
+        assert outcomes(stopped) == outcomes(tmp_path / "whole")
+
+    @pytest.mark.parametrize("lost", [1, 40, 2000, "a line", "a batch and a half"])
+    def test_drops_what_was_not_written_to_its_end_and_says_so(self, whole, folder, lost):
+        lines = outcomes(folder).splitlines(keepends=True)
+        kept = {"a line": 15, "a batch and a half": 4}.get(lost)
+        text = outcomes(folder)[:-lost] if kept is None else b"".join(lines[:kept])
+        (folder / OUTCOMES).write_bytes(text)
+        said: list = []
+        resume_campaign(folder, warn=said.append)
+        assert outcomes(folder) == outcomes(whole)
+        (sentence,) = said
+        assert "dropped" in sentence
+
+    def test_runs_a_batch_again_whose_trajectories_are_gone(self, whole, folder):
+        (folder / TRAJECTORIES / "00001.npz").unlink()
+        resume_campaign(folder)
+        assert outcomes(folder) == outcomes(whole)
+        assert len(Run(folder).trajectory(12).motion) > 1
+
+    def test_names_a_torn_line_in_the_middle_and_changes_nothing(self, folder):
+        lines = outcomes(folder).splitlines(keepends=True)
+        lines[4] = lines[4][:70] + b"\n"
+        (folder / OUTCOMES).write_bytes(b"".join(lines))
+        before = contents(folder)
+        with pytest.raises(UserError, match=r"line 5 of .*outcomes\.jsonl"):
+            resume_campaign(folder)
+        assert contents(folder) == before
+
+    def test_with_more_cases_is_as_one_that_had_them_from_the_start(self, tmp_path, whole):
+        folder = run_campaign(settings("coverage", cases=2 * BATCH), tmp_path / "grown").folder
+        run = resume_campaign(folder, given={"cases": 28})
+        run_campaign(settings("coverage"), tmp_path / "at once")
+        assert outcomes(folder) == outcomes(tmp_path / "at once")
+        assert run.settings["cases"] == 28
+        assert "forced" not in run.settings
+        once = read_settings(tmp_path / "at once")
+        assert differences(once, run.settings) == {}
+
+    def test_tells_what_ran_before_apart(self, folder):
+        before: list = []
+        after: list = []
+        resume_campaign(folder, None, after.append, on_before=before.append)
+        assert [len(before), len(after)] == [2 * BATCH, 28 - 2 * BATCH]
+
+    def test_of_a_finished_campaign_changes_nothing(self, whole):
+        before = contents(whole)
+        assert len(resume_campaign(whole).outcomes) == 28
+        assert contents(whole) == before
+
+    def test_exports_failures_that_are_not_there_yet(self, run, tmp_path):
+        folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
+        first, *_ = sorted((folder / SCENARIOS).iterdir())
+        shutil.rmtree(first)
+        resume_campaign(folder)
+        names = {path.relative_to(folder) for path in folder.rglob("*")}
+        assert names >= {path.relative_to(run.folder) for path in run.folder.rglob("*")}
+
+    def test_tells_of_every_case_also_of_those_before(self, folder):
+        seen = []
+        resume_campaign(folder, on_case=lambda outcome: seen.append(outcome.index))
+        assert sorted(seen) == list(range(28))
+
+    def test_of_no_campaign_is_refused(self, tmp_path):
+        for name in ("nowhere", "."):
+            with pytest.raises(UserError, match="not a campaign"):
+                resume_campaign(tmp_path / name)
+        assert list(tmp_path.iterdir()) == []
+
+
+class TestWhatDiffers:
+    @pytest.mark.parametrize(
+        ("given", "name"),
+        [
+            ({"seed": 3}, "seed differs: .* run with 2, now it is 3"),
+            ({"vut": "design2"}, "vut differs"),
+            ({"levels": (1,)}, "levels differs"),
+            ({"sampler": "gpr"}, "sampler differs"),
+            ({"cases": 24}, "cases differs"),
+            ({"batch": 4}, "batch differs"),
+            ({"v_vut0_mps": 17.0}, "v_vut0_mps differs"),
+        ],
+    )
+    def test_of_the_settings_is_refused_by_name(self, folder, given, name):
+        before = contents(folder)
+        with pytest.raises(UserError, match=name):
+            resume_campaign(folder, given=given)
+        assert contents(folder) == before
+
+    @pytest.mark.parametrize(
+        ("where", "name"),
+        [
+            (("versions", "numpy"), r"versions\.numpy differs"),
+            (("versions", "merge-sumo"), r"versions\.merge-sumo differs"),
+            (("net_sha256",), "net_sha256 differs"),
+            (("policies_sha256", "pov1"), r"policies_sha256\.pov1 differs"),
+        ],
+    )
+    def test_of_software_net_and_policies_is_refused_by_name(self, folder, where, name):
+        edit(folder, where, "another")
+        before = contents(folder)
+        with pytest.raises(UserError, match=name):
+            resume_campaign(folder)
+        assert contents(folder) == before
+
+    def test_is_recorded_when_it_is_forced(self, whole, folder):
+        edit(folder, ("versions", "numpy"), "1.0")
+        resume_campaign(folder, force=True)
+        assert outcomes(folder) == outcomes(whole)
+        record = json.loads((folder / SETTINGS).read_text())
+        now = json.loads((whole / SETTINGS).read_text())["versions"]["numpy"]
+        (forced,) = record["forced"]
+        assert forced == {"from_case": 16, "differs": {"versions.numpy": ["1.0", now]}}
+        assert record["versions"]["numpy"] == now
+        resume_campaign(folder)  # it is settled
+
+    def test_may_be_a_larger_number_of_cases(self, whole, tmp_path):
+        longer = Path(shutil.copytree(whole, tmp_path / "run"))
+        run = resume_campaign(longer, given={"cases": 36})
+        assert len(run.outcomes) == 36
+        assert outcomes(longer).startswith(outcomes(whole))
+        assert [outcome.batch for outcome in run.outcomes][-9:] == [3] + [4] * 8
+
+    def test_is_nothing_where_what_is_given_is_what_was_recorded(self, whole, folder):
+        resume_campaign(folder, given={"seed": 2, "levels": (0,), "v_vut0_mps": 18})
+        assert outcomes(folder) == outcomes(whole)
+
+    def test_by_hand(self):
+        was = {"a": 1, "b": {"x": 1, "y": 2}, "levels": [0, 1], "gone": 0}
+        now = {"a": 1, "b": {"x": 1, "y": 3}, "levels": (0, 1), "new": 5}
+        assert differences(was, now) == {"b.y": (2, 3), "gone": (0, None), "new": (None, 5)}
+
+
+def edit(folder: Path, where: tuple[str, ...], value) -> None:
+    """Change a value of campaign.json, as a person may who removes its checksum."""
+    record = json.loads((folder / SETTINGS).read_text())
+    del record[CHECKSUM]
+    inner = record
+    for key in where[:-1]:
+        inner = inner[key]
+    inner[where[-1]] = value
+    (folder / SETTINGS).write_text(json.dumps(record))
+
+
+class TestTwoProcessesOnOneFolder:
+    def test_are_one_too_many(self, folder):
+        journal, _, _ = Journal.reopen(folder)
+        before = contents(folder)
+        with journal, pytest.raises(UserError, match="another process writes"):
+            resume_campaign(folder)
+        assert contents(folder) == before
+        resume_campaign(folder)
+
+    def test_are_one_too_many_from_its_very_beginning(self, tmp_path):
+        journal = Journal.create(tmp_path / "run", {})
+        with journal, pytest.raises(UserError, match="another process writes"):
+            Journal.reopen(tmp_path / "run")
+
+    def test_leave_no_lock_behind_when_one_is_killed(self, folder):
+        script = (
+            "import os, sys, pathlib; from merge_sumo.campaigns.journal import Journal;"
+            "kept = Journal.reopen(pathlib.Path(sys.argv[1])); os.kill(os.getpid(), 9)"
+        )
+        killed = subprocess.run([sys.executable, "-c", script, str(folder)], check=False)
+        assert killed.returncode == -signal.SIGKILL
+        resume_campaign(folder)
+
+    def test_that_create_one_folder_leave_it_to_the_first(self, tmp_path, monkeypatch):
+        take_name = folders._take_name
+
+        def overtaken(new: Path, path: Path, shown: Path, option: str) -> None:
+            monkeypatch.setattr(folders, "_take_name", take_name)
+            Journal.create(shown, {"first": True})
+            take_name(new, path, shown, option)
+
+        monkeypatch.setattr(folders, "_take_name", overtaken)
+        with pytest.raises(UserError, match="run exists"):
+            Journal.create(tmp_path / "run", {"first": False})
+        assert read_settings(tmp_path / "run") == {"first": True}
+        assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+class TestADisk:
+    def test_that_becomes_full_ends_in_a_sentence_and_loses_nothing(
+        self, whole, folder, small_disk
+    ):
+        run = Path(shutil.copytree(folder, small_disk / "run"))
+        before = outcomes(run)
+        free = shutil.disk_usage(small_disk).free
+        # Room for outcomes, and not for the trajectories of a batch.
+        (small_disk / "others").write_bytes(bytes(free - 12_288))
+        with pytest.raises(UserError, match=r"cannot write .*No space left on device.*--resume"):
+            resume_campaign(run)
+        assert outcomes(run) == before
+        (small_disk / "others").unlink()
+        with contextlib.suppress(UserError):
+            resume_campaign(run)  # the scenarios may not fit
+        assert outcomes(run) == outcomes(whole)
+
+    def test_that_is_full_takes_no_new_campaign(self, small_disk):
+        (small_disk / "others").write_bytes(bytes(shutil.disk_usage(small_disk).free))
+        with pytest.raises(UserError, match=r"cannot write .*No space left on device"):
+            run_campaign(settings(), small_disk / "run")
+        assert [path.name for path in small_disk.iterdir()] == ["others"]
+
+    def test_that_is_read_only_is_refused_and_left_alone(self, folder, small_disk):
+        run = Path(shutil.copytree(folder, small_disk / "run"))
+        before = contents(run)
+        subprocess.run([MOUNT, "-o", "remount,ro", str(small_disk)], check=True)
+        with pytest.raises(UserError, match=r"cannot write .*Read-only file system"):
+            resume_campaign(run)
+        with pytest.raises(UserError, match=r"cannot write .*Read-only file system"):
+            run_campaign(settings(), small_disk / "another")
+        assert contents(run) == before
+        assert len(Run(run).outcomes) == 2 * BATCH, "it can still be read"
+
+
+COMMAND = [sys.executable, "-m", "merge_sumo.cli", "campaign"]
+LONG = [*("--vut", "design1", "--level", "0", "--sampler", "uniform"), "--cases", "1000000"]
+
+
+class TestASignal:
+    @pytest.mark.parametrize("number", some([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
+    def test_lets_the_batch_end_and_says_how_to_go_on(self, tmp_path, number):
+        folder = tmp_path / "run"
+        process = started(folder, "--batch", "40")
+        process.send_signal(number)
+        _, said = process.communicate(timeout=600)
+        assert process.returncode == 128 + number
+        assert "finishing the running batch" in said
+        assert f"merge-sumo campaign --resume {folder}" in said
+        assert "Traceback" not in said
+        run = Run(folder)
+        assert not run.torn
+        assert len(run.outcomes) == run.whole_batches() > 0
+        assert len(run.outcomes) % 40 == 0
+
+    def test_stops_at_once_when_it_comes_twice_even_with_workers(self, tmp_path):
+        folder = tmp_path / "run"
+        process = started(folder, "--batch", "100000", "--workers", "2")
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=600)
+        assert process.returncode == 130
+        assert f"merge-sumo campaign --resume {folder}" in said
+        assert "Traceback" not in said
+        assert Run(folder).outcomes == []
+        with Journal.reopen(folder)[0]:
+            pass
+
+    def test_is_noted_in_this_process_and_the_second_one_raises(self, monkeypatch):
+        before = signal.getsignal(signal.SIGINT)
+        said: list = []
+        monkeypatch.setattr(os, "write", lambda file, text: said.append((file, text)))
+        with Interrupt("wait") as stop:
+            stop.check()
+            signal.raise_signal(signal.SIGTERM)
+            with pytest.raises(Stopped) as stopped:
+                stop.check()
+            assert stopped.value.exit_code == 143
+            with pytest.raises(Stopped) as stopped:
+                signal.raise_signal(signal.SIGINT)
+            assert stopped.value.exit_code == 130
+        assert said == [(interrupt.STDERR, b"\nwait\n")]
+        assert signal.getsignal(signal.SIGINT) is before
+
+
+def started(folder: Path, *options: str) -> subprocess.Popen[str]:
+    """Start a campaign without an end, and return when it has a folder and is at work."""
+    process = subprocess.Popen(
+        [*COMMAND, *LONG, "--out", str(folder), *options], stderr=subprocess.PIPE, text=True
+    )
+    assert wait_for(lambda: (folder / OUTCOMES).exists() or process.poll() is not None)
+    time.sleep(0.3)
+    assert process.poll() is None, process.stderr.read()
+    return process
+
+
+class TestTheCommand:
+    def test_goes_on_by_its_folder_alone(self, whole, folder):
+        done = subprocess.run(
+            [*COMMAND, "--resume", str(folder), "--json"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["cases"] == 28
+        assert outcomes(folder) == outcomes(whole)
+
+    @pytest.mark.parametrize(
+        ("options", "sentence"),
+        [
+            (("--seed", "9"), "seed differs"),
+            (("--level", "1"), "levels differs"),
+            (("--out", "elsewhere"), "leave --out away"),
+            (("--cases", "0"), "--cases is 0"),
+        ],
+    )
+    def test_refuses_in_a_sentence(self, folder, options, sentence):
+        before = contents(folder)
+        result = CliRunner().invoke(cli.app, ["campaign", "--resume", str(folder), *options])
+        assert isinstance(result.exception, UserError)
+        assert sentence in str(result.exception)
+        assert contents(folder) == before
+
+
+class TestFromAnotherFolder:
+    """Names of a controller's files are relative to where its campaign was begun."""
+
+    @pytest.fixture
+    def begun(self, tmp_path, monkeypatch):
+        """Return a function that begins a campaign here, stops it, and goes elsewhere."""
+
+        def begin(spec: str) -> Path:
+            (tmp_path / "my_vut.py").write_text("def drive(seen):\n    return 1.0\n")
+            monkeypatch.chdir(tmp_path)
+            values = settings(vut=spec, in_process=True)
+            with pytest.raises(Stopped):
+                run_campaign(values, tmp_path / "run", check=StopAfter(2))
+            (tmp_path / "other").mkdir()
+            monkeypatch.chdir(tmp_path / "other")
+            return tmp_path / "run"
+
+        return begin
+
+    def test_goes_on_with_a_controller_that_is_named_by_its_whole_path(self, begun, tmp_path):
+        folder = begun(f"{tmp_path / 'my_vut.py'}:drive")
+        assert len(resume_campaign(folder).outcomes) == 28
+
+    def test_of_one_that_has_changed_is_refused(self, begun, tmp_path):
+        folder = begun(f"{tmp_path / 'my_vut.py'}:drive")
+        (tmp_path / "my_vut.py").write_text("def drive(seen):\n    return 0.5\n")
+        with pytest.raises(UserError, match=r"vut_files\.my_vut\.py differs"):
+            resume_campaign(folder)
+
+    def test_says_where_to_go_for_one_beside_which_it_was_begun(self, begun, monkeypatch):
+        folder = begun("my_vut.py:drive")
+        before = contents(folder)
+        with pytest.raises(UserError, match=r"was begun where my_vut\.py is"):
+            resume_campaign(folder)
+        assert contents(folder) == before
+        monkeypatch.chdir(folder.parent)
+        assert len(resume_campaign(folder).outcomes) == 28
+
+
+def kill_campaigns(kills: int, seed: int) -> str:
+    """Kill and resume campaigns, and return what was said of each."""
+    done = subprocess.run(
+        [sys.executable, str(KILLER), "--kills", str(kills), "--seed", str(seed)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_campaigns_that_are_killed_and_resumed_have_the_same_outcomes():
+    assert "the same outcomes.jsonl after 2 of 2 kills" in kill_campaigns(2, seed=1)
+
+
+@pytest.mark.long
+def test_100_campaigns_that_are_killed_and_resumed_have_the_same_outcomes():
+    assert "the same outcomes.jsonl after 100 of 100 kills" in kill_campaigns(100, seed=0)

@@ -1,0 +1,514 @@
+"""The command line: what it prints where, how it ends, and what it leaves alone."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from lxml import etree
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.campaigns.run import Run, failures, read_settings, spread_failures
+from merge_sumo.road.merge import default_net_path
+from merge_sumo.sumo.binding import DEBIAN_PACKAGES, SUMO_VERSION, sumo_program
+from merge_sumo.sumo.replay_folder import CONFIG, RECORD
+
+COMMANDS = [command.name or command.callback.__name__ for command in cli.app.registered_commands]
+SMALL = ("campaign", "--vut", "design1", "--level", "0")
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a command printed, and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+
+Call = Callable[..., Said]
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path, command_line) -> Call:
+    """Return what runs the command line, from an empty folder."""
+    folder = tmp_path / "cwd"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return lambda *arguments: Said(*command_line(*arguments))
+
+
+@pytest.fixture
+def campaign(run, tmp_path) -> Path:
+    """Return a copy of the finished campaign."""
+    return Path(shutil.copytree(run.folder, tmp_path / "campaign"))
+
+
+@pytest.fixture
+def scenario(run, tmp_path) -> Path:
+    """Return a copy of an exported failure."""
+    (first, *_) = sorted((run.folder / "scenarios").iterdir())
+    return Path(shutil.copytree(first, tmp_path / "scenario"))
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    """Return everything below a folder: files with their bytes, folders with None."""
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+def assert_refused(said: Said, *parts: str) -> None:
+    """One sentence on standard error, nothing on standard output, exit code 2."""
+    assert said.code == 2
+    assert said.out == ""
+    assert said.err.startswith("merge-sumo: ")
+    assert said.err.endswith("\n")
+    assert said.err.count("\n") == 1
+    for part in parts:
+        assert part in said.err
+
+
+def diverge(scenario: Path) -> None:
+    """Let the record of a scenario have a speed at which the vehicle does not move."""
+    record = etree.parse(scenario / RECORD)
+    vehicle = record.findall("timestep")[20][1]
+    vehicle.set("speed", str(float(vehicle.get("speed")) + 1.0))
+    record.write(scenario / RECORD)
+
+
+class TestACampaignThatCannotRunIsRefusedInOneSentence:
+    @pytest.mark.parametrize(
+        ("arguments", "parts"),
+        [
+            (("--vut", "design9"), ("'design9'", "design1", "level0")),
+            (("--vut", ""), ("design1",)),
+            (("--level", "3"), ("'3'", "0, 1, 2 or all")),
+            (("--level", "-1"), ("'-1'", "0, 1, 2 or all")),
+            (("--cases", "0"), ("--cases is 0",)),
+            (("--cases", "-5"), ("--cases is -5",)),
+            (("--cases", "-5", "--batch", "5"), ("--cases is -5",)),
+            (("--cases", "10", "--batch", "0"), ("--batch is 0",)),
+            (("--cases", "10", "--batch", "-1"), ("--batch is -1",)),
+            (("--cases", "10", "--batch", "11"), ("--batch is 11", "--cases is 10")),
+            (("--sampler", "grp"), ("'grp'", "gpr", "uniform")),
+            (("--seed", "-1"), ("--seed is -1",)),
+            (("--v-vut0", "46"), ("46", "45")),
+            (("--v-vut0", "nan"), ("nan", "45")),
+            (("--net", "nowhere.net.xml"), ("nowhere.net.xml",)),
+        ],
+        ids=" ".join,
+    )
+    def test_for_its_settings(self, call, tmp_path, arguments, parts):
+        before = contents(tmp_path)
+        others = [option for option in (SMALL[1:3], SMALL[3:5]) if option[0] not in arguments]
+        assert_refused(call(SMALL[0], *sum(others, ()), "--out", "run", *arguments), *parts)
+        assert contents(tmp_path) == before
+
+    @pytest.mark.parametrize("level", ["1", "2"])
+    def test_for_a_level_without_a_policy(self, call, tmp_path, monkeypatch, level):
+        monkeypatch.setattr("merge_sumo.engine.povs.policies_sha256", lambda _: {})
+        before = contents(tmp_path)
+        said = call("campaign", "--vut", "design1", "--level", level, "--out", "run")
+        assert_refused(said, f"level {level}", "merge-sumo train")
+        assert contents(tmp_path) == before
+
+    @pytest.mark.parametrize("level", [("--level", "0"), ()], ids=["level 0", "all levels"])
+    def test_for_a_folder_that_exists(self, call, tmp_path, level):
+        (tmp_path / "mine").mkdir()
+        (tmp_path / "mine" / "outcomes.jsonl").write_text("mine")
+        before = contents(tmp_path)
+        said = call(
+            "campaign", "--vut", "design1", *level, "--cases", 4, "--out", tmp_path / "mine"
+        )
+        assert_refused(said, "mine exists", "--out")
+        assert contents(tmp_path) == before
+
+    def test_for_a_file_in_place_of_the_folder(self, call, tmp_path):
+        (tmp_path / "mine").write_text("mine")
+        before = contents(tmp_path)
+        assert_refused(call(*SMALL, "--cases", 4, "--out", tmp_path / "mine"), "mine exists")
+        assert_refused(call(*SMALL, "--cases", 4, "--out", tmp_path / "mine/run"), "cannot write")
+        assert contents(tmp_path) == before
+
+    @pytest.mark.parametrize(
+        ("old", "new"),
+        [
+            ("<net ", "net "),
+            ('<edge id="ramp"', '<edge id="slip_road"'),
+            ('from="ramp" to="main_out"', 'from="ramp" to="main_in"'),
+            ('type="zipper"', 'type="chaos"'),
+            ("</net>", '<edge id="ramp" from="ramp_start" to="M"/></net>'),
+        ],
+        ids=["no XML", "no ramp", "no way onto the road", "an unknown junction", "two ramps"],
+    )
+    def test_for_a_broken_net(self, call, tmp_path, old, new):
+        text = default_net_path().read_text()
+        assert old in text
+        broken = tmp_path / "broken.net.xml"
+        broken.write_text(text.replace(old, new))
+        before = contents(tmp_path)
+        said = call(*SMALL, "--cases", 4, "--net", broken, "--out", "run")
+        assert_refused(said, "broken.net.xml")
+        assert contents(tmp_path) == before
+
+    def test_for_a_system_library_that_libsumo_lacks(self, call, tmp_path, monkeypatch):
+        cannot_import(
+            monkeypatch,
+            "libsumo",
+            ImportError("libGL.so.1: cannot open shared object file: No such file or directory"),
+        )
+        before = contents(tmp_path)
+        said = call(*SMALL, "--cases", 4, "--out", "run")
+        assert_refused(said, "libGL.so.1", "apt-get install", DEBIAN_PACKAGES)
+        assert contents(tmp_path) == before
+
+    def test_for_the_libsumo_of_another_sumo(self, call, tmp_path, monkeypatch):
+        import libsumo
+
+        monkeypatch.setattr(libsumo, "getVersion", lambda: (21, "SUMO 1.18.0"))
+        before = contents(tmp_path)
+        said = call(*SMALL, "--cases", 4, "--out", "run")
+        assert_refused(said, "libsumo is of SUMO 1.18.0", "pip install --force-reinstall")
+        assert contents(tmp_path) == before
+
+    def test_knows_the_sumo_that_the_package_pins(self):
+        pinned = (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+        for package in ("libsumo", "eclipse-sumo", "sumolib"):
+            assert f'"{package}=={SUMO_VERSION}"' in pinned
+
+    def test_for_libsumo_that_is_not_installed(self, call, monkeypatch):
+        cannot_import(monkeypatch, "libsumo", ModuleNotFoundError("No", name="libsumo"))
+        said = call(*SMALL, "--cases", 4, "--out", "run")
+        assert_refused(said, "pip install libsumo==")
+
+
+def cannot_import(monkeypatch, module: str, error: ImportError) -> None:
+    """Let the import of one module by name fail."""
+    import_module = importlib.import_module
+
+    def refuse(name: str, package: str | None = None):
+        if name == module:
+            raise error
+        return import_module(name, package)
+
+    monkeypatch.setattr(importlib, "import_module", refuse)
+
+
+def test_the_debian_packages_are_those_that_the_wheels_need():
+    needed = ("libgl1", "libx11-6", "libxext6", "libxrender1", "libatomic1", "libexpat1")
+    assert sorted(DEBIAN_PACKAGES.split()) == sorted(needed)
+
+
+def run_in_a_process(folder: Path, *arguments: object) -> Said:
+    done = subprocess.run(
+        [sys.executable, "-m", "merge_sumo.cli", *map(str, arguments)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return Said(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory) -> tuple[Path, Said]:
+    """Return where a campaign of 80 cases ran in a process of its own, and what it said."""
+    folder = tmp_path_factory.mktemp("ended")
+    arguments = ("--cases", 80, "--batch", 20, "--seed", 1, "--out", "run", "--json")
+    return folder, run_in_a_process(folder, *SMALL, *arguments)
+
+
+class TestACampaign:
+    @pytest.mark.long
+    def test_of_400_cases_finds_failures_that_replay_identically(self, tmp_path):
+        arguments = ("--cases", 400, "--batch", 20, "--seed", 1, "--out", "run")
+        assert run_in_a_process(tmp_path, *SMALL, *arguments).code == 0
+        assert (tmp_path / "run" / "outcomes.jsonl").read_bytes().count(b"\n") == 400
+        assert len(failures(Run(tmp_path / "run").outcomes)) >= 20
+        exported = sorted((tmp_path / "run" / "scenarios").iterdir())
+        assert len(exported) == 10
+        for folder in exported:
+            assert run_in_a_process(tmp_path, "replay", folder).code == 0
+
+    def test_finds_failures_and_writes_a_line_per_case(self, ended):
+        folder, said = ended
+        assert said.code == 0, said.err
+        run = Run(folder / "run")
+        assert len(run.outcomes) == 80
+        assert (folder / "run" / "outcomes.jsonl").read_bytes().count(b"\n") == 80
+        assert failures(run.outcomes)
+        assert [o.batch for o in run.outcomes] == [index // 20 for index in range(80)]
+
+    def test_prints_exactly_one_json_object_with_its_summary(self, ended):
+        folder, said = ended
+        assert said.out.count("\n") == 1
+        summary = json.loads(said.out)
+        found = len(failures(Run(folder / "run").outcomes))
+        assert (summary["cases"], summary["failures"]) == (80, found)
+        assert summary["levels"]["0"]["failures"] == found
+        # One ball of radius 0.05 has 0.00785.
+        assert 0.0078 < summary["levels"]["0"]["fmc"] <= found * 0.0079
+        assert (folder / summary["report"]).is_file()
+        assert (folder / summary["run"]).is_dir()
+
+    def test_says_on_standard_error_how_far_it_came(self, ended):
+        _, said = ended
+        assert "80/80" in said.err
+        assert " cases/" in said.err
+        assert "failures" in said.err
+
+    def test_exports_its_worst_failures_as_scenarios_that_replay_identically(self, ended, call):
+        folder, _ = ended
+        worst = spread_failures(Run(folder / "run").outcomes)[:10]
+        names = {f"case-{outcome.index:05d}" for outcome in worst}
+        assert {path.name for path in (folder / "run" / "scenarios").iterdir()} == names
+        for name in sorted(names)[:3]:
+            said = call("replay", folder / "run" / "scenarios" / name)
+            assert (said.code, said.err) == (0, "")
+            assert said.out.startswith("identical")
+
+    def test_records_its_settings(self, ended):
+        folder, _ = ended
+        settings = json.loads((folder / "run" / "campaign.json").read_text())
+        for name, value in {"vut": "design1", "levels": [0], "cases": 80, "seed": 1}.items():
+            assert settings[name] == value
+        assert len(settings["net_sha256"]) == 64
+        assert settings["versions"]["libsumo"]
+
+    def test_has_a_report_that_needs_no_network(self, ended):
+        folder, _ = ended
+        page = (folder / "run" / "report.html").read_text()
+        assert "in 80 cases" in page
+        assert "<svg" in page
+        assert "http:" not in page
+        assert "https:" not in page
+
+    def test_with_the_same_seed_gives_the_same_bytes_and_with_another_seed_others(self, call):
+        arguments = (*SMALL, "--cases", 16, "--batch", 8)
+        for folder, seed in (("first", 7), ("second", 7), ("third", 8)):
+            assert call(*arguments, "--seed", seed, "--out", folder).code == 0
+        first, second, third = (
+            Path(name, "outcomes.jsonl").read_bytes() for name in ("first", "second", "third")
+        )
+        assert first == second
+        assert first != third
+        assert first.count(b"\n") == third.count(b"\n") == 16
+
+    def test_gives_the_same_bytes_in_another_process(self, ended, call):
+        folder, _ = ended
+        # The first two batches know nothing of how many follow.
+        assert call(*SMALL, "--cases", 40, "--batch", 20, "--seed", 1, "--out", "short").code == 0
+        short = Path("short", "outcomes.jsonl").read_bytes()
+        assert (folder / "run" / "outcomes.jsonl").read_bytes().startswith(short)
+
+    def test_tells_a_person_what_to_do_next(self, call):
+        said = call(*SMALL, "--cases", 60, "--seed", 1, "--out", "run")
+        assert said.code == 0
+        assert "failures in 60 cases" in said.out
+        assert f"report: {Path('run', 'report.html')}" in said.out
+        (command,) = (line for line in said.out.splitlines() if line.startswith("worst case: "))
+        name, *arguments = command.removeprefix("worst case: ").split()
+        assert name == "merge-sumo"
+        arguments.remove("--gui")
+        assert call(*arguments).code == 0
+
+    def test_of_all_levels_says_which_it_has_policies_for(self, call, monkeypatch):
+        monkeypatch.setattr("merge_sumo.engine.povs.policies_sha256", lambda _: {})
+        said = call("campaign", "--vut", "level0", "--cases", 3, "--out", "run", "--json")
+        assert said.code == 0
+        assert list(json.loads(said.out)["levels"]) == ["0"]
+        assert "level 0" in said.err
+        assert "merge-sumo train" in said.err
+
+    def test_goes_by_default_into_a_folder_named_after_the_vut(self, call):
+        assert call(*SMALL, "--cases", 2, "--sampler", "uniform").code == 0
+        (folder,) = Path("runs").glob("*-*")
+        assert Path("runs/latest").resolve() == folder.resolve()
+        assert folder.name.startswith("design1-")
+        assert len(Run(folder).outcomes) == 2
+
+
+class TestExport:
+    def test_writes_the_cases_that_it_is_asked_for(self, call, campaign):
+        said = call("export", campaign, 3, 0, "--out", "cases")
+        assert said.code == 0
+        configs = [Path("cases", name, CONFIG) for name in ("case-00003", "case-00000")]
+        assert said.out.splitlines() == [str(config) for config in configs]
+        assert all(config.is_file() for config in configs)
+
+    def test_writes_into_the_campaign_by_default(self, call, campaign):
+        case = next(o.index for o in Run(campaign).outcomes if not o.failed)
+        assert call("export", campaign, case).code == 0
+        assert (campaign / "scenarios" / f"case-{case:05d}" / CONFIG).is_file()
+
+    @pytest.mark.parametrize("cases", [(60,), (0, 60), (10**9, 0)])
+    def test_refuses_a_case_that_there_is_not_and_writes_nothing(
+        self, call, campaign, tmp_path, cases
+    ):
+        before = contents(tmp_path)
+        assert_refused(call("export", campaign, *cases, "--out", "cases"), "no case", "0 to 59")
+        assert contents(tmp_path) == before
+
+    def test_refuses_a_folder_that_exists(self, call, campaign, tmp_path):
+        (tmp_path / "cases" / "case-00000").mkdir(parents=True)
+        before = contents(tmp_path)
+        assert_refused(call("export", campaign, 0, "--out", tmp_path / "cases"), "exists")
+        assert contents(tmp_path) == before
+
+    def test_refuses_a_folder_that_is_no_campaign(self, call, tmp_path):
+        assert_refused(call("export", tmp_path, 0), "not a campaign")
+
+    def test_refuses_trajectories_that_are_gone(self, call, campaign, tmp_path):
+        shutil.rmtree(campaign / "trajectories")
+        before = contents(tmp_path)
+        assert_refused(call("export", campaign, 0, "--out", "cases"), "trajectories")
+        assert contents(tmp_path) == before
+
+
+class TestReplay:
+    def test_of_a_good_scenario_says_identical_and_exits_with_0(self, call, scenario):
+        said = call("replay", scenario)
+        assert (said.code, said.err) == (0, "")
+        assert said.out.startswith("identical")
+
+    def test_of_another_motion_says_when_it_diverged_and_exits_with_1(self, call, scenario):
+        diverge(scenario)
+        said = call("replay", scenario)
+        assert (said.code, said.err) == (1, "")
+        assert said.out.startswith("diverged at t = 2.0 s")
+        assert said.out.count("\n") == 1
+
+    def test_prints_exactly_one_json_object(self, call, scenario):
+        good = call("replay", scenario, "--json")
+        diverge(scenario)
+        bad = call("replay", scenario, "--json")
+        assert (good.code, bad.code) == (0, 1)
+        assert good.out.count("\n") == bad.out.count("\n") == 1
+        assert json.loads(good.out)["identical"] is True
+        assert json.loads(good.out)["diverged_at_s"] is None
+        assert json.loads(bad.out)["identical"] is False
+        assert json.loads(bad.out)["diverged_at_s"] == 2.0
+
+    def test_refuses_a_folder_that_is_no_scenario(self, call, tmp_path):
+        assert_refused(call("replay", tmp_path / "nowhere"), "not a replay folder")
+        assert_refused(call("replay", tmp_path, "--json"), "not a replay folder")
+
+    @pytest.mark.parametrize("gui", [(), ("--gui",)], ids=["headless", "gui"])
+    def test_refuses_without_sumo(self, call, scenario, tmp_path, monkeypatch, gui):
+        monkeypatch.setenv("DISPLAY", ":0")
+        before = contents(tmp_path)
+        monkeypatch.setattr(importlib.import_module("sumo"), "SUMO_HOME", str(tmp_path / "gone"))
+        assert_refused(call("replay", scenario, *gui), "is missing", "eclipse-sumo==")
+        cannot_import(monkeypatch, "sumo", ModuleNotFoundError("No", name="sumo"))
+        assert_refused(call("replay", scenario, *gui), "is not installed", "eclipse-sumo==")
+        assert contents(tmp_path) == before
+
+    def test_refuses_the_gui_without_a_display(self, call, scenario, monkeypatch):
+        monkeypatch.delenv("DISPLAY", raising=False)
+        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+        assert_refused(call("replay", scenario, "--gui"), "DISPLAY")
+
+    def test_starts_the_program_itself_and_not_its_python_wrapper(self):
+        with Path(sumo_program("sumo")).open("rb") as program:
+            assert program.read(2) != b"#!"
+
+
+class TestReport:
+    def test_is_written_again_and_its_path_printed(self, call, campaign):
+        said = call("report", campaign)
+        assert (said.code, said.err) == (0, "")
+        assert said.out == f"{campaign / 'report.html'}\n"
+        first = (campaign / "report.html").read_text()
+        found = len(failures(Run(campaign).outcomes))
+        assert f"{found} failures in 60 cases" in first
+        (campaign / "report.html").write_text(first[:1000])
+        assert call("report", campaign).code == 0
+        assert (campaign / "report.html").read_text() == first
+
+    def test_leaves_the_rest_of_the_campaign_alone(self, call, campaign, tmp_path):
+        before = contents(tmp_path)
+        assert call("report", campaign).code == 0
+        after = contents(tmp_path)
+        del after[campaign / "report.html"]
+        before.pop(campaign / "report.html", None)
+        assert after == before
+
+    def test_of_an_interrupted_campaign_counts_what_ran(self, call, campaign):
+        outcomes = (campaign / "outcomes.jsonl").read_bytes()
+        (campaign / "outcomes.jsonl").write_bytes(outcomes[: len(outcomes) // 2])
+        whole = len(Run(campaign).outcomes)
+        assert call("report", campaign).code == 0
+        assert f"in {whole} cases" in (campaign / "report.html").read_text()
+
+    @pytest.mark.parametrize("kept", [0, 1])
+    def test_of_a_campaign_without_failures_is_written_too(self, call, campaign, kept):
+        lines = (campaign / "outcomes.jsonl").read_bytes().splitlines(keepends=True)
+        assert b"MERGED" in lines[0]
+        (campaign / "outcomes.jsonl").write_bytes(b"".join(lines[:kept]))
+        assert call("report", campaign).code == 0
+        assert f"0 failures in {kept} cases" in (campaign / "report.html").read_text()
+
+    def test_refuses_a_folder_that_is_no_campaign(self, call, tmp_path):
+        before = contents(tmp_path)
+        assert_refused(call("report", tmp_path), "not a campaign", "campaign.json")
+        assert contents(tmp_path) == before
+
+    @pytest.mark.parametrize("text", ["{}", "[]", "null", '{"levels": 0}', "{"])
+    def test_refuses_settings_that_are_no_campaigns(self, call, campaign, text):
+        (campaign / "campaign.json").write_text(text)
+        assert_refused(call("report", campaign), "campaign.json")
+
+    def test_refuses_outcomes_with_a_broken_line_and_names_it(self, call, campaign, tmp_path):
+        lines = (campaign / "outcomes.jsonl").read_bytes().splitlines(keepends=True)
+        lines[6] = lines[6][:50] + b"\n"
+        (campaign / "outcomes.jsonl").write_bytes(b"".join(lines))
+        before = contents(tmp_path)
+        assert_refused(call("report", campaign), "line 7", "outcomes.jsonl")
+        assert contents(tmp_path) == before
+
+    def test_shows_no_markup_that_hides_in_the_settings(self, call, campaign):
+        settings = read_settings(campaign)
+        settings["vut"] = "<script>alert(1)</script>"
+        (campaign / "campaign.json").write_text(json.dumps(settings))
+        assert call("report", campaign).code == 0
+        page = (campaign / "report.html").read_text()
+        assert "<script>alert" not in page
+        assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+
+
+class TestHelp:
+    @pytest.mark.parametrize("name", COMMANDS)
+    def test_of_every_command_has_an_example_of_that_command(self, name):
+        result = CliRunner().invoke(cli.app, [name, "--help"])
+        assert result.exit_code == 0
+        words = " ".join(result.output.split())
+        assert f"Example: merge-sumo {name}" in words
+
+    @pytest.mark.parametrize("flag", ["--help", "-h"])
+    def test_says_how_to_start_and_names_every_command(self, flag):
+        result = CliRunner().invoke(cli.app, [flag])
+        assert result.exit_code == 0
+        assert "merge-sumo campaign --vut" in result.output
+        assert {"campaign", "export", "replay", "report"} <= set(COMMANDS)
+        assert all(name in result.output for name in COMMANDS)
+
+    def test_is_what_the_bare_command_prints(self):
+        assert "Usage" in CliRunner().invoke(cli.app, []).output
+
+    def test_knows_the_version(self):
+        result = CliRunner().invoke(cli.app, ["--version"])
+        assert result.exit_code == 0
+        assert result.output.startswith("merge-sumo ")
+
+
+def test_an_error_in_a_process_of_its_own_is_one_sentence_without_a_traceback(tmp_path):
+    assert_refused(run_in_a_process(tmp_path, "replay", "nowhere"), "nowhere")

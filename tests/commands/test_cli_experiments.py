@@ -1,0 +1,143 @@
+"""The commands compare, reproduce and probability, and a campaign that stops early."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from merge_sumo.reports.reproduction import TABLE_JSON
+from merge_sumo.studies.table2 import TABLE_II, Scale
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path, command_line):
+    """Return what runs the command line, from a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+    return command_line
+
+
+def refused(said: tuple[int, str, str], *parts: str) -> bool:
+    code, out, err = said
+    one_sentence = err.startswith("merge-sumo: ") and err.count("\n") == 1
+    return code == 2 and out == "" and one_sentence and all(part in err for part in parts)
+
+
+COMPARE = ("compare", "--vut", "design1", "--level", "0", "--truth-cases", 300, "--workers", 1)
+SMALL = ("--samplers", "uniform,gpr", "--seeds", 2, "--cases", 30, "--batch", 15)
+
+
+class TestCompare:
+    def test_prints_one_json_object_with_the_keys_that_are_promised(self, call):
+        code, out, err = call(*COMPARE, *SMALL, "--json")
+        assert code == 0, err
+        assert out.count("\n") == 1
+        found = json.loads(out)
+        assert found["truth_fmc"] > 0.0
+        assert found["limit_fmc"] >= found["truth_fmc"]
+        assert found["dense_levels"] == []
+        assert len(found["oracle_fmc_by_batch"]) == 2
+        promised = {
+            "fmc_median",
+            "fmc_over_truth_median",
+            "fmc_over_truth_quartiles",
+            "fmc_over_limit_median",
+            "regions_found_median",
+            "cases_to_90_percent_median",
+            "sampler_s_median",
+        }
+        for name in ("uniform", "gpr"):
+            assert promised <= set(found[name])
+
+    def test_prints_a_line_per_sampler_and_draws_the_figure(self, call, tmp_path):
+        code, out, err = call(*COMPARE, *SMALL, "--figure", "curves.svg")
+        assert code == 0, err
+        assert (tmp_path / "curves.svg").read_text().count("<svg") == 1
+        assert "figure: curves.svg" in out
+        assert {"truth:", "limit:", "oracle:", "uniform", "gpr"} <= {
+            line.split()[0] for line in out.splitlines() if line.strip()
+        }
+
+    def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
+        for module in ("merge_sumo.api.studies", "merge_sumo.api.study_results"):
+            monkeypatch.setattr(f"{module}.DENSE_CASES", 900)
+        tiny = (*COMPARE, "--samplers", "uniform", "--seeds", 1, "--cases", 10, "--batch", 10)
+        found: dict = {}
+        for option in ("", "--dense", "--dense", "", "--no-dense"):
+            code, out, err = call(*tiny, *filter(None, [option]), "--json")
+            assert code == 0, err
+            result = json.loads(out)
+            found.setdefault(option, []).append((result["dense_levels"], result["limit_fmc"]))
+        (none_yet, (kept, limit)), (without,) = found[""], found["--no-dense"]
+        assert none_yet == without
+        assert without[0] == []
+        assert kept == [0]
+        assert found["--dense"] == [(kept, limit)] * 2
+        assert limit > without[1]
+        code, out, err = call(*tiny)
+        assert "limit: FMC" in out
+        assert "of 900 uniform cases" in out
+
+    @pytest.mark.parametrize("figure", ["f.pdf", "gone/f.png", "mine.png"])
+    def test_refuses_a_figure_that_cannot_be_before_it_runs_anything(self, call, tmp_path, figure):
+        (tmp_path / "mine.png").write_text("mine")
+        assert refused(call(*COMPARE, *SMALL, "--figure", figure), "--figure")
+        assert not (tmp_path / "cache").exists()
+        assert (tmp_path / "mine.png").read_text() == "mine"
+
+
+class TestReproduce:
+    @pytest.fixture
+    def tiny(self, monkeypatch):
+        scale = Scale(seeds=1, truth_cases=(100, 100, 100), batches=1, batch=6)
+        monkeypatch.setattr("merge_sumo.studies.table2.quick", lambda seeds: scale)
+        monkeypatch.setattr("merge_sumo.reports.reproduction.TABLE_II", TABLE_II[:1])
+
+    def test_prints_the_table_and_where_the_rest_is(self, call, tiny, tmp_path):
+        code, out, err = call("reproduce", "--quick", "--workers", 1, "--out", "here")
+        assert code == 0, err
+        assert out.startswith("| FMC: ours (the paper's) |")
+        assert "here/index.html" in out.splitlines()[-1]
+        assert json.loads((tmp_path / "here" / TABLE_JSON).read_text())["scale"]["seeds"] == 1
+        assert refused(call("reproduce", "--quick", "--out", "here"), "here exists")
+
+    def test_refuses_no_seeds_and_no_workers(self, call, tmp_path):
+        assert refused(call("reproduce", "--seeds", 0, "--out", "here"), "--seeds is 0")
+        assert refused(call("reproduce", "--workers", 0, "--out", "here"), "--workers is 0")
+        assert not (tmp_path / "here").exists()
+
+
+class TestProbability:
+    def test_prints_an_estimate_and_writes_it_into_the_run(self, call, run, tmp_path):
+        folder = shutil.copytree(run.folder, tmp_path / "run")
+        code, out, err = call("probability", folder, "--cases", 50, "--json")
+        assert code == 0, err
+        found = json.loads(out)
+        assert found["low"] <= found["probability"] <= found["high"]
+        assert json.loads((folder / "probability.json").read_text())["high"] == found["high"]
+        assert (folder / "probability.jsonl").read_bytes().count(b"\n") == 50
+        assert refused(call("probability", folder, "--cases", 50), "probability.json exists")
+
+    def test_says_what_the_interval_is_of(self, call, run, tmp_path):
+        (tmp_path / "d.json").write_text('{"x_pov0_m": {"kind": "uniform", "high": -250}}')
+        arguments = ("--cases", 40, "--out", "p.json", "--confidence", 0.9)
+        code, out, err = call("probability", run.folder, "--distribution", "d.json", *arguments)
+        assert code == 0, err
+        assert out.startswith("P(fail) under the stated distribution: ")
+        assert "90 % interval" in out
+        assert "written: p.json" in out
+
+    def test_refuses_a_folder_that_is_no_campaign(self, call, tmp_path):
+        assert refused(call("probability", tmp_path), "not a campaign")
+
+
+def test_a_campaign_that_converged_says_so(call):
+    plan = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "coverage", "--seed", 1)
+    share = ("--stop-after-converged", 0.95)
+    code, out, err = call(*plan, "--cases", 300, "--batch", 20, *share, "--out", "run")
+    assert code == 0, err
+    assert out.startswith("stopped after ")
+    assert "of 300 cases" in out
+    assert refused(call(*plan[:5], "--sampler", "gpr", *share), "--sampler coverage")

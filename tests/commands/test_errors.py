@@ -1,0 +1,204 @@
+"""What a person is told who mistypes: the place of the mistake, and the name that was meant."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from typing import Any
+
+import pytest
+from conftest import some
+
+import merge_sumo as ms
+from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.system.suggestions import either, meant, nearest
+from merge_sumo.values.case import Pool
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.scenario import US23
+from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.signatures import check_call, check_methods
+
+
+class TestNearestNames:
+    def test_are_those_that_share_most_characters(self):
+        assert nearest("desgin2", ["design1", "design2", "level0"]) == ["design2", "design1"]
+        assert nearest("11x", ["10", "11", "12", "13"], 0.5)[0] == "11"
+        assert nearest("nothing", ["design1", "level0"]) == []
+
+    def test_are_one_where_only_its_letters_are_of_another_size(self):
+        assert nearest("TTC_s", ["pet_s", "ttc_s", "after_ttc_s"]) == ["ttc_s"]
+
+    def test_are_said_in_words(self):
+        assert either(["a"]) == "a"
+        assert either(["a", "b", "c"]) == "a, b or c"
+        assert meant("b", ["x"]) == ""
+        assert meant("lvel0", ["level0"]) == "did you mean level0? "
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("TTC_s < 2", "at character 1, near 'TTC_s < 2': there is no measure 'TTC_s': did you "),
+        ("ttc_s < 2 or TTC_S < 1", "at character 14, near 'TTC_S < 1': there is no measure"),
+        ("merged_first == VUT", "character 17, near 'VUT': .* quotes: merged_first == \"VUT\""),
+        ("ttc_s > 2 and vut == merged_first", 'character 15.* quotes: merged_first == "VUT"'),
+        ("merged_first == level0", "character 17, near 'level0': there is no measure 'level0'"),
+        ("end == 'timeout'", "at character 1, .* end is never 'timeout': did you mean TIMEOUT?"),
+        ("ttc_s = 2", "at character 7, near '= 2': write == or < instead of ="),
+        ("ttc_s < 2 && dx_m > 3", "at character 11, near '&& dx_m > 3': write and instead of &&"),
+        ("ttc_s < 2 || dx_m > 3", "write or instead of ||"),
+        ("!(ttc_s < 2)", "at character 1, .* write not instead of !"),
+        ("ttc_s < 3 x", "look at character 11, near 'x'"),
+        ("  ttc_s < 3 x", "look at character 13, near 'x'"),
+        ("ttc_s <", "it breaks off at its end"),
+        ("(ttc_s < 1 or\n dx_n > 3)", "at character 16, near 'dx_n > 3"),
+        ("end == 'ä' or ttc_s < 1", "at character 1, near"),
+        ("(ttc_s < 1\n  or end == 'MERGED' and dx_n > 3)", "at character 37, near 'dx_n > 3"),
+        ("ttc_s < 1 or 3 < 4", "at character 14, near '3 < 4': a comparison of two numbers"),
+        ("ttc_s < 1 or ttc_s", "at character 14, near 'ttc_s': ttc_s stands alone"),
+    ],
+)
+def test_a_condition_is_refused_with_the_place_of_the_mistake(text, said):
+    parts = map(re.escape, said.split(".*"))
+    with pytest.raises(UserError, match=".*".join(parts)):
+        Criterion(text)
+
+
+def test_a_place_counts_characters_and_not_bytes():
+    with pytest.raises(UserError, match="at character 17, near 'dx_n > 3'"):
+        Criterion("ttc_s < 1.5 and dx_n > 3")
+    with pytest.raises(UserError, match="at character 7, near 'ü > 3'"):
+        Criterion("ä < 1 and ü > 3".replace("ä < 1 and", "'ä' <"))
+
+
+def test_a_formula_is_refused_with_the_place_of_the_mistake():
+    with pytest.raises(UserError, match="at character 9: there is no signal 'v_vut': did you mean"):
+        Criterion(require="always (v_vut > 2)")
+    with pytest.raises(UserError, match="at character 19: '!'"):
+        Criterion(require="always (v_vut_mps ! 2)")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: vut_factory("desgin2"), "did you mean design2"),
+        (lambda: vut_factory("Design2"), r"did you mean design2\? choose"),
+        (lambda: vut_factory("tracy"), "did you mean traci"),
+        (lambda: vut_factory(""), "name the vehicle under test, as in --vut design2: level0, "),
+        (lambda: make_sampler("unifrom", Pool(levels=(0,), scenario=US23), 0), "mean uniform"),
+        (lambda: named_scenario("us23-trafic"), "did you mean us23-traffic"),
+        (lambda: Criterion("contat"), "did you mean contact"),
+    ],
+)
+def test_a_name_that_nobody_knows_is_answered_with_one_that_was_meant(make, said):
+    with pytest.raises(UserError, match=said):
+        make()
+
+
+class TestAWrongSignature:
+    @pytest.mark.parametrize("in_process", some([False, True], True))
+    @pytest.mark.parametrize(
+        ("source", "said"),
+        [
+            (
+                "class V:\n\n    def act(self):\n        return 0.0\n",
+                "my.py:3: act(self) takes 1 argument, act(self, seen) is called",
+            ),
+            (
+                "class V:\n    def act(self, seen): return 0.0\n    def reset(self): ...\n",
+                "my.py:3: reset(self) takes 1 argument, reset(self, seen) is called",
+            ),
+            (
+                "class V:\n    @staticmethod\n    def act(): return 0.0\n",
+                "my.py:2: act() takes 0 arguments, act(seen) is called",
+            ),
+            (
+                "class V:\n    @classmethod\n    def act(cls, a, b): return 0.0\n",
+                "my.py:2: act(cls, a, b) takes 3 arguments, act(cls, seen) is called",
+            ),
+            (
+                "class V:\n    def act_batch(self, seen): ...\n    def reset(self, seen): ...\n",
+                "my.py:3: reset(self, seen) takes 2 arguments, reset(self, corridor, seen) is "
+                "called",
+            ),
+            ("def V():\n    return 0.0\n", "my.py:1: V() takes 0 arguments, V(seen) is called"),
+            (
+                "def V(x, v, *rest, gain):\n    return 0.0\n",
+                "my.py:1: V(x, v, *rest, gain=...) takes 4 arguments, V(seen) is called",
+            ),
+        ],
+    )
+    def test_is_named_in_the_users_file(
+        self, source, said, in_process, tmp_path, monkeypatch, command_line
+    ):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "my.py").write_text(source)
+        hosted = ("--in-process",) if in_process else ()
+        code, out, err = command_line("campaign", "--vut", "my.py:V", *hosted, "--out", "run")
+        assert (code, out, err) == (2, "", f"merge-sumo: {said}\n")
+        assert not (tmp_path / "run").exists()
+
+    def test_of_an_object_is_told_from_python(self):
+        class Mine:
+            def act(self, seen, gain):
+                return 0.0
+
+        wrong: list[Any] = [Mine, Mine()]
+        for vut in wrong:
+            with pytest.raises(
+                UserError, match=r"test_errors\.py:\d+: act\(self, seen, gain\) takes"
+            ):
+                ms.campaign(vut, cases=1)
+
+    @pytest.mark.parametrize(
+        "source",
+        [
+            "def f(*arguments, **named): ...",
+            "def f(seen, gain=1.0): ...",
+            "class f:\n    def act(self, *rest): ...\n    def reset(self, seen, seed=0): ...",
+            "class f:\n    act = staticmethod(lambda seen: 0.0)",
+            "class f:\n    reset = None\n    def act(self, seen): ...",
+            "import functools\nclass f:\n    act = functools.partialmethod(lambda s, a, b: 0.0, 1)",
+        ],
+    )
+    def test_is_none_where_the_call_fits(self, source):
+        names: dict = {}
+        exec(source, names)  # noqa: S102
+        check = (
+            check_methods
+            if isinstance(names["f"], type)
+            else partial(check_call, arguments=("seen",))
+        )
+        check(names["f"])
+
+
+class TestAnOptionThatIsGivenTwice:
+    @pytest.mark.parametrize(
+        "asked",
+        [
+            ("campaign", "--vut", "design1", "--vut", "design2"),
+            ("truth", "--vut", "design1", "--level", 0, "--level", 1),
+            ("compare", "--vut", "design1", "--level", 0, "--dense", "--no-dense"),
+            ("scenario", "new", "a.toml", "--net", "x", "--net", "y"),
+            ("policies", "export", "vut1", "--out", "a", "--out", "b"),
+        ],
+    )
+    def test_is_refused(self, command_line, asked):
+        code, out, err = command_line(*asked)
+        assert (code, out) == (2, "")
+        assert "is given 2 times: give it once" in err
+
+    @pytest.mark.parametrize(
+        "asked", [("--gate", "errors", "--gate", "failures"), ("--quiet", "-q")]
+    )
+    def test_is_taken_where_that_says_nothing_else(self, command_line, asked):
+        code, _, err = command_line("campaign", "--vut", "desgin2", *asked)
+        assert code == 2
+        assert "there is no VUT 'desgin2'" in err
+
+    def test_may_be_a_value_that_looks_like_one(self, command_line):
+        code, _, err = command_line("campaign", "--vut", "--vut")
+        assert code == 2
+        assert "there is no VUT '--vut'" in err

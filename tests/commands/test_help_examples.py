@@ -1,0 +1,71 @@
+"""Every example in --help runs as it stands, with a small budget in the place of its own."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.settings import CampaignSettings
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = {"--cases": "40", "--seeds": "1", "--radius": "0.3"}
+MORE = {"compare": ["--cases", "40", "--truth-cases", "300"]}
+ELSEWHERE = {"train", "reproduce"}
+"""These take minutes: tests/training/test_training.py and the README's commands run them small."""
+
+
+def examples() -> list[str]:
+    found = []
+    command = typer.main.get_command(cli.app)
+    waiting = [command]
+    while waiting:
+        one = waiting.pop()
+        waiting += getattr(one, "commands", {}).values()
+        for line in (one.help or "").splitlines():
+            if line.strip().startswith("Example:"):
+                found.append(line.split("Example:")[1].strip())
+    return sorted(found)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """Return a folder with what the examples name: two campaigns, and the shipped scenarios."""
+    folder = tmp_path_factory.mktemp("examples")
+    for vut in ("design1", "design2"):
+        settings = CampaignSettings(vut=vut, levels=(0,), cases=60, batch=20, seed=1)
+        run_campaign(settings, folder / "runs" / vut)
+    shutil.copytree(ROOT / "scenarios" / "stalemate", folder / "scenarios" / "stalemate")
+    net = (ROOT / "sumo_net" / "us23.net.xml").read_text()
+    for ours, theirs in (("main_in", "a"), ("main_out", "b"), ("ramp", "r")):
+        net = re.sub(rf"\b{ours}(?=[_\"])", theirs, net)
+    (folder / "my.net.xml").write_text(net)
+    return folder
+
+
+def test_there_are_examples_of_every_command():
+    assert len(examples()) >= 13
+
+
+@pytest.mark.parametrize("example", [e for e in examples() if e.split()[1] not in ELSEWHERE])
+def test_runs(example, place, monkeypatch, tmp_path):
+    monkeypatch.chdir(place)
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
+    words = [word for word in shlex.split(example) if word != "--gui"]
+    assert words.pop(0) == "merge-sumo"
+    for place_of, word in enumerate(words[:-1]):
+        if word in SMALL:
+            words[place_of + 1] = SMALL[word]
+    if "--batch" not in words:
+        words += MORE.get(words[0], [])
+    done = CliRunner().invoke(cli.app, words)
+    # Their ways to say "worse" and "not certain".
+    failed = words[0] in ("compare-runs", "certify") and done.exit_code == 1
+    assert done.exit_code == 0 or failed, done.output

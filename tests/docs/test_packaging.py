@@ -1,0 +1,51 @@
+"""What a person sees of the package before they run it: its version, types, and papers."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+import merge_sumo as ms
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = CONFIG["project"]
+
+
+def test_the_version_is_the_same_everywhere():
+    assert ms.__version__ == version("merge-sumo") == PROJECT["version"]
+    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
+    assert f"\n## {PROJECT['version']} (" in (ROOT / "CHANGELOG.md").read_text("utf-8")
+
+
+def test_the_package_says_that_it_is_typed():
+    assert (ROOT / "merge_sumo" / "py.typed").read_bytes() == b""
+    assert "Typing :: Typed" in PROJECT["classifiers"]
+
+
+def test_the_classifiers_begin_with_the_oldest_python_that_it_takes():
+    prefix = "Programming Language :: Python :: 3."
+    versions = [c.removeprefix(prefix) for c in PROJECT["classifiers"] if c.startswith(prefix)]
+    assert f">=3.{versions[0]}" == PROJECT["requires-python"]
+    assert versions == ["11", "12", "13"]
+
+
+def test_types_are_checked_everywhere_and_strictly_outside_of_the_tests():
+    mypy = CONFIG["tool"]["mypy"]
+    assert mypy["strict"]
+    assert mypy["files"] == ["merge_sumo", "tools", "tests", "examples"]
+    strict = next(o for o in mypy["overrides"] if "merge_sumo.*" in o["module"])
+    tools = sorted(path.stem for path in (ROOT / "tools").glob("*.py"))
+    assert strict["module"] == ["merge_sumo.*", *tools]
+    assert {name for name, value in mypy.items() if value is False} <= set(strict)
+
+
+def test_a_release_has_the_same_day_in_the_changelog_and_in_the_citation():
+    (released,) = re.findall(
+        rf"^## {re.escape(PROJECT['version'])} \((.*)\)$",
+        (ROOT / "CHANGELOG.md").read_text("utf-8"),
+        re.MULTILINE,
+    )
+    assert f"\ndate-released: {released}\n" in (ROOT / "CITATION.cff").read_text("utf-8")

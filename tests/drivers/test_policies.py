@@ -1,0 +1,293 @@
+"""The shipped drivers: deterministic, rational, and with the paper's picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from itertools import pairwise
+
+import make_scenarios
+import numpy as np
+import pytest
+from merges import HALF, LIKE_A_ROUNDABOUT, SMALLER
+
+from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
+from merge_sumo.drivers.levelk import FEATURES, QNetwork, actions_mps2, features
+from merge_sumo.drivers.policies import NETWORKS, load_driver, load_network, read_manifest
+from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.rollout import rollout
+from merge_sumo.sumo.world import World
+from merge_sumo.training import check as checking
+from merge_sumo.training.best_response import best_response
+from merge_sumo.training.env import pool_starts
+from merge_sumo.training.game import Game, greedy
+from merge_sumo.training.reward import Reward, RewardWeights
+from merge_sumo.values.case import from_unit, to_unit
+from merge_sumo.values.fmc import fmc, regions
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End
+from merge_sumo.vuts.registry import vut_factory
+
+REWARD = Reward(RewardWeights())
+REGRET_BOUNDS = {
+    "pov1": (0.01, 0.05),
+    "vut1": (0.01, 0.05),
+    "pov2": (0.02, 0.15),
+    # The 99th percentile is short of the 15 % aimed at: `policies/README.md` says why.
+    "vut2": (0.02, 0.20),
+}
+"""Mean and 99th percentile of the regret, as shares of the mean gain over level-0 behaviour."""
+
+
+def uniform_cases(level, count, seed=0):
+    points = np.random.default_rng(seed).random((count, 3 if level == 2 else 2))
+    return from_unit(points, level)
+
+
+def played(vut, cases, corridors=32):
+    """Return the measures of cases, in order, and the trajectories."""
+    with World(corridors) as world:
+        driver = vut_factory(vut)(corridors)
+        got = dict(rollout(world, PovLibrary(corridors), driver, cases))
+    trajectories = [got[index] for index in range(len(cases))]
+    return [measure(t) for t in trajectories], trajectories
+
+
+def picture(vut, level, count):
+    """Return FMC and sizes of the failure regions over uniform cases."""
+    cases = uniform_cases(level, count, seed=1)
+    measures, _ = played(vut, cases)
+    failing = (c for c, m in zip(cases, measures, strict=True) if m.is_close)
+    points = to_unit(failing, level)
+    return fmc(points), np.bincount(regions(points)) if len(points) else np.array([])
+
+
+def test_the_library_is_complete_and_its_manifest_says_how_it_was_made():
+    manifest = read_manifest()
+    assert tuple(manifest) == NETWORKS
+    for name, entry in manifest.items():
+        assert load_network(name).sees_svo == (name == "pov2")
+        assert entry["command"].startswith(f"merge-sumo train --only {name} ")
+        assert RewardWeights(**entry["reward_weights"]) == RewardWeights()
+        assert entry["check"]["avoidable_collisions"] == 0
+        mean_bound, p99_bound = REGRET_BOUNDS[name]
+        assert entry["check"]["mean_regret"] <= mean_bound
+        assert entry["check"]["p99_regret"] <= p99_bound
+    for name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
+        assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
+
+
+@pytest.mark.parametrize("episodes", [100, pytest.param(1000, marks=pytest.mark.long)])
+def test_learned_episodes_are_the_same_in_1_and_in_32_corridors(episodes):
+    cases = [case for level in (1, 2) for case in uniform_cases(level, episodes // 2, seed=3)]
+    one, many = (played("level1", cases, corridors)[1] for corridors in (1, 32))
+    for alone, beside in zip(one, many, strict=True):
+        assert np.array_equal(alone.motion, beside.motion)
+
+
+def test_a_row_of_q_does_not_depend_on_the_rows_beside_it():
+    rng = np.random.default_rng(0)
+    layers = [
+        (rng.normal(size=(64, FEATURES)), rng.normal(size=64)),
+        (rng.normal(size=(7, 64)), np.zeros(7)),
+    ]
+    network = QNetwork(layers)
+    inputs = rng.normal(size=(33, FEATURES))
+    together = network.values(inputs)
+    for row in range(33):
+        assert np.array_equal(network.values(inputs[row : row + 1])[0], together[row])
+
+
+def test_features_are_finite_and_bounded_wherever_a_vut_may_take_a_driver():
+    rng = np.random.default_rng(0)
+    n = 20_000
+    found = features(
+        rng.uniform(-900, 1800, n), rng.uniform(0, 95, n), rng.uniform(-182, 20, n),
+        rng.uniform(0, 80, n), rng.uniform(0, math.pi / 2, n),
+    )  # fmt: skip
+    assert found.shape == (n, 28)
+    assert np.isfinite(found).all()
+    zero = np.zeros(1)
+    standing = features(zero - 200.0, zero, zero - 100.0, zero)
+    assert np.isfinite(standing).all()
+
+
+def papers_features(x_pov, v_pov, x_vut, v_vut):
+    """Return what a network of the paper's scenario sees, with its numbers written out."""
+    distance = np.maximum(-x_vut, 0.0)
+    t_level0 = np.minimum(level0_time_to(distance, v_vut), 20.0)
+    t_constant = np.minimum(distance / np.maximum(v_vut, 0.5), 20.0)
+    t_full = (np.sqrt(v_vut * v_vut + 4.0 * distance) - v_vut) / 2.0
+    t_brake = np.minimum(t_level0, v_pov / 4.0)
+    gaps = (
+        x_pov + v_pov * t_level0,
+        x_pov + (v_pov + t_level0) * t_level0,
+        x_pov + (v_pov - 2.0 * t_brake) * t_brake,
+        x_pov + v_pov * t_constant,
+        x_pov + v_pov * t_full,
+    )
+    v_level0 = np.maximum(v_vut, np.minimum(v_vut + t_level0, 28.0))
+    columns = [
+        x_pov / 100.0 + 1.0,
+        (v_pov - 28.0) / 6.0,
+        x_vut / 100.0 + 1.0,
+        (v_vut - 22.0) / 6.0,
+        t_level0 / 5.0 - 1.0,
+        t_constant / 5.0 - 1.0,
+        t_full / 5.0 - 1.0,
+        *(np.tanh(gap / scale) for gap in gaps for scale in (80.0, 25.0, 8.0)),
+        (v_level0 - 24.6) / 4.0,
+        (v_vut + 2.0 * t_full - 24.6) / 8.0,
+        np.tanh((v_pov - v_level0) / 3.0),
+        (v_pov - 24.6) / 4.0,
+    ]
+    return np.stack(columns, axis=-1)
+
+
+def states(n):
+    rng = np.random.default_rng(1)
+    return rng.uniform((-900.0, 0.0, -182.0, 0.0), (200.0, 60.0, 20.0, 60.0), (n, 4))
+
+
+class TestOtherScenarios:
+    def test_the_shipped_networks_see_the_paper_s_numbers_to_the_last_bit(self):
+        assert np.array_equal(features(*states(20_000).T), papers_features(*states(20_000).T))
+        assert actions_mps2(US23).tolist() == [-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0]
+
+    def test_in_a_merge_of_half_the_size_they_see_the_same_and_act_half(self):
+        x_pov, v_pov, x_vut, v_vut = (states(20_000) / 2).T
+        half = features(x_pov, v_pov, x_vut, v_vut, scenario=HALF)
+        assert np.array_equal(half, features(*states(20_000).T))
+        assert np.array_equal(actions_mps2(HALF), actions_mps2(US23) / 2)
+
+    def test_a_driver_of_corridors_with_two_scenarios_acts_in_each_as_if_alone(self):
+        scenarios = [US23, HALF, LIKE_A_ROUNDABOUT, US23, HALF, LIKE_A_ROUNDABOUT]
+        cases = [from_unit(np.array([[0.4, 0.6]]), 1, scenario=s)[0] for s in scenarios]
+        rows = np.array([[*zip(*case.starts(), strict=True)] for case in cases])
+        every = np.ones(1, dtype=bool), np.zeros(1, dtype=np.int64)
+
+        def act(which):
+            driver = load_driver("vut1", len(which))
+            for corridor, number in enumerate(which):
+                driver.begin(corridor, cases[number])
+            x_m, v_mps = rows[which].transpose(1, 2, 0)
+            active, step = (np.repeat(one, len(which)) for one in every)
+            return driver.act(Scene(active, step, x_m, v_mps)).tolist()
+
+        together = act(list(range(6)))
+        assert together == [act([number])[0] for number in range(6)]
+        assert together[1] == together[0] / 2 != 0.0
+
+    @pytest.mark.parametrize("name", ["pov1", "vut1"])
+    def test_on_a_ramp_like_ours_they_are_nearly_rational_as_they_would_not_be_unscaled(self, name):
+        role = name[:3]
+        game, network = Game(role, None, Reward.of(SMALLER)), load_network(name)
+        start = pool_starts(60, np.random.default_rng(2), SMALLER)
+        psi = np.zeros(len(start))
+        best = best_response(game, start)
+        scaled = best - game.play(start, psi, greedy(network, SMALLER))
+        unscaled = best - game.play(start, psi, greedy(network, US23))
+        assert scaled.mean() < 0.02
+        assert unscaled.mean() > 5.0 * scaled.mean()
+
+
+class TestTheExampleRuns:
+    """Wang et al., Fig. 5, as they ship in scenarios/."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def examples(cls):
+        return {name: make_scenarios.play(e) for name, e in make_scenarios.EXAMPLES.items()}
+
+    def test_1_the_level1_pov_slows_and_the_level0_vut_merges_first(self, examples):
+        run = examples["pov-yields"]
+        assert run.v_pov_mps.min() < 33.0 - 0.9
+        assert measure(run).end is End.MERGED
+        assert measure(run).merged_first == "VUT"
+
+    def test_2_the_level1_vut_waits_the_pov_accelerates_and_merges_first(self, examples):
+        run = examples["vut-waits"]
+        assert run.a_vut_mps2[0] <= 0.0
+        assert run.a_vut_mps2.max() >= 1.0
+        assert run.v_pov_mps.max() > 33.0
+        assert measure(run).end is End.MERGED
+        assert measure(run).merged_first == "POV"
+
+    def test_3_both_yield_and_collide(self, examples):
+        run = examples["stalemate"]
+        assert measure(run).is_close
+        assert run.a_pov_mps2.min() <= -1.0
+        assert run.a_vut_mps2[5:20].min() >= 0.5, "at first it accelerates, behind its lag"
+        assert np.abs(run.a_vut_mps2[30:60]).max() <= 0.3, "then it coasts"
+        assert run.a_vut_mps2.min() <= -1.0
+
+
+@pytest.mark.long
+class TestRationality:
+    @pytest.mark.parametrize("name", ["pov1", "vut1", "pov2"])
+    def test_no_collision_in_10000_uniform_cases(self, name):
+        cases = checking.check_cases(name, 10_000, seed=5)
+        network, opponent = load_network(name), checking.opponents(name, None)
+        pair = (network, opponent) if name.startswith("pov") else (opponent, network)
+        returns = checking.returns_of(checking.play(cases, *pair), REWARD)
+        assert returns.collided.sum() == 0
+
+    @pytest.mark.parametrize("name", NETWORKS)
+    def test_regret_over_300_cases_that_training_never_saw(self, name):
+        found = checking.check_policy(name)
+        mean_bound, p99_bound = REGRET_BOUNDS[name]
+        assert found.mean_regret <= mean_bound
+        assert found.p99_regret <= p99_bound
+        assert found.avoidable_collisions == 0
+
+    def test_a_level0_driver_in_their_place_would_collide(self):
+        cases = checking.check_cases("pov1", 2000, seed=5)
+        returns = checking.returns_of(checking.play(cases, Level0Pov, Level0Vut), REWARD)
+        assert returns.collided.sum() > 20
+
+    def test_a_prosocial_pov_gives_up_its_own_return_for_the_vuts(self):
+        cases = checking.check_cases("pov2", 4000, seed=6)
+        pov2, vut1 = load_network("pov2"), load_network("vut1")
+        vut_ego, pov_ego = [], []
+        for svo_rad in (0.0, 0.375, 0.75, 1.125, 1.5):
+            turned = [dataclasses.replace(case, svo_rad=svo_rad) for case in cases]
+            returns = checking.returns_of(checking.play(turned, pov2, vut1), REWARD)
+            vut_ego.append(returns.vut_ego)
+            pov_ego.append(returns.pov_ego)
+        for rising in (vut_ego, [-x for x in pov_ego]):
+            steps = [after - before for before, after in pairwise(rising)]
+            for step in steps:
+                assert step.mean() > -standard_error(step)
+            whole = rising[-1] - rising[0]
+            ends = math.hypot(standard_error(rising[-1]), standard_error(rising[0]))
+            assert whole.mean() > 5.0 * ends
+
+
+def standard_error(values):
+    return values.std(ddof=1) / math.sqrt(len(values))
+
+
+@pytest.mark.long
+class TestThePapersPicture:
+    """Wang et al., Table II: where the designs fail, and in how many regions."""
+
+    def test_design1_fails_against_level_0_in_one_band(self):
+        found, sizes = picture("design1", 0, 10_000)
+        assert 0.10 <= found <= 0.16
+        # A lone failure at a thin end of the band may be farther than rho from its neighbour.
+        assert sizes[0] >= 0.95 * sizes.sum()
+
+    def test_design2_never_fails_against_level_0(self):
+        assert picture("design2", 0, 10_000)[0] == 0.0
+
+    def test_design2_fails_against_level_1_in_at_least_three_regions(self):
+        found, sizes = picture("design2", 1, 10_000)
+        assert 0.05 <= found <= 0.12
+        assert (sizes >= 0.03 * sizes.sum()).sum() >= 3
+
+    def test_design2_has_two_far_apart_modes_at_level_2(self):
+        found, sizes = picture("design2", 2, 20_000)
+        assert 0.003 <= found <= 0.02
+        assert len(sizes) >= 2

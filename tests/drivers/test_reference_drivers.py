@@ -1,0 +1,333 @@
+"""The reference drivers: formulas and reactions by hand, tables, and cases a blind driver fails."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plans import plan_for
+
+from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.drivers.reference import (
+    REFERENCES,
+    CarefulPov,
+    CarefulVut,
+    FsmVut,
+    Reg157Vut,
+    RssVut,
+)
+from merge_sumo.drivers.safety_models import (
+    CarefulModel,
+    FsmModel,
+    Reaction,
+    Reg157Model,
+    RssModel,
+    rss_distance_m,
+    ttc_s,
+)
+from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.values.case import Case
+from merge_sumo.values.merge import brake_after_mps2
+from merge_sumo.values.scenario import DT_S, US23, Scenario
+from merge_sumo.values.trajectory import End, Trajectory
+
+CASE = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0)
+TABLES = Path(__file__).parents[1] / "data" / "reference"
+OF_TABLE = {"CC": "careful", "FSM": "fsm", "Reg157": "reg157", "RSS": "rss"}
+
+
+def rows_of(name):
+    with (TABLES / name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def one(value):
+    return np.array([float(value)])
+
+
+def started(driver, scenario=US23):
+    made = driver(1)
+    made.begin(0, Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
+    return made
+
+
+def scene(x_pov_m, v_pov_mps, x_vut_m, v_vut_mps):
+    state = map(one, (x_pov_m, v_pov_mps, x_vut_m, v_vut_mps))
+    return Scene.of_pair(np.array([True]), np.array([0]), *state)
+
+
+def at_m(dx_m, v_pov_mps=30.0, x_vut_m=-140.0):
+    """Return a scene with a VUT at 28 m/s, at M in 5 s, and the POV dx ahead of it then."""
+    return scene(dx_m + v_pov_mps * x_vut_m / 28.0, v_pov_mps, x_vut_m, 28.0)
+
+
+def answers(driver, seen, steps):
+    return [round(float(driver.act(seen)[0]), 4) for _ in range(steps)]
+
+
+class TestFormulas:
+    def test_time_to_collision(self):
+        assert ttc_s(one(10), one(25), one(20)) == 2.0
+        assert ttc_s(one(10), one(20), one(25)) == np.inf
+        assert ttc_s(one(-1), one(20), one(25)) == 0.0
+
+    def test_rss_distance(self):
+        # 15 + 2 * 0.75^2 / 2 + 21.5^2 / 8 - 20^2 / 8
+        assert rss_distance_m(one(20), one(20), 0.75, 2.0, 4.0, 4.0) == pytest.approx(23.34375)
+        assert rss_distance_m(one(5), one(40), 0.75, 2.0, 4.0, 4.0) == 0.0
+
+    @pytest.mark.parametrize(
+        ("gap_m", "wanted"),
+        # Unsafe below 7.5 + 100 / 12, safe above 7.5 + 100 / 8.
+        [(20.0, 0.0), (18.0, 0.48), (15.8, 1.0), (0.0, 1.0)],
+    )
+    def test_cfs(self, gap_m, wanted):
+        assert FsmModel().cfs(one(gap_m), one(20), one(10)) == pytest.approx(wanted)
+
+    def test_cfs_is_0_where_the_gap_opens(self):
+        assert FsmModel().cfs(one(1), one(20), one(21)) == 0.0
+
+    def test_cfs_of_a_vehicle_that_brakes_below_the_speed_of_the_leader(self):
+        # Slower by 1 m/s, after 0.5^2 / 4 m of approach.
+        assert FsmModel().cfs(one(0.05), one(20.5), one(20), one(-2)) == 1.0
+        assert FsmModel().cfs(one(0.07), one(20.5), one(20), one(-2)) == 0.0
+
+    @pytest.mark.parametrize(
+        ("gap_m", "wanted"),
+        # Unsafe below 2 + 15 + 200 / 6 - 200 / 7, safe above 2 + 15 + 200 / 4 - 200 / 7 + 2.
+        [(40.5, 0.0), (30.0, (17.0 + 150.0 / 7.0 - 28.0) / (2.0 + 50.0 / 3.0)), (21.7, 1.0)],
+    )
+    def test_pfs(self, gap_m, wanted):
+        assert FsmModel().pfs(one(gap_m), one(20), one(20)) == pytest.approx(wanted)
+
+
+class TestModels:
+    @pytest.mark.parametrize(("gap_m", "unsafe"), [(9.9, True), (10.1, False)])
+    def test_the_careful_driver_fears_a_time_to_collision_of_two_seconds(self, gap_m, unsafe):
+        assert CarefulModel().is_unsafe(one(gap_m), one(30), one(25)) == unsafe
+
+    @pytest.mark.parametrize(("gap_m", "unsafe"), [(5.09, True), (5.11, False)])
+    def test_reg157_waits_until_it_has_to(self, gap_m, unsafe):
+        # v_rel / 12 + 0.35 = 0.85 s at 6 m/s.
+        assert Reg157Model().is_unsafe(one(gap_m), one(30), one(24)) == unsafe
+
+    def test_rss_keeps_its_distance(self):
+        # 15 + 3 * 0.75^2 / 2 + 22.25^2 / 12 - 20^2 / 12
+        assert RssModel().is_unsafe(one(23.7), one(20), one(20))
+        assert not RssModel().is_unsafe(one(23.9), one(20), one(20))
+
+    def test_fsm_brakes_as_far_as_the_situation_is_unsafe(self):
+        # CFS 0.48 between 4 and 6 m/s2.
+        assert FsmModel().demand_mps2(one(18), one(20), one(10)) == pytest.approx(4.96)
+        proactive = (17.0 + 150.0 / 7.0 - 28.0) / (2.0 + 50.0 / 3.0)
+        found = FsmModel().demand_mps2(one(30), one(20), one(20))
+        assert found == pytest.approx(4.0 * proactive)
+        assert FsmModel().is_unsafe(one(30), one(20), one(20))
+        assert not FsmModel().endangers(one(30), one(20), one(20))
+
+    def test_the_reaction_waits_brakes_and_holds(self):
+        reaction, yes, no = Reaction(1, CarefulModel()), np.array([True]), np.array([False])
+        found = [float(reaction.acceleration_mps2(yes, one(4.0))[0]) for _ in range(12)]
+        assert found == pytest.approx([-0.4] * 8 + [-1.665, -2.93, -4.0, -4.0])
+        assert reaction.acceleration_mps2(no, one(4.0)) == 0.0
+        assert reaction.acceleration_mps2(yes, one(4.0)) == -4.0
+        reaction.forget(yes)
+        assert reaction.acceleration_mps2(yes, one(4.0)) == -0.4
+
+
+class TestRampDrivers:
+    def test_fsm_waits_and_brakes_by_its_jerk(self):
+        found = answers(started(FsmVut), at_m(0.0), 13)
+        assert found == [0.0] * 8 + [-1.265, -2.53, -3.795, -4.0, -4.0]
+
+    def test_the_careful_driver_waits_until_a_collision_is_less_than_2_s_away(self):
+        assert answers(started(CarefulVut), at_m(0.0), 13) == [0.0] * 13
+        # Perceived for the first time: 0.4 s and 0.75 s, with the pedal released.
+        near = scene(-36.0, 20.0, -55.9, 28.0)
+        found = answers(started(CarefulVut, Scenario(a_min_mps2=-9.0)), near, 15)
+        assert found == [-0.4] * 12 + [-1.665, -2.93, -4.195]
+
+    def test_a_conflict_that_was_predicted_before_is_perceived_already(self):
+        careful = started(CarefulVut, Scenario(a_min_mps2=-9.0))
+        assert answers(careful, scene(-40.0, 20.0, -57.0, 28.0), 3) == [0.0] * 3
+        found = answers(careful, scene(-36.0, 20.0, -55.9, 28.0), 11)
+        assert found == [-0.4] * 9 + [-1.665, -2.93]
+
+    def test_reg157_reacts_when_it_would_just_stop_before_m(self):
+        # 0.35 * 28 + 28^2 / 8 = 107.8 m.
+        assert answers(started(Reg157Vut), at_m(0.0, x_vut_m=-107.9), 6) == [0.0] * 6
+        found = answers(started(Reg157Vut), at_m(0.0, x_vut_m=-107.7), 6)
+        assert found == [0.0] * 4 + [-4.0] * 2
+
+    def test_rss_reacts_within_its_own_distance_of_m(self):
+        # R = 0.75 + 4 / 25.3: 28 R + R^2 + (28 + 2 R)^2 / 8 = 137.7 m.
+        assert answers(started(RssVut), at_m(0.0, x_vut_m=-138.2), 10) == [0.0] * 10
+        assert answers(started(RssVut), at_m(0.0, x_vut_m=-137.0), 10)[-1] == -2.53
+
+    def test_who_has_reacted_stays_alert_and_begins_to_brake_afresh(self):
+        fsm = started(FsmVut)
+        assert answers(fsm, at_m(0.0), 10)[-1] == -2.53
+        assert fsm.act(at_m(100.0)) == 0.0  # at its speed already
+        assert answers(fsm, at_m(0.0), 2) == [-1.265, -2.53]
+
+    @pytest.mark.parametrize("begin", [True, False])
+    def test_begins_afresh(self, begin):
+        fsm = started(FsmVut)
+        answers(fsm, at_m(0.0), 10)
+        if begin:
+            fsm.begin(0, CASE)
+        else:
+            fsm.forget(np.array([True]))
+        assert answers(fsm, at_m(0.0), 9) == [0.0] * 8 + [-1.265]
+
+    def test_a_scenario_that_lets_them_brake_harder_does(self):
+        hard = started(Reg157Vut, Scenario(a_min_mps2=-9.0))
+        # 0.35 * 28 + 28^2 / 12 = 75.1 m.
+        assert answers(hard, at_m(0.0, x_vut_m=-75.0), 5)[-1] == -6.0
+
+    def test_fsm_brakes_by_6_where_4_is_too_late(self):
+        hard = Scenario(a_min_mps2=-9.0)
+        # 0.5 s before M braking by 4 m/s2 costs 0.02 s and by 6 m/s2 0.03 s: 0.6 m and 0.9 m.
+        late = answers(started(FsmVut, hard), at_m(5.25, x_vut_m=-14.0), 14)[-1]
+        early = answers(started(FsmVut, hard), at_m(5.25, x_vut_m=-80.0), 14)[-1]
+        assert (late, early) == (-6.0, -4.0)
+
+    def test_who_cannot_fall_behind_any_more_goes_on(self):
+        # 0.5 s before M full braking gains half a metre.
+        assert answers(started(Reg157Vut), at_m(-1.0, x_vut_m=-14.0), 6) == [0.0] * 6
+
+    @pytest.mark.parametrize(
+        ("driver", "dx_m", "brakes"),
+        [
+            # Ahead of a POV that comes nearer by 2 m/s, the gap 4 m and 8 m.
+            (FsmVut, -10.0, False),
+            (FsmVut, -6.9, True),
+            (RssVut, -20.0, True),
+            (RssVut, -60.0, False),
+            # Behind one that draws away, both as far as they fear that it brakes.
+            (FsmVut, 10.0, True),
+            (RssVut, 10.0, True),
+            (FsmVut, 70.0, False),
+        ],
+    )
+    def test_who_leads_at_m_must_not_make_another_run_into_it(self, driver, dx_m, brakes):
+        found = answers(started(driver), at_m(dx_m, x_vut_m=-112.0), 14)[-1]
+        assert (found < 0.0) == brakes
+
+    def test_a_standing_vut_waits_without_a_conflict(self):
+        fsm = started(FsmVut)
+        found = answers(fsm, scene(-160.0, 30.0, -14.0, 0.0), 12)
+        assert found[-1] == 0.0
+
+    def test_corridors_do_not_know_of_each_other(self):
+        pair = FsmVut(2)
+        for corridor in (0, 1):
+            pair.begin(corridor, CASE)
+        both = [
+            np.array([a[0], b[0]])
+            for a, b in ((at_m(0.0).x_m[row], at_m(100.0).x_m[row]) for row in (0, 1))
+        ]
+        state = both[0], np.full(2, 30.0), both[1], np.full(2, 28.0)
+        seen = Scene.of_pair(np.ones(2, dtype=bool), np.zeros(2, dtype=int), *state)
+        found = [pair.act(seen).tolist() for _ in range(12)]
+        assert found[-1] == [-4.0, 0.0]
+
+
+class TestTheCarefulPov:
+    def test_brakes_for_a_vut_that_cuts_in(self):
+        # The VUT is at M in 1 s, 11 m ahead and slower by 10 m/s: 5 m in 0.5 s more.
+        found = answers(started(CarefulPov), scene(-41.0, 30.0, -20.0, 20.0), 12)
+        assert found == [-0.4] * 8 + [-1.665, -2.93, -4.0, -4.0]
+
+    def test_keeps_its_speed_where_it_is_ahead_or_the_vut_far(self):
+        assert answers(started(CarefulPov), scene(-19.0, 30.0, -20.0, 20.0), 10) == [0.0] * 10
+        assert answers(started(CarefulPov), scene(-71.0, 30.0, -20.0, 20.0), 10) == [0.0] * 10
+        assert answers(started(CarefulPov), scene(-60.0, 30.0, -50.0, 20.0), 10) == [0.0] * 10
+
+
+class TestTables:
+    @pytest.mark.parametrize("name", OF_TABLE)
+    def test_the_ramp_drivers_are_those_of_another_implementation(self, name):
+        rows = [row for row in rows_of("ramp.csv") if row["driver"] == name]
+        assert len(rows) == 240
+        cases = [
+            Case(
+                level=int(row["level"]),
+                x_pov0_m=float(row["x_pov0_m"]),
+                v_pov0_mps=float(row["v_pov0_mps"]),
+                svo_rad=float(row["svo_rad"]) if row["svo_rad"] else None,
+            )
+            for row in rows
+        ]
+        t_s, dx_m, v_mps = driven(OF_TABLE[name], cases)
+        for found, column, within in (
+            (t_s, "t_end_s", 1e-9),
+            (dx_m, "dx_m", 1e-3),
+            (v_mps, "v_vut_mps", 1e-3),
+        ):
+            assert np.abs(found - [float(row[column]) for row in rows]).max() < within
+        collides = [row["end"] == "COLLISION" for row in rows]
+        assert (np.abs(dx_m) < 6.0).tolist() == collides
+        assert sum(collides) == (10 if name == "CC" else 0)
+
+    def test_braking_behind_m_is_no_less_strict_than_the_table(self):
+        rows = rows_of("follow_up.csv")
+        needed = np.array([brake_after_mps2(merged(row)) for row in rows])
+        touch = np.array([row["contact_at_4"] == "1" for row in rows])
+        assert (needed[touch] > 4.0).all()
+        # The table lets a VUT that is ahead go on accelerating; here it keeps its speed.
+        stricter = np.flatnonzero((needed > 4.0) & ~touch)
+        assert len(stricter) == 9
+        for place in stricter.tolist():
+            row = rows[place]
+            assert float(row["x_vut_m"]) > float(row["x_pov_m"])
+            assert float(row["v_vut_mps"]) < 28.0
+
+
+def driven(name, cases):
+    """Return when merges by eq. (4) end, dx at M, and the VUT's speed there, (n,) each."""
+    n = len(cases)
+    vut, pov = REFERENCES[name](n), PovLibrary(n)
+    for corridor, case in enumerate(cases):
+        vut.begin(corridor, case)
+        pov.begin(corridor, case)
+    starts = [case.starts() for case in cases]
+    (x_pov, v_pov), (x, v) = (np.array(state).T for state in zip(*starts, strict=True))
+    found = np.full((3, n), np.nan)
+    for step in range(300):
+        runs = np.isnan(found[0])
+        seen = Scene.of_pair(runs, np.full(n, step), x_pov, v_pov, x, v)
+        a_pov, a = (np.clip(driver.act(seen), -4.0, 2.0) for driver in (pov, vut))
+        x_pov, x = x_pov + v_pov * DT_S, x + v * DT_S
+        v_pov, v = (np.maximum(w + b * DT_S, 0.0) for w, b in ((v_pov, a_pov), (v, a)))
+        ends = runs & (x >= 0.0)
+        state = np.array((np.full(n, (step + 1) * DT_S), x_pov - x, v))
+        found[:, ends] = state[:, ends]
+    return found
+
+
+def merged(row):
+    """Return a trajectory that ends with the state of a row of the table."""
+    state = [[float(row[f"{name}_{who}_{unit}"]) for name, unit in UNITS] for who in ("pov", "vut")]
+    return Trajectory(CASE, np.array([state]), End.MERGED)
+
+
+UNITS = (("x", "m"), ("v", "mps"), ("a", "mps2"))
+
+
+@pytest.mark.parametrize("name", ["level0", *REFERENCES])
+def test_only_the_blind_driver_collides_where_both_are_due_at_the_same_time(name):
+    due_s = level0_time_to(one(182), one(18))[0]
+    speeds = np.arange(25.0, 35.5, 2.0)
+    cases = [Case(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v) for v in speeds.tolist()]
+    with plan_for(name, corridors=6).open() as ground:
+        gaps = [abs(ran.x_pov_m[-1] - ran.x_vut_m[-1]) for _, ran in ground.run(cases)]
+        assert len(gaps) == len(cases)
+    collides = [gap < 6.0 for gap in gaps]
+    if name == "careful":  # brakes 2 s before a collision at the earliest
+        assert any(collides)
+    else:
+        assert collides == [name == "level0"] * len(cases)

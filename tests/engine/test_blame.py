@@ -1,0 +1,211 @@
+"""Deaths and stops that come from outside, and those that are a VUT's own doing."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+from conftest import some
+
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.system import pulse
+from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame
+from merge_sumo.system.pulse import PAUSE_S, AwakeClock, Pulse
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.trajectory import End
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX are needed")
+
+CALM = "class Vut:\n    def act(self, seen):\n        return 0.5\n"
+DIES = """
+import os, pathlib, signal, sys
+FLAGS = pathlib.Path(__file__).with_name("flags")
+class Vut:
+    def reset(self, seen):
+        self.name = f"{{seen.x_pov_m}}"
+        self.bad = seen.v_pov_mps > 31.0
+    def act(self, seen):
+        flags = list(FLAGS.glob(self.name + " *"))
+        if self.bad and seen.t_s == 0.3 and len(flags) < {times}:
+            (FLAGS / f"{{self.name}} {{len(flags)}}").touch()
+            {how}
+        return 0.5
+"""
+KILLED = "os.kill(os.getpid(), signal.SIGKILL)"
+STOPS = """
+import os, pathlib, subprocess, time
+HERE = pathlib.Path(__file__).parent
+class Vut:
+    def reset(self, seen):
+        self.bad = seen.v_pov_mps > 31.0
+    def act(self, seen):
+        if self.bad and seen.t_s == 0.3 and not (HERE / "was-stopped").exists():
+            (HERE / "was-stopped").touch()
+            all_of_us = f"{os.getpid()} {os.getppid()}" if "{hosted}" else f"{os.getpid()}"
+            script = f"kill -STOP {all_of_us}; sleep 5; touch went-on; kill -CONT {all_of_us}"
+            subprocess.Popen(["sh", "-c", script], cwd=HERE)
+            while not (HERE / "went-on").exists():
+                time.sleep(0.01)
+        return 0.5
+"""
+
+
+def settings(spec: str, **more: object) -> CampaignSettings:
+    return CampaignSettings(vut=spec, levels=(0,), cases=12, batch=12, seed=1, **more)  # type: ignore[arg-type]
+
+
+def outcomes(run: Run) -> bytes:
+    return (run.folder / OUTCOMES).read_bytes()
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    """Return a function that runs a campaign of a source."""
+    (tmp_path / "flags").mkdir()
+
+    def run(name: str, source: str, **more: object) -> Run:
+        (tmp_path / f"{name}.py").write_text(source, encoding="utf-8")
+        return run_campaign(settings(f"{tmp_path / name}.py:Vut", **more), tmp_path / name)
+
+    return run
+
+
+class TestBlame:
+    def test_is_for_what_dies_again_alone(self):
+        blame = Blame[int]()
+        assert not blame.died(1, alone=False)
+        assert not blame.died(1, alone=True)
+        assert blame.died(1, alone=True)
+        assert not blame.died(2, alone=True)
+
+    def test_never_falls_on_what_died_beside_others(self):
+        blame = Blame[int]()
+        assert not any(blame.died(1, alone=False, named=True) for _ in range(9))
+        assert blame.died(1, alone=True)
+
+    def test_comes_at_once_where_it_hangs_and_late_where_it_is_killed(self):
+        assert Blame[int]().died(1, alone=True, repeatable=True)
+        blame = Blame[int]()
+        found = [blame.died(1, alone=True, killed=True) for _ in range(MAX_KILLS)]
+        assert found == [False] * (MAX_KILLS - 1) + [True]
+        assert MAX_DEATHS < MAX_KILLS
+
+
+class TestClocks:
+    @pytest.fixture
+    def now(self, monkeypatch):
+        now = [100.0]
+        monkeypatch.setattr(pulse, "monotonic", lambda: now[0])
+        return now
+
+    def test_that_are_awake_count_no_pause(self, now):
+        clock = AwakeClock(0.5)
+        for passed_s in (0.25, 0.25, 9.0, 0.25):
+            now[0] += passed_s
+            found_s = clock.elapsed_s()
+        assert found_s == 0.25 + 0.25 + 0.5 + 0.25
+        clock.restart()
+        assert clock.elapsed_s() == 0.0
+
+    def test_a_pause_is_known_before_the_next_tick(self, now):
+        still = Pulse()
+        assert still.pauses() == 0
+        now[0] += PAUSE_S * 1.1
+        assert still.pauses() == 1
+
+    def test_a_pulse_ticks_and_ends(self):
+        with Pulse() as ticking:
+            thread = ticking._thread
+            assert thread.is_alive()
+        assert not thread.is_alive()
+
+
+class TestKills:
+    @pytest.mark.parametrize(
+        ("how", "times"),
+        [(KILLED, 1), (KILLED, MAX_KILLS - 1), ("os._exit(3)", 1), ("os.abort()", 1)],
+    )
+    def test_that_a_case_did_not_earn_leave_it_as_it_is(self, campaign, how, times, capsys):
+        calm = campaign("calm", CALM)
+        struck = campaign("struck", DIES.format(how=how, times=times))
+        assert outcomes(struck) == outcomes(calm)
+        bad = sum(outcome.case.v_pov0_mps > 31.0 for outcome in calm.outcomes)
+        assert calm.ran_again == 0
+        assert RAN_AGAIN not in calm.settings
+        assert struck.ran_again == bad
+        assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] == bad
+        assert f"{bad} cases ran again, because a process of theirs" in struck.ran_again_in_words
+
+    @pytest.mark.parametrize(
+        ("how", "said"),
+        [(KILLED, "(SIGKILL)"), ("os._exit(3)", "exit code 3"), ("os.abort()", "(SIGABRT)")],
+    )
+    def test_that_come_each_time_are_the_vuts_own_doing(self, campaign, how, said):
+        run = campaign("dies", DIES.format(how=how, times=99))
+        for outcome in run.outcomes:
+            if outcome.case.v_pov0_mps > 31.0:
+                assert outcome.measures.end is End.VUT_ERROR
+                assert said in outcome.measures.error
+            else:
+                assert not outcome.measures.end.is_error
+        assert run.ran_again == 0
+
+    def test_while_a_vut_is_opened_do_not_end_the_campaign(self, campaign, tmp_path):
+        once = """
+import os, pathlib, signal
+flag = pathlib.Path(__file__).with_name("opened")
+if not flag.exists():
+    flag.touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+        assert outcomes(campaign("once", once + CALM)) == outcomes(campaign("calm", CALM))
+        with pytest.raises(UserError, match=r"opening the VUT .* by signal 9 \(SIGKILL\)"):
+            campaign("always", f"import os, signal\n{KILLED}\n{CALM}")
+
+    def test_of_a_vut_that_is_opened_again_are_not_those_of_all_cases(self, campaign):
+        """The process dies at a case, and again when it starts anew: the other cases pass."""
+        source = DIES.format(how="(FLAGS / 'again').touch(); os._exit(3)", times=1)
+        source += """
+if (FLAGS / "again").exists():
+    (FLAGS / "again").unlink()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+        assert outcomes(campaign("struck", source)) == outcomes(campaign("calm", CALM))
+
+    def test_of_a_worker_mark_what_ran_again(self, tmp_path):
+        with open_workers(2) as workers:
+            work = partial(killed_once, tmp_path / "flag")
+            found = dict(
+                workers.run(work, range(6), lambda _: (0, False), chunk=2, ran_again=marked)
+            )
+        assert [found[k][0] for k in range(6)] == [k * k for k in range(6)]
+        assert any(found[k][1] for k in (2, 3))
+
+
+def killed_once(flag: Path, items):
+    if 3 in items and not flag.exists():
+        flag.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return [(item * item, False) for item in items]
+
+
+def marked(result):
+    return result[0], True
+
+
+@pytest.mark.parametrize("hosted", some(["yes", ""], "yes"))
+def test_a_stop_of_all_of_us_is_no_error_of_the_vut(campaign, hosted):
+    calm = campaign("calm", CALM)
+    source = STOPS.replace("{hosted}", hosted)
+    stopped = campaign("stopped", source, deadline_s=2.0, in_process=not hosted)
+    assert (stopped.folder.parent / "went-on").exists()
+    assert outcomes(stopped) == outcomes(calm)
+    assert stopped.ran_again >= 1

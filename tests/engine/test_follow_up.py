@@ -1,0 +1,139 @@
+"""What happens behind M: both drive on, and it is measured."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plans import plan_for
+from test_score import CASE, ending
+
+from merge_sumo.drivers.following import keep_behind_vut
+from merge_sumo.errors import UserError
+from merge_sumo.values.case import Pool
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.merge import followed_up
+from merge_sumo.values.scenario import DT_S, US23, VUT
+from merge_sumo.values.score import FOLLOWED_UP, Outcome, measure
+from merge_sumo.values.trajectory import End
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.registry import vut_factory
+
+FOLLOWED = replace(US23, follow_up_s=3.0)
+CASES = Pool(levels=(0,), scenario=FOLLOWED).cases(np.random.default_rng(3).random((12, 2)), 0)
+
+
+def followed(*states):
+    """Return a merge with (x_pov, v_pov, x_vut, v_vut) at each step of the follow-up."""
+    after = np.array([[[xp, vp, 0.0], [xv, vv, 0.0]] for xp, vp, xv, vv in states])
+    merged = ending(20.0)
+    return replace(merged, case=replace(CASE, scenario=FOLLOWED), after=after)
+
+
+class TestMeasures:
+    def test_by_hand(self):
+        # The VUT is 15 m behind the POV's rear and 5 m/s faster, then 10 m and 4 m/s.
+        episode = followed((20.0, 20.0, 0.0, 25.0), (22.0, 20.0, 7.0, 24.0))
+        assert followed_up(episode) == pytest.approx((10.0, 2.5, max(25.0 / 30.0, 16.0 / 20.0)))
+
+    def test_of_a_gap_that_opens(self):
+        # The POV is behind, 5 m between bumpers, and slower.
+        assert followed_up(followed((-10.0, 20.0, 0.0, 25.0))) == (5.0, math.inf, 0.0)
+        measures = measure(followed((-10.0, 20.0, 0.0, 25.0)))
+        assert [getattr(measures, name) for name in FOLLOWED_UP] == [5.0, None, 0.0]
+
+    def test_of_bodies_that_touch(self):
+        episode = followed((-10.0, 30.0, 0.0, 20.0), (-4.0, 30.0, 0.5, 20.0))
+        assert followed_up(episode) == (-0.5, 0.0, math.inf)
+        measures = measure(episode)
+        assert (measures.after_gap_m, measures.after_ttc_s) == (-0.5, 0.0)
+        assert measures.after_drac_mps2 is None
+        for met in ("after_drac_mps2 > 99", "after_ttc_s < 0.1", "contact", "unsafe"):
+            assert Criterion(met).margin(episode, measures) < 0.0, met
+
+    def test_are_in_the_record_where_there_is_a_follow_up(self):
+        outcome = Criterion("contact").outcome(0, 0, followed((-10.0, 20.0, 0.0, 25.0)))
+        record = json.loads(json.dumps(outcome.to_record()))
+        assert list(record)[-4:] == [*FOLLOWED_UP, "margin"]
+        assert Outcome.from_record(record, FOLLOWED) == outcome
+        assert not set(FOLLOWED_UP) & set(Outcome(0, 0, CASE, measure(ending(9.0))).to_record())
+
+    def test_that_nobody_takes_are_refused(self):
+        with pytest.raises(UserError, match="--follow-up SECONDS"):
+            Criterion("after_ttc_s < 2").check(US23)
+        Criterion("after_ttc_s < 2").check(FOLLOWED)
+
+    @pytest.mark.parametrize("seconds", [-1.0, 31.0, math.nan])
+    def test_have_a_length_that_can_be(self, seconds):
+        with pytest.raises(UserError, match="follow_up_s is"):
+            replace(US23, follow_up_s=seconds)
+
+
+def test_a_car_behind_brakes_as_krauss_does():
+    # 42.5 m between fronts leave 35 m; b tau = 4: sqrt(16 + 400 + 280) - 4 = 22.38 m/s.
+    x, v = np.array([[-42.5, 20.0], [0.0, 0.0]]), np.array([[25.0, 25.0], [20.0, 20.0]])
+    wanted = np.array([[1.0, 1.0], [1.0, 1.0]])
+    keep_behind_vut(wanted, x, v, US23)
+    assert wanted[0, 0] == pytest.approx((math.sqrt(696.0) - 4.0 - 25.0) / DT_S)
+    assert wanted[0, 1] == wanted[1, 0] == wanted[1, 1] == 1.0  # ahead of it, or the VUT itself
+    before = np.array([[1.0], [1.0]])
+    keep_behind_vut(before, np.array([[-42.5], [-1.0]]), v[:, :1], US23)
+    assert before[0, 0] == 1.0
+
+
+def run(vut, scenario):
+    """Return the trajectories of the cases in a scenario."""
+    cases = [replace(case, scenario=scenario) for case in CASES]
+    factory = vut_factory(vut, VutOptions(in_process=True))
+    with plan_for(factory, scenario=scenario, corridors=5).open() as ground:
+        return dict(ground.run(cases))
+
+
+class TestDrivingOn:
+    def test_changes_nothing_up_to_m(self):
+        at_m, behind = run("design1", US23), run("design1", FOLLOWED)
+        for index, merged in at_m.items():
+            on = behind[index]
+            assert np.array_equal(on.motion, merged.motion)
+            assert (on.end, on.clipped_steps) == (merged.end, merged.clipped_steps)
+            assert measure(on).score == measure(merged).score
+            assert merged.after is None
+
+    def test_is_the_motion_of_both_by_eq_4(self):
+        for trajectory in run("level0", FOLLOWED).values():
+            after = trajectory.after
+            assert after.shape == (31, 2, 3)
+            assert np.array_equal(after[0, :, :2], trajectory.motion[-1, :, :2])
+            x, v, a = (after[:, :, column] for column in range(3))
+            assert np.allclose(x[1:], x[:-1] + v[:-1] * DT_S, atol=1e-9)
+            assert np.allclose(v[1:], np.maximum(v[:-1] + a[:-1] * DT_S, 0.0), atol=1e-9)
+            assert (x[:, VUT] >= 0.0).all()
+
+    def test_ends_where_the_vut_goes_wrong_and_the_merge_stays(self, tmp_path):
+        (tmp_path / "ends.py").write_text(
+            "def ends(seen):\n    return 1.0 if seen.x_vut_m < 10.0 else 1 / 0\n", encoding="utf-8"
+        )
+        for trajectory in run(f"{tmp_path / 'ends.py'}:ends", FOLLOWED).values():
+            assert trajectory.end is End.MERGED
+            assert trajectory.error is None
+            assert trajectory.after[-1, VUT, 0] >= 10.0
+            assert len(trajectory.after) < 10
+
+    def test_is_what_the_command_line_asks_for(self, tmp_path, command_line):
+        code, _, err = command_line(
+            *("campaign", "--vut", "level0", "--level", 0, "--cases", 4, "--follow-up", 2, "-q"),
+            *("--fail-when", "after_drac_mps2 > 1", "--out", tmp_path / "run"),
+        )
+        assert (code, err) == (0, "")
+        record = json.loads((tmp_path / "run" / "campaign.json").read_text(encoding="utf-8"))
+        assert record["scenario"]["follow_up_s"] == 2.0
+        lines = (tmp_path / "run" / "outcomes.jsonl").read_text(encoding="utf-8").splitlines()
+        assert all(json.loads(line)["after_gap_m"] is not None for line in lines)
+        code, _, err = command_line("campaign", "--vut", "level0", "--fail-when", "after_gap_m < 1")
+        assert code == 2
+        assert "--follow-up SECONDS" in err

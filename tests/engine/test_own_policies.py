@@ -1,0 +1,386 @@
+"""Learned drivers of one's own: `--policies DIR` for everything that runs or needs drivers."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from numpy.typing import NDArray
+from plans import key_of, plan_for
+
+import merge_sumo as ms
+from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.levelk import ACTIONS, FEATURES
+from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_of
+from merge_sumo.engine.povs import Povs
+from merge_sumo.engine.simulator import runs_on
+from merge_sumo.errors import UserError
+from merge_sumo.studies.truth import ground_truth
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.trajectory import End
+
+SMALL = {"levels": (1,), "cases": 24, "batch": 8, "seed": 2, "sampler": "uniform"}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("policies")
+
+
+@pytest.fixture(scope="module")
+def same(home) -> Path:
+    """Return a folder with the shipped policies."""
+    return Path(shutil.copytree(policies_of(), home / "same"))
+
+
+@pytest.fixture(scope="module")
+def swapped(home) -> Path:
+    """Return a folder in which the POV of level 1 is the shipped VUT, and the other way round."""
+    folder = Path(shutil.copytree(policies_of(), home / "swapped"))
+    one, other = folder / "pov1.safetensors", folder / "vut1.safetensors"
+    first, second = one.read_bytes(), other.read_bytes()
+    one.write_bytes(second)
+    other.write_bytes(first)
+    known = networks(folder)
+    known["pov1"], known["vut1"] = known["vut1"], known["pov1"]
+    write(folder, known)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def one(home) -> Path:
+    """Return a folder in which only the POV of level 1 is trained."""
+    folder = Path(shutil.copytree(policies_of(), home / "one"))
+    write(folder, {"pov1": networks(folder)["pov1"]})
+    return folder
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path, command_line):
+    monkeypatch.chdir(tmp_path)
+    return command_line
+
+
+def networks(folder: Path) -> dict:
+    return json.loads((folder / MANIFEST).read_text())["networks"]
+
+
+def write(folder: Path, known: dict) -> None:
+    (folder / MANIFEST).write_text(json.dumps({"networks": known}))
+
+
+def outcomes(folder: Path) -> bytes:
+    return (folder / OUTCOMES).read_bytes()
+
+
+def with_layers(
+    policies: Path, folder: Path, name: str, weights: Sequence[NDArray[np.float64]]
+) -> Path:
+    """Return a copy of policies in which a network has other layers, with its true hash."""
+    shutil.copytree(policies, folder)
+    path = folder / f"{name}.safetensors"
+    tensors = {f"{i}.weight": weight for i, weight in enumerate(weights)}
+    biases = {f"{i}.bias": np.zeros(len(weight)) for i, weight in enumerate(weights)}
+    safetensors.numpy.save_file(tensors | biases, path)
+    known = networks(folder)
+    known[name]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    write(folder, known)
+    return folder
+
+
+def settings(policies: Path | None, **changes) -> CampaignSettings:
+    named = None if policies is None else str(policies)
+    return CampaignSettings(vut="design2", policies=named, **{**SMALL, **changes})
+
+
+class TestACampaign:
+    def test_drives_with_the_policies_that_it_is_given(self, same, swapped, tmp_path):
+        for name, folder in (("shipped", None), ("same", same), ("swapped", swapped)):
+            run_campaign(settings(folder), tmp_path / name)
+        assert outcomes(tmp_path / "same") == outcomes(tmp_path / "shipped")
+        assert outcomes(tmp_path / "swapped") != outcomes(tmp_path / "shipped")
+
+    def test_records_where_they_were_and_their_hashes(self, swapped, tmp_path):
+        recorded = run_campaign(settings(swapped), tmp_path / "run").settings
+        assert recorded["policies"] == str(swapped)
+        hashes = {name: entry["sha256"] for name, entry in networks(swapped).items()}
+        assert recorded["policies_sha256"] == hashes
+        assert run_campaign(settings(None), tmp_path / "shipped").settings["policies"] is None
+
+    def test_has_its_learned_vut_from_there_too(self, swapped, tmp_path):
+        for name, folder in (("shipped", None), ("swapped", swapped)):
+            values: dict[str, Any] = {**SMALL, "levels": (0,)}
+            named = None if folder is None else str(folder)
+            level1 = CampaignSettings(vut="level1", policies=named, **values)
+            run_campaign(level1, tmp_path / name)
+        assert outcomes(tmp_path / "swapped") != outcomes(tmp_path / "shipped")
+
+    def test_has_the_same_outcomes_on_two_workers(self, swapped, tmp_path):
+        run_campaign(settings(swapped), tmp_path / "one")
+        with open_workers(2) as workers:
+            run_campaign(settings(swapped), tmp_path / "two", workers=workers)
+        assert outcomes(tmp_path / "one") == outcomes(tmp_path / "two")
+
+    def test_from_python_takes_them(self, swapped, tmp_path):
+        options = {"level": 1, "cases": 4, "out": tmp_path / "run", "policies": swapped}
+        assert ms.campaign("design2", **options).settings["policies"] == str(swapped)
+
+    def test_of_all_levels_is_of_those_that_are_trained_there(self, call, one):
+        code, out, err = call(
+            *("campaign", "--vut", "level0", "--cases", 4, "--policies", one, "--json")
+        )
+        assert code == 0
+        assert list(json.loads(out)["levels"]) == ["0", "1"]
+        assert "policies are there for level 0, 1" in err
+
+
+class TestResuming:
+    @pytest.fixture
+    def stopped(self, swapped, tmp_path) -> Path:
+        """Return a campaign with policies of its own that has run a batch of three."""
+        folder = run_campaign(settings(swapped), tmp_path / "run").folder
+        lines = outcomes(folder).splitlines(keepends=True)
+        (folder / OUTCOMES).write_bytes(b"".join(lines[:8]))
+        for batch in (1, 2):
+            (folder / "trajectories" / f"{batch:05d}.npz").unlink()
+        (folder.parent / "whole").write_bytes(b"".join(lines))
+        return folder
+
+    def test_takes_the_policies_with_which_it_began(self, stopped):
+        resume_campaign(stopped)
+        assert outcomes(stopped) == (stopped.parent / "whole").read_bytes()
+
+    def test_takes_them_from_elsewhere_when_they_are_named_there(self, stopped, swapped, tmp_path):
+        moved = Path(shutil.copytree(swapped, tmp_path / "moved"))
+        resume_campaign(stopped, given={"policies": str(moved)})
+        assert outcomes(stopped) == (stopped.parent / "whole").read_bytes()
+        assert read_settings(stopped)["policies"] == str(moved)
+        assert "forced" not in read_settings(stopped)
+
+    def test_says_when_they_are_gone(self, stopped, swapped, call):
+        hidden = swapped.rename(swapped.with_name("hidden"))
+        try:
+            code, _, err = call("campaign", "--resume", stopped)
+        finally:
+            hidden.rename(swapped)
+        assert code == 2
+        assert err.count("\n") == 1
+        assert "there are none any more" in err
+        assert "--policies" in err
+
+    def test_is_refused_by_name_with_others(self, stopped, same, call):
+        before = outcomes(stopped)
+        code, _, err = call("campaign", "--resume", stopped, "--policies", same)
+        assert code == 2
+        assert err.startswith("merge-sumo: policies_sha256.pov1 differs: ")
+        assert outcomes(stopped) == before
+
+    def test_a_folder_that_somebody_sent_opens_no_policies_but_those_that_it_was_run_with(
+        self, stopped, same, swapped, monkeypatch, tmp_path
+    ):
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
+        record = read_settings(stopped) | {"policies": str(same)}
+        (stopped / SETTINGS).write_text(json.dumps(record))
+        with pytest.raises(UserError, match=r"policies_sha256\.pov1 differs"):
+            resume_campaign(stopped)
+        resume_campaign(stopped, given={"policies": str(swapped)})
+        assert outcomes(stopped) == (stopped.parent / "whole").read_bytes()
+
+    @pytest.mark.parametrize("named", ["../swapped", "a\0b", "x" * 5000, 3, ["a"], "\ud800"])
+    def test_a_folder_that_names_no_policies_is_told_so_in_a_sentence(self, stopped, named):
+        record = read_settings(stopped) | {"policies": named}
+        (stopped / SETTINGS).write_text(json.dumps(record))
+        with pytest.raises(UserError, match=r"policies|not readable JSON"):
+            resume_campaign(stopped)
+
+
+class TestOtherCommands:
+    def test_a_truth_is_of_its_policies_wherever_they_are(self, same, swapped, tmp_path):
+        def counted(folder: Path | None) -> int:
+            ran: list[int] = []
+            povs = None if folder is None else Povs(policies=folder)
+            plan = plan_for("design2", povs=povs)
+            ground_truth(plan, 1, 30, cache=tmp_path, on_cases=ran.append)
+            return sum(ran)
+
+        assert [counted(folder) for folder in (None, same, swapped, swapped)] == [30, 0, 30, 0]
+
+    def test_the_key_of_a_truth_has_the_hashes(self):
+        assert key_of().path() != key_of(policies={"pov1": "another"}).path()
+
+    def test_a_search_and_its_truth_take_them(self, call, swapped, monkeypatch, tmp_path):
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+        options = ("--vut", "design2", "--level", 1, "--workers", 1)
+        compare = ("compare", *options, "--seeds", 1, "--cases", 40, "--truth-cases", 200)
+        found = [
+            json.loads(call(*compare, "--samplers", "uniform", "--json", *named)[1])
+            for named in ((), ("--policies", swapped))
+        ]
+        assert found[0]["truth_fmc"] != found[1]["truth_fmc"]
+        code, out, _ = call(*("truth", *options, "--cases", 200, "--policies", swapped, "--json"))
+        assert code == 0
+        assert json.loads(out)["fmc"] == found[1]["truth_fmc"]
+
+    def test_two_campaigns_against_other_povs_are_not_compared(self, call, swapped, tmp_path):
+        for name, folder in (("a", None), ("b", swapped)):
+            run_campaign(settings(folder), tmp_path / name)
+        for more in ((), ("--no-rerun",)):
+            code, _, err = call("compare-runs", tmp_path / "a", tmp_path / "b", *more)
+            assert code == 2
+            assert "the POV of level 1 is another in" in err
+
+    def test_two_campaigns_against_the_same_povs_are(self, call, same, swapped, tmp_path):
+        for name, folder in (("a", None), ("b", same)):
+            run_campaign(settings(folder, cases=100, batch=50), tmp_path / name)
+        pair = (tmp_path / "a", tmp_path / "b")
+        assert call("compare-runs", *pair)[0] == 0
+        assert call("compare-runs", *pair, "--policies", same)[0] == 0
+        code, out, _ = call("compare-runs", *pair, "--policies", swapped)
+        assert code == 0
+        assert "does not do again what case" in out
+
+    def test_a_probability_is_of_the_policies_of_its_campaign(self, call, same, swapped, tmp_path):
+        run_campaign(settings(swapped), tmp_path / "run")
+        fresh = ("probability", tmp_path / "run", "--cases", 8)
+        code, _, err = call(*fresh, "--policies", same)
+        assert code == 2
+        assert "run with other policies" in err
+        assert call(*fresh)[0] == 0
+
+    def test_vuts_lists_those_that_are_trained_there(self, call, same, one):
+        assert "level1, level2, design1" in call("vuts", "--policies", same)[1]
+        said = call("vuts", "--policies", one)[1]
+        assert "built in: level0, design1, design2, roundabout, careful, " in said
+
+    def test_a_check_and_an_export_take_them(self, call, swapped, one):
+        assert call("check-vut", "level1", "--policies", swapped)[0] == 0
+        code, _, err = call("check-vut", "level1", "--policies", one)
+        assert code == 2
+        assert f"no policy 'vut1' in {one}" in err
+        pytest.importorskip("onnx")
+        for name, folder in (("vut1", swapped), ("pov1", policies_of())):
+            assert call("policies", "export", name, "--out", name, "--policies", folder)[0] == 0
+        assert Path("vut1").read_bytes().replace(b"vut1", b"pov1") == Path("pov1").read_bytes()
+
+    @pytest.mark.parametrize(
+        "command",
+        [
+            ("campaign", "--vut", "design1"),
+            ("truth", "--vut", "design1", "--level", 0),
+            ("compare", "--vut", "design1", "--level", 0),
+            ("reproduce", "--quick"),
+            ("vuts",),
+            ("check-vut", "design1"),
+            ("policies", "export", "vut1", "--out", "vut1.onnx"),
+        ],
+        ids=lambda command: command[0],
+    )
+    def test_all_refuse_what_is_no_folder_of_policies_in_one_sentence(
+        self, call, command, tmp_path
+    ):
+        (tmp_path / "file").touch()
+        (tmp_path / "empty").mkdir()
+        before = sorted(tmp_path.iterdir())
+        for named in ("nowhere", "file", "empty", ".", "/dev/null"):
+            code, out, err = call(*command, "--policies", named)
+            assert (code, out, err.count("\n")) == (2, "", 1)
+            assert "name a folder of policies" in err
+        assert sorted(tmp_path.iterdir()) == before
+
+
+class TestAFolder:
+    @pytest.mark.parametrize("level", [1, 2])
+    def test_without_a_network_says_how_to_make_it(self, one, level):
+        values: dict[str, Any] = {**SMALL, "levels": (level,)}
+        if level == 1:
+            CampaignSettings(vut="design1", policies=str(one), **values)
+            return
+        with pytest.raises(UserError, match=rf"level 2 in {one}: run `merge-sumo train --out"):
+            CampaignSettings(vut="design1", policies=str(one), **values)
+
+    @pytest.mark.parametrize("what", ["gone", "another", "a pipe", "a folder", "a giant"])
+    def test_whose_networks_are_not_those_of_its_manifest_leaves_nothing(
+        self, same, tmp_path, what
+    ):
+        folder = Path(shutil.copytree(same, tmp_path / "policies"))
+        network = folder / "pov1.safetensors"
+        network.unlink()
+        if what == "another":
+            network.write_bytes((folder / "pov2.safetensors").read_bytes())
+        elif what == "a pipe":
+            os.mkfifo(network)
+        elif what == "a folder":
+            network.mkdir()
+        elif what == "a giant":
+            with network.open("wb") as file:
+                file.truncate(MOST_BYTES + 1)
+        with pytest.raises(UserError, match=r"pov1\.safetensors"):
+            run_campaign(settings(folder), tmp_path / "run")
+        assert not (tmp_path / "run").exists()
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e39])
+    @pytest.mark.parametrize("name", ["pov1", "vut1"])
+    def test_with_a_weight_that_is_not_finite_is_refused(self, call, same, tmp_path, name, value):
+        layers = [np.zeros((ACTIONS, FEATURES))]
+        layers[0][3, 4] = value
+        folder = with_layers(same, tmp_path / "policies", name, layers)
+        vut = "level1" if name == "vut1" else "design2"
+        code, _, err = call(
+            *("campaign", "--vut", vut, "--level", "1", "--cases", 4, "--workers", 1, "-q"),
+            *("--policies", folder, "--out", tmp_path / "run"),
+        )
+        assert code == 2
+        assert err.count("\n") == 1
+        assert f"{name}.safetensors holds no action-value network: a weight is NaN" in err
+        assert not (tmp_path / "run").exists()
+
+    @pytest.mark.parametrize(("name", "end"), [("pov1", End.SIM_ERROR), ("vut1", End.VUT_ERROR)])
+    def test_whose_action_values_are_not_finite_gives_no_result(self, same, tmp_path, name, end):
+        big = np.full((2, 2), 1e38)  # finite weights whose products are not
+        layers = [np.outer([1.0, -1.0], np.ones(FEATURES)), *[big] * 9, np.full((ACTIONS, 2), 1e38)]
+        folder = with_layers(same, tmp_path / "policies", name, layers)
+        vut = "level1" if name == "vut1" else "design2"
+        asked = dataclasses.replace(settings(folder), vut=vut)
+        ran = run_campaign(asked, tmp_path / "run")
+        assert {outcome.measures.end for outcome in ran.outcomes} == {end}
+        assert {outcome.score for outcome in ran.outcomes} == {None}
+        assert "action values that are not finite" in str(ran.outcomes[0].measures.error)
+
+    @pytest.mark.parametrize("manifest", [b"", b"{", b"[]", b'{"networks": 3}', b"\xff\xfe\xfd"])
+    def test_with_a_spoilt_manifest_is_refused(self, tmp_path, manifest):
+        (tmp_path / MANIFEST).write_bytes(manifest)
+        with pytest.raises(UserError, match="is not a readable manifest"):
+            settings(tmp_path)
+
+    def test_that_a_worker_does_not_have_is_said_in_a_sentence(self, same, tmp_path):
+        folder = Path(shutil.copytree(same, tmp_path / "policies"))
+        plan = plan_for("design1", corridors=2, povs=Povs(policies=folder))
+        shutil.rmtree(folder)
+        with open_workers(1) as workers, pytest.raises(UserError, match="put the same files there"):
+            runs_on(workers, plan)
+
+    def test_of_the_name_of_a_scenario_is_its_shipped_one(self, tmp_path, same, monkeypatch):
+        shipped = Path(shutil.copytree(same, tmp_path / "shipped"))
+        shutil.copytree(same, shipped / "my-ring")
+        (shipped / "without").mkdir()
+        monkeypatch.setattr("merge_sumo.drivers.policies.resource", lambda _: shipped)
+        assert policies_of(Scenario(name="my-ring")) == shipped / "my-ring"
+        for name in ("us23", "without", "..", ".", "", "/", "../shipped/my-ring", "my-ring/"):
+            assert policies_of(Scenario(name=name)) == shipped
+        ring = CampaignSettings(vut="level1", levels=(1,), scenario=Scenario(name="my-ring"))
+        assert ring.povs.policies == shipped / "my-ring"
+        assert ring.vut_factory.options.policies == shipped / "my-ring"
+        assert CampaignSettings(vut="level1", levels=(1,)).povs.policies == shipped
+        assert US23.name == "us23"

@@ -1,0 +1,602 @@
+"""A POV of one's own: any kind of VUT in the POV's seat, at a level of its own."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import some
+from misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS
+from plans import plan_for
+from processes import none_left
+from vut_contract import cases_of, factory
+
+import merge_sumo as ms
+from merge_sumo import cli
+from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
+from merge_sumo.engine.pov_adapter import PovAdapter
+from merge_sumo.engine.povs import Povs, own_pov
+from merge_sumo.errors import UserError
+from merge_sumo.reports.report import report_page
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import LEVELS, OWN, Scenario
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.base import VutOptions, seen_at_start
+
+KEEPS = "def Pov(seen):\n    return 0.0\n"
+YIELDS = """
+class Pov:
+    def act(self, seen):
+        gap_m = seen.x_pov_m - seen.x_vut_m
+        return -1.0 if abs(gap_m) < 40.0 and seen.x_vut_m < 0.0 else 0.3
+"""
+BATCHED = """
+import numpy as np
+class Pov:
+    def __init__(self, corridors):
+        pass
+    def act_batch(self, seen):
+        near = np.abs(seen.x_pov_m - seen.x_vut_m) < 40.0
+        return np.where(seen.active, np.where(near & (seen.x_vut_m < 0.0), -1.0, 0.3), np.nan)
+"""
+LONG = partial(pytest.param, marks=pytest.mark.long)
+SMALL = {
+    "vut": "design2",
+    "levels": (OWN,),
+    "cases": 18,
+    "batch": 6,
+    "seed": 2,
+    "sampler": "uniform",
+}
+
+
+@pytest.fixture(autouse=True)
+def of_a_user(tmp_path, monkeypatch):
+    """Work as a user with a cache and a folder of their own."""
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "mine"))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+
+
+@pytest.fixture
+def call(monkeypatch, capfd):
+    def main(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
+        capfd.readouterr()
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return code, *capfd.readouterr()
+
+    return main
+
+
+def pov(source: str, name: str = "my_pov.py") -> str:
+    """Write a POV and return what a person writes for it."""
+    Path(name).write_text(source)
+    return f"{name}:Pov"
+
+
+def settings(spec: str, **changes) -> CampaignSettings:
+    return CampaignSettings(pov=spec, **{**SMALL, **changes})
+
+
+def outcomes(folder: Path) -> bytes:
+    return (folder / OUTCOMES).read_bytes()
+
+
+def own(cases: list[Case]) -> list[Case]:
+    return [replace(case, level=OWN, svo_rad=None) for case in cases]
+
+
+def run(
+    spec: str | None, cases: list[Case], vut: str = "design2", corridors: int = 4, **options
+) -> list[Trajectory]:
+    """Return what became of every case against a POV of one's own."""
+    povs = Povs(own=None if spec is None else own_pov(spec, VutOptions(**options)))
+    scenario = cases[0].scenario
+    with plan_for(factory(vut), scenario=scenario, povs=povs, corridors=corridors).open() as ground:
+        found = dict(ground.run(cases))
+    return [found[place] for place in range(len(cases))]
+
+
+def same(one: list[Trajectory], other: list[Trajectory]) -> bool:
+    return all(
+        np.array_equal(a.motion, b.motion) and a.end is b.end
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+class Noting(Driver):
+    """Notes what it is told and shown, and answers by it."""
+
+    def __init__(self, corridors: int) -> None:
+        super().__init__(corridors)
+        self.begun: list[tuple] = []
+        self.scenes: list[Scene] = []
+
+    def begin(self, corridor, case):
+        self.begun.append((corridor, seen_at_start(case)))
+
+    def act(self, scene):
+        self.scenes.append(scene)
+        return scene.x_vut_m / 100.0
+
+
+class TestTheSeat:
+    def test_shows_the_car_of_the_mainline_as_vut_and_the_vut_as_pov(self):
+        noting = Noting(2)
+        seat = PovAdapter(noting)
+        case = Case(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, v_vut0_mps=17.0)
+        seat.begin(1, case)
+        assert noting.begun == [(1, (0.0, -182.0, 17.0, -273.0, 33.0))]
+        active, step = np.array([False, True]), np.array([0, 7])
+        state = [np.array([1.0, n]) for n in (-200.0, 33.0, -150.0, 18.0)]
+        answer = seat.act(Scene.of_pair(active, step, *state))
+        (seen,) = noting.scenes
+        assert (seen.x_vut_m[1], seen.v_vut_mps[1]) == (-200.0, 33.0)
+        assert (seen.x_pov_m[1], seen.v_pov_mps[1]) == (-150.0, 18.0)
+        assert seen.active.tolist() == [False, True]
+        assert answer[1] == -2.0
+
+    @pytest.mark.parametrize("x_pov0_m", [-900.0, -1e-12, 0.0])
+    def test_takes_a_case_from_wherever_the_pov_starts(self, x_pov0_m):
+        noting = Noting(1)
+        PovAdapter(noting).begin(0, Case(level=OWN, x_pov0_m=x_pov0_m, v_pov0_mps=33.0))
+        assert noting.begun[0][1].x_vut_m == pytest.approx(x_pov0_m, abs=1e-9)
+
+    def test_in_traffic_shows_every_car_itself(self):
+        noting = Noting(6)
+        seat = PovAdapter(noting)
+        point = np.array([[0.5, 0.5, 0.5, 0.5]])
+        (case,) = from_unit(point, OWN, scenario=named_scenario("us23-traffic"))
+        (x, v), _, (ahead, _), (behind, _) = case.starts()
+        for corridor in (1, 3, 5):
+            seat.begin(corridor, case)
+        assert [seen.x_vut_m for _, seen in noting.begun] == pytest.approx([x, ahead, behind])
+        assert {(seen.v_vut_mps, seen.x_pov_m) for _, seen in noting.begun} == {(v, -182.0)}
+
+    def test_passes_on_what_its_driver_loses_as_the_povs(self):
+        class Losing(Noting):
+            def act(self, _scene):
+                raise VutLostError("died", 3, final=True)
+
+        zeros = np.zeros(4)
+        nothing = Scene.of_pair(zeros > 0, zeros.astype(int), zeros, zeros, zeros, zeros)
+        with pytest.raises(PovLostError, match=r"^died$") as lost:
+            PovAdapter(Losing(4)).act(nothing)
+        assert (lost.value.corridor, lost.value.final) == (3, True)
+
+
+class TestAPov:
+    def test_that_keeps_its_speed_drives_as_level_0_to_the_last_bit(self):
+        cases = cases_of(20)
+        assert same(run(pov(KEEPS), own(cases)), run(None, cases))
+
+    def test_sees_the_same_in_either_seat(self):
+        source = """
+            log = open(__file__.replace("my_pov.py", "seen.txt"), "a", buffering=1)
+            def Pov(seen):
+                log.write(f"{seen!r}\\n")
+                return 0.5
+        """
+        spec = pov(dedent(source))
+        case = Case(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0)
+        (motion,) = run(spec, [case], vut="level0")
+        first, *_, last = Path("seen.txt").read_text().splitlines()
+        state = "x_pov_m=-182.0, v_pov_mps=18.0, x_vut_m=-273.0, v_vut_mps=33.0"
+        assert first == f"Seen(t_s=0.0, {state})"
+        # It goes on past M until the vehicle under test is there.
+        assert f"x_vut_m={motion.x_pov_m[-2]}" in last
+        assert motion.x_pov_m[-2] > 0.0
+        assert motion.a_pov_mps2[:-1] == pytest.approx(0.5)
+
+    def test_may_be_the_very_file_that_is_the_vut(self):
+        spec = pov(YIELDS)
+        hosted = run(spec, own(cases_of(6)), vut=spec)
+        povs = Povs(own=own_pov(spec, VutOptions(in_process=True)))
+        with plan_for(factory(spec, in_process=True), povs=povs, corridors=4).open() as ground:
+            found = dict(ground.run(own(cases_of(6))))
+        assert same(hosted, [found[k] for k in range(6)])
+        assert any(trajectory.a_pov_mps2.min() == -1.0 for trajectory in hosted)
+
+    @pytest.mark.parametrize("corridors", some([1, 8], 8))
+    def test_drives_an_episode_whatever_runs_beside_it(self, corridors):
+        cases = own(cases_of(9))
+        assert same(run(pov(YIELDS), cases, corridors=corridors), run(pov(YIELDS), cases))
+
+    def test_that_is_batched_drives_as_one_that_is_not(self):
+        cases = own(cases_of(9))
+        assert same(run(pov(BATCHED, "batched.py"), cases), run(pov(YIELDS), cases))
+
+    def test_that_asks_for_too_much_is_clipped_and_the_vut_not_blamed(self):
+        for motion in run(pov("def Pov(seen):\n    return -99.0\n"), own(cases_of(4))):
+            assert motion.a_pov_mps2.min() == -4.0
+            assert motion.clipped_steps == 0
+
+    @pytest.mark.parametrize(
+        "spec", ["my_pov.py:Pov", "sumo:IDM", *map(LONG, ("design1", "sumo:EIDM"))]
+    )
+    def test_changes_nothing_at_the_other_levels(self, spec):
+        pov(YIELDS)
+        rng = np.random.default_rng(3)
+        points = rng.random((12, 3))
+        others = [from_unit(points[:, : 2 + (level == 2)], level) for level in LEVELS]
+        cases = [case for group in zip(*others, own(others[0]), strict=True) for case in group]
+        mixed = run(spec, cases, vut="sumo:IDM", corridors=5)
+        learned = [case for case in cases if case.level != OWN]
+        kept = [motion for motion in mixed if motion.case.level != OWN]
+        assert same(kept, run(None, learned, vut="sumo:IDM", corridors=5))
+        alone = run(spec, [case for case in cases if case.level == OWN], vut="sumo:IDM")
+        assert same([motion for motion in mixed if motion.case.level == OWN], alone)
+
+    def test_that_is_a_network_drives_as_the_driver_that_was_exported(self, call):
+        pytest.importorskip("onnxruntime")
+        assert call("policies", "export", "vut1", "--out", "vut1.onnx")[0] == 0
+        motions = run("onnx:vut1.onnx", own(cases_of(3)))
+        assert all(motion.error is None for motion in motions)
+        assert any(motion.a_pov_mps2.any() for motion in motions)
+
+
+class TestSumosOwnPov:
+    @pytest.mark.parametrize("model", ["IDM", *map(LONG, ("Krauss", "EIDM", "ACC", "CACC"))])
+    def test_keeps_its_speed_where_nobody_is(self, model):
+        # It starts so near to M that it is past it long before the VUT.
+        case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=31.0)
+        (motion,) = run(f"sumo:{model}", [case])
+        assert motion.v_pov_mps == pytest.approx(31.0, abs=0.3)
+
+    def test_goes_for_the_speed_that_it_is_told_within_the_limits(self):
+        case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=34.0)
+        (motion,) = run("sumo:IDM?maxSpeed=30", [case])
+        assert motion.v_pov_mps[-1] == pytest.approx(30.0, abs=0.1)
+        assert motion.a_pov_mps2.min() == pytest.approx(-4.0)
+
+    def test_brakes_for_the_vut_where_level_0_does_not(self):
+        (motion,) = run("sumo:IDM", [Case(level=OWN, x_pov0_m=-280.0, v_pov0_mps=33.0)], "level0")
+        assert motion.a_pov_mps2.min() < -1.0
+        assert measure(motion).end is End.MERGED
+
+    def test_is_moved_exactly_by_the_equations_of_motion(self):
+        for motion in run("sumo:IDM", own(cases_of(8))):
+            x, v, a = motion.x_pov_m, motion.v_pov_mps, motion.a_pov_mps2
+            assert x[1:] == pytest.approx(x[:-1] + 0.1 * v[:-1], abs=1e-9)
+            assert v[1:] == pytest.approx(np.maximum(v[:-1] + 0.1 * a[:-1], 0.0), abs=1e-9)
+
+    def test_drives_all_cars_of_a_queue(self):
+        points = np.random.default_rng(1).random((6, 4))
+        cases = from_unit(points, OWN, scenario=named_scenario("us23-traffic"))
+        motions = run("sumo:IDM", cases)
+        assert all(motion.error is None for motion in motions)
+        assert any(motion.motion[:, 3, 2].min() < -0.1 for motion in motions), "the last one reacts"
+
+
+CASES = own([case for k, case in enumerate(cases_of(6)) if k != 4])
+SOME = ("os._exit 0", "batched: dies")
+
+
+class TestWhatItDoesWrong:
+    @pytest.mark.parametrize(
+        "name",
+        [pytest.param(n, marks=() if n in SOME else pytest.mark.long) for n in CATALOGUE],
+    )
+    def test_is_an_error_of_its_case_and_never_the_vuts(self, name):
+        how = CATALOGUE[name]
+        # Guilty is, as there, the case with the fastest POV: now that is itself.
+        source = how.source.replace("seen.v_pov_mps", "seen.v_vut_mps")
+        spec = pov(source).replace("Pov", "Vut")
+        options: dict[str, Any] = {
+            "deadline_s": DEADLINE_S,
+            "memory_gib": 1.0,
+            "log": Path("controller.log"),
+        }
+        with none_left():
+            if how.refused:
+                with pytest.raises(UserError) as refused:
+                    run(spec, CASES, **options)
+                assert how.reason in str(refused.value)
+                return
+            ran = run(spec, CASES, **options)
+        assert {trajectory.end for trajectory in ran} <= {End.MERGED, End.TIMEOUT, End.SIM_ERROR}
+        if how.shared:
+            return
+        for case, trajectory in zip(CASES, ran, strict=True):
+            if case.v_pov0_mps > GUILTY_MPS and how.reason is not None:
+                assert trajectory.end is End.SIM_ERROR
+                assert trajectory.error.startswith("the POV: ")
+                assert how.reason in trajectory.error
+                assert measure(trajectory).score is None
+            else:
+                assert trajectory.error is None
+
+    @pytest.mark.parametrize("answer", some(["float('nan')", "None"], "None"))
+    def test_is_no_number_for_an_answer(self, answer):
+        spec = pov(f"def Pov(seen):\n    return {answer} if seen.t_s == 1.0 else 0.0\n")
+        for trajectory in run(spec, own(cases_of(3))):
+            assert trajectory.end is End.SIM_ERROR
+            assert trajectory.t_end_s == 1.0
+            assert trajectory.error.startswith("the POV: ")
+
+    def test_beside_a_vut_that_errs_is_told_apart(self):
+        def wrong(speed: str) -> str:
+            return f"def Pov(seen):\n    assert seen.{speed} < 30.0\n    return 0.0\n"
+
+        vut = pov(wrong("v_pov_mps"), "vut.py")
+        cases = own(cases_of(8))
+        for trajectory in run(pov(KEEPS), cases, vut=vut):
+            erred = trajectory.case.v_pov0_mps >= 30.0
+            assert (trajectory.end is End.VUT_ERROR) == erred
+        for trajectory in run(pov(wrong("v_vut_mps")), cases):
+            erred = trajectory.case.v_pov0_mps >= 30.0
+            assert (trajectory.end is End.SIM_ERROR) == erred
+
+    def test_when_both_processes_die_in_the_same_case_is_found_out(self):
+        dies = "import os\ndef Pov(seen):\n    return os._exit(3) if seen.{} > 34.0 else 0.0\n"
+        vut, other = pov(dies.format("v_pov_mps"), "vut.py"), pov(dies.format("v_vut_mps"))
+        with none_left():
+            ran = run(other, CASES, vut=vut)
+        for case, trajectory in zip(CASES, ran, strict=True):
+            assert (trajectory.error is not None) == (case.v_pov0_mps > GUILTY_MPS)
+
+
+class TestACampaign:
+    @pytest.fixture
+    def done(self, tmp_path) -> Run:
+        return run_campaign(settings(pov(YIELDS)), tmp_path / "run")
+
+    def test_records_its_pov_its_files_and_level_3(self, done):
+        assert done.settings["pov"] == "my_pov.py:Pov"
+        assert list(done.settings["pov_files"]) == ["my_pov.py"]
+        assert done.settings["levels"] == [OWN] == [3]
+        assert {outcome.to_record()["level"] for outcome in done.outcomes} == {3}
+
+    def test_has_the_same_outcomes_on_two_workers_and_in_process(self, done, tmp_path):
+        with open_workers(2) as workers:
+            run_campaign(settings("my_pov.py:Pov"), tmp_path / "two", workers=workers)
+        run_campaign(settings("my_pov.py:Pov", in_process=True), tmp_path / "here-too")
+        assert outcomes(tmp_path / "two") == outcomes(done.folder)
+        assert outcomes(tmp_path / "here-too") == outcomes(done.folder)
+
+    def test_of_all_levels_has_the_own_one_too(self, call):
+        pov(YIELDS)
+        code, out, err = call(
+            *("campaign", "--vut", "level0", "--pov", "my_pov.py:Pov", "--cases", 8, "--json")
+        )
+        assert code == 0
+        assert list(json.loads(out)["levels"]) == ["0", "1", "2", "3"]
+        assert "policies are there" not in err
+
+    def test_from_python_takes_one(self, tmp_path):
+        options = {"level": "own", "cases": 4, "out": tmp_path / "run", "pov": pov(YIELDS)}
+        done = ms.campaign("design2", **options)
+        assert {row["level"] for row in done.cases} == {3}
+        assert "<td>own</td>" in done._repr_html_()
+
+    def test_says_own_where_a_person_reads(self, call, tmp_path):
+        pov(YIELDS)
+        given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", "--cases", 20)
+        junit = tmp_path / "junit.xml"
+        code, out, _ = call("campaign", *given, "--junit", junit, "--out", "run", "-q")
+        assert code == 0
+        assert "  level own: " in out
+        assert 'name="POV level own"' in junit.read_text()
+        page = report_page(Run(Path("run")))
+        assert "POV level own: my_pov.py:Pov" in page
+        assert 'data-level="3"' in page
+
+    def test_whose_pov_errs_is_not_the_vuts_but_an_error_all_the_same(self, call):
+        pov("def Pov(seen):\n    raise ValueError('no idea')\n")
+        given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", "--cases", 3)
+        code, out, err = call("campaign", *given, "-q", "--gate", "failures", "--gate", "errors")
+        assert code == 1
+        assert "3 SIM_ERROR, the first in case 0: the POV: ValueError: no idea" in out
+        assert "nothing was tested" in err
+        assert "failures is not met" in err or "failures" in err
+
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (("--level", "own"), "--level own is a POV that you bring: name it with --pov"),
+            (("--level", "0", "--pov", "my_pov.py:Pov"), "--pov drives at --level own or all"),
+            (("--level", "3", "--pov", "my_pov.py:Pov"), "there is no POV level '3'"),
+            (("--pov", "traci"), "a TraCI client drives the vehicle `vut` and no other"),
+            (("--pov", "traci:8813"), "a TraCI client drives the vehicle `vut` and no other"),
+            (("--pov", "level1"), "--level chooses the POVs"),
+            (("--pov", "nowhere.py:Pov"), "--pov nowhere.py:Pov: cannot read"),
+            (("--pov", "my_pov.py:Other"), "has no 'Other'"),
+            (("--pov", "design9"), "there is no VUT 'design9'"),
+            (("--pov", "onnx:nowhere.onnx"), "--pov onnx:nowhere.onnx"),
+            (("--pov", "fmu:nowhere.fmu"), "--pov fmu:nowhere.fmu"),
+            (("--pov", "sumo:Nobody"), "--pov sumo:Nobody"),
+            (("--pov", ""), "--pov"),
+        ],
+    )
+    def test_is_refused_in_one_sentence(self, call, arguments, said):
+        pov(YIELDS)
+        for command in (("campaign", "--vut", "design1"), ("compare", "--vut", "design1")):
+            level = () if "--level" in arguments or command[0] == "campaign" else ("--level", "all")
+            code, out, err = call(*command, *level, *arguments)
+            assert (code, out, err.count("\n")) == (2, "", 1)
+            assert said in err
+        assert sorted(path.name for path in Path().iterdir()) == ["my_pov.py"]
+
+
+class TestResuming:
+    @pytest.fixture
+    def stopped(self, tmp_path) -> Path:
+        folder = run_campaign(settings(pov(YIELDS)), tmp_path / "run").folder
+        (tmp_path / "whole").write_bytes(outcomes(folder))
+        lines = outcomes(folder).splitlines(keepends=True)
+        (folder / OUTCOMES).write_bytes(b"".join(lines[:6]))
+        for batch in (1, 2):
+            (folder / "trajectories" / f"{batch:05d}.npz").unlink()
+        return folder
+
+    def test_goes_on_as_if_nothing_had_been(self, stopped, tmp_path):
+        resume_campaign(stopped)
+        assert outcomes(stopped) == (tmp_path / "whole").read_bytes()
+
+    def test_is_refused_by_name_when_its_file_has_changed(self, stopped, call):
+        Path("my_pov.py").write_text(KEEPS)
+        code, _, err = call("campaign", "--resume", stopped)
+        assert code == 2
+        assert "pov_files.my_pov.py differs" in err
+
+    def test_with_another_pov_is_refused_by_name(self, stopped):
+        other = pov(YIELDS, "other.py")
+        with pytest.raises(UserError, match="pov differs"):
+            resume_campaign(stopped, given={"pov": other})
+
+    def test_with_force_takes_a_pov_that_was_not_there(self, call, tmp_path):
+        values: dict[str, Any] = {**SMALL, "levels": (0,)}
+        folder = run_campaign(CampaignSettings(**values), tmp_path / "run").folder
+        pov(YIELDS)
+        forced = ("campaign", "--resume", folder, "--pov", "my_pov.py:Pov", "--level", "own")
+        assert call(*forced)[0] == 2
+        assert call(*forced, "--cases", 24, "--force", "-q")[0] == 0
+        assert [o.case.level for o in Run(folder).outcomes][18:] == [OWN] * 6
+
+
+TELLTALE = """
+import pathlib
+pathlib.Path(__file__).with_name("it-ran").touch()
+def Pov(seen):
+    return 0.0
+"""
+
+
+class TestTrust:
+    @pytest.fixture
+    def theirs(self, tmp_path, monkeypatch) -> Path:
+        """Return a campaign with a POV that somebody sent; nobody here has its key."""
+        folder = run_campaign(settings(pov(TELLTALE)), tmp_path / "run").folder
+        Path("it-ran").unlink()
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
+        return folder
+
+    def test_the_pov_of_a_received_folder_is_not_run(self, theirs, call, tmp_path):
+        shutil.copytree(theirs, tmp_path / "copy")
+        for command in (
+            ("campaign", "--resume", theirs),
+            ("campaign", "--resume", theirs, "--vut", "design2"),
+            ("probability", theirs, "--cases", 4, "--out", tmp_path / "p.json"),
+        ):
+            code, _, err = call(*command)
+            assert code == 2
+            assert "my_pov.py:Pov: say --trust-vut" in err
+        assert call("report", theirs)[0] == 0
+        assert call("export", theirs, 0)[0] == 0
+        assert call("compare-runs", theirs, tmp_path / "copy", "--no-rerun")[0] == 0
+        assert not Path("it-ran").exists()
+
+    def test_a_person_may_trust_it_or_name_it_again(self, theirs):
+        resume_campaign(theirs, trust=True)
+        assert Path("it-ran").exists()
+        Path("it-ran").unlink()
+        resume_campaign(theirs, given={"pov": "my_pov.py:Pov"})
+        assert Path("it-ran").exists()
+
+    @pytest.mark.parametrize("forged", ["my_pov.py:Pov", "onnx:x.onnx", "an_installed_name"])
+    def test_a_pov_that_somebody_put_into_a_folder_of_ones_own_is_a_strangers(
+        self, tmp_path, forged
+    ):
+        pov(TELLTALE)
+        values: dict[str, Any] = {**SMALL, "levels": (0,)}
+        folder = run_campaign(CampaignSettings(**values), tmp_path / "run").folder
+        record = json.loads((folder / SETTINGS).read_text())
+        record.pop(CHECKSUM)
+        (folder / SETTINGS).write_text(json.dumps(record | {"pov": forged, "levels": [3]}))
+        with pytest.raises(UserError, match="--trust-vut"):
+            resume_campaign(folder)
+        assert not Path("it-ran").exists()
+
+    @pytest.mark.parametrize("spec", ["design1", "sumo:IDM"])
+    def test_what_is_of_this_package_or_of_sumo_runs_from_any_folder(
+        self, tmp_path, monkeypatch, spec
+    ):
+        folder = run_campaign(settings(spec, cases=2, batch=2), tmp_path / "run").folder
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
+        assert len(resume_campaign(folder).outcomes) == 2
+
+
+class TestOtherCommands:
+    def test_a_truth_is_of_the_files_of_its_pov(self, call):
+        given = ("--vut", "design2", "--level", "own", "--pov", "my_pov.py:Pov", "--workers", 1)
+        source = """
+            from pathlib import Path
+            def Pov(seen):
+                Path(__file__).with_name("it-drove").touch()
+                return {}
+        """
+
+        def drives(answer: float) -> bool:
+            Path("it-drove").unlink(missing_ok=True)
+            Path("my_pov.py").write_text(dedent(source.format(answer)))
+            code, out, _ = call("truth", *given, "--cases", 30, "--json")
+            assert code == 0
+            assert json.loads(out)["level"] == OWN
+            return Path("it-drove").exists()
+
+        assert [drives(answer) for answer in (0.0, 0.0, 1.0)] == [True, False, True]
+
+    def test_a_comparison_of_samplers_draws_it(self, call):
+        pov(YIELDS)
+        given = ("--vut", "design2", "--level", "own", "--pov", "my_pov.py:Pov", "--workers", 1)
+        sizes = ("--seeds", 1, "--cases", 20, "--batch", 10, "--truth-cases", 60)
+        code, out, _ = call("compare", *given, *sizes, "--samplers", "uniform,gpr", "--json")
+        assert code == 0
+        assert list(json.loads(out)["uniform"]["levels"]) == ["3"]
+
+    def test_campaigns_against_other_povs_are_not_compared(self, call, tmp_path):
+        for name, spec in (("a", pov(YIELDS)), ("b", pov(KEEPS, "other.py"))):
+            run_campaign(settings(spec), tmp_path / name)
+        code, _, err = call("compare-runs", tmp_path / "a", tmp_path / "b")
+        assert code == 2
+        assert "the POV of level own is another" in err
+        run_campaign(settings("my_pov.py:Pov", vut="design1"), tmp_path / "c")
+        code, out, _ = call("compare-runs", tmp_path / "a", tmp_path / "c")
+        assert code in (0, 1)
+        assert "\nown " in out
+        pov(KEEPS)
+        run_campaign(settings("my_pov.py:Pov"), tmp_path / "d")
+        assert call("compare-runs", tmp_path / "a", tmp_path / "d")[0] == 2
+
+    def test_a_probability_is_against_it(self, call, tmp_path):
+        run_campaign(settings(pov(YIELDS)), tmp_path / "run")
+        Path("d.json").write_text('{"levels": {"3": 1}}')
+        fresh = ("probability", tmp_path / "run", "--cases", 10, "--distribution", "d.json")
+        assert call(*fresh)[0] == 0
+
+    def test_an_export_of_a_case_replays(self, call, tmp_path):
+        run_campaign(settings(pov(YIELDS)), tmp_path / "run")
+        assert call("export", tmp_path / "run", 3, "--out", "out")[0] == 0
+        assert "identical" in call("replay", "out/case-00003")[1]
+
+
+def test_settings_know_a_scenario_with_its_own_speeds():
+    slow: dict[str, Any] = {
+        "v_vut0_mps": 9.0,
+        "v_pov0_mps": (5.0, 12.0),
+        "x_pov0_m": (-80.0, -20.0),
+    }
+    scenario = Scenario(name="slow", **slow)
+    cases = from_unit(np.random.default_rng(1).random((3, 2)), OWN, scenario=scenario)
+    assert all(motion.error is None for motion in run("sumo:IDM", cases))

@@ -1,0 +1,343 @@
+"""The second shipped scenario: its road, its pool, and that it is one data file."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import make_scenarios
+import numpy as np
+import pytest
+from lxml import etree
+from plans import plan_for
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.analysis.diagnosis import Kind, diagnose
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.scenario_suggestion import unseen
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.base import Driver
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
+from merge_sumo.drivers.policies import (
+    NETWORKS,
+    load_network,
+    plays_as,
+    policies_of,
+    read_manifest,
+    scenario_of,
+)
+from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.reports.report import write_report
+from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
+from merge_sumo.sumo.world import World
+from merge_sumo.training import check as checking
+from merge_sumo.training.env import MergeGame
+from merge_sumo.training.reward import Reward, RewardWeights
+from merge_sumo.values.case import from_unit, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End
+
+ROOT = Path(__file__).resolve().parents[2]
+ROUNDABOUT = named_scenario("roundabout")
+RADIUS_M = 25.0
+
+
+@pytest.fixture(scope="module")
+def road():
+    return road_for(ROUNDABOUT)
+
+
+def uniform_cases(count: int, level: int = 0, seed: int = 0):
+    points = np.random.default_rng(seed).random((count, 3 if level == 2 else 2))
+    return from_unit(points, level, scenario=ROUNDABOUT)
+
+
+def from_the_middle_m(at) -> float:
+    return math.hypot(at.x_m, at.y_m)
+
+
+class TestItsRoad:
+    def test_is_a_ring_of_a_real_size_on_which_the_pov_drives_in_all_of_the_pool(self, road):
+        for x_m in np.arange(ROUNDABOUT.x_pov0_m[0], 0.5, 0.5):
+            at = road.lane_point(x_m, on_ramp=False)
+            assert from_the_middle_m(at) == pytest.approx(RADIUS_M, abs=0.2)
+
+    def test_is_driven_round_counterclockwise(self, road):
+        before, m = (road.lane_point(x_m, on_ramp=False) for x_m in (-75.0, 0.0))
+        turned = math.atan2(m.y_m, m.x_m) - math.atan2(before.y_m, before.x_m)
+        assert math.degrees(turned) % 360.0 == pytest.approx(math.degrees(75.0 / RADIUS_M), abs=1.0)
+
+    def test_has_an_entry_that_comes_from_the_south_and_touches_the_ring(self, road):
+        start, line, m = (road.lane_point(x_m, on_ramp=True) for x_m in (-50.0, -11.3, 0.0))
+        assert start.angle_deg == pytest.approx(0.0)
+        assert line.lane == "in_s_0"
+        assert from_the_middle_m(line) > RADIUS_M + 3.2
+        assert m == road.lane_point(0.0, on_ramp=False)
+
+    def test_gives_the_ring_the_right_of_way(self, road):
+        assert road.ramp_approach.yields
+        assert not road.mainline_approach.yields
+
+    def test_limits_speeds_to_the_fastest_of_the_pool(self, road):
+        assert road.speed_limit_mps == ROUNDABOUT.v_pov0_mps[1] == 12.0
+
+    def test_is_drawn_all_around(self, road):
+        drawn = [*road.surroundings, *(piece.shape for piece in road.mainline.pieces)]
+        corners = np.array([point[:2] for shape in drawn for point in shape])
+        for angle in range(0, 360, 5):
+            turn = math.radians(angle)
+            on_ring = RADIUS_M * np.array([math.cos(turn), math.sin(turn)])
+            assert np.linalg.norm(corners - on_ring, axis=1).min() < 3.2
+
+
+class TestItsPool:
+    def test_has_a_conflict_in_half_of_its_cases(self):
+        cases = uniform_cases(20_000)
+        due_s = float(
+            level0_time_to(
+                np.array(-ROUNDABOUT.x_vut0_m),
+                np.array(ROUNDABOUT.v_vut0_mps),
+                ROUNDABOUT.level0_a_mps2,
+                ROUNDABOUT.level0_v_mps,
+            )
+        )
+        gaps_m = np.abs([case.x_pov0_m + case.v_pov0_mps * due_s for case in cases])
+        assert (gaps_m < ROUNDABOUT.dx_critical_m).mean() == pytest.approx(0.5, abs=0.02)
+        assert (gaps_m < ROUNDABOUT.dx_crash_m).mean() > 0.15
+
+    def test_lets_who_waits_for_the_slowest_get_there_before_the_timeout(self):
+        waits_s = -ROUNDABOUT.x_pov0_m[0] / ROUNDABOUT.v_pov0_mps[0]
+        from_a_stand = level0_time_to(
+            np.array(11.2), np.array(0.0), ROUNDABOUT.level0_a_mps2, ROUNDABOUT.level0_v_mps
+        )
+        assert waits_s + float(from_a_stand) < ROUNDABOUT.timeout_s
+
+
+class Haphazard(Driver):
+    """Accelerates at random, now and then to a stand."""
+
+    def __init__(self, corridors: int, seed: int) -> None:
+        super().__init__(corridors)
+        self._rng = np.random.default_rng(seed)
+
+    def act(self, scene):
+        return self._rng.uniform(-4.0, 2.0, self.corridors) + 0.9
+
+
+def test_random_episodes_follow_the_equations_of_motion_to_the_digit(road):
+    with World(32, road) as world:
+        played = list(rollout(world, Haphazard(32, 1), Haphazard(32, 2), uniform_cases(200)))
+    assert len(played) == 200
+    for _, trajectory in played:
+        for x, v, a in (
+            (trajectory.x_pov_m, trajectory.v_pov_mps, trajectory.a_pov_mps2),
+            (trajectory.x_vut_m, trajectory.v_vut_mps, trajectory.a_vut_mps2),
+        ):
+            assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
+            assert v[1:] == pytest.approx(np.maximum(v[:-1] + a[:-1] * 0.1, 0.0), abs=1e-9)
+
+
+class TestItsDrivers:
+    def test_are_its_own_and_rational(self):
+        folder = policies_of(ROUNDABOUT)
+        assert folder == policies_of() / "roundabout"
+        manifest = read_manifest(folder)
+        assert tuple(manifest) == NETWORKS
+        for name, entry in manifest.items():
+            assert load_network(name, folder).sees_svo == (name == "pov2")
+            assert plays_as(scenario_of(entry), ROUNDABOUT)
+            weights = RewardWeights.of(ROUNDABOUT)
+            assert entry["reward_weights"] == pytest.approx(dataclasses.asdict(weights))
+            assert entry["check"]["mean_regret"] <= 0.02
+            assert entry["check"]["avoidable_collisions"] == 0
+        for name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
+            assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
+
+    def test_have_seen_its_starts(self):
+        assert unseen(ROUNDABOUT) == []
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("name", ["pov1", "vut1"])
+    def test_of_level_1_collide_in_none_of_3000_cases(self, name):
+        cases = checking.check_cases(name, 3000, seed=5, scenario=ROUNDABOUT)
+        network, level0 = (
+            load_network(name, policies_of(ROUNDABOUT)),
+            checking.opponents(name, None),
+        )
+        pair = (network, level0) if name == "pov1" else (level0, network)
+        returns = checking.returns_of(checking.play(cases, *pair), Reward.of(ROUNDABOUT))
+        assert returns.collided.sum() == 0
+        unmoved = checking.play(cases, Level0Pov, Level0Vut)
+        assert checking.returns_of(unmoved, Reward.of(ROUNDABOUT)).collided.sum() > 300
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("name", NETWORKS)
+    def test_lose_little_over_300_cases_that_training_never_saw(self, name):
+        found = checking.check_policy(name, policies_of(ROUNDABOUT), scenario=ROUNDABOUT)
+        assert found.mean_regret <= 0.02
+        assert found.avoidable_collisions == 0
+
+
+class TestItsVut:
+    @pytest.mark.long
+    @pytest.mark.parametrize(
+        ("level", "count", "bounds", "kinds"),
+        [
+            (0, 10_000, (0.0, 0.0), set()),
+            (1, 10_000, (0.05, 0.13), {Kind.STALEMATE}),
+            (2, 20_000, (0.005, 0.02), {Kind.SQUEEZE}),
+        ],
+    )
+    def test_fails_only_against_drivers_who_react(self, level, count, bounds, kinds):
+        cases = uniform_cases(count, level, seed=1)
+        with plan_for("roundabout", scenario=ROUNDABOUT).open() as ground:
+            failing = [
+                trajectory for _, trajectory in ground.run(cases) if measure(trajectory).is_close
+            ]
+        points = to_unit((trajectory.case for trajectory in failing), level)
+        assert bounds[0] <= (fmc(points) if failing else 0.0) <= bounds[1]
+        assert {diagnose(trajectory, measure(trajectory)).kind for trajectory in failing} == kinds
+
+
+class TestTheExampleRuns:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def runs(cls):
+        names = ("roundabout-yields", "roundabout-stalemate")
+        return [make_scenarios.play(make_scenarios.EXAMPLES[name]) for name in names]
+
+    def test_begin_alike(self, runs):
+        assert np.array_equal(runs[0].motion[0, :, :2], runs[1].motion[0, :, :2])
+
+    def test_in_one_the_pov_slows_and_the_vut_merges_first(self, runs):
+        run = runs[0]
+        assert run.v_pov_mps[-1] < run.v_pov_mps[0] - 3.0
+        assert (measure(run).end, measure(run).merged_first) == (End.MERGED, "VUT")
+
+    def test_in_the_other_both_nearly_stop_go_at_the_same_moment_and_collide(self, runs):
+        run = runs[1]
+        assert measure(run).is_close
+        assert diagnose(run, measure(run)).kind is Kind.STALEMATE
+        slowest = run.v_pov_mps.argmin(), run.v_vut_mps.argmin()
+        assert abs(slowest[0] - slowest[1]) <= 2
+        assert (run.v_pov_mps.min(), run.v_vut_mps.min()) < (2.0, 2.0)
+        assert -12.0 < run.x_pov_m[slowest[0]] < run.x_vut_m[slowest[1]] < -6.0
+
+
+def test_a_game_on_it_is_played_by_its_numbers(road):
+    game = MergeGame("pov", Level0Vut(1), Reward.of(ROUNDABOUT), road)
+    try:
+        game.begin(0, np.array([-60.0, 8.0, -50.0, 7.8]))
+        state, _, over = game.decide(np.array([1.0]))
+    finally:
+        game.close()
+    # 8, 8.1 ... 8.4 and 7.8, 7.9, 8, 8, 8 m/s for 0.1 s each: level 0 holds 8 m/s.
+    assert state[0] == pytest.approx([-60.0 + 4.1, 8.5, -50.0 + 3.97, 8.0], abs=1e-9)
+    assert not over[0]
+
+
+def call(*arguments: object):
+    return CliRunner().invoke(cli.app, [*map(str, arguments)])
+
+
+class TestACampaignOnIt:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def run(cls, tmp_path_factory) -> Run:
+        settings = CampaignSettings(
+            vut="level0", levels=(0,), cases=40, batch=20, scenario=ROUNDABOUT
+        )
+        return run_campaign(settings, tmp_path_factory.mktemp("round") / "run")
+
+    def test_replays_its_worst_cases_identically(self, run):
+        folders = sorted((run.folder / "scenarios").iterdir())
+        assert len(folders) == 10
+        for folder in folders[:3]:
+            replayed = call("replay", folder)
+            assert replayed.stdout.startswith("identical"), replayed.output
+
+    def test_is_shown_in_sumo_gui_as_large_as_the_ring_with_cars_of_their_size(self, run):
+        view = next((run.folder / "scenarios").iterdir()) / "view.settings.xml"
+        shown = etree.fromstring(view.read_bytes())
+        place = shown.find("viewport").attrib
+        assert math.hypot(float(place["x"]), float(place["y"])) < 3.0 * RADIUS_M
+        # The arms that are driven on, of 250 m, and 2 km straight on behind the last of them.
+        assert 100.0 * 2000.0 / float(place["zoom"]) < 6.0 * 2.0 * RADIUS_M
+        assert float(shown.find("scheme/vehicles").get("vehicle_exaggeration")) <= 1.5
+
+    def test_names_the_net_as_the_package_does_wherever_it_is_installed(self, run):
+        recorded = json.loads((run.folder / "campaign.json").read_text())["scenario"]
+        assert recorded["net"] == "roundabout.net.xml"
+        assert Run(run.folder).scenario == ROUNDABOUT
+
+    def test_has_a_report_that_shows_the_ring_to_the_left_of_the_way_through_m(self, run):
+        page = write_report(run).read_text()
+        data = json.loads(page.split('id="data">', 1)[1].split("</script>", 1)[0])
+        on_ring = [(x, y) for x_m, x, y in data["main"] if ROUNDABOUT.x_pov0_m[0] < x_m <= 0.0]
+        assert len(on_ring) > 15
+        for place in on_ring:
+            assert math.dist(place, (0.0, RADIUS_M)) == pytest.approx(RADIUS_M, abs=1.5)
+
+
+ANOTHER_ARM = """
+net = "roundabout.net.xml"
+mainline = ["in_w", "ring_ws", "pass_s", "ring_se", "out_e"]
+ramp = ["in_s", "ring_se", "out_e"]
+x_pov0_m = [-60, -25]
+v_pov0_mps = [5, 10]
+x_vut0_m = -50
+v_vut0_mps = 6
+level0_v_mps = 8
+"""
+
+
+def test_a_shipped_scenario_is_one_data_file_and_no_code(tmp_path):
+    for name in ("merge_sumo", "sumo_net", "policies"):
+        ignored = shutil.ignore_patterns("__pycache__", "shipped")
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
+    (tmp_path / "sumo_net" / "another-arm.toml").write_text(ANOTHER_ARM)
+
+    options = ("--vut", "level0", "--level", "0", "--cases", "20", "--batch", "20", "--quiet")
+    commands = [
+        ("scenario", "list"),
+        ("scenario", "check", "another-arm"),
+        ("campaign", "--scenario", "another-arm", *options, "--out", "run"),
+    ]
+    script = "from merge_sumo.cli import app\n" + "".join(
+        f"app({words!r}, standalone_mode=False)\n" for words in commands
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "another-arm: POV from -60 to -25 m at 5 to 10 m/s" in done.stdout
+    assert "mainline: in_w ring_ws" in done.stdout
+    run = Run(tmp_path / "run")
+    assert run.scenario.name == "another-arm"
+    assert any(outcome.failed for outcome in run.outcomes)
+    assert call("replay", next((run.folder / "scenarios").iterdir())).stdout.startswith("identical")
+
+
+def test_every_shipped_scenario_has_a_road_with_room_for_its_starts():
+    assert {"us23", "roundabout"} <= set(shipped_scenarios())
+    for name in shipped_scenarios():
+        scenario = named_scenario(name)
+        assert scenario.name == name
+        road_for(scenario)

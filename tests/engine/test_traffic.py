@@ -1,0 +1,350 @@
+"""Traffic: three cars on the mainline, what they do to each other, and what the VUT sees."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from plans import plan_for
+
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.sumo.replay import replay
+from merge_sumo.sumo.replay_folder import HOLD_STEPS, RECORD, write_scenario
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, Pool, from_unit, to_unit
+from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, VUT, Scenario
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.base import VutOptions, seen_at_start, seen_in
+from merge_sumo.vuts.registry import vut_factory
+
+TRAFFIC = replace(
+    US23, name="us23-traffic", headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 4.0)
+)
+RANGED = replace(US23, v_vut0_mps=(14.0, 22.0))
+
+
+def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) -> list[Case]:
+    rng = np.random.default_rng([seed, level])
+    points = rng.random((n, len(scenario.dimensions(level))))
+    return Pool(levels=(level,), scenario=scenario).cases(points, level)
+
+
+def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
+    factory = vut_factory(vut, VutOptions(**options))
+    with plan_for(factory, scenario=cases[0].scenario, corridors=corridors).open() as ground:
+        ran = dict(ground.run(cases))
+    return [ran[place] for place in range(len(cases))]
+
+
+class TestThePool:
+    @pytest.mark.parametrize(("level", "dims"), [(0, 4), (1, 4), (2, 5)])
+    def test_has_a_coordinate_for_every_range(self, level, dims):
+        assert len(TRAFFIC.dimensions(level)) == dims
+        points = np.random.default_rng(1).random((20, dims))
+        cases = from_unit(points, level, scenario=TRAFFIC)
+        assert to_unit(cases, level) == pytest.approx(points, abs=1e-12)
+
+    @pytest.mark.parametrize(("level", "dims"), [(0, 3), (1, 3), (2, 4)])
+    def test_has_the_speed_of_the_vut_where_that_is_a_range(self, level, dims):
+        names = [d.field for d in RANGED.dimensions(level)]
+        assert len(names) == dims
+        assert names[2] == "v_vut0_mps"
+        speeds = [case.v_vut0_mps for case in cases_of(level, 200, RANGED)]
+        assert 14.0 <= min(speeds) < 14.2
+        assert 21.8 < max(speeds) <= 22.0
+
+    def test_starts_the_cars_at_their_headways_and_the_speed_of_the_pov(self):
+        (case,) = from_unit(np.array([[0.5, 0.5, 0.0, 1.0]]), 0, scenario=TRAFFIC)
+        assert case.starts() == [
+            (-260.0, 30.0),
+            (-182.0, 18.0),
+            (-260.0 + 1.0 * 30.0, 30.0),
+            (-260.0 - 4.0 * 30.0, 30.0),
+        ]
+
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"headway_behind_s": (1.0, 4.0)},
+            {"headway_behind_s": (1.0, 4.0), "headway_ahead_s": (0.1, 4.0)},
+            {"headway_ahead_s": (1.0, 4.0), "headway_behind_s": (4.0, 1.0)},
+            {"headway_ahead_s": (1.0, 4.0), "headway_behind_s": (1.0, 40.0)},
+            {"v_vut0_mps": (20.0, 10.0)},
+            {"v_vut0_mps": (20.0, 20.0)},
+            {"v_vut0_mps": (20.0, 1e3)},
+            {"tau_s": 0.0},
+            {"min_gap_m": -1.0},
+            {"pov_length_m": 0.0},
+            {"vut_length_m": float("nan")},
+        ],
+    )
+    def test_refuses_what_makes_no_traffic_in_a_sentence(self, wrong):
+        with pytest.raises(UserError, match=next(reversed(wrong))):
+            replace(US23, **wrong)
+
+    def test_refuses_a_case_without_its_headways_or_with_some_that_do_not_belong_there(self):
+        state: dict[str, Any] = {"level": 0, "x_pov0_m": -300.0, "v_pov0_mps": 30.0}
+        with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
+            Case(**state, scenario=TRAFFIC)
+        with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
+            Case(**state, headway_ahead_s=2.0, headway_behind_s=2.0)
+        with pytest.raises(UserError, match="3 m apart"):
+            Case(**state, headway_ahead_s=0.1, headway_behind_s=2.0, scenario=TRAFFIC)
+
+
+def test_the_safe_speed_is_that_of_sumos_original_krauss_model():
+    libsumo = load_libsumo()
+    attributes = {"carFollowModel": "KraussOrig1", "decel": "4", "tau": "1.3", "accel": "1000"}
+    rng = np.random.default_rng(0)
+    gaps, leaders = rng.uniform(0.5, 200.0, 200), rng.uniform(0.0, 45.0, 200)
+    with World(1, vut_type={**attributes, "minGap": "0", "maxSpeed": "200"}) as world:
+        world.place(0, [(-340.0, 0.0), (-182.0, 18.0)])
+        theirs = [
+            libsumo.vehicle.getFollowSpeed("vut.0", 45.0, gap, leader, 4.0)
+            for gap, leader in zip(gaps.tolist(), leaders.tolist(), strict=True)
+        ]
+    assert safe_speed_mps(gaps, leaders, 4.0, 1.3) == pytest.approx(theirs, abs=1e-9)
+
+
+class TestCarsOfTheMainline:
+    @pytest.mark.parametrize("level", [0, 1, 2])
+    def test_that_are_far_away_change_nothing(self, level):
+        alone = cases_of(level, 60, US23)
+        far = [
+            replace(case, headway_ahead_s=18.0, headway_behind_s=16.0, scenario=TRAFFIC)
+            for case in alone
+        ]
+        for one, other in zip(run("design2", alone), run("design2", far), strict=True):
+            assert np.array_equal(one.motion, other.motion[:, :2])
+            assert one.end == other.end
+            # A car far behind may still have to brake a little.
+            found = measure(other)
+            assert found.brake_after_mps2 == pytest.approx(measure(one).brake_after_mps2, abs=0.2)
+            assert replace(found, brake_after_mps2=measure(one).brake_after_mps2) == measure(one)
+
+    @pytest.mark.parametrize("level", [0, 1, 2])
+    def test_obey_eq4_and_keep_apart(self, level):
+        for trajectory in run("level0", cases_of(level, 60)):
+            x, v, a = np.moveaxis(trajectory.motion, 2, 0)
+            assert x.shape[1] == 4
+            assert np.abs(x[1:] - x[:-1] - v[:-1] * DT_S).max() < 1e-9
+            assert np.abs(v[1:] - v[:-1] - a[:-1] * DT_S).max() < 1e-9
+            for leader, follower in ((AHEAD, POV), (POV, BEHIND)):
+                assert (x[:, leader] - x[:, follower]).min() > TRAFFIC.pov_length_m
+
+    def test_brake_behind_one_that_brakes_and_never_touch_it(self):
+        following, rng = Following(50), np.random.default_rng(0)
+        case = cases_of(0, 1)[0]
+        for k in range(50):
+            following.begin(k, case)
+        v = np.tile(rng.uniform(5.0, 35.0, 50), (4, 1))
+        x = np.zeros((4, 50))
+        x[AHEAD], x[BEHIND] = rng.uniform(1.1, 2.0, (2, 50)) * [[1.0], [-1.0]] * v[0]
+        for step in range(200):
+            a = np.full((4, 50), 2.0)
+            a[AHEAD] = -4.0 if step > 10 else 0.0
+            following.limit(a, x, v)
+            a = np.clip(a, -4.0, 2.0)
+            x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
+            assert (x[[AHEAD, POV]] - x[[POV, BEHIND]]).min() > TRAFFIC.pov_length_m
+        assert v.max(axis=1)[[POV, AHEAD, BEHIND]].max() < 0.2
+
+    def test_do_not_depend_on_what_runs_beside(self):
+        cases = cases_of(2, 12)
+        for one, other in zip(run("design2", cases, 1), run("design2", cases, 12), strict=True):
+            assert np.array_equal(one.motion, other.motion)
+
+
+class TestWhatTheVutMeets:
+    def test_is_the_car_that_will_be_nearest_to_m(self):
+        # At 28 m/s already, the VUT is at M in 5 s; then the cars are at -50, 10 and -40 m.
+        x = np.array([[-200.0], [-140.0], [-140.0], [-190.0]])
+        v = np.array([[30.0], [28.0], [30.0], [30.0]])
+        assert car_met(x, v, 1.0, 28.0).tolist() == [AHEAD]
+        assert car_met(x, v, 1.0, 28.0 / 1.5).tolist() == [AHEAD]
+        x[AHEAD] = 0.0
+        assert car_met(x, v, 1.0, 28.0).tolist() == [BEHIND]
+
+    def test_counts_as_pov_and_all_cars_are_seen_from_the_front_to_the_back(self):
+        seen = seen_in(1.5, BEHIND, [-200.0, -140.0, -150.0, -190.0], [30.0, 28.0, 31.0, 29.0])
+        assert seen == (1.5, -190.0, 29.0, -140.0, 28.0)
+        assert seen.others == ((-150.0, 31.0), (-190.0, 29.0), (-200.0, 30.0))
+        assert seen.others[0].x_m == -150.0
+
+    def test_is_the_pov_where_there_is_no_other(self):
+        seen = seen_at_start(Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0))
+        assert seen.others == ((-300.0, 30.0),)
+        assert len(seen) == 5
+
+    def test_is_told_to_a_vut_in_a_process_of_its_own_as_to_one_in_ours(self, tmp_path):
+        file = tmp_path / "notes.py"
+        file.write_text(
+            "class Notes:\n"
+            "    def reset(self, seen):\n"
+            "        self.first = seen.others\n"
+            "    def act(self, seen):\n"
+            "        cars = [x for car in (*self.first, *seen.others) for x in car]\n"
+            "        assert len(cars) == 12 and (seen[1], seen[2]) in seen.others\n"
+            "        return sum(cars) % 1.0\n"
+            "class Batch:\n"
+            "    def __init__(self, corridors):\n"
+            "        self.first = [None] * corridors\n"
+            "    def reset(self, corridor, seen):\n"
+            "        self.first[corridor] = [x for car in seen.others for x in car]\n"
+            "    def act_batch(self, seen):\n"
+            "        now = seen.x_others_m, seen.v_others_mps\n"
+            "        assert (now[0][:-1] >= now[0][1:]).all()\n"
+            "        import numpy as np\n"
+            "        answers = []\n"
+            "        for k, first in enumerate(self.first):\n"
+            "            cars = [x for car in zip(now[0][:, k], now[1][:, k]) for x in car]\n"
+            "            answers.append(sum([*(first or []), *cars]) % 1.0)\n"
+            "        return np.array(answers)\n"
+        )
+        cases = cases_of(1, 6)
+        hosted = run(f"{file}:Notes", cases, 4)
+        assert [t.error for t in hosted] == [None] * 6
+        for other in (run(f"{file}:Notes", cases, 4, in_process=True), run(f"{file}:Batch", cases)):
+            for one, two in zip(hosted, other, strict=True):
+                assert np.array_equal(one.motion, two.motion)
+
+    def test_is_all_cars_for_sumos_own_drivers(self):
+        # Behind M the car ahead is its leader; far away there is none.
+        near = Case(
+            level=0,
+            x_pov0_m=-340.0,
+            v_pov0_mps=25.0,
+            headway_ahead_s=10.0,
+            headway_behind_s=4.0,
+            scenario=TRAFFIC,
+        )
+        far = replace(near, headway_ahead_s=30.0)
+        (behind_it,), (alone,) = run("sumo:IDM", [near], 1), run("sumo:IDM", [far], 1)
+        assert not np.array_equal(behind_it.motion[:80, VUT], alone.motion[:80, VUT])
+
+
+class TestARunInTraffic:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def made(cls, tmp_path_factory):
+        folder = tmp_path_factory.mktemp("traffic") / "run"
+        settings = CampaignSettings(
+            vut="design2", levels=(0, 1, 2), sampler="uniform", cases=30, batch=15, scenario=TRAFFIC
+        )
+        return run_campaign(settings, folder)
+
+    def test_is_read_back_as_it_was_written(self, made):
+        again = Run(made.folder)
+        assert again.outcomes == made.outcomes
+        assert again.scenario == TRAFFIC
+        assert {o.measures.nearest for o in again.outcomes} == {"pov", "ahead", "behind"}
+        trajectory = again.trajectory(7)
+        assert trajectory.motion.shape[1:] == (4, 3)
+        lines = centre_lines(road_for(TRAFFIC))
+        assert measure(trajectory, lines) == again.outcome(7).measures
+
+    @pytest.mark.parametrize("hosted", [False, True])
+    def test_is_replayed_identically(self, made, tmp_path, hosted):
+        road = road_for(TRAFFIC)
+        if hosted:  # as a road that is not the shipped one
+            road = replace(road, sha256="0" * 64)
+        for index in (0, 12, 25):
+            folder = tmp_path / str(index)
+            write_scenario(folder, road, made.outcome(index), made.trajectory(index))
+            result = replay(folder)
+            assert (result.diverged_at_s, result.detail) == (None, "")
+            assert result.rows == 4 * (len(made.trajectory(index).motion) + HOLD_STEPS)
+
+    def test_is_no_replay_without_one_of_the_cars(self, made, tmp_path):
+        write_scenario(tmp_path / "c", road_for(TRAFFIC), made.outcome(0), made.trajectory(0))
+        record = tmp_path / "c" / RECORD
+        lines = record.read_text().splitlines(keepends=True)
+        gone = next(n for n, line in enumerate(lines) if 'id="behind"' in line)
+        record.write_text("".join(lines[:gone] + lines[gone + 1 :]))
+        with pytest.raises(UserError, match="every vehicle in every timestep"):
+            replay(tmp_path / "c")
+
+    def test_shows_all_cars_to_a_traci_client(self, tmp_path):
+        script = tmp_path / "client.py"
+        script.write_text(
+            "import sys, traci\n"
+            "traci.init(int(sys.argv[1]))\n"
+            "while traci.simulation.getMinExpectedNumber() > 0:\n"
+            "    traci.simulationStep()\n"
+            "    if 'vut' in (names := traci.vehicle.getIDList()):\n"
+            "        assert sorted(names) == ['ahead', 'behind', 'pov', 'vut'], names\n"
+            "        assert traci.vehicle.getLeader('behind', 500.0)[0] == 'pov'\n"
+            "        assert traci.vehicle.getLength('vut') == 4.0\n"
+            "        gap = traci.vehicle.getLeader('pov', 500.0)[1]\n"
+            "        at = [traci.vehicle.getPosition(n)[0] for n in ('ahead', 'pov')]\n"
+            "        assert abs(gap - (at[0] - at[1] - 6.0)) < 1e-6, (gap, at)\n"
+            "        traci.vehicle.setSpeed('vut', 20.0)\n"
+        )
+        scenario = replace(TRAFFIC, pov_length_m=6.0, vut_length_m=4.0)
+        command = f"{sys.executable} {script} {{port}}"
+        trajectories = run("traci", cases_of(0, 2, scenario), command=command)
+        assert [t.error for t in trajectories] == [None, None]
+        assert [t.end for t in trajectories] == [End.MERGED] * 2
+
+
+def ending(gaps_m: dict[int, float], speeds: dict[int, float] | None = None) -> Trajectory:
+    """Return an episode at whose end the cars are so far ahead of the VUT, which is at M."""
+    case = cases_of(0, 1)[0]
+    motion = np.zeros((3, 4, 3))
+    motion[:, :, 1] = 25.0
+    for row, speed in (speeds or {}).items():
+        motion[:, row, 1] = speed
+    motion[-1, :, 0] = [gaps_m.get(row, 0.0) for row in range(4)]
+    for step in (1, 0):
+        motion[step, :, 0] = motion[step + 1, :, 0] - motion[step, :, 1] * DT_S
+    return Trajectory(case, motion, End.MERGED)
+
+
+class TestTheVerdict:
+    @pytest.mark.parametrize(("row", "name"), [(POV, "pov"), (AHEAD, "ahead"), (BEHIND, "behind")])
+    def test_is_a_failure_where_any_car_is_too_near(self, row, name):
+        gaps = {POV: 40.0, AHEAD: 90.0, BEHIND: -50.0}
+        measures = measure(ending({**gaps, row: 4.0}, {row: 27.0}))
+        assert measures.is_close
+        assert (measures.dx_m, measures.dv_mps, measures.nearest) == (4.0, 2.0, name)
+
+    def test_is_of_the_nearest_car(self):
+        measures = measure(ending({POV: 40.0, AHEAD: 90.0, BEHIND: -12.0}, {BEHIND: 29.0}))
+        assert (measures.end, measures.dx_m, measures.nearest) == (End.MERGED, -12.0, "behind")
+        assert measures.ttc_s == pytest.approx(3.0)
+        assert measures.merged_first == "VUT"
+
+    def test_goes_into_the_record_and_back(self):
+        trajectory = ending({POV: 40.0, AHEAD: 90.0, BEHIND: -5.0})
+        outcome = Outcome(3, 0, trajectory.case, measure(trajectory))
+        record = outcome.to_record()
+        assert record["nearest"] == "behind"
+        assert record["headway_ahead_s"] == trajectory.case.headway_ahead_s
+        assert Outcome.from_record(record, TRAFFIC) == outcome
+
+    def test_knows_no_way_out_through_a_car(self):
+        # Braking avoids the POV, but not the car behind it.
+        case = cases_of(0, 1)[0]
+        motion = np.zeros((6, 4, 3))
+        x = np.array([-14.0, -12.0, 100.0, -25.0])
+        v = np.array([20.0, 20.0, 20.0, 20.0])
+        for step in range(6):
+            motion[step, :, 0], motion[step, :, 1] = x, v
+            x = x + v * DT_S
+        motion = np.concatenate([motion, motion[-1:] + [[[2.0, 0.0, 0.0]]] * 4], axis=0)
+        with_queue = measure(Trajectory(case, motion, End.MERGED))
+        alone = measure(Trajectory(case, motion[:, :2], End.MERGED))
+        assert with_queue.is_close
+        assert alone.is_close
+        assert (with_queue.last_avoidable_s or -1.0) <= (alone.last_avoidable_s or -1.0)

@@ -1,0 +1,846 @@
+"""The report in a real browser: Debian's Chromium without a window."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from conftest import require, some
+from foreign_nets import corridor_of
+from handmade import write_run
+
+from merge_sumo.analysis import diagnosis
+from merge_sumo.analysis.coordinates import WRITTEN
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.reports import comparison_page, report
+from merge_sumo.reports import report_model as report_facts
+from merge_sumo.reports.campaign_progress import CampaignProgress
+from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.reports.running_page import running_page
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.studies import comparison
+from merge_sumo.studies.avoidance import write_avoidance
+from merge_sumo.studies.counterfactuals import Avoidance
+from merge_sumo.values.scenario import POV
+
+EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    program = shutil.which("chromium") or shutil.which("google-chrome")
+    require(program is not None, "chromium is not on the PATH")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        # No sandbox: CI runs as root, and the page is our own.
+        opened = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    run = write_run(tmp_path_factory.mktemp("browser") / "run", error=None)
+    report.write_report(run)
+    return run
+
+
+FIELDS = {name: field for field, (name, *_) in WRITTEN.items()}
+INSIDE = """() => views.filter((view) => view.moving).flatMap(({ svg, cars }) => {
+    const all = svg.getBoundingClientRect();
+    return Object.values(cars).map(({ group }) => {
+        const car = group.getBoundingClientRect();
+        return car.left >= all.left && car.right <= all.right
+            && car.top >= all.top && car.bottom <= all.bottom;
+    });
+})"""
+"""Whether each car is in the picture, for all pictures."""
+
+
+@contextmanager
+def shown(browser, file: Path, **options) -> Iterator:
+    """Open a file; afterwards, fail if the page had anything to complain about."""
+    complaints: list[str] = []
+    context = browser.new_context(**{"viewport": {"width": 1280, "height": 900}, **options})
+    page = context.new_page()
+    page.set_default_timeout(60_000)
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("dialog", lambda dialog: complaints.append(f"dialog {dialog.message}"))
+    page.on(
+        "request",
+        lambda request: complaints.extend(
+            [] if request.url.startswith(("file:", "data:")) else [request.url]
+        ),
+    )
+    try:
+        page.goto(file.as_uri())
+        yield page
+    finally:
+        context.close()
+    assert complaints == []
+
+
+@pytest.fixture
+def page(browser, made):
+    with shown(browser, made.folder / report.REPORT) as opened:
+        yield opened
+
+
+def chosen(page) -> int:
+    """Return the index of the case that is shown."""
+    return int(page.inner_text("#case-title").split()[1])
+
+
+def marks(page, kind: str) -> int:
+    return page.locator(f".map[data-level='2'] {kind}").count()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"viewport": {"width": 1280, "height": 900}},
+        {"viewport": {"width": 380, "height": 800}},
+        {"color_scheme": "dark"},
+    ],
+    ids=["wide", "narrow", "dark"],
+)
+def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options):
+    with shown(browser, made.folder / report.REPORT, **options) as page:
+        assert page.locator(".map .mark.fail").count() == len(failures(made.outcomes))
+        width = page.evaluate("document.documentElement.scrollWidth")
+        assert width <= page.viewport_size["width"]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"viewport": {"width": 1280, "height": 900}},
+        {"viewport": {"width": 390, "height": 800}},
+        {"color_scheme": "dark"},
+    ],
+    ids=["wide", "narrow", "dark"],
+)
+def test_pages_without_a_script_open_without_a_complaint_and_fit_the_window(
+    browser, made, tmp_path, options
+):
+    other = write_run(tmp_path / "other", 20, vut=EVIL, error=EVIL)
+    compared = comparison.compare_runs(made, other, rerun=False)
+    file = tmp_path / "compared.html"
+    comparison_page.write_comparison(compared, made, other, {}, 0.0, file)
+    progress = CampaignProgress(EVIL, 400, (0, 1, 2))
+    for outcome in made.outcomes:
+        progress.case_ended(outcome)
+    running = tmp_path / "running.html"
+    running.write_text(running_page(progress, tmp_path, stopped=True), encoding="utf-8")
+    for page_file in (file, running):
+        with shown(browser, page_file, **options) as page:
+            assert EVIL in page.inner_text("h1")
+            for details in page.locator("details").all()[:3]:
+                details.locator("summary").click()
+                assert details.locator("svg").first.is_visible()
+            width = page.evaluate("document.documentElement.scrollWidth")
+            assert width <= page.viewport_size["width"]
+
+
+def test_marks_filters_and_table_know_the_four_words(browser, made):
+    classed = {
+        word: sorted(o.index for o in made.outcomes if o.measures.severity == word)
+        for word in ("contact", "conflict", "harsh", "safe")
+    }
+    assert sum(map(bool, classed.values())) >= 3
+    with shown(browser, made.folder / report.REPORT) as page:
+        for word, indices in classed.items():
+            marks = page.locator(f".map .mark.{word}")
+            drawn = marks.evaluate_all("all => all.map((m) => m.dataset.case)")
+            assert sorted(map(int, drawn)) == indices
+            chip = page.locator(f".legend [data-filter=severity][data-value={word}]")
+            assert chip.inner_text().split() == [word, str(len(indices))]
+            if indices:
+                chip.click()
+                assert page.evaluate("location.hash").endswith(f"severity={word}")
+                assert bright(page) == all_rows(page) == indices
+                assert set(column(page, "severity")) == {word}
+                chip.click()
+        fails = page.locator(".map .mark.fail").evaluate_all(
+            "all => all.map((m) => m.dataset.case)"
+        )
+        assert sorted(map(int, fails)) == sorted(o.index for o in failures(made.outcomes))
+        page.locator("#table th button", has_text="severity").click()
+        words = [word for word in column(page, "severity") if word]
+        order = list(classed)
+        assert words == sorted(words, key=order.index), "the most severe first"
+
+
+def test_it_starts_with_the_worst_case(page, made):
+    assert chosen(page) == failures(made.outcomes)[0].index
+    worst = failures(made.outcomes)[0].measures.severity
+    assert page.inner_text("#case-words").lower().startswith(worst)
+
+
+def test_the_slider_shows_the_cases_near_a_psi(page, made):
+    third = page.locator(".map[data-level='2'] .third")
+    slider, value = third.locator("input[type=range]"), third.locator("output")
+    slider.fill("0.2")
+    assert value.inner_text() == "0.20 rad (11°)"
+    all_of_level = sum(o.case.level == 2 for o in made.outcomes)
+    near = sum(o.case.level == 2 and abs(o.case.svo_rad - 0.2) <= 0.1 for o in made.outcomes)
+    assert marks(page, ".mark.faint") == all_of_level - near
+    slider.focus()
+    page.keyboard.press("ArrowRight")
+    assert value.inner_text().startswith("0.21 rad")
+    third.locator("input[type=checkbox]").check()
+    assert marks(page, ".mark.faint") == 0
+
+
+def test_a_click_on_a_case_shows_it(page, made):
+    mark = page.locator(".map[data-level='0'] .mark.fail").last
+    mark.scroll_into_view_if_needed()
+    box = mark.bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    outcome = made.outcome(chosen(page))
+    assert outcome.failed
+    assert outcome.case.level == 0
+    assert f"x_POV0 \u2212{-outcome.case.x_pov0_m:.1f} m" in page.inner_text("#case-title")
+    command = f"merge-sumo replay {made.folder} {outcome.index} --gui"
+    assert page.inner_text("#command") == command
+
+
+def in_sight(page, part: str) -> bool:
+    """Return whether a part of the page is in the window and nothing lies over its middle."""
+    return page.locator(part).evaluate(
+        """(part) => {
+            const { top, bottom, left, right } = part.getBoundingClientRect();
+            const over = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+            return top >= 0 && bottom <= innerHeight && left >= 0 && right <= innerWidth
+                && (part === over || part.contains(over));
+        }"""
+    )
+
+
+def click(page, part: str) -> None:
+    """Click where something is drawn, once it has come into the window."""
+    found = page.locator(part)
+    found.scroll_into_view_if_needed()
+    box = found.bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+
+
+WINDOWS = pytest.mark.parametrize("size", [(1280, 900), (390, 800)], ids=["wide", "phone"])
+
+
+@WINDOWS
+def test_a_click_on_a_mark_shows_its_case_and_the_mark_without_scrolling(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    level = failures(made.outcomes)[0].case.level
+    lowest = min(
+        (o for o in made.outcomes if o.failed and o.case.level == level),
+        key=lambda o: o.case.v_pov0_mps,
+    )
+    mark = f".map [data-case='{lowest.index}'].mark"
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        click(page, mark)
+        assert chosen(page) == lowest.index
+        for part in ("#case-title", "#road", "#play"):
+            assert in_sight(page, part), part
+        box, panel = (page.locator(part).bounding_box() for part in (mark, "#case"))
+        assert box["y"] >= 0.0
+        assert box["y"] + box["height"] <= panel["y"]
+        assert page.evaluate(INSIDE) == [True, True]
+        assert page.evaluate("location.hash") == f"#case-{lowest.index}"
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        page.keyboard.press("Escape")
+        assert not in_sight(page, "#case-title")
+
+
+@WINDOWS
+def test_a_link_opens_its_case(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        for index in (111, 7):
+            page.evaluate(f"location.hash = '#case-{index}'")
+            page.locator(f"#case-link[href='#case-{index}']").wait_for()
+            assert chosen(page) == index
+            assert in_sight(page, "#case-title")
+        page.reload()
+        assert chosen(page) == 7
+        assert in_sight(page, "#case-title")
+        page.evaluate("location.hash = '#case-99999'")
+        assert chosen(page) == 7
+
+
+def rows(page) -> list[int]:
+    """Return the cases of the table of all cases, from top to bottom."""
+    return [int(text) for text in page.locator("#table td button").all_inner_texts()]
+
+
+def column(page, name: str) -> list[str]:
+    names = [text.strip() for text in page.locator("#table th").all_inner_texts()]
+    cells = page.locator(f"#table td:nth-child({names.index(name) + 1})")
+    return cells.all_inner_texts()
+
+
+@WINDOWS
+def test_all_cases_sort_and_open(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        worst = sorted((round(o.score, 1), o.index) for o in failures(made.outcomes))
+        assert rows(page)[: len(worst)] == [index for _, index in worst]
+        assert len(rows(page)) == 100
+        page.locator("#more").click()
+        assert sorted(rows(page)) == [o.index for o in made.outcomes]
+        by_gap = page.locator("#table th button", has_text="Δx at M")
+        for way, order in (("ascending", 1), ("descending", -1)):
+            by_gap.click()
+            assert page.locator(f"#table th[aria-sort={way}]").inner_text().startswith("Δx at M")
+            told = [o for o in made.outcomes if o.measures.dx_m is not None]
+            told.sort(key=lambda o: (order * round(o.measures.dx_m, 4), o.index))
+            assert rows(page) == [o.index for o in told[:100]]
+        row = page.locator("#table tbody tr").nth(5)
+        row.click()
+        assert chosen(page) == rows(page)[5]
+        assert in_sight(page, "#case-title")
+        assert in_sight(page, "#table tr.on td:first-child")
+        row.locator("button").focus()
+        page.keyboard.press("ArrowDown")
+        assert chosen(page) == rows(page)[6]
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+
+
+def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser, made):
+    found = failures(made.outcomes)
+    region = regions_of(found)
+    with shown(browser, made.folder / report.REPORT) as page:
+        filters = page.locator("#filters")
+        filters.locator("[name=verdict]").select_option("failure")
+        assert sorted(rows(page)) == sorted(o.index for o in found)
+        filters.locator("[name=level]").select_option("1")
+        of_level = [o for o in found if o.case.level == 1]
+        assert sorted(rows(page)) == sorted(o.index for o in of_level)
+        filters.locator("[name=region]").select_option("1:0")
+        assert sorted(rows(page)) == sorted(o.index for o in of_level if region[o.index] == 0)
+        assert set(column(page, "region")) == {"1"}
+        filters.locator(".reset").click()
+        page.locator("#matching:text('180 of 180')").wait_for()
+        kind = filters.locator("[name=kind] option").nth(1).get_attribute("value")
+        filters.locator("[name=kind]").select_option(kind)
+        assert set(column(page, "kind")) == {kind}
+        filters.locator(".reset").click()
+        page.locator("#matching:text('180 of 180')").wait_for()
+        filters.locator("[name=measure]").select_option(label="Δx at M m")
+        filters.locator("[name=from]").fill("-8")
+        filters.locator("[name=to]").fill("-6")
+        inside = [o.index for o in made.outcomes if -8 <= round(o.measures.dx_m or 0, 4) <= -6]
+        assert sorted(rows(page)) == inside
+        assert inside
+
+
+def bright(page) -> list[int]:
+    """Return the cases that are drawn and not faint; maps with a slider show all values."""
+    for check in page.locator(".map input[type=checkbox]").all():
+        check.check()
+    found = page.locator(".map .mark:not(.faint)").evaluate_all(
+        "all => all.map((m) => m.dataset.case)"
+    )
+    return sorted(map(int, found))
+
+
+def all_rows(page) -> list[int]:
+    """Return the cases of the whole table."""
+    while page.locator("#more").is_visible():
+        page.locator("#more").click()
+    return sorted(rows(page))
+
+
+@WINDOWS
+def test_a_click_on_a_region_in_words_shows_its_cases_in_maps_and_table(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    found = failures(made.outcomes)
+    near = [o for o in made.outcomes if o.is_tested and not o.failed]
+    kinds = ReportModel(made).kinds
+    boxes = [b for n in (0, 1, 2) for b in diagnosis.failure_boxes(found + near, n, kinds)]
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        sentences = page.locator(".sentences button")
+        assert sentences.all_inner_texts() == [box.sentence for box in boxes]
+        for number in (0, len(boxes) - 1):
+            sentences.nth(number).click()
+            inside = sorted(boxes[number].indices)
+            assert len(inside) == boxes[number].cases
+            assert all_rows(page) == inside
+            assert bright(page) == inside
+            assert sentences.nth(number).get_attribute("aria-pressed") == "true"
+            assert page.inner_text("#filtered-number").startswith(f"{len(inside)} of 180 cases")
+        sentences.nth(len(boxes) - 1).click()
+        assert len(bright(page)) == 180
+        assert not page.locator("#filtered").is_visible()
+        kind = page.locator("[data-filter=kind]").first
+        kind.click()
+        assert set(column(page, "kind")) == {kind.get_attribute("data-value")}
+        page.locator("#filtered .reset").click()
+        assert len(all_rows(page)) == 180
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+
+
+def test_the_address_keeps_the_filters_through_reload_back_and_forward(browser, made):
+    found = failures(made.outcomes)
+    of_level = sorted(o.index for o in found if o.case.level == 1)
+    with shown(browser, made.folder / report.REPORT) as page:
+        filters = page.locator("#filters")
+        filters.locator("[name=verdict]").select_option("failure")
+        filters.locator("[name=level]").select_option("1")
+        page.evaluate(f"openCase(place.get({of_level[0]}))")
+        address = page.evaluate("location.hash")
+        assert address == f"#case-{of_level[0]}&level=1&verdict=failure"
+        assert page.get_attribute("#case-link", "href") == address
+        page.reload()
+        assert (all_rows(page), chosen(page)) == (of_level, of_level[0])
+        page.go_back()
+        page.locator("#matching:not(:text-is(''))").wait_for()
+        assert all_rows(page) == sorted(o.index for o in found)
+        page.go_back()
+        assert len(all_rows(page)) == 180
+        page.go_forward()
+        page.go_forward()
+        assert all_rows(page) == bright(page) == of_level
+        filters.locator("[name=measure]").select_option(label="score")
+        filters.locator("[name=to]").press_sequentially("-1000")
+        assert "measure=score&to=-1000" in page.evaluate("location.hash")
+        page.go_back()  # one step back is the whole number
+        assert all_rows(page) == of_level
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "#verdict=nothing&level=7&kind=%3Cscript%3E&region=9:9&box=99&avoided=me&from=x&to=1e999",
+        "#case-1e3&level=%E0%A4%A&__proto__=1&constructor=2&box=-1&measure=__proto__&from=",
+        "#&&&===&verdict&%00" + "&level=0" * 0 + "&x=" + "y" * 10_000,
+        "#case-0x1&verdict=failure%0A&kind=" + EVIL,
+    ],
+)
+def test_what_an_address_says_wrongly_is_left_out(browser, made, address):
+    with shown(browser, made.folder / report.REPORT) as page:
+        page.evaluate("(address) => { location.hash = address; }", address)
+        page.wait_for_timeout(100)
+        assert len(all_rows(page)) == 180
+        page.reload()
+        assert len(all_rows(page)) == 180
+        assert page.locator(".map .mark").count() == 180
+
+
+def test_the_table_is_downloaded_as_it_is_filtered_and_no_text_in_it_is_a_formula(
+    browser, tmp_path
+):
+    formulas = {4: "=1+1", 9: "@SUM(A1)\nnext;=2", 11: '-1,"x"', 13: "harmless, -3 m"}
+    run = write_run(tmp_path / "run", 20, errors=formulas)
+    with shown(browser, report.write_report(run)) as page:
+        with page.expect_download() as started:
+            page.locator("#download").click()
+        assert started.value.suggested_filename == "cases.csv"
+        text = started.value.path().read_text(encoding="utf-8")
+        table = list(csv.DictReader(io.StringIO(text, newline="")))
+        assert sorted(int(row["case"]) for row in table) == [o.index for o in run.outcomes]
+        by_case = {int(row["case"]): row for row in table}
+        for outcome in run.outcomes:
+            row = by_case[outcome.index]
+            score = outcome.score
+            assert row["score"] == ("" if score is None else f"{round(score, 1):g}") or (
+                float(row["score"]) == pytest.approx(score, abs=0.06)
+            )
+            assert float(row["x_POV0 m"]) == pytest.approx(outcome.case.x_pov0_m, abs=1e-3)
+        assert by_case[4]["verdict"] == "VUT_ERROR: =1+1"
+        cells = [cell for row in csv.reader(io.StringIO(text, newline="")) for cell in row]
+        # Where a list separator is another one, cells are split without a look at quotes.
+        cells += [cell for line in text.splitlines() for cell in re.split("[;\t]", line)]
+        for cell in cells:
+            plain = cell.strip('" ')
+            assert re.fullmatch(r"-?[0-9.]*", plain) or plain[:1] not in tuple("=+-@"), cell
+        page.locator("#filters [name=verdict]").select_option("failure")
+        with page.expect_download() as started:
+            page.locator("#download").click()
+        table = list(csv.DictReader(started.value.path().open(encoding="utf-8", newline="")))
+        assert [int(row["case"]) for row in table] == rows(page)
+
+
+def test_a_map_zooms_about_the_case_and_is_dragged(page, made):
+    index = failures(made.outcomes)[0].index
+    figure = f".map[data-level='{made.outcome(index).case.level}']"
+    mark, whole = f"{figure} [data-case='{index}'].mark", page.locator(f"{figure} .mark").count()
+    click(page, mark)
+    page.keyboard.press("Escape")
+    for _ in range(2):
+        page.locator(f"{figure} [aria-label='Zoom in']").click()
+    assert page.locator(f"{figure} .mark").count() < whole
+    frame, box = (page.locator(part).bounding_box() for part in (f"{figure} .frame", mark))
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    assert frame["x"] <= x <= frame["x"] + frame["width"]
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 5, y + 5)
+    page.mouse.move(x + 20, y + 10)
+    page.mouse.up()
+    assert chosen(page) == index, "a drag is no click"
+    page.locator(f"{figure} button", has_text="All").click()
+    assert page.locator(f"{figure} .mark").count() == whole
+
+
+@WINDOWS
+def test_two_cases_are_compared(browser, made, size):
+    viewport = {"width": size[0], "height": size[1]}
+    first, second = (o.index for o in spread_failures(made.outcomes)[:2])
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        page.locator("#keep").click()
+        page.locator(f".list [data-case='{second}']").click()
+        assert chosen(page) == second
+        assert page.inner_text("#beside-title").startswith(f"Case {first} ")
+        word = made.outcome(first).measures.severity
+        assert page.inner_text("#beside-words").lower().startswith(word)
+        if size[0] < 1000:
+            assert page.locator("#case").evaluate("(panel) => panel.matches('.docked')")
+        page.evaluate("dock(true)")
+        upper, lower = (page.locator(part).bounding_box() for part in ("#keep", ".case-command"))
+        assert upper["y"] + upper["height"] <= lower["y"]
+        for chart, lines in (("speed", 2), ("position", 2), ("gap", 1)):
+            assert page.locator(f"#chart-{chart} .line.beside").count() == lines
+            assert page.locator(f"#chart-{chart} .line").count() == 2 * lines
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        page.locator("#keep").click()
+        assert page.locator(".line.beside").count() == 0
+        for part in ("#beside", "#view-beside"):
+            assert not page.locator(part).is_visible()
+
+
+def placed(page, view: str, who: str) -> tuple[float, float]:
+    """Return where a car is drawn, in metres."""
+    moved = page.locator(f"#{view} g:has(> rect.{who})").get_attribute("transform")
+    found = re.match(r"translate\((\S+) (\S+)\)", moved)
+    assert found is not None
+    x, y = found.groups()
+    return float(x), float(y)
+
+
+@WINDOWS
+def test_two_top_views_move_together_and_show_the_same_stretch_of_road(browser, tmp_path, size):
+    run = write_run(tmp_path / "run", 20, error=None, timeouts=(0,))
+    report.write_report(run)
+    first, second = failures(run.outcomes)[0].index, 0
+    rows = {index: len(run.trajectory(index).motion) for index in (first, second)}
+    last = rows[second] - 1
+    assert rows[first] < last
+    with shown(
+        browser, run.folder / report.REPORT, viewport={"width": size[0], "height": size[1]}
+    ) as page:
+        page.evaluate(f"openCase(place.get({first}))")
+        page.locator("#keep").click()
+        page.evaluate(f"openCase(place.get({second}))")
+        for part in ("#case-title", "#road", "#road-beside", "#play", "#time"):
+            assert in_sight(page, part), part
+        own, other = (page.locator(part).bounding_box() for part in ("#road", "#road-beside"))
+        side_by_side = own["y"] == other["y"] and own["x"] + own["width"] < other["x"]
+        one_below_the_other = own["x"] == other["x"] and own["y"] + own["height"] < other["y"]
+        assert (side_by_side, one_below_the_other) == (size[0] > 1000, size[0] < 1000)
+        assert (own["width"], own["height"]) == (other["width"], other["height"])
+        slider = page.locator("#time")
+        assert slider.get_attribute("max") == str(last)
+        for step in (0, 30, last):
+            slider.fill(str(step))
+            road, other_road = page.locator("#road"), page.locator("#road-beside")
+            assert road.get_attribute("viewBox") == other_road.get_attribute("viewBox")
+            assert page.evaluate(INSIDE) == [True] * 4
+            for view, index in (("view", second), ("view-beside", first)):
+                motion = run.trajectory(index).motion[min(step, rows[index] - 1)]
+                assert placed(page, view, "pov")[0] == pytest.approx(motion[POV, 0], abs=0.1)
+        slider.fill(str(last - 1))
+        assert page.inner_text("#view figcaption") == f"Case {second}"
+        ended = f"Case {first}, ended at {(rows[first] - 1) / 10:.1f} s"
+        assert page.inner_text("#view-beside figcaption") == ended
+        slider.fill("0")
+        page.locator("#play").click()
+        for _ in range(600):
+            if int(page.input_value("#time")) > 3:
+                break
+            page.wait_for_timeout(50)
+        page.locator("#play").click()
+        assert 3 < int(page.input_value("#time")) < last
+        assert placed(page, "view", "vut") == placed(page, "view-beside", "vut")
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+
+
+def test_a_command_breaks_between_words_only(browser, made):
+    viewport = {"width": 390, "height": 800}
+    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
+        words = page.locator("#command span")
+        rows = words.evaluate_all("all => all.map((word) => word.getClientRects().length)")
+        assert rows == [1] * len(f"merge-sumo replay {made.folder} 1 --gui".split())
+
+
+def test_arrow_keys_move_through_the_lists(page, made):
+    worst = [o.index for o in spread_failures(made.outcomes)]
+    page.locator(".list button").first.focus()
+    for expected in (worst[1], worst[2]):
+        page.keyboard.press("ArrowDown")
+        assert chosen(page) == expected
+    page.keyboard.press("ArrowUp")
+    assert chosen(page) == worst[1]
+
+
+def test_arrow_keys_move_over_a_map(page, made):
+    page.locator(".map[data-level='0'] > svg").focus()
+    page.keyboard.press("ArrowLeft")
+    start = made.outcome(chosen(page))
+    assert start.case.level == 0
+    page.keyboard.press("ArrowLeft")
+    left = made.outcome(chosen(page))
+    assert left.case.x_pov0_m < start.case.x_pov0_m
+    page.keyboard.press("ArrowUp")
+    assert made.outcome(chosen(page)).case.v_pov0_mps > left.case.v_pov0_mps
+
+
+def test_the_animation_plays_pauses_and_is_scrubbed(page, made):
+    last = len(made.trajectory(chosen(page)).motion) - 1
+    assert page.input_value("#time") == str(last), "a failure is shown as it ended"
+    page.locator("#time").fill("0")
+    assert page.inner_text("#time-value") == "0.0 s"
+    before = page.locator("#road").get_attribute("viewBox")
+    page.locator("#play").focus()
+    page.keyboard.press("Enter")
+    assert page.locator("#play").get_attribute("aria-label") == "Pause"
+    for _ in range(600):
+        if int(page.input_value("#time")) > 3:
+            break
+        page.wait_for_timeout(50)
+    assert int(page.input_value("#time")) > 3
+    page.keyboard.press("Enter")
+    assert page.locator("#play").get_attribute("aria-label") == "Play"
+    assert page.locator("#road").get_attribute("viewBox") != before
+    page.locator("#time").focus()
+    page.keyboard.press("End")
+    assert page.input_value("#time") == str(last)
+
+
+def test_the_command_is_copied(browser, made):
+    with shown(
+        browser, made.folder / report.REPORT, permissions=["clipboard-read", "clipboard-write"]
+    ) as page:
+        page.locator("#copy").click()
+        page.locator("#copy:text('Copied')").wait_for()
+        assert page.evaluate("navigator.clipboard.readText()") == page.inner_text("#command")
+
+
+def test_what_is_drawn_is_where_the_case_is(page, made):
+    outcome = failures(made.outcomes)[0]
+    mark = page.locator(f"[data-case='{outcome.index}'].mark")
+    frame = page.locator(f".map[data-level='{outcome.case.level}'] .frame").bounding_box()
+    box = mark.bounding_box()
+    x = (box["x"] + box["width"] / 2 - frame["x"]) / frame["width"]
+    y = 1.0 - (box["y"] + box["height"] / 2 - frame["y"]) / frame["height"]
+    assert x == pytest.approx((outcome.case.x_pov0_m + 340.0) / 160.0, abs=0.01)
+    assert y == pytest.approx((outcome.case.v_pov0_mps - 25.0) / 10.0, abs=0.01)
+
+
+def test_print_leaves_out_what_cannot_be_pressed(page):
+    page.emulate_media(media="print")
+    assert not page.locator("#play").is_visible()
+    assert page.locator(".map .mark.fail").first.is_visible()
+
+
+def test_nothing_from_outside_runs(browser, tmp_path):
+    run = write_run(tmp_path / "run", per_level=10, vut=EVIL, error=EVIL)
+    report.write_report(run)
+    with shown(browser, run.folder / report.REPORT) as page:
+        assert page.inner_text("h1") == EVIL
+        page.locator(".list button").first.click()
+        assert EVIL in page.inner_text("#case-words")
+
+
+def test_errors_and_timeouts_are_drawn_as_no_result_and_shown_first(browser, tmp_path):
+    run = write_run(tmp_path / "run", 20, errors={4: "boom"}, timeouts=(0, 3, 6))
+    report.write_report(run)
+    with shown(browser, run.folder / report.REPORT) as page:
+        drawn = page.locator(".map .mark.error").evaluate_all(
+            "all => all.map((m) => m.dataset.case)"
+        )
+        assert sorted(map(int, drawn)) == [0, 3, 4, 6]
+        assert page.inner_text("#case-words").startswith("VUT_ERROR: boom")
+        page.locator(".list [data-case='3']").click()
+        assert page.inner_text("#case-words").startswith("Timeout: the VUT did not arrive")
+
+
+def test_errors_and_timeouts_are_grouped_by_message_in_the_table(browser, tmp_path):
+    run = write_run(tmp_path / "run", 20, errors={4: "boom", 9: EVIL, 11: "boom"}, timeouts=(0, 6))
+    with shown(browser, report.write_report(run)) as page:
+        verdict = page.locator("#filters [name=verdict]")
+        for label, expected in (
+            ("boom (2)", [4, 11]),
+            (f"{EVIL[:60]} (1)", [9]),
+            ("VUT_ERROR (3)", [4, 9, 11]),
+            ("TIMEOUT (2)", [0, 6]),
+        ):
+            verdict.select_option(label=label)
+            assert sorted(rows(page)) == expected
+        verdict.select_option(label="boom (2)")
+        assert set(column(page, "verdict")) == {"VUT_ERROR: boom"}
+
+
+def test_a_long_campaign_opens_too(browser, made, tmp_path, monkeypatch):
+    monkeypatch.setattr(report_facts, "SHOWN", 50)
+    file = tmp_path / "long.html"
+    file.write_text(report.report_page(made), encoding="utf-8")
+    with shown(browser, file) as page:
+        assert page.locator(".map .mark").count() == 50
+        assert page.locator(".map .count").count() > 20
+
+
+def test_a_campaign_without_cases_opens_too(browser, made, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(made.folder, folder)
+    (folder / "outcomes.jsonl").write_bytes(b"")
+    report.write_report(Run(folder))
+    with shown(browser, folder / report.REPORT) as page:
+        assert "No case has run" in page.inner_text(".verdict")
+
+
+@pytest.mark.parametrize("name", some([None, "curved", "left turn"], None, "left turn"))
+def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch, name):
+    if name is not None:
+        corridor = corridor_of(name, tmp_path)
+        monkeypatch.setattr(report_facts, "road_of", lambda: corridor)
+    run = write_run(tmp_path / "run", per_level=3, error=None)
+    with shown(browser, report.write_report(run)) as page:
+        for step in ("0", "0.5 * moving.rows", "moving.rows - 1"):
+            page.evaluate(f"at({step})")
+            assert page.evaluate(INSIDE) == [True, True]
+
+
+@pytest.fixture(scope="module")
+def in_traffic(tmp_path_factory) -> Run:
+    folder = tmp_path_factory.mktemp("traffic") / "run"
+    run = write_run(folder, per_level=40, error=None, scenario=named_scenario("us23-traffic"))
+    report.write_report(run)
+    return run
+
+
+def drawn_at(page, outcome, axes: Sequence[str]) -> tuple[float, float]:
+    """Return how far a mark is from where a case is in two coordinates, as shares of the map."""
+    level = outcome.case.level
+    dims = {d.field: d for d in outcome.case.scenario.dimensions(level)}
+    frame = page.locator(f".map[data-level='{level}'] .frame").bounding_box()
+    box = page.locator(f".map [data-case='{outcome.index}'].mark").bounding_box()
+    x = (box["x"] + box["width"] / 2 - frame["x"]) / frame["width"]
+    y = 1.0 - (box["y"] + box["height"] / 2 - frame["y"]) / frame["height"]
+    u, v = (
+        (getattr(outcome.case, name) - dims[name].low) / (dims[name].high - dims[name].low)
+        for name in axes
+    )
+    return x - u, y - v
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"viewport": {"width": 1280, "height": 900}},
+        {"viewport": {"width": 380, "height": 800}},
+        {"color_scheme": "dark"},
+    ],
+    ids=["wide", "narrow", "dark"],
+)
+def test_a_campaign_in_traffic_fits_the_window_too(browser, in_traffic, options):
+    with shown(browser, in_traffic.folder / report.REPORT, **options) as page:
+        width = page.evaluate("document.documentElement.scrollWidth")
+        assert width <= page.viewport_size["width"]
+        assert page.locator(".map .mark").count() == len(in_traffic.outcomes)
+
+
+def test_of_more_coordinates_the_reader_chooses_a_pair(browser, in_traffic):
+    worst = failures(in_traffic.outcomes)[0]
+    level = worst.case.level
+    with shown(browser, in_traffic.folder / report.REPORT) as page:
+        for choice in page.locator(f".map[data-level='{level}'] option").all_inner_texts():
+            page.locator(f".map[data-level='{level}'] select").select_option(choice)
+            axes = [name.strip() for name in choice.partition(":")[0].split("×")]
+            fields = tuple(FIELDS[name] for name in axes)
+            assert drawn_at(page, worst, fields) == pytest.approx((0.0, 0.0), abs=0.02)
+            words = page.locator(f".map[data-level='{level}'] > svg text").all_text_contents()
+            assert [w.partition(",")[0] for w in words[-2:]] == axes
+
+
+def test_all_cars_are_drawn_and_say_which_one_the_vut_meets(browser, in_traffic):
+    index = next(o.index for o in in_traffic.outcomes if o.measures.nearest == "behind")
+    with shown(browser, in_traffic.folder / report.REPORT) as page:
+        page.evaluate(f"show(place.get({index}))")
+        inside = page.evaluate(INSIDE)
+        assert inside == [True] * 4
+        labels = page.locator("#road text").all_text_contents()
+        assert [label.split()[0] for label in labels] == ["POV", "VUT", "ahead", "behind"]
+        for chart in ("speed", "position"):
+            assert page.locator(f"#chart-{chart} .line").count() == 4
+        assert page.locator("#chart-gap .line.behind").count() == 1
+        assert "headway behind" in page.inner_text("#case-title")
+        assert "car behind" in page.inner_text("#case-words")
+
+
+def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):
+    run = write_run(tmp_path / "run", error=None)
+    found = failures(run.outcomes)
+    first, others = found[0].index, [o.index for o in found[1:]]
+    lines = [Avoidance(first, ("careful", "rss"), 3.0, pov_careful=True)]
+    lines += [Avoidance(index, (), None, pov_careful=False) for index in others]
+    write_avoidance(run.folder, lines)
+    with shown(browser, report.write_report(run)) as page:
+        assert "In the VUT's place careful, rss would have avoided it." in page.inner_text("#case")
+        assert "1 of" in page.inner_text(".verdict")
+        page.locator(".map input[type=checkbox]").first.check()
+        bright = page.locator(".map .mark.fail:not(.faint)")
+        for value, wanted in (("careful", 1), ("pov", 1), ("fsm", 0), ("", len(found))):
+            page.select_option("#avoided-by", value)
+            assert bright.count() == wanted
+        page.select_option("#avoided-by", "none")
+        assert bright.count() == len(others)
+
+
+LEAVES = """
+class Vut:
+    def act(self, seen):
+        late = seen.x_vut_m > -90.0
+        self.signals = {"mode <b>": "late" if late else "early", "level": 2.0 if late else -1.0}
+        return 1.0
+"""
+
+
+def test_signals_are_drawn_beside_the_motion_and_follow_its_slider(browser, tmp_path):
+    (tmp_path / "my_vut.py").write_text(LEAVES, encoding="utf-8")
+    vut = f"{tmp_path / 'my_vut.py'}:Vut"
+    settings = CampaignSettings(vut=vut, levels=(0,), cases=24, batch=24, sampler="uniform")
+    run = run_campaign(settings, tmp_path / "run")
+    with shown(browser, report.write_report(run)) as page:
+        page.evaluate(f"location.hash = '#case-{ReportModel(run).shown[0].index}'")
+        figures = page.locator("#signals figure")
+        figures.nth(1).wait_for()
+        assert figures.count() == 2
+        assert page.locator("#signals figcaption").all_text_contents() == [
+            "signal mode <b>",
+            "signal level",
+        ]
+        words = figures.nth(0).locator("svg text").all_text_contents()
+        assert {"early", "late"} <= set(words)
+        early, late = (box["x"] for box in map(_box, figures.nth(0).locator("rect.word").all()))
+        assert early < late
+        page.evaluate("at(0)")
+        before = _box(figures.nth(1).locator(".now"))["x"]
+        page.evaluate("at(final)")
+        assert _box(figures.nth(1).locator(".now"))["x"] > before + 50
+
+
+def _box(locator):
+    return locator.bounding_box()

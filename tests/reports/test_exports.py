@@ -1,0 +1,292 @@
+"""Cases for other tools: OpenSCENARIO with OpenDRIVE, and tables of motion."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import csv
+import importlib
+import math
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import polars
+import pytest
+from handmade import write_run
+from lxml import etree
+from scenariogeneration import xosc
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.campaigns.campaign import export_case
+from merge_sumo.campaigns.run import failures
+from merge_sumo.errors import UserError
+from merge_sumo.reports.exports import columns_of, write_folders, write_openscenario, write_table
+from merge_sumo.road.merge import road_of
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.scenario import BEHIND, DT_S, US23
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return write_run(tmp_path_factory.mktemp("exports") / "run", per_level=10)
+
+
+@pytest.fixture(scope="module")
+def scenario(made, tmp_path_factory):
+    """Return the OpenSCENARIO file of the worst case."""
+    index = failures(made.outcomes)[0].index
+    return write_openscenario(made, index, tmp_path_factory.mktemp("osc") / "case", road_of())
+
+
+def vertices(tree: etree._ElementTree, who: str) -> list[tuple[float, ...]]:
+    """Return (time, x, y, heading) of a car's trajectory as written."""
+    found = []
+    for vertex in tree.iterfind(f".//Trajectory[@name='{who} recorded']//Vertex"):
+        place = vertex.find("Position/WorldPosition")
+        found.append((float(vertex.get("time")), *(float(place.get(n)) for n in ("x", "y", "h"))))
+    return found
+
+
+class TestOpenScenario:
+    def test_is_valid_by_the_schema_of_the_standard_and_is_read_back(self, scenario):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read = xosc.ParseOpenScenario(str(scenario))
+        assert isinstance(read, xosc.Scenario)
+        assert {car.name for car in read.entities.scenario_objects} == {"pov", "vut"}
+        header = etree.parse(scenario).find("FileHeader")
+        assert (header.get("revMajor"), header.get("revMinor")) == ("1", "2")
+
+    def test_has_the_places_of_sumos_record_at_every_step(self, made, scenario, tmp_path):
+        index = failures(made.outcomes)[0].index
+        export_case(made, index, tmp_path / "sumo")
+        record = etree.parse(tmp_path / "sumo" / "episode.fcd.xml")
+        tree = etree.parse(scenario)
+        rows = len(made.trajectory(index).motion)
+        for who in ("pov", "vut"):
+            written = vertices(tree, who)
+            assert len(written) == rows
+            recorded = [
+                (
+                    float(step.get("time")),
+                    float(car.get("x")),
+                    float(car.get("y")),
+                    car.get("angle"),
+                )
+                for step in record.iterfind("timestep")
+                for car in step.iterfind("vehicle")
+                if car.get("id") == who
+            ][:rows]
+            for (t, x, y, h), (time, x_fcd, y_fcd, angle) in zip(written, recorded, strict=True):
+                assert (t, x, y) == pytest.approx((time, x_fcd, y_fcd), abs=1e-8)
+                # Degrees clockwise from north there, radians the other way from east here.
+                assert math.cos(h) == pytest.approx(math.sin(math.radians(float(angle))), abs=1e-8)
+                assert math.sin(h) == pytest.approx(math.cos(math.radians(float(angle))), abs=1e-8)
+
+    def test_starts_at_the_recorded_speed_and_stops_with_the_episode(self, made, scenario):
+        trajectory = made.trajectory(failures(made.outcomes)[0].index)
+        tree = etree.parse(scenario)
+        speeds = [float(e.get("value")) for e in tree.iterfind(".//Init//AbsoluteTargetSpeed")]
+        assert speeds == pytest.approx([trajectory.v_pov_mps[0], trajectory.v_vut_mps[0]])
+        stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
+        assert float(stop.get("value")) == trajectory.t_end_s
+
+    def test_has_the_car_behind_its_front_bumper(self, scenario):
+        box = etree.parse(scenario).find(".//Vehicle/BoundingBox")
+        centre, size = box.find("Center"), box.find("Dimensions")
+        assert float(centre.get("x")) + float(size.get("length")) / 2.0 == 0.0
+
+    def test_lies_on_the_road_of_its_opendrive(self, scenario):
+        tree = etree.parse(scenario)
+        road_file = tree.find(".//RoadNetwork/LogicFile").get("filepath")
+        # Roads with junction -1 are the edges; the others join them at M.
+        roads = etree.parse(scenario.parent / road_file).findall("road[@junction='-1']")
+        assert len(roads) == 3
+        lines = []
+        for road in roads:
+            geometry = road.findall("planView/geometry")
+            assert sum(float(g.get("length")) for g in geometry) == pytest.approx(
+                float(road.get("length")), abs=1e-3
+            )
+            lines += [tuple(float(g.get(n)) for n in ("x", "y", "hdg", "length")) for g in geometry]
+        for who in ("pov", "vut"):
+            for _, x, y, _ in vertices(tree, who):
+                across = []
+                for x0, y0, heading, length in lines:
+                    along = (x - x0) * math.cos(heading) + (y - y0) * math.sin(heading)
+                    aside = (y - y0) * math.cos(heading) - (x - x0) * math.sin(heading)
+                    if -0.01 <= along <= length + 0.01:
+                        across.append(abs(aside))
+                # The reference line of a road is its edge: two lanes of 3.2 m lie beside it.
+                assert min(across) <= 6.4 + 1e-3
+
+    def test_of_the_same_case_is_the_same_bytes(self, made, scenario, tmp_path):
+        again = write_openscenario(
+            made, failures(made.outcomes)[0].index, tmp_path / "again", road_of()
+        )
+        assert again.read_bytes() == scenario.read_bytes()
+
+
+class TestAFreeVut:
+    @pytest.fixture
+    def free(self, scenario):
+        return scenario.with_name(f"{scenario.stem}-free.xosc")
+
+    def test_is_valid_by_the_schema_of_the_standard_and_is_read_back(self, free):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read = xosc.ParseOpenScenario(str(free))
+        assert {car.name for car in read.entities.scenario_objects} == {"pov", "vut"}
+
+    def test_starts_where_it_started_and_then_nobody_tells_it_where_to_go(self, scenario, free):
+        recorded, tree = etree.parse(scenario), etree.parse(free)
+        start = ".//Private[@entityRef='vut']/PrivateAction"
+        for path in (f"{start}/TeleportAction", f"{start}/LongitudinalAction"):
+            (here,), (there,) = recorded.findall(path), tree.findall(path)
+            assert etree.tostring(here) == etree.tostring(there)
+        assert {e.get("entityRef") for e in tree.iterfind(".//Story//EntityRef")} == {"pov"}
+        assert vertices(tree, "vut") == []
+
+    def test_has_the_controller_that_a_parameter_names(self, free):
+        tree = etree.parse(free)
+        (assigned,) = tree.findall(".//Private[@entityRef='vut']//AssignControllerAction")
+        assert assigned.get("activateLateral") == assigned.get("activateLongitudinal") == "true"
+        assert assigned.find("Controller").get("name") == "$EgoController"
+        (declared,) = tree.findall("ParameterDeclarations/ParameterDeclaration")
+        assert (declared.get("name"), declared.get("value")) == ("EgoController", "user")
+
+    def test_meets_a_pov_that_does_what_it_did_and_then_keeps_its_speed(self, made, scenario, free):
+        trajectory = made.trajectory(failures(made.outcomes)[0].index)
+        tree = etree.parse(free)
+        assert vertices(tree, "pov") == vertices(etree.parse(scenario), "pov")
+        after = tree.find(".//Event[@name='pov afterwards']")
+        assert float(after.find(".//SimulationTimeCondition").get("value")) == trajectory.t_end_s
+        assert float(after.find(".//AbsoluteTargetSpeed").get("value")) == trajectory.v_pov_mps[-1]
+        stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
+        assert float(stop.get("value")) == US23.timeout_s
+
+    def test_meets_all_cars_of_the_traffic(self, tmp_path):
+        run = write_run(
+            *(tmp_path / "run", 2), levels=(1,), error=None, scenario=named_scenario("us23-traffic")
+        )
+        path = write_openscenario(run, 0, tmp_path / "case", road_of())
+        tree = etree.parse(path.with_name(f"{path.stem}-free.xosc"))
+        followers = {e.get("entityRef") for e in tree.iterfind(".//Story//EntityRef")}
+        assert followers == {"pov", "ahead", "behind"}
+
+
+class TestATable:
+    def test_has_a_row_for_every_step_of_every_case(self, made, tmp_path):
+        path = write_table(made, [0, 3], tmp_path, "csv")
+        with path.open(newline="") as file:
+            header, *rows = csv.reader(file)
+        assert header == [
+            *("case", "level", "time_s", "x_pov_m", "v_pov_mps", "a_pov_mps2"),
+            *("x_vut_m", "v_vut_mps", "a_vut_mps2", "x_pov0_m", "v_pov0_mps", "svo_rad"),
+            "severity",
+        ]
+        motion = np.concatenate([made.trajectory(i).motion for i in (0, 3)])
+        assert np.array_equal(
+            np.array([row[3:9] for row in rows], dtype=float), motion.reshape(-1, 6)
+        )
+        case = made.outcome(0).case
+        assert [float(cell) for cell in rows[5][9:11]] == [case.x_pov0_m, case.v_pov0_mps]
+        assert rows[5][11] == "", "level 0 has no psi"
+        assert {row[12] for row in rows} == {made.outcome(i).measures.severity for i in (0, 3)}
+        assert {row[0] for row in rows} == {"0", "3"}
+        assert float(rows[5][2]) == pytest.approx(5 * DT_S)
+
+    def test_is_the_same_in_parquet(self, made, tmp_path):
+        frame = polars.read_parquet(write_table(made, [0, 3], tmp_path, "parquet"))
+        text = polars.read_csv(write_table(made, [0, 3], tmp_path, "csv"))
+        assert frame.columns == list(columns_of(US23))
+        assert frame.rows() == text.rows()
+
+    @pytest.mark.parametrize("file_format", ["csv", "parquet"])
+    def test_has_all_cars_and_all_coordinates_of_the_case(self, tmp_path, file_format):
+        scenario = named_scenario("us23-traffic")
+        run = write_run(tmp_path / "run", 2, levels=(1, 2), error=None, scenario=scenario)
+        path = write_table(run, [0, 1], tmp_path / "table", file_format)
+        frame = (polars.read_csv if file_format == "csv" else polars.read_parquet)(path)
+        assert frame.columns[9:15] == [
+            *("x_ahead_m", "v_ahead_mps", "a_ahead_mps2"),
+            *("x_behind_m", "v_behind_mps", "a_behind_mps2"),
+        ]
+        first, second = frame.filter(time_s=0.0).to_dicts()
+        for row, outcome in zip((first, second), run.outcomes, strict=False):
+            case = outcome.case
+            for name in ("x_pov0_m", "v_pov0_mps", "headway_ahead_s", "headway_behind_s"):
+                assert row[name] == getattr(case, name)
+            assert row["svo_rad"] == case.svo_rad
+            assert row["x_behind_m"] == case.starts()[BEHIND][0]
+
+    def test_is_not_written_over(self, made, tmp_path):
+        (tmp_path / "trajectories.csv").write_text("mine")
+        with pytest.raises(UserError, match="exists"):
+            write_table(made, [0], tmp_path, "csv")
+        assert (tmp_path / "trajectories.csv").read_text() == "mine"
+
+
+def call(*arguments: object):
+    return CliRunner().invoke(cli.app, ["export", *map(str, arguments)])
+
+
+class TestTheCommand:
+    def test_writes_all_cases_as_a_table_when_none_is_named(self, made, tmp_path):
+        said = call(made.folder, "--format", "csv", "--out", tmp_path)
+        assert said.exit_code == 0, said.output
+        assert said.stdout == f"{tmp_path / 'trajectories.csv'}\n"
+        with (tmp_path / "trajectories.csv").open() as file:
+            assert len({line.split(",")[0] for line in file}) == len(made.outcomes) + 1
+
+    def test_writes_a_folder_for_each_openscenario(self, made, tmp_path):
+        said = call(made.folder, 1, 2, "--format", "openscenario", "--out", tmp_path)
+        assert said.exit_code == 0, said.output
+        names = ("case-00001", "case-00002")
+        assert said.stdout.split() == [str(tmp_path / n / f"{n}.xosc") for n in names]
+
+    def test_writes_nothing_when_one_of_the_cases_is_not_there(self, made, tmp_path):
+        said = call(made.folder, 1, 999, "--format", "openscenario", "--out", tmp_path)
+        assert isinstance(said.exception, UserError)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize("file_format", ["sumo", "openscenario"])
+    def test_asks_for_cases_where_it_needs_them(self, made, file_format):
+        said = call(made.folder, "--format", file_format)
+        assert isinstance(said.exception, UserError)
+        assert "indices" in str(said.exception)
+
+    @pytest.mark.parametrize(
+        ("package", "file_format"),
+        [("polars", "parquet"), ("scenariogeneration", "openscenario")],
+    )
+    def test_says_what_to_install(self, made, tmp_path, monkeypatch, package, file_format):
+        load = importlib.import_module
+
+        def refuse(name, *rest):
+            if name == package:
+                raise ImportError(name)
+            return load(name, *rest)
+
+        monkeypatch.setattr(importlib, "import_module", refuse)
+        said = call(made.folder, 1, "--format", file_format, "--out", tmp_path)
+        assert isinstance(said.exception, UserError)
+        assert "merge-sumo[export]" in str(said.exception)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_folders_are_checked_before_the_first_is_written(made, tmp_path):
+    (tmp_path / "case-00002").mkdir()
+    with pytest.raises(UserError, match="case-00002 exists"):
+        list(write_folders(made, [1, 2], tmp_path, write_openscenario, road_of()))
+    assert not (tmp_path / "case-00001").exists()
+
+
+def test_no_export_loads_libsumo():
+    script = "import sys, merge_sumo.reports.exports; print('libsumo' in sys.modules)"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

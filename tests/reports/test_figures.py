@@ -1,0 +1,191 @@
+"""Figures: what they draw, the files that they make, and what is refused before anything runs."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+from matplotlib.collections import EllipseCollection
+from matplotlib.text import Annotation
+from mpl_toolkits.mplot3d import Axes3D
+from PIL import Image
+
+from merge_sumo.errors import UserError
+from merge_sumo.reports import figures
+from merge_sumo.reports.figures import Levels, Panel, Surface
+from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.studies.benchmark import Comparison, LevelShare
+from merge_sumo.values.fmc import RADIUS
+
+
+def compared(end: float) -> Comparison:
+    return Comparison(
+        fmc_median=end,
+        fmc_quartiles=(end, end),
+        fmc_over_truth_median=None,
+        fmc_over_truth_quartiles=(None, None),
+        fmc_over_limit_median=None,
+        fmc_over_limit_quartiles=(None, None),
+        failures_median=1.0,
+        failures_quartiles=(1.0, 1.0),
+        regions_found_median=1.0,
+        regions_found_quartiles=(1.0, 1.0),
+        seeds_with_all_regions=1,
+        cases_to_50_percent_median=None,
+        cases_to_50_percent_quartiles=(None, None),
+        cases_to_90_percent_median=None,
+        cases_to_90_percent_quartiles=(None, None),
+        sampler_s_median=0.0,
+        cases_by_batch=[20, 40],
+        fmc_by_batch_median=[end / 2.0, end],
+        fmc_by_batch_quartiles=([0.0, end / 2.0], [end, 2.0 * end]),
+        levels={0: LevelShare(40.0, 1.0, end)},
+    )
+
+
+def curves():
+    return figures.coverage_curves(
+        "design1 v level 0",
+        {"uniform": compared(0.01), "gpr": compared(0.05)},
+        0.12,
+        {0: 0.0, 10: 0.1, 40: 0.12},
+        0.15,
+    )
+
+
+def panel(n: int, dims: int) -> Panel:
+    points = np.random.default_rng(0).random((n, dims))
+    return Panel(points, points[:, 0] < 0.5, 0.1)
+
+
+class TestTheCurves:
+    def test_show_each_sampler_the_oracle_and_the_truth(self):
+        (axes,) = curves().axes
+        lines = [(list(line.get_xdata()), list(line.get_ydata())) for line in axes.lines]
+        assert ([0, 20, 40], [0.0, 0.005, 0.01]) in lines
+        assert ([0, 20, 40], [0.0, 0.025, 0.05]) in lines
+        assert ([0, 10, 40], [0.0, 0.1, 0.12]) in lines
+        assert any(y == [0.12, 0.12] for _, y in lines)
+        assert any(y == [0.15, 0.15] for _, y in lines)
+        names = {"uniform", "gpr", "truth", "limit", "oracle"}
+        assert {text.get_text() for text in axes.texts} == names
+        assert len(axes.collections) == 2, "a band for each sampler"
+
+    def test_name_lines_that_end_together_apart(self):
+        figure = figures.coverage_curves(
+            "t", {"uniform": compared(0.05), "gpr": compared(0.05)}, 0.05, {0: 0.0, 40: 0.05}, 0.05
+        )
+        heights = sorted(
+            text.xyann[1] for text in figure.axes[0].texts if isinstance(text, Annotation)
+        )
+        assert min(np.diff(heights)) > 0.0
+
+    def test_have_axes_that_say_what_they_are(self):
+        (axes,) = curves().axes
+        assert axes.get_xlabel() == "cases"
+        assert "FMC" in axes.get_ylabel()
+
+
+class TestTheMaps:
+    def test_show_cases_in_the_units_of_the_pool_and_the_balls_that_fmc_counts(self):
+        one = Panel(np.array([[0.5, 0.5], [1.0, 0.0]]), np.array([True, False]), 0.0079)
+        (axes,) = figures.maps("t", {"gpr": one}, 0).axes
+        (balls,) = (c for c in axes.collections if isinstance(c, EllipseCollection))
+        assert np.asarray(balls.get_offsets()).tolist() == [[-260.0, 30.0]]
+        assert balls.get_widths() == pytest.approx([2 * RADIUS * 160.0])
+        assert balls.get_heights() == pytest.approx([2 * RADIUS * 10.0])
+        assert axes.get_xlim() == (-340.0, -180.0)
+        assert "(m)" in axes.get_xlabel()
+        assert "(m/s)" in axes.get_ylabel()
+        assert "1 of 2 fail, FMC 0.0079" in [text.get_text() for text in axes.texts]
+
+    def test_at_level_2_are_boxes_with_the_social_value_orientation(self):
+        figure = figures.maps("t", {"truth": panel(30, 3), "gpr": panel(30, 3)}, 2)
+        (axes, _) = figure.axes
+        assert isinstance(axes, Axes3D)
+        assert "(rad)" in axes.get_zlabel()
+
+    def test_of_no_failures_are_drawn_too(self, tmp_path):
+        for dims, level in ((2, 1), (3, 2)):
+            safe = Panel(np.full((3, dims), 0.5), np.zeros(3, dtype=bool), 0.0)
+            figures.save(figures.maps("t", {"gpr": safe}, level), tmp_path / f"{level}.png")
+
+
+def test_surfaces_show_a_panel_per_batch_on_one_scale(tmp_path):
+    predicted = np.linspace(-900.0, 50.0, 25).reshape(5, 5)
+    shown = {batch: Surface(predicted, panel(20, 2)) for batch in (1, 4)}
+    figure = figures.surfaces("t", shown, 1, np.array([[0.2, 0.2]]))
+    assert [axes.get_title("left") for axes in figure.axes[:2]] == [
+        "after batch 1: 20 cases",
+        "after batch 4: 20 cases",
+    ]
+    figures.save(figure, tmp_path / "surface.png")
+
+
+@pytest.mark.parametrize("batches", [(1,), (1, 4, 13)])
+def test_surfaces_of_any_number_of_batches_are_drawn(batches):
+    flat = Surface(np.full((5, 5), -10.0), panel(20, 2))
+    figure = figures.surfaces("t", dict.fromkeys(batches, flat), 1, np.zeros((0, 2)))
+    assert sum(axes.get_visible() for axes in figure.axes) == len(batches) + 1
+
+
+def test_allocation_shows_each_level_and_leaves_a_gap_where_it_had_no_case(tmp_path):
+    cases = {level: np.full((3, 4), 10.0) for level in (0, 1, 2)}
+    score = {level: np.full((3, 4), -50.0) for level in (0, 1, 2)}
+    score[0][:, 1] = np.nan
+    figure = figures.allocation("t", {"gpr": Levels(cases, score)})
+    above, below = figure.axes
+    assert [line.get_label() for line in above.lines] == ["0", "1", "2"]
+    assert np.isnan(below.lines[0].get_ydata()).tolist() == [False, True, False, False]
+    figures.save(figure, tmp_path / "allocation.png")
+
+
+def test_every_sampler_has_a_colour_of_its_own():
+    colours = [figures.colour(name) for name in [*SAMPLERS, "truth", "another"]]
+    assert len(set(colours)) == len(colours)
+
+
+class TestAFile:
+    @pytest.mark.parametrize("kind", [".png", ".svg", ".html"])
+    def test_is_the_same_for_the_same_numbers(self, tmp_path, kind):
+        first, second = tmp_path / f"first{kind}", tmp_path / f"second{kind}"
+        for path in (first, second):
+            figures.save(curves(), path)
+        assert first.read_bytes() == second.read_bytes()
+
+    def test_can_be_looked_at(self, tmp_path):
+        figures.save(curves(), tmp_path / "f.png")
+        with Image.open(tmp_path / "f.png") as image:
+            assert image.size[0] > 1000
+            assert len(image.convert("RGB").getcolors(1 << 20) or []) > 50, "it is not one colour"
+
+    def test_as_a_page_needs_no_network(self, tmp_path):
+        figures.save(curves(), tmp_path / "f.html")
+        page = (tmp_path / "f.html").read_text()
+        assert "<title>design1 v level 0</title>" in page
+        assert page.count("<svg") == 1
+        assert "<script" not in page
+
+    @pytest.mark.parametrize(
+        ("name", "says"),
+        [
+            ("f.pdf", "end it in"),
+            ("f", "end it in"),
+            ("gone/f.png", "no folder"),
+            ("old.png", "ex"),
+        ],
+    )
+    def test_that_cannot_be_is_refused(self, tmp_path, name, says):
+        (tmp_path / "old.png").write_text("mine")
+        with pytest.raises(UserError, match=says):
+            figures.check_figure(tmp_path / name)
+        assert (tmp_path / "old.png").read_text() == "mine"
+
+    def test_without_matplotlib_is_refused_in_a_sentence(self, tmp_path, monkeypatch):
+        def refuse(name: str):
+            raise ModuleNotFoundError(name=name)
+
+        monkeypatch.setattr(importlib, "import_module", refuse)
+        with pytest.raises(UserError, match=r"pip install 'merge-sumo\[plot\]'"):
+            figures.check_figure(tmp_path / "f.png")

@@ -1,0 +1,439 @@
+"""What the report says, what it holds, and what it lets in."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from handmade import write_run
+from lxml import html
+
+from merge_sumo.analysis.summary import summarise
+from merge_sumo.analysis.surface import Surface, learn_surface
+from merge_sumo.analysis.verdict import judge
+from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
+from merge_sumo.reports import report_data
+from merge_sumo.reports import report_model as report_facts
+from merge_sumo.reports.headline import Rule, headline
+from merge_sumo.reports.report import report_page, write_report
+from merge_sumo.reports.report_data import SPEED_UNIT_MPS
+from merge_sumo.road.merge import road_of
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.studies.truth import Truth
+from merge_sumo.system.workers import InProcess, Workers
+from merge_sumo.values.case import to_unit
+from merge_sumo.values.criterion import PAPER_CRITERION
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import DT_S, US23, Scenario
+from merge_sumo.values.trajectory import REASON_CHARACTERS
+from merge_sumo.vuts.output import LINES, LOG
+
+EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    return write_run(tmp_path_factory.mktemp("made") / "run")
+
+
+@pytest.fixture(scope="module")
+def page(made) -> str:
+    return report_page(made)
+
+
+def root_of(page: str) -> Any:
+    return html.fromstring(page)
+
+
+def data_of(page: str) -> dict:
+    (element,) = root_of(page).xpath("//script[@id='data']")
+    return json.loads(element.text)
+
+
+def text_of(page: str) -> str:
+    root = root_of(page)
+    for element in root.xpath("//script | //style"):
+        element.drop_tree()
+    return " ".join(root.text_content().split())
+
+
+class TestThePage:
+    def test_says_the_result_first(self, made, page):
+        found = len(failures(made.outcomes))
+        assert found > 10
+        text = text_of(page)
+        assert f"handmade: 1 error and {found} failures (" in text
+        assert f"{found} failures in 180 cases" in text
+        assert text.index("within 6 m at M;") < text.index("Failure mode coverage")
+
+    def test_loads_nothing_and_runs_nothing_but_its_own_script(self, page):
+        root = root_of(page)
+        assert "//" not in "".join(root.xpath("//@href | //@src"))
+        assert "http:" not in page
+        assert "https:" not in page
+        (policy,) = root.xpath("//meta[@http-equiv='Content-Security-Policy']/@content")
+        assert policy.startswith("default-src 'none'")
+        for name in ("style", "script"):
+            (source,) = root.xpath(f"//{name}[not(@type)]")
+            digest = hashlib.sha256(source.text.encode()).digest()
+            assert f"'sha256-{base64.b64encode(digest).decode()}'" in policy
+        assert root.xpath("//@style") == []
+
+    def test_is_small(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=267)
+        assert len(run.outcomes) > 800
+        assert write_report(run).stat().st_size < 1e6
+
+    def test_is_the_same_when_written_again(self, made, page):
+        assert report_page(Run(made.folder)) == page
+
+    def test_is_the_same_where_workers_ask_the_surrogates(self, made, page):
+        with Workers(InProcess, 2) as workers:
+            assert report_page(made, workers=workers) == page
+
+    def test_shows_what_comes_from_outside_as_text(self, tmp_path):
+        run = write_run(tmp_path / "run", vut=EVIL, error=EVIL, sampler=EVIL)
+        page = report_page(run)
+        root = root_of(page)
+        assert len(root.xpath("//script")) == 2
+        assert root.xpath("//img | //@onerror") == []
+        (title,) = root.xpath("//h1")
+        assert title.text == EVIL
+        assert data_of(page)["errors"][str(len(run.outcomes) - 1)] == EVIL
+
+    def test_quotes_a_folder_with_a_space(self, tmp_path):
+        run = write_run(tmp_path / "a run", per_level=10)
+        assert data_of(report_page(run))["replay"].endswith(" '" + str(tmp_path / "a run") + "'")
+
+    def test_lists_the_worst_and_the_nearest_misses(self, made, page):
+        root = root_of(page)
+        listed = [int(n) for n in root.xpath("//button/@data-case")]
+        assert listed[0] == 179, "the case that ended with an error"
+        assert listed[1:11] == [o.index for o in spread_failures(made.outcomes)[:10]]
+        near = [made.outcome(index) for index in listed[11:]]
+        assert len(near) == 10
+        assert not any(o.failed for o in near)
+        scores = [o.measures.score for o in near]
+        assert scores == sorted(scores)
+        assert scores[-1] <= min(
+            o.measures.score
+            for o in made.outcomes
+            if o.measures.score is not None and not o.failed and o not in near
+        )
+
+    def test_worst_failures_are_of_one_region_each_before_a_second_of_any(self, made):
+        found, region = failures(made.outcomes), regions_of(made.outcomes)
+        spread = spread_failures(made.outcomes)
+        assert sorted(o.index for o in spread) == sorted(o.index for o in found)
+        assert spread[0] == found[0]
+        own = [(o.case.level, region[o.index]) for o in spread]
+        different = len(set(own))
+        assert 1 < different < len(own)
+        assert len(set(own[:different])) == different
+        firsts = spread[:different]
+        assert [o.score for o in firsts] == sorted(o.score for o in firsts)
+        for o in firsts:
+            same = [
+                f.score for f in found if (f.case.level, region[f.index]) == own[firsts.index(o)]
+            ]
+            assert o.score == min(same)
+
+    def test_a_bar_of_failures_is_their_share_of_the_levels_cases(self, made, page):
+        rows = root_of(page).xpath("(//table[@class='bars'])[1]//tr[td]")
+        for level, row in zip((0, 1, 2), rows, strict=True):
+            cases = [o for o in made.outcomes if o.case.level == level]
+            untested = 100 * sum(not o.is_tested for o in cases) / len(cases)
+            failed = 100 * sum(o.failed for o in cases) / len(cases)
+            widths = {
+                kind: float(row.xpath(f".//rect[@class='{kind}']/@width")[0])
+                for kind in ("untested", "fail", "track")
+            }
+            assert widths["track"] == 100.0
+            assert widths["untested"] == pytest.approx(untested, abs=0.06)
+            assert widths["fail"] == pytest.approx(failed, abs=0.06)
+
+    def test_bars_of_coverage_end_at_the_number_that_stands_above_them(self, page):
+        root = root_of(page)
+        (end,) = root.xpath("(//table[@class='bars'])[2]//*[@class='axis']/span[2]")
+        for row in root.xpath("(//table[@class='bars'])[2]//tr[td]"):
+            found = float(row.xpath("./td[1]")[0].text_content())
+            bar = float(row.xpath(".//rect[@class='fail']/@width")[0])
+            assert bar == pytest.approx(100 * found / float(end.text), abs=0.1)
+
+    @pytest.mark.parametrize("name", ["us23", "us23-traffic"])
+    def test_has_no_column_of_a_coordinate_that_no_level_of_it_has(self, tmp_path, name):
+        run = write_run(tmp_path / "run", 20, levels=(0, 1), scenario=named_scenario(name))
+        page = report_page(run)
+        assert "psi" not in [c["name"] for c in data_of(page)["coordinates"]]
+        assert "psi" not in root_of(page).xpath("//th/text()")
+
+    def test_bars_of_all_levels_share_a_scale(self, page):
+        root = root_of(page)
+        rows = root.xpath("(//table[@class='bars'])[2]//tr[td]")
+        found = [float(row.xpath("./td[1]")[0].text_content()) for row in rows]
+        bars = [float(row.xpath(".//rect[@class='fail']/@width")[0]) for row in rows]
+        assert len(bars) == 3
+        scales = [bar / value for bar, value in zip(bars, found, strict=True)]
+        assert scales == pytest.approx([scales[0]] * 3, rel=0.01)
+
+    def test_says_when_it_was_recorded_and_how_long_it_took(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=10)
+        for file in (run.folder / "campaign.json", *(run.folder / "trajectories").iterdir()):
+            os.utime(file, (1_800_000_000, 1_800_000_000))
+        os.utime(run.folder / "trajectories" / "00000.npz", (1_800_000_090, 1_800_000_090))
+        assert "2027-01-15 08:00 UTC, in 90 s" in text_of(report_page(run))
+
+    def test_says_when_a_campaign_was_interrupted(self, made, tmp_path):
+        assert "interrupted" not in text_of(report_page(made))
+        assert "interrupted" in text_of(report_page(write_run(tmp_path / "run", 10, cases=999)))
+
+    def test_goes_without_trajectories_that_are_lost(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=10)
+        shutil.rmtree(run.folder / "trajectories")
+        data = data_of(report_page(Run(run.folder)))
+        assert set(data["cases"]["rows"]) == {0}
+
+
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory) -> str:
+    errors = {3: f"{EVIL}\x1b[31m", 6: f"{EVIL}\x1b[31m", 9: "other"}
+    folder = tmp_path_factory.mktemp("broken") / "run"
+    return report_page(write_run(folder, 20, errors=errors, timeouts=(0, 1, 2, 4)))
+
+
+class TestWhatWasNotTested:
+    def test_is_listed_by_message_with_counts_before_all_else(self, broken):
+        root = root_of(broken)
+        rows = root.xpath("//section[@aria-labelledby='untested']//tbody/tr")
+        assert [[cell.text_content() for cell in row] for row in rows] == [
+            [f"{EVIL}\\x1b[31m", "VUT_ERROR", "2", "3"],
+            ["other", "VUT_ERROR", "1", "9"],
+            ["the VUT did not reach the merge point in 12 s", "TIMEOUT", "4", "0"],
+        ]
+        assert broken.index('id="untested"') < broken.index("Failure mode coverage")
+        assert root.xpath("//p[contains(@class, 'verdict')]/@class") == ["verdict broken"]
+
+    def test_has_its_cases_in_lists_of_their_own_and_in_no_other(self, broken):
+        root = root_of(broken)
+        lists = {
+            table.get("aria-label"): [int(n) for n in table.xpath(".//button/@data-case")]
+            for table in root.xpath("//table[@class='list']")
+        }
+        by_message = list(lists.values())[:3]
+        assert by_message == [[3, 6], [9], [0, 1, 2, 4]]
+        names = ("Ten worst failures, one of each region first", "Ten cases nearest to a failure")
+        others = {index for name in names for index in lists[name]}
+        assert len(others) > 10
+        assert others & {0, 1, 2, 3, 4, 6, 9} == set()
+
+    def test_is_no_part_of_a_report_of_a_campaign_without(self, tmp_path):
+        page = report_page(write_run(tmp_path / "run", 10, error=None))
+        assert "untested" not in root_of(page).xpath("//@aria-labelledby")
+        assert "broken" not in "".join(root_of(page).xpath("//body//@class"))
+
+    def test_has_no_message_of_megabytes(self, tmp_path):
+        page = report_page(write_run(tmp_path / "run", 10, errors={0: "x" * 10**7}))
+        assert len(page) < 1e6
+        assert data_of(page)["errors"]["0"] == "x" * REASON_CHARACTERS
+
+    def test_ends_with_what_the_controller_printed_last(self, tmp_path):
+        run = write_run(tmp_path / "run", 10, error=None)
+        assert "Printed by the controller" not in text_of(report_page(run))
+        lines = [f"line {n} </pre><script>" for n in range(1000)]
+        (run.folder / LOG).write_text("\x1b[31m" + "\n".join(lines), encoding="utf-8")
+        page = report_page(run)
+        (shown,) = root_of(page).xpath("//pre")
+        assert shown.text.splitlines() == lines[-LINES:]
+        (run.folder / LOG).unlink()
+        (run.folder / LOG).symlink_to(tmp_path / "run" / "campaign.json")
+        assert "Printed by the controller" not in text_of(report_page(run))
+
+    def test_gives_no_coverage_where_nothing_was_tested(self, tmp_path):
+        page = report_page(write_run(tmp_path / "run", 10, levels=(0,), timeouts=range(10)))
+        assert "0.0000" not in text_of(page)
+        assert "Nothing was tested in 10 cases." in text_of(page)
+
+
+class TestTheMotion:
+    def test_follows_from_the_speeds_to_within_2_cm(self, made, page):
+        data = data_of(page)
+        packed = np.frombuffer(base64.b64decode(data["speeds"]), dtype="<u2").reshape(-1, 2)
+        for i, index in enumerate(data["cases"]["index"]):
+            first, rows = data["cases"]["offset"][i], data["cases"]["rows"][i]
+            motion = made.trajectory(index).motion
+            assert rows == len(motion)
+            speeds = packed[first : first + rows] * SPEED_UNIT_MPS
+            assert np.abs(speeds - motion[:, :, 1]).max() <= SPEED_UNIT_MPS / 2
+            moved = np.cumsum(speeds * DT_S, axis=0)[:-1]
+            assert np.abs(data["cases"]["starts"][i] + moved - motion[1:, :, 0]).max() < 0.02
+
+
+class TestALongCampaign:
+    def test_shows_some_cases_and_counts_the_others(self, made, monkeypatch):
+        monkeypatch.setattr(report_facts, "SHOWN", 50)
+        page = report_page(made)
+        data = data_of(page)
+        assert len(data["cases"]["index"]) == 50
+        counted = sum(
+            sum(of["grids"][0]["counts"][name])
+            for of in data["maps"].values()
+            for name in ("safe", "failing")
+        )
+        assert counted == len(made.outcomes) - 50
+        assert f"how many of the {counted} further cases" in text_of(page)
+        root = root_of(page)
+        shown = set(data["cases"]["index"])
+        assert {int(n) for n in root.xpath("//button/@data-case")} <= shown
+
+    def test_with_many_failures_has_fewer_points_of_coverage(self, made, monkeypatch):
+        monkeypatch.setattr(report_data, "MOST_BALLS", 60)
+        for level in data_of(report_page(made))["search"]["levels"]:
+            known = [value for value in level["fmc"] if value is not None]
+            assert 1 <= len(known) < len(level["fmc"])
+            assert level["fmc"][-1] is not None
+            # A volume in three dimensions may fall by its rounding.
+            assert (np.diff(known) > -1e-4).all()
+
+    def test_is_drawn_in_groups_of_batches(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(report_data, "MOST_STEPS", 4)
+        run = write_run(tmp_path / "run", per_level=60)
+        search = data_of(report_page(run))["search"]
+        assert search["batch"] == [0, 3, 6]
+        assert sum(sum(level["cases"]) for level in search["levels"]) == 180
+        for level in search["levels"]:
+            found = summarise(run.outcomes, (level["level"],)).levels[level["level"]]
+            assert level["fmc"][-1] == pytest.approx(found.fmc, abs=1e-5)
+
+
+class TestTheTruth:
+    @pytest.fixture
+    def cached(self, monkeypatch):
+        """Keep a truth where the left half of each pool fails."""
+
+        def truth(path: object, level: int, cases: int, scenario: Scenario = US23) -> Truth:
+            points = np.random.default_rng(1).random((2000, len(scenario.dimensions(level))))
+            return Truth(points, np.where(points[:, 0] < 0.5, -900.0, -10.0))
+
+        monkeypatch.setattr(report_facts, "read_truth", truth)
+        return truth
+
+    def test_is_drawn_where_it_is_cached(self, tmp_path, cached):
+        run = write_run(tmp_path / "run", per_level=10, net_sha256=road_of().sha256)
+        page = report_page(run)
+        grid = data_of(page)["maps"]["0"]["grids"][0]["truth"]
+        values = np.frombuffer(base64.b64decode(grid["data"]), dtype=np.uint8)
+        values = values.reshape(grid["ny"], grid["nx"])
+        assert (values[:, :46] == 255).all()
+        assert (values[:, -46:] == 0).all()
+        assert f"{fmc(cached(None, 0, 0).failures):.4f}" in text_of(page)
+
+    def test_of_a_pool_with_a_range_of_speeds_is_drawn_too(self, tmp_path, cached):
+        net, ranged = road_of().sha256, replace(US23, v_vut0_mps=(14.0, 22.0))
+        run = write_run(
+            *(tmp_path / "run", 10, (0, 2)),
+            scenario=ranged,
+            net_sha256=net,
+            v_vut0_mps=None,
+        )
+        maps = data_of(report_page(run))["maps"]
+        assert {grid["truth"] is None for of in maps.values() for grid in of["grids"]} == {False}
+
+    @pytest.mark.parametrize(
+        "settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}, {"v_vut0_mps": 10.0}]
+    )
+    def test_of_something_else_is_not(self, tmp_path, cached, settings):
+        run = write_run(
+            tmp_path / "run", per_level=10, **{"net_sha256": road_of().sha256, **settings}
+        )
+        maps = data_of(report_page(run))["maps"].values()
+        assert {grid["truth"] for of in maps for grid in of["grids"]} == {None}
+
+
+class TestTheSurrogate:
+    def test_gives_failures_a_higher_chance_than_other_cases(self, made):
+        for level in (0, 1):
+            surface = learn_surface(made.outcomes, level)
+            told = [o for o in made.outcomes if o.case.level == level and o.measures.score]
+            chance = surface.chance(to_unit([o.case for o in told], level))
+            failed = np.array([o.failed for o in told])
+            assert chance[failed].min() > np.median(chance[~failed])
+            assert chance[failed].mean() > 0.5
+            assert chance[~failed].mean() < 0.1
+
+    def test_finds_at_least_plausible_what_was_found(self, made):
+        for level, found in summarise(made.outcomes, (0, 1, 2)).levels.items():
+            surface = learn_surface(made.outcomes, level)
+            assert surface.plausible_fmc() >= found.fmc - 1e-3
+
+    def test_finds_no_more_than_the_pool_plausible(self):
+        everywhere = Surface(np.array([[0.5, 0.5]]), lambda sets: [np.ones(len(s)) for s in sets])
+        assert everywhere.plausible_fmc() == 1.0
+
+    def test_is_not_made_of_too_few_failures(self, made):
+        few = [o for o in made.outcomes if not o.failed] + failures(made.outcomes)[:4]
+        assert all(learn_surface(few, level) is None for level in (0, 1, 2))
+
+
+def headline_of(outcomes) -> str:
+    levels = (0, 1, 2) if outcomes else (0,)
+    rule = Rule(PAPER_CRITERION, US23.dx_crash_m)
+    return headline(judge(outcomes), summarise(outcomes, levels), failures(outcomes), {}, rule)
+
+
+class TestTheHeadline:
+    def test_of_no_failure_is_no_proof(self, made):
+        safe = [o for o in made.outcomes if o.measures.end.is_tested and not o.failed]
+        assert headline_of(safe) == (
+            f"No failure (front bumpers within 6 m at M) in {len(safe)} cases. That is no proof: "
+            "the search saw these cases and no others."
+        )
+
+    def test_names_what_was_not_tested_before_what_was(self, made):
+        safe = [o for o in made.outcomes if not o.failed]
+        assert headline_of(safe).startswith(
+            f"1 of {len(safe)} cases ended in a VUT error: “answered nan”. "
+            f"No failure (front bumpers within 6 m at M) in the other {len(safe) - 1} cases."
+        )
+
+    def test_of_nothing_says_so(self):
+        assert headline_of([]) == "No case has run."
+
+    def test_of_timeouts_alone_speaks_of_no_collision(self, tmp_path):
+        run = write_run(tmp_path / "run", 10, levels=(0,), timeouts=range(10))
+        said = "All 10 cases timed out: the VUT never reached the merge point. Nothing was tested."
+        assert headline_of(run.outcomes) == said
+
+    def test_of_errors_alone_speaks_of_no_collision(self, tmp_path):
+        run = write_run(tmp_path / "run", 10, levels=(0,), errors=dict.fromkeys(range(10), "boom"))
+        said = "All 10 cases ended in a VUT error: “boom”. Nothing was tested."
+        assert headline_of(run.outcomes) == said
+
+    def test_of_a_mix_has_errors_then_timeouts_then_collisions(self, tmp_path):
+        errors = {1: "boom", 4: "boom", 7: "other"}
+        run = write_run(tmp_path / "run", 40, levels=(0,), errors=errors, timeouts=(2, 3))
+        assert failures(run.outcomes)
+        assert headline_of(run.outcomes).startswith(
+            "3 of 40 cases ended in a VUT error, 2 of them: “boom”. 2 of 40 cases timed out: there "
+            "the VUT never reached the merge point. "
+        )
+
+    def test_names_a_level_at_which_nothing_was_tested(self, tmp_path):
+        run = write_run(tmp_path / "run", 10, levels=(0, 1), timeouts=range(1, 20, 2))
+        text = headline_of(run.outcomes)
+        assert "At POV level 1 nothing was tested." in text
+        assert "never at level 1" not in text
+
+    def test_names_levels_that_fail_and_levels_that_do_not(self, made):
+        some = [o for o in made.outcomes if o.case.level == 0 or not o.failed]
+        text = headline_of(some)
+        assert "cases at POV level 0" in text
+        assert "never at level 1 and 2." in text

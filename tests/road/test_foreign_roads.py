@@ -1,0 +1,522 @@
+"""Episodes on roads that are not ours: replayed, exported, drawn, and driven over TraCI."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import re
+import shutil
+import socket
+import subprocess
+import threading
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import traci
+from conftest import some
+from foreign_nets import ALL, FOREIGN, OTHERS, SIX, corridor_of
+from handmade import write_run
+from lxml import etree
+
+from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.rollout import rollout
+from merge_sumo.errors import UserError
+from merge_sumo.reports.exports import write_openscenario
+from merge_sumo.reports.report_data import _road
+from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.sumo import replay as replay_module
+from merge_sumo.sumo.binding import run_program, sumo_program
+from merge_sumo.sumo.opendrive import opendrive
+from merge_sumo.sumo.replay import replay
+from merge_sumo.sumo.replay_folder import (
+    CASE,
+    CONFIG,
+    HOLD_STEPS,
+    HOSTED_NET,
+    LABELS,
+    RECORD,
+    SURROUNDINGS,
+    TYPES,
+    VIEW,
+    write_scenario,
+)
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.traci.vut import TraciVut
+
+FILES = {CONFIG, HOSTED_NET, SURROUNDINGS, TYPES, LABELS, RECORD, VIEW, CASE}
+LANE_WIDTH_M = 3.2
+
+
+@pytest.fixture(scope="module")
+def folder_of(corridor, tmp_path_factory):
+    """Return a function that gives a folder with an episode of `design1`, made once."""
+    made = {}
+
+    def get(name):
+        if name not in made:
+            trajectory = driven(corridor(name), 1)[0]
+            made[name] = write(
+                tmp_path_factory.mktemp("foreign") / "case", corridor(name), trajectory
+            )
+        return made[name]
+
+    return get
+
+
+@pytest.fixture
+def folder(folder_of, tmp_path) -> Path:
+    """Return a copy of a folder on a road with curves and lanes inside of junctions."""
+    return Path(shutil.copytree(folder_of("curved"), tmp_path / "case"))
+
+
+def driven(road, count: int) -> list[Trajectory]:
+    """Return what SUMO drove in cases of level 0 on a road."""
+    factory = vut_factory("design1")
+    cases = from_unit(np.random.default_rng(3).random((count, 2)), level=0)
+    with World(4, road) as world:
+        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
+    return [ran[index] for index in range(count)]
+
+
+def commanded(a_mps2: np.ndarray, road) -> Trajectory:
+    """Return the motion of eq. (4) under accelerations, (steps, 2); no speed falls below 0."""
+    far_m = (road.mainline.before_m, road.ramp.before_m)
+    case = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0)
+    x, v = -np.minimum([-case.x_pov0_m, 182.0], far_m), np.array([case.v_pov0_mps, case.v_vut0_mps])
+    rows = []
+    for wanted in a_mps2:
+        a = np.maximum(wanted, -v / DT_S)
+        rows.append([x[0], v[0], a[0], x[1], v[1], a[1]])
+        x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
+    rows.append([x[0], v[0], 0.0, x[1], v[1], 0.0])
+    return Trajectory(case, np.array(rows).reshape(-1, 2, 3), End.TIMEOUT)
+
+
+STEPS = 300
+RANDOM = np.random.default_rng(0).uniform(A_MIN_MPS2, A_MAX_MPS2 + 1.5, (STEPS, 2))
+STANDS_THEN_GOES = np.array([(2.0, -4.0 if step < 120 else 2.0) for step in range(STEPS)])
+
+
+def write(folder: Path, road, trajectory: Trajectory) -> Path:
+    write_scenario(folder, road, Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory)
+    return folder
+
+
+def assert_identical(folder: Path, steps: int) -> None:
+    result = replay(folder)
+    assert (result.diverged_at_s, result.detail) == (None, "")
+    assert result.rows == 2 * (steps + 1 + HOLD_STEPS)
+
+
+class TestAReplay:
+    @pytest.mark.parametrize("name", ALL[:-2])
+    def test_of_what_sumo_drove_is_identical(self, corridor, tmp_path, name):
+        for number, trajectory in enumerate(driven(corridor(name), 3)):
+            folder = write(tmp_path / str(number), corridor(name), trajectory)
+            assert {path.name for path in folder.iterdir()} == FILES
+            assert_identical(folder, len(trajectory.motion) - 1)
+
+    @pytest.mark.parametrize("name", ALL)
+    def test_of_any_motion_is_identical_also_behind_the_end_of_the_net(
+        self, corridor, tmp_path, name
+    ):
+        road = corridor(name)
+        for number, accelerations in enumerate((RANDOM, STANDS_THEN_GOES)):
+            trajectory = commanded(accelerations, road)
+            assert_identical(write(tmp_path / str(number), road, trajectory), STEPS)
+        assert (trajectory.v_vut_mps == 0.0).sum() > 50
+        assert trajectory.x_pov_m[-1] > 1400.0
+        assert trajectory.x_vut_m[-1] > 0.0
+
+    @pytest.mark.parametrize("name", SIX)
+    def test_needs_nothing_but_sumo(self, folder_of, tmp_path, name):
+        folder = folder_of(name)
+        out = tmp_path / "fcd.xml"
+        command = [sumo_program("sumo"), "-c", folder / CONFIG, "--fcd-output", out]
+        done = subprocess.run(
+            [*command, "--precision", "9"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        places = [
+            [
+                (v.get("id"), round(float(v.get("x")), 6), round(float(v.get("y")), 6))
+                for v in etree.parse(path).iter("vehicle")
+            ]
+            for path in (folder / RECORD, out)
+        ]
+        assert places[0] == places[1]
+        assert len(places[0]) > 100
+
+    @pytest.mark.parametrize("name", SIX)
+    def test_has_the_places_of_the_net_that_was_driven_in(self, corridor, folder_of, name):
+        road = corridor(name)
+        (trajectory,) = driven(road, 1)
+        record = etree.parse(folder_of(name) / RECORD).getroot()
+        for timestep, row in zip(record, trajectory.motion.tolist(), strict=False):
+            for vehicle, x_m in zip(timestep, (row[0][0], row[1][0]), strict=True):
+                at = road.lane_point(x_m, on_ramp=vehicle.get("id") == "vut")
+                seen = [float(vehicle.get(key)) for key in ("x", "y", "angle", "pos")]
+                assert seen == pytest.approx(
+                    [at.x_m, at.y_m, at.angle_deg, at.position_m], abs=1e-6
+                )
+
+    @pytest.mark.parametrize("by", [0.5, pytest.param(-0.5, marks=pytest.mark.long)])
+    @pytest.mark.parametrize("column", some(["x", "y", "pos", "speed"], "y", "speed"))
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_is_not_identical_when_a_number_was_changed(self, folder, who, column, by):
+        record = etree.parse(folder / RECORD)
+        for row in (5, 40, -15):
+            vehicle = [v for v in record.iter("vehicle") if v.get("id") == who][row]
+            was = vehicle.get(column)
+            vehicle.set(column, f"{float(was) + by:.9f}")
+            record.write(folder / RECORD)
+            assert replay(folder).diverged_at_s is not None
+            vehicle.set(column, was)
+        record.write(folder / RECORD)
+        assert replay(folder).diverged_at_s is None
+
+    def test_is_not_identical_on_the_lanes_of_the_other_vehicle(self, folder):
+        record = etree.parse(folder / RECORD)
+        for timestep in record.getroot():
+            pov, vut = timestep
+            for key in ("x", "y", "pos", "speed", "angle", "lane"):
+                vut.set(key, pov.get(key))
+        record.write(folder / RECORD)
+        result = replay(folder)
+        assert result.diverged_at_s == 0.0
+
+    def test_of_the_shipped_road_has_its_own_net_as_ever(self, tmp_path):
+        trajectory = commanded(RANDOM, road_of())
+        copy = Path(shutil.copy(default_net_path(), tmp_path / "copy.net.xml"))
+        folders = [
+            write(tmp_path / str(n), road, trajectory)
+            for n, road in enumerate((road_of(copy), road_of()))
+        ]
+        contents = [{p.name: p.read_bytes() for p in folder.iterdir()} for folder in folders]
+        assert contents[0] == contents[1]
+        assert contents[0]["us23.net.xml"] == default_net_path().read_bytes()
+
+
+def replaced(old: str, new: str):
+    def edit(text: str) -> str:
+        assert re.search(old, text)
+        return re.sub(old, new, text, count=1)
+
+    return edit
+
+
+SECRET = "/home/somebody/secret.xml"  # noqa: S105 (a path of nobody)
+HOSTILE = {
+    "a picture for a polygon": (SURROUNDINGS, replaced("<poly ", f'<poly imgFile="{SECRET}" ')),
+    "an output": (
+        SURROUNDINGS,
+        replaced("</additional>", f'<edgeData id="a" file="{SECRET}"/></additional>'),
+    ),
+    "a parameter": (HOSTED_NET, replaced("</net>", f'<param key="a" value="{SECRET}"/></net>')),
+    "an option": (
+        CONFIG,
+        replaced("</configuration>", f'<fcd-output value="{SECRET}"/></configuration>'),
+    ),
+}
+BROKEN = {
+    "a polygon nowhere": (SURROUNDINGS, replaced('shape="[^"]*"', 'shape="nan,1 2,3"')),
+    "a polygon without a shape": (SURROUNDINGS, replaced('shape="[^"]*"', "")),
+    "polygons with an entity": (
+        SURROUNDINGS,
+        replaced("<additional>", f'<!DOCTYPE a [<!ENTITY b SYSTEM "{SECRET}">]><additional>'),
+    ),
+    "a net with an entity": (
+        HOSTED_NET,
+        replaced("<net ", f'<!DOCTYPE a [<!ENTITY b SYSTEM "{SECRET}">]><net '),
+    ),
+    "a lane inside that is a path": (HOSTED_NET, replaced('via="[^"]*"', f'via="{SECRET}"')),
+    "a lane inside that is missing": (HOSTED_NET, replaced('via="[^"]*"', 'via=":M.0_x_0"')),
+    "no ramp": (HOSTED_NET, lambda text: text.replace('"ramp1.0"', '"romp1.0"')),
+    "no edges": (HOSTED_NET, lambda _: '<net version="1.20"/>'),
+    "no net": (HOSTED_NET, lambda _: "<routes/>"),
+    "an endless lane": (HOSTED_NET, replaced('length="[^"]*"', 'length="inf"')),
+    "a record on a lane that is a path": (RECORD, replaced('lane="[^"]*"', f'lane="{SECRET}"')),
+}
+
+
+class TestAFolderThatSomebodySent:
+    @pytest.mark.parametrize("what", HOSTILE)
+    def test_is_played_without_what_it_asks_for_besides(self, folder, monkeypatch, what):
+        file, edit = HOSTILE[what]
+        (folder / file).write_text(edit((folder / file).read_text()))
+        staged = []
+
+        def looked_at(name, arguments, stage, **options):
+            staged.append({path.name: path.read_text() for path in stage.iterdir()})
+            return run_program(name, arguments, stage, **options)
+
+        monkeypatch.setattr(replay_module, "run_program", looked_at)
+        assert replay(folder).diverged_at_s is None
+        (files,) = staged
+        assert files.keys() == FILES - {CASE}
+        assert not any(SECRET in text for text in files.values())
+
+    @pytest.mark.parametrize("what", BROKEN)
+    def test_is_refused_before_sumo_starts_when_it_holds_what_it_cannot(
+        self, folder, monkeypatch, what
+    ):
+        file, edit = BROKEN[what]
+        (folder / file).write_text(edit((folder / file).read_text()))
+        monkeypatch.setattr(replay_module, "run_program", lambda *_, **__: pytest.fail("started"))
+        with pytest.raises(UserError) as error:
+            replay(folder)
+        assert "\n" not in str(error.value)
+        assert str(folder) in str(error.value)
+
+    @pytest.mark.parametrize("name", [HOSTED_NET, SURROUNDINGS, TYPES, RECORD])
+    def test_is_refused_when_a_file_is_missing_or_a_link(self, folder, tmp_path, name):
+        (folder / name).rename(tmp_path / "elsewhere")
+        with pytest.raises(UserError, match=r"is not a replay folder: it has no "):
+            replay(folder)
+        (folder / name).symlink_to(tmp_path / "elsewhere")
+        with pytest.raises(UserError, match="it is a link"):
+            replay(folder)
+
+
+def lane_centres(road_file: Path) -> np.ndarray:
+    """Return the centres of all lanes of an OpenDRIVE file as segments, (n, 2, 2).
+
+    Reads what netconvert writes: lines and cubic curves, lanes of constant width.
+    """
+    segments = []
+    for road in etree.parse(road_file).findall("road"):
+        places = []
+        for geometry in road.findall("planView/geometry"):
+            x, y, heading, length = (float(geometry.get(n)) for n in ("x", "y", "hdg", "length"))
+            curve = geometry.find("paramPoly3")
+            for share in np.linspace(0.0, 1.0, 2 if curve is None else 40):
+                u, v, du, dv = share * length, 0.0, 1.0, 0.0
+                if curve is not None:
+                    u, v = (poly(curve, axis, share) for axis in "UV")
+                    du, dv = (slope(curve, axis, share) for axis in "UV")
+                c, s = math.cos(heading), math.sin(heading)
+                at = np.array([x + c * u - s * v, y + s * u + c * v])
+                ahead = np.array([c * du - s * dv, s * du + c * dv])
+                places.append((at, ahead / np.linalg.norm(ahead)))
+        shift = road.find("lanes/laneOffset")
+        offset = 0.0 if shift is None else float(shift.get("a"))
+        for section in road.findall("lanes/laneSection"):
+            across = offset
+            for lane in sorted(section.findall("right/lane"), key=lambda e: -int(e.get("id"))):
+                width = float(lane.find("width").get("a"))
+                centre = across - width / 2.0
+                across -= width
+                line = [at + centre * np.array([-d[1], d[0]]) for at, d in places]
+                segments += list(pairwise(line))
+    return np.array(segments)
+
+
+def poly(curve, axis: str, p: float) -> float:
+    return sum(float(curve.get(f"{n}{axis}")) * p**k for k, n in enumerate("abcd"))
+
+
+def slope(curve, axis: str, p: float) -> float:
+    return sum(float(curve.get(f"{n}{axis}")) * k * p ** (k - 1) for k, n in enumerate("abcd") if k)
+
+
+def distance(segments: np.ndarray, x: float, y: float) -> float:
+    begin, along = segments[:, 0], segments[:, 1] - segments[:, 0]
+    to = np.array([x, y]) - begin
+    share = np.clip((to * along).sum(1) / np.maximum((along**2).sum(1), 1e-12), 0.0, 1.0)
+    return float(np.linalg.norm(to - share[:, None] * along, axis=1).min())
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return write_run(tmp_path_factory.mktemp("exports") / "run", per_level=3)
+
+
+class TestAnExport:
+    @pytest.mark.parametrize("name", [*SIX, *OTHERS[2:5]])
+    def test_to_openscenario_lies_on_the_lanes_of_its_opendrive(
+        self, made, corridor, tmp_path, name
+    ):
+        road = corridor(name)
+        scenario = write_openscenario(made, 0, tmp_path / "case", road)
+        tree = etree.parse(scenario)
+        road_file = tree.find(".//RoadNetwork/LogicFile").get("filepath")
+        segments = lane_centres(tmp_path / "case" / road_file)
+        # Where a lane ends, OpenDRIVE has no way from it to the next lane.
+        crossing_m = road.ramp.pieces[-2].length_m if road.lane_drop else 0.0
+        compared = 0
+        for who, column in (("pov", 0), ("vut", 1)):
+            vertices = tree.findall(f".//Trajectory[@name='{who} recorded']//Vertex")
+            motion = made.trajectory(0).motion[:, column, 0].tolist()
+            assert len(vertices) == len(motion)
+            for vertex, x_m in zip(vertices, motion, strict=True):
+                place = vertex.find("Position/WorldPosition")
+                off_m = distance(segments, float(place.get("x")), float(place.get("y")))
+                beside = who == "vut" and -crossing_m <= x_m < 0.0
+                assert off_m < (LANE_WIDTH_M if beside else 0.03), x_m
+                compared += not beside
+        assert compared > 150
+
+    def test_to_opendrive_is_refused_when_the_net_was_changed_since(self, tmp_path):
+        road = corridor_of("zipper", tmp_path)
+        assert len(opendrive(road)) > 1000
+        road.path.write_text(road.path.read_text().replace("</net>", "\n</net>"))
+        with pytest.raises(UserError, match="is not the one that was driven in"):
+            opendrive(road)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@pytest.mark.parametrize("name", ["curved", "lane drop"])
+def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net(corridor, name):
+    road, port, seen = corridor(name), free_port(), list[Any]()
+
+    def drive() -> None:
+        c = traci.connect(port, numRetries=200, waitBetweenRetries=0.02)
+        try:
+            seen.append((c.junction.getIDList(), c.edge.getIDList(), c.vehicle.getIDList()))
+            while c.simulation.getMinExpectedNumber() > 0:
+                c.simulationStep()
+                for who in c.vehicle.getIDList():
+                    v, lane = c.vehicle, c.vehicle.getLaneID(who)
+                    seen.append(
+                        {
+                            "who": who,
+                            "lane": lane,
+                            "edge": (v.getRoadID(who), c.lane.getEdgeID(lane)),
+                            "index": v.getLaneIndex(who),
+                            "at": (v.getLanePosition(who), *v.getPosition(who), v.getAngle(who)),
+                            "length": c.lane.getLength(lane),
+                            "limit": (v.getAllowedSpeed(who), c.lane.getMaxSpeed(lane)),
+                            "shape": c.lane.getShape(lane),
+                            "on": who in c.lane.getLastStepVehicleIDs(lane),
+                            "on edge": who in c.edge.getLastStepVehicleIDs(v.getRoadID(who)),
+                            "next": v.getRoute(who)[v.getRouteIndex(who)],
+                        }
+                    )
+                if "vut" in c.vehicle.getIDList():
+                    c.vehicle.setSpeed("vut", c.vehicle.getSpeed("vut") + 0.05)
+        finally:
+            c.close()
+
+    client = threading.Thread(target=drive)
+    client.start()
+    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
+    with World(1, road) as world:
+        vut = TraciVut(
+            1, world.road, world.scenario, port, None, VutOptions(deadline_s=5.0, connect_s=10.0)
+        )
+        try:
+            ((_, trajectory),) = rollout(world, PovLibrary(1), vut, [case])
+        finally:
+            vut.close()
+            client.join()
+    assert trajectory.end is not End.VUT_ERROR, trajectory.error
+    assert trajectory.x_vut_m[-1] >= 0.0
+    (junctions, edges, vehicles), *rows = seen
+    pieces = {p.lane: p for path in (road.mainline, road.ramp) for p in path.pieces}
+    assert road.junction_id in junctions
+    assert (set(edges), vehicles) == ({lane.rpartition("_")[0] for lane in pieces}, ())
+    paths = {"pov": (road.mainline, 0), "vut": (road.ramp, 1)}
+    assert len(rows) >= 2 * (len(trajectory.motion) - 1)
+    for number, row in enumerate(rows):
+        path, column = paths[row["who"]]
+        at = path.point(float(trajectory.motion[number // 2, column, 0]))
+        edge, _, index = at.lane.rpartition("_")
+        piece = path.piece(float(trajectory.motion[number // 2, column, 0]))
+        assert (row["lane"], row["edge"], row["index"]) == (at.lane, (edge, edge), int(index))
+        assert row["at"] == pytest.approx((at.position_m, at.x_m, at.y_m, at.angle_deg), abs=1e-9)
+        # The client sees the net of the file: there the last lane is not continued.
+        sizes = (
+            min(piece.length_m, road.drawn_after_m - piece.start_m),
+            piece.speed_limit_mps,
+            piece.speed_limit_mps,
+        )
+        assert (row["length"], *row["limit"]) == pytest.approx(sizes, abs=1e-9)
+        assert (row["on"], row["on edge"]) == (True, True)
+        if not piece.is_internal:
+            shape = tuple((x, y) for x, y, _ in pieces[at.lane].shape)
+            assert row["shape"] == shape[: len(shape) - (piece is path.pieces[-1])]
+            assert row["next"] == edge
+    driven_on = list(dict.fromkeys(row["lane"] for row in rows if row["who"] == "vut"))
+    at = [p.lane for p in road.ramp.pieces].index(driven_on[0])
+    assert driven_on == [p.lane for p in road.ramp.pieces[at : at + len(driven_on)]]
+    assert len(driven_on) >= 2
+
+
+@pytest.mark.parametrize("name", ["curved", "zipper", "OSM"])
+def test_the_report_draws_cars_where_they_are_with_m_as_origin_and_the_road_to_the_right(
+    corridor, name
+):
+    road = corridor(name)
+    drawn = _road(road)
+    m = road.lane_point(0.0, on_ramp=False)
+    turn = math.radians(m.angle_deg - 90.0)
+    for on_ramp, path in ((False, drawn["main"]), (True, drawn["ramp"])):
+        along, x, y = np.array(path).T
+        assert (np.diff(along) >= 0.0).all()
+        for x_m in np.linspace(-180.0, 400.0, 59):
+            at = road.lane_point(float(x_m), on_ramp=on_ramp)
+            dx, dy = at.x_m - m.x_m, at.y_m - m.y_m
+            turned = (
+                dx * math.cos(turn) - dy * math.sin(turn),
+                dx * math.sin(turn) + dy * math.cos(turn),
+            )
+            seen = np.interp(x_m, along, x), np.interp(x_m, along, y)
+            assert seen == pytest.approx(turned, abs=0.05)
+    assert np.interp(5.0, *np.array(drawn["main"]).T[:2]) == pytest.approx(5.0, abs=0.1)
+    assert len(drawn["lanes"]) >= len(road.surroundings) + 4
+
+
+class TestRoadOf:
+    def test_is_the_shipped_road_when_nothing_is_named(self):
+        path = default_net_path()
+        assert road_of() == road_of(path, ("main_in", "main_out"), ("ramp", "main_out"))
+        assert road_of().sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+    def test_finds_a_merge_once_and_again_when_the_file_was_changed(self, tmp_path, monkeypatch):
+        path = FOREIGN["zipper"][0](tmp_path)
+        edges = (["in", "out"], ["r0", "r1", "out", "out2"])
+        first = road_of(path, *edges)
+        assert road_of(path, *edges) is first
+        text = path.read_text()
+        path.write_text(text.replace('speed="14.00"', 'speed="15.00"'))
+        assert path.read_text() != text
+        assert road_of(path, *edges).ramp.pieces[0].speed_limit_mps == 15.0
+
+    @pytest.mark.parametrize(
+        ("content", "said"),
+        [
+            (b"<!DOCTYPE net [<!ENTITY a 'b'>]><net/>", "declares a document type"),
+            ("<net/>".encode("utf-16"), "save it as UTF-8"),
+            (b"<net>", "not readable XML"),
+        ],
+    )
+    def test_refuses_what_is_no_net(self, tmp_path, content, said):
+        (tmp_path / "a.net.xml").write_bytes(content)
+        with pytest.raises(UserError, match=said):
+            road_of(tmp_path / "a.net.xml", ["a", "b"], ["c", "b"])
+
+    def test_opens_nothing_that_is_no_plain_file(self, tmp_path):
+        os.mkfifo(tmp_path / "fifo")
+        with pytest.raises(UserError, match="no plain file"):
+            road_of(tmp_path / "fifo", ["a", "b"], ["c", "b"])

@@ -1,0 +1,185 @@
+"""The road: exact lane coordinates around M, copies side by side, and broken nets refused."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.sumo.world import World
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def road() -> Corridor:
+    return road_of()
+
+
+def test_the_shipped_nets_are_what_their_sources_build(tmp_path):
+    tool = ROOT / "tools" / "build_net.py"
+    subprocess.run([sys.executable, tool, "--out", tmp_path], check=True, capture_output=True)
+    built = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert built == {path.name: path.read_bytes() for path in (ROOT / "sumo_net").glob("*.net.xml")}
+    assert default_net_path().name in built
+
+
+class TestTheShippedRoad:
+    def test_has_the_merge_point_as_origin_of_all_lanes(self, road):
+        for path in (road.mainline, road.ramp):
+            before, behind = path.pieces
+            assert before.shape[-1][:2] == behind.shape[0][:2] == (0.0, 0.0)
+
+    def test_has_lanes_of_whole_lengths(self, road):
+        assert [piece.length_m for piece in road.mainline.pieces] == [1000.0, 2000.0]
+        assert [piece.length_m for piece in road.ramp.pieces] == [425.0, 2000.0]
+
+    def test_draws_its_lanes_as_long_as_they_are(self, road):
+        for piece in (*road.mainline.pieces, road.ramp.pieces[0]):
+            (x0, y0, _), (x1, y1, _) = piece.shape
+            assert math.hypot(x1 - x0, y1 - y0) == pytest.approx(piece.length_m, abs=1e-9)
+
+    def test_is_a_main_road_with_two_lanes_and_a_ramp_with_one(self):
+        lanes = re.findall(r'<lane id="(\w+)_\d"', default_net_path().read_text())
+        assert [lanes.count(edge) for edge in ("main_in", "main_out", "ramp")] == [2, 2, 1]
+
+    def test_limits_no_speed_of_the_scenario(self, road):
+        assert road.speed_limit_mps >= 45.0
+
+    @pytest.mark.parametrize("on_ramp", [False, True])
+    def test_puts_a_lane_coordinate_at_its_distance_from_the_merge_point(self, road, on_ramp):
+        for x_m in (-340.0, -182.0, -1e-6, 0.0, 1e-6, 25.0):
+            lane, position, x, y, _ = road.lane_point(x_m, on_ramp=on_ramp)
+            assert math.hypot(x, y) == pytest.approx(abs(x_m), abs=1e-9)
+            before = "ramp_0" if on_ramp else "main_in_0"
+            assert lane == (before if x_m < 0 else "main_out_0")
+            length = {"ramp_0": 425.0, "main_in_0": 1000.0, "main_out_0": 0.0}[lane]
+            assert position == pytest.approx(length + x_m, abs=1e-9)
+
+    def test_points_the_main_road_east_and_the_ramp_towards_it(self, road):
+        assert road.lane_point(-10.0, on_ramp=False)[4] == pytest.approx(90.0)
+        assert road.lane_point(10.0, on_ramp=True)[4] == pytest.approx(90.0)
+        # From (-420, -65): atan(420 / 65), clockwise from north.
+        assert road.lane_point(-10.0, on_ramp=True)[4] == pytest.approx(81.2025893, abs=1e-6)
+
+    def test_has_a_hash_of_the_bytes_of_its_file(self, road, tmp_path):
+        copy, content = tmp_path / "copy.net.xml", default_net_path().read_bytes()
+        copy.write_bytes(content)
+        assert road_of(copy).sha256 == road.sha256
+        copy.write_bytes(content + b"\n")
+        assert road_of(copy).sha256 != road.sha256
+
+
+def edited(old: str, new: str):
+    """Return an edit of the net's text that must find what it replaces."""
+
+    def edit(text: str) -> str:
+        assert old in text
+        return text.replace(old, new)
+
+    return edit
+
+
+def without(pattern: str):
+    """Return an edit that takes out what a pattern finds."""
+
+    def edit(text: str) -> str:
+        assert re.search(pattern, text, re.DOTALL)
+        return re.sub(pattern, "", text, flags=re.DOTALL)
+
+    return edit
+
+
+RAMP_SHAPE = "-420.000000,-65.000000 0.000000,0.000000"
+
+BROKEN = {
+    "empty": (lambda text: "", "not readable XML"),
+    "no XML": (lambda text: "ceci n'est pas une route", "not readable XML"),
+    "cut off": (lambda text: text[: len(text) // 2], "not readable XML"),
+    "another root": (lambda text: "<routes/>", "it does not begin with <net>"),
+    "no edge": (lambda text: "<net/>", "no edge main_in"),
+    "no ramp": (without(r'<edge id="ramp".*?</edge>'), "no edge ramp"),
+    "no main road behind M": (without(r'<edge id="main_out".*?</edge>'), "no edge main_out"),
+    "a shape of words": (
+        edited(f'shape="{RAMP_SHAPE}"/>', 'shape="here there"/>'),
+        "lane ramp_0 is no number",
+    ),
+    "a shape that is no number": (
+        edited(f'shape="{RAMP_SHAPE}"/>', 'shape="-420,nan 0,0"/>'),
+        "lane ramp_0 is no number",
+    ),
+    "a length that is no number": (
+        edited('length="425.000000" shape="-4', 'length="nan" shape="-4'),
+        "lane ramp_0 is no number",
+    ),
+    "no speed": (
+        edited('speed="45.000000" length="425', 'length="425'),
+        "lane ramp_0 is no number",
+    ),
+    "no way off the ramp": (
+        without(r'<connection from="ramp"[^>]*/>'),
+        "ramp does not lead to edge main_out",
+    ),
+}
+
+
+class TestABrokenNet:
+    @pytest.mark.parametrize("name", BROKEN)
+    def test_is_refused_in_one_sentence(self, name, tmp_path):
+        edit, reason = BROKEN[name]
+        path = tmp_path / "broken.net.xml"
+        path.write_text(edit(default_net_path().read_text()))
+        with pytest.raises(UserError) as error:
+            road_of(path)
+        assert "\n" not in str(error.value)
+        assert str(path) in str(error.value)
+        assert reason in str(error.value)
+
+    @pytest.mark.parametrize("missing", ["nowhere.net.xml", "."])
+    def test_that_is_no_file_is_refused_in_one_sentence(self, missing, tmp_path):
+        with pytest.raises(UserError, match="cannot read the net") as error:
+            road_of(tmp_path / missing)
+        assert "\n" not in str(error.value)
+
+    @pytest.mark.parametrize(
+        "edit",
+        [
+            without(r"<junction.*?</junction>|<junction[^>]*/>"),
+            edited('type="zipper"', 'type="chaos"'),
+            edited('x="0.000000" y="1.600000"', 'x="0.000000" y="north"'),
+        ],
+        ids=["no junctions", "an unknown junction", "a junction nowhere"],
+    )
+    def test_that_only_sumo_sees_through_is_refused_in_one_sentence(self, edit, tmp_path):
+        path = tmp_path / "broken.net.xml"
+        path.write_text(edit(default_net_path().read_text()))
+        with pytest.raises(UserError) as error, World(2, road_of(path)):
+            pass
+        assert "\n" not in str(error.value)
+        assert str(path) in str(error.value)
+
+    def test_shows_no_file_that_an_external_entity_names(self, tmp_path):
+        secret, path = tmp_path / "secret.xml", tmp_path / "broken.net.xml"
+        text = default_net_path().read_text()
+        (ramp,) = re.findall(r'<edge id="ramp".*?</edge>', text, re.DOTALL)
+        secret.write_text(ramp)
+        doctype = f'<!DOCTYPE net [<!ENTITY ramp SYSTEM "{secret.as_uri()}">]>\n<net '
+        path.write_text(text.replace(ramp, "&ramp;").replace("<net ", doctype))
+        with pytest.raises(UserError, match="declares a document type"):
+            road_of(path)
+
+
+@pytest.mark.parametrize("extra", ["<!-- surveyed -->", "<?editor id='7'?>"])
+def test_notes_between_the_lanes_do_no_harm(extra, tmp_path):
+    path = tmp_path / "noted.net.xml"
+    lane = '<lane id="ramp_0"'
+    path.write_text(edited(lane, extra + lane)(default_net_path().read_text()))
+    ours, noted = road_of(), road_of(path)
+    assert (noted.mainline, noted.ramp) == (ours.mainline, ours.ramp)

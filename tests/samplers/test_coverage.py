@@ -1,0 +1,308 @@
+"""`coverage`: what it takes a case to be worth, and that it finds what others do not."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import math
+import statistics
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import some
+
+from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.belief import CALIBRATION, Calibration, _as_if, _calibrated, margin_of
+from merge_sumo.samplers.coverage import NEAREST, PATIENCE, CoverageSampler, _limit, _Search
+from merge_sumo.samplers.coverage_grid import CoverageGrid, _Scattered
+from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
+from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.surrogate import Branches, Margin
+from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
+
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
+
+
+def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = True) -> Outcome:
+    """Return what came of a case: a band of gaps below 6 m, unless this level never fails."""
+    x, v = to_unit([case], case.level)[0, :2].tolist()
+    dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7) if fails else 80.0
+    overlap_m = 6.0 - abs(dx_m)
+    end = End.MERGED
+    score = -560.0 - 75.0 * overlap_m if overlap_m > 0.0 else -450.0 * math.exp(overlap_m / 15.0)
+    values = {**NOTHING, "end": end, "score": score, "dx_m": None if blind else dx_m}
+    return Outcome(index, batch, case, Measures(**values))
+
+
+def play(
+    sampler: Sampler, batches: int, n: int = 20, *, blind: bool = False, level_that_fails: int = -1
+) -> list[Outcome]:
+    outcomes: list[Outcome] = []
+    for batch in range(batches):
+        ran = [
+            outcome(
+                len(outcomes) + i,
+                batch,
+                case,
+                blind=blind,
+                fails=level_that_fails in (-1, case.level),
+            )
+            for i, case in enumerate(sampler.ask(n))
+        ]
+        sampler.tell(ran)
+        outcomes += ran
+    return outcomes
+
+
+def coverage_of(outcomes: list[Outcome], level: int) -> float:
+    return fmc(to_unit([o.case for o in outcomes if o.failed], level))
+
+
+class TestTheGround:
+    @pytest.mark.parametrize("dims", some(range(2, 7), 2, 3, 4))
+    def test_counts_what_fmc_measures(self, dims):
+        reach = 2.0 * radius_for(dims)
+        points = np.random.default_rng(dims).uniform(0.5 - reach, 0.5 + reach, (30, dims))
+        ground = CoverageGrid(dims)
+        ground.cover(ground.balls(points), 1.0)
+        one = np.array([[0.5] * dims])
+        assert ground.covered_balls() == pytest.approx(fmc(points) / fmc(one), rel=0.05)
+
+    @pytest.mark.parametrize("dims", range(2, 7))
+    def test_holds_the_balls_at_the_corners_of_the_cube(self, dims):
+        corners = np.array([[0.0] * dims, [1.0] * dims])
+        ground = CoverageGrid(dims)
+        ground.cover(ground.balls(corners), 1.0)
+        assert ground.covered_balls() == pytest.approx(2.0)
+
+    @pytest.mark.parametrize("dims", [2, 5])
+    def test_a_pick_that_fails_with_a_chance_of_60_percent_leaves_40_percent_uncovered(self, dims):
+        ground = CoverageGrid(dims)
+        here = ground.balls(np.full((1, dims), 0.4))
+        ground.cover(here[0], 0.6)
+        assert ground.new(here) == pytest.approx([0.4], rel=1e-6)
+
+    @pytest.mark.parametrize("dims", [2, 4])
+    def test_a_ball_two_radii_away_is_all_new(self, dims):
+        ground = CoverageGrid(dims)
+        here = np.full((1, dims), 0.3)
+        ground.cover(ground.balls(here), 1.0)
+        beside = here + (2.0 * radius_for(dims) + 0.02) * np.eye(dims)[0]
+        assert ground.new(ground.balls(beside)) == pytest.approx([1.0])
+
+    @pytest.mark.parametrize("dims", [4, 5, 6])
+    def test_has_balls_of_the_radius_where_they_are_no_grid(self, dims):
+        points = np.random.default_rng(1).random((200, dims))
+        places = CoverageGrid(dims)._places
+        assert isinstance(places, _Scattered)
+        farthest = places._tree.query(points, k=places.per_ball)[0][:, -1]
+        assert farthest == pytest.approx(radius_for(dims), rel=0.1)
+
+    @pytest.mark.parametrize("dims", [2, 3, 5])
+    def test_a_greedy_batch_is_that_of_who_looks_at_every_candidate_again(self, dims):
+        rng = np.random.default_rng(dims)
+        points, chance = 0.3 * rng.random((100, dims)), rng.random(100)
+        picks, gains = greedy(CoverageGrid(dims), points, chance, chance, 20)
+        ground, free = CoverageGrid(dims), np.ones(100)
+        balls = ground.balls(points)
+        for pick, gain in zip(picks, gains, strict=True):
+            new = ground.new(balls)
+            assert pick == np.argmax(free * chance * (new + EVEN_IF_COVERED))
+            assert gain == chance[pick] * new[pick]
+            ground.cover(balls[pick], max(PICKED, chance[pick]))
+            free[pick] = 0.0
+
+    def test_is_new_each_time(self):
+        first, second = CoverageGrid(4), CoverageGrid(4)
+        ball = first.balls(np.full((1, 4), 0.5))
+        first.cover(ball, 1.0)
+        assert second.new(ball) == [1.0]
+
+
+@pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
+@pytest.mark.parametrize("level", some([0, 2], 2))
+def test_covers_more_than_twice_of_what_uniform_covers(level, blind):
+    uniform, ours = (
+        statistics.median(
+            coverage_of(
+                play(make_sampler(name, Pool(levels=(level,)), seed), 5, blind=blind), level
+            )
+            for seed in (1, 2, 3)
+        )
+        for name in ("uniform", "coverage")
+    )
+    assert uniform > 0.0, "the band must not be invisible"
+    assert ours > 2.0 * uniform
+
+
+def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
+    points = np.random.default_rng(0).random((30, 2))
+    gap_m = 60.0 * (points[:, 0] - 0.5)
+    missing = np.where(points[:, 0] > 0.9, np.nan, gap_m)
+    score, batch = np.full(30, -5.0), np.zeros(30, dtype=np.int64)
+    history = LevelHistory(points, score, np.abs(gap_m) < 6.0, missing, batch)
+    values, low, high = margin_of(history)
+    assert values[np.isnan(missing)] == pytest.approx(np.arcsinh(200.0 / 6.0) / np.arcsinh(1.0))
+    sure = Margin(points, values, low, high, rough=False).at(np.array([[0.5, 0.5], [0.97, 0.5]]))
+    assert sure[0] > 0.5 > sure[1]
+
+
+def test_gives_more_cases_to_the_level_with_more_to_cover_but_starves_none():
+    sampler = make_sampler("coverage", Pool(levels=(0, 1, 2)), 4)
+    outcomes = play(sampler, 5, 30, level_that_fails=1)
+    last = [o.case.level for o in outcomes if o.batch == 4]
+    assert last.count(1) == 20, "5 of the half that is shared out evenly, and the other half"
+    assert last.count(0) == last.count(2) == 5
+
+
+def test_expects_less_of_the_next_batch_the_more_it_has_covered():
+    sampler = CoverageSampler(Pool(levels=(0,)), 2)
+    assert sampler.expected_gain(20) == math.inf
+    play(sampler, 4)
+    early = sampler.expected_gain(20)
+    play(later := CoverageSampler(Pool(levels=(0,)), 2), 14)
+    assert later.expected_gain(20) < 0.5 * early
+
+
+def test_learns_from_a_bounded_number_of_cases_in_a_long_campaign():
+    cases = make_sampler("uniform", Pool(levels=(0,)), 0).ask(1200)
+    sampler = make_sampler("coverage", Pool(levels=(0,)), 0)
+    sampler.tell([outcome(i, i // 40, case, blind=False) for i, case in enumerate(cases)])
+    points = to_unit(sampler.ask(10), 0)
+    assert points.shape == (10, 2)
+
+
+class TestTheBranches:
+    """A margin that comes up to `top` on the left of 0.5, and jumps to 3 on the right of it."""
+
+    @staticmethod
+    def chance(top: float) -> np.ndarray:
+        rng = np.random.default_rng(3)
+        points = rng.random((80, 2))
+        x = points[:, 0]
+        points = points[(x < 0.5) | (x > 0.54)]
+        x = points[:, 0]
+        values = np.where(x < 0.5, top - 8.0 * (0.5 - x), 3.0)
+        branches = Branches(points, values, Margin(points, values, -1.0, 1.0, rough=False))
+        left_out = branches.left_out()
+        assert left_out.shape == (len(points),)
+        assert left_out[x > 0.8].max() < 0.05
+        return branches.at(np.array([[0.47, 0.5], [0.2, 0.5], [0.9, 0.5]]))
+
+    def test_expect_no_failure_where_the_margin_jumps_over_it(self):
+        assert self.chance(top=-3.0).max() < 0.1
+
+    def test_expect_failures_where_one_side_comes_down_to_them_before_the_jump(self):
+        near, *far = self.chance(top=-0.3)
+        assert near > 0.7
+        assert max(far) < 0.05
+
+    def test_a_smooth_process_alone_is_taken_in_by_the_jump(self):
+        points = np.random.default_rng(3).random((80, 2))
+        points = points[np.abs(points[:, 0] - 0.5) > 0.04]
+        values = np.where(points[:, 0] < 0.5, -3.0, 3.0)
+        smooth = Margin(points, values, -1.0, 1.0, rough=False)
+        here = np.array([[0.5, 0.5]])
+        assert smooth.at(here)[0] > 3.0 * Branches(points, values, smooth).at(here)[0]
+
+
+class TestTheCalibration:
+    @staticmethod
+    def evidence(n: int) -> np.ndarray:
+        rng = np.random.default_rng(8)
+        return np.column_stack([rng.normal(0.0, 2.0, n), np.ones(n), rng.normal(size=(n, 2))])
+
+    def test_finds_the_weights_that_the_outcomes_were_drawn_with(self):
+        evidence, true = self.evidence(20_000), np.array([1.5, -1.0, 0.2, -0.3])
+        luck = np.random.default_rng(9).random(len(evidence))
+        failed = luck < 1.0 / (1.0 + np.exp(-evidence @ true))
+        assert _calibrated(evidence, failed)[0] == pytest.approx(true, abs=0.08)
+
+    @pytest.mark.parametrize("n", [1, 3])
+    def test_stays_near_what_it_believed_before_while_it_has_seen_little(self, n):
+        weights, _ = _calibrated(self.evidence(n), np.zeros(n, dtype=bool))
+        assert (np.abs(weights - CALIBRATION[0]) < 2.0 * CALIBRATION[1]).all()
+
+    def test_does_not_run_away_where_failures_are_perfectly_foretold(self):
+        evidence = self.evidence(400)
+        evidence[:, 0] *= 20.0
+        weights, posterior = _calibrated(evidence, evidence[:, 0] > 0.0)
+        assert np.isfinite(posterior)
+        assert np.abs(weights).max() < 5.0
+
+
+class TestWhatIsAimedAt:
+    """Where failures are rare, the nearest cases stand in for them."""
+
+    @staticmethod
+    def history(n: int, failures: int, *, blind: bool = False) -> LevelHistory:
+        rng = np.random.default_rng(6)
+        gap_m = rng.permutation(np.arange(n) + 10.0) * rng.choice([-1.0, 1.0], n)
+        gap_m[:failures] = 1.0
+        score = np.where(np.abs(gap_m) < 6.0, -600.0, -450.0 * np.exp((6.0 - np.abs(gap_m)) / 15))
+        failed = score < -500.0
+        gap_m = np.full(n, np.nan) if blind else gap_m
+        return LevelHistory(rng.random((n, 2)), score, failed, gap_m, np.arange(n) // 20)
+
+    @pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
+    def test_are_the_nearest_cases_where_nothing_failed(self, blind):
+        history = self.history(PATIENCE, 0, blind=blind)
+        near = _as_if(history, _limit(history)).failed
+        assert near.sum() == NEAREST
+        assert set(np.flatnonzero(near)) == set(np.argsort(history.score)[:NEAREST])
+
+    def test_are_failures_alone_once_enough_are_known(self):
+        assert _limit(self.history(PATIENCE, NEAREST)) is None
+
+    def test_are_failures_alone_in_the_first_batches(self):
+        assert _limit(self.history(PATIENCE - 1, 0)) is None
+
+    def test_a_gap_at_the_limit_has_a_margin_of_one(self):
+        history = self.history(PATIENCE, 0)
+        values, low, high = margin_of(history, 12.0)
+        at_limit = np.abs(history.dx_m) == 12.0
+        assert np.abs(values[at_limit]) == pytest.approx([high])
+        assert low == -high
+
+
+def test_looks_where_cases_come_near_but_counts_on_failures_alone():
+    rng = np.random.default_rng(2)
+    points = rng.random((2 * PATIENCE, 2))
+    gap_m = 8.0 + 60.0 * points[:, 0]
+    score = -450.0 * np.exp((6.0 - gap_m) / 15.0)
+    nothing, batch = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=np.int64)
+    history = LevelHistory(points, score, nothing, gap_m, batch)
+    assert _limit(history) is not None
+    proposal = _Search(history, rng, 20).batch(20)
+    assert np.median(proposal.points[:, 0]) < 0.1
+    assert proposal.gain.sum() < 2.0
+
+
+class TestTheTrust:
+    """What came of the last picks says how far P(fail) is to be trusted."""
+
+    def history(self, failing_late: bool) -> LevelHistory:
+        """Return 200 cases with a band of failures; the last 100 in it, failing there or not."""
+        rng = np.random.default_rng(5)
+        points = rng.random((200, 2))
+        points[100:, 0] = 0.5 + 0.04 * (rng.random(100) - 0.5)
+        in_band = np.abs(points[:, 0] - 0.5) < 0.05
+        failed = in_band & ((np.arange(200) < 100) | failing_late)
+        gap_m = np.where(failed, 0.0, np.where(points[:, 0] < 0.5, -20.0, 20.0))
+        score = np.where(failed, -600.0, -50.0)
+        return LevelHistory(points, score, failed, gap_m, np.arange(200) // 20)
+
+    def test_is_whole_where_the_picks_came_true(self):
+        assert Calibration(self.history(failing_late=True)).factors[0] == 1.0
+
+    def test_is_small_where_they_did_not(self):
+        assert Calibration(self.history(failing_late=False)).factors.min() < 0.5
+
+    def test_is_whole_while_there_is_little_to_judge_by(self):
+        first = self.history(failing_late=False).take(slice(120))
+        assert Calibration(first).factors.tolist() == [1.0, 1.0]

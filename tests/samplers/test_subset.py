@@ -1,0 +1,113 @@
+"""Subset simulation: its chains, and its estimate of a probability with a closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from merge_sumo.samplers import subset
+from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.samplers.subset import (
+    STAGE_SIZE,
+    Stage,
+    SubsetSampler,
+    failure_probability,
+    replay,
+)
+from merge_sumo.values.case import Pool
+
+FloatArray = np.ndarray
+CORNER = 0.1
+"""x + v below this fails: a triangle with probability CORNER^2 / 2 = .005."""
+PROBABILITY = CORNER**2 / 2.0
+
+
+def score_of(points: FloatArray) -> FloatArray:
+    """Return a score that falls towards a corner of the square and passes -500 at the line."""
+    return -500.0 - 400.0 * (CORNER - points.sum(axis=1))
+
+
+def history_of(points: FloatArray, batch: FloatArray) -> LevelHistory:
+    score = score_of(points)
+    return LevelHistory(points, score, score < -500.0, np.full(len(score), np.nan), batch)
+
+
+def simulate(seed: int, batches: int, n: int = 20) -> LevelHistory:
+    sampler = SubsetSampler(Pool(levels=(0,)), seed)
+    history = history_of(np.empty((0, 2)), np.empty(0, dtype=np.int64))
+    for batch in range(batches):
+        rng = np.random.default_rng([seed, batch])
+        points = np.vstack([history.points, sampler.propose(history, n, rng, 0)])
+        history = history_of(points, np.append(history.batch, np.full(n, batch)))
+    return history
+
+
+@pytest.fixture(scope="module")
+def estimates() -> FloatArray:
+    """Return estimates with stages of 1000: the bias of the estimate falls with their size."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(subset, "STAGE_SIZE", 1000)
+        runs = [simulate(seed, batches=30, n=200) for seed in range(30)]
+        return np.array([failure_probability(run) for run in runs])
+
+
+def test_estimates_the_probability_of_a_triangle(estimates):
+    error_of_mean = estimates.std(ddof=1) / np.sqrt(len(estimates))
+    assert error_of_mean < 0.15 * PROBABILITY, "the check must be able to fail"
+    assert abs(estimates.mean() - PROBABILITY) < 3.0 * error_of_mean
+
+
+def test_estimates_the_same_as_openturns(estimates):
+    ot = pytest.importorskip("openturns")
+    ot.RandomGenerator.SetSeed(1)
+    cube = ot.RandomVector(ot.JointDistribution([ot.Uniform(0.0, 1.0)] * 2))
+    line = ot.CompositeRandomVector(ot.SymbolicFunction(["x", "v"], ["x + v"]), cube)
+    event = ot.ThresholdEvent(line, ot.Less(), CORNER)
+    theirs = ot.SubsetSampling(event)
+    theirs.setMaximumOuterSampling(10_000)
+    theirs.run()
+    reference = theirs.getResult().getProbabilityEstimate()
+    assert reference == pytest.approx(PROBABILITY, rel=0.1)
+    error_of_mean = estimates.std(ddof=1) / np.sqrt(len(estimates))
+    assert abs(estimates.mean() - reference) < 3.0 * error_of_mean + 0.1 * PROBABILITY
+
+
+def test_knows_of_no_failure_before_there_is_one():
+    points = np.random.default_rng(0).uniform(0.5, 1.0, (40, 2))
+    assert failure_probability(history_of(points, np.repeat([0, 1], 20))) == 0.0
+
+
+def test_is_a_plain_share_of_failures_while_it_samples_the_whole_cube():
+    points = np.vstack([np.full((3, 2), 0.01), np.full((37, 2), 0.8)])
+    history = history_of(points, np.repeat([0, 1], 20))
+    assert failure_probability(history) == pytest.approx(3 / 40)
+
+
+def stages() -> list[Stage]:
+    history = simulate(3, batches=20)
+    ends = range(20, len(history.points) + 1, 20)
+    return [replay(history_of(history.points[:end], history.batch[:end])) for end in ends]
+
+
+def test_goes_through_ever_lower_and_rarer_regions_to_the_failures():
+    seen = stages()
+    assert seen[0].number == 0
+    assert seen[STAGE_SIZE // 20 - 1].number == 1
+    assert np.all(np.diff([stage.threshold for stage in seen[4:]]) <= 0.0)
+    assert np.all(np.diff([stage.probability for stage in seen]) <= 0.0)
+    assert seen[-1].threshold < -500.0
+
+
+def test_no_chain_ever_leaves_its_region():
+    for stage in stages():
+        assert np.all(score_of(stage.chains) <= stage.threshold)
+
+
+def test_a_rejected_move_leaves_its_chain_where_it_is():
+    history = simulate(3, batches=5)
+    before = replay(history)
+    far = np.full((3, 2), 0.99)
+    points = np.vstack([history.points, far])
+    after = replay(history_of(points, np.append(history.batch, [5, 5, 5])))
+    assert after.moved == 3
+    np.testing.assert_array_equal(after.chains, before.chains)

@@ -1,0 +1,273 @@
+"""Who would have avoided a failure: checked against eq. (4) worked out here, without SUMO."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import shutil
+from concurrent.futures import BrokenExecutor, Future
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plans import plan_for
+
+import merge_sumo as ms
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.reference import REFERENCES, CarefulPov
+from merge_sumo.engine.povs import Povs, own_pov
+from merge_sumo.engine.simulator import opened_simulator, road_for
+from merge_sumo.errors import UserError
+from merge_sumo.reports.report import report_page
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.studies.avoidance import (
+    AVOIDANCE,
+    avoidance,
+    in_a_sentence,
+    read_avoidance,
+    write_avoidance,
+)
+from merge_sumo.studies.counterfactuals import Avoidance, Stage, avoidances, drive_again
+from merge_sumo.system.workers import InProcess, Workers, open_workers
+from merge_sumo.values.scenario import OWN, US23
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.registry import vut_factory
+
+LONG = pytest.mark.long
+
+
+def avoidance_of(run, workers=None, **other):
+    settings = settings_of(run.folder, run.settings, trust=True)
+    return avoidance(run, settings, road_for(US23), workers=workers, **other)
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    return avoidance_of(run)
+
+
+@pytest.fixture
+def folder(run, tmp_path):
+    return shutil.copytree(run.folder, tmp_path / "run")
+
+
+def passes(failure, driver, until, *, in_the_povs_place=False):
+    """Return whether a driver passes a failure: eq. (4), with a POV that keeps its speed."""
+    case = failure.case
+    driver.begin(0, case)
+    (x_pov, v_pov), (x, v) = case.starts()
+    for step in range(300):
+        state = (np.array([value]) for value in (x_pov, v_pov, x, v))
+        seen = Scene.of_pair(np.array([True]), np.array([step]), *state)
+        a = a_pov = 0.0
+        if in_the_povs_place:
+            a, a_pov = failure.a_vut_mps2[step], driver.act(seen)[0]
+        elif step < until:
+            a = failure.a_vut_mps2[step]
+        else:
+            a = driver.act(seen)[0]
+        x, x_pov = x + 0.1 * v, x_pov + 0.1 * v_pov
+        v, v_pov = max(v + 0.1 * a, 0.0), max(v_pov + 0.1 * a_pov, 0.0)
+        if x >= 0.0:
+            gap, closing = abs(x_pov - x) - 5.0, max(v_pov - v if x_pov < x else v - v_pov, 0.0)
+            # Whoever is behind has 0.75 s, and then 4 m/s2.
+            return gap >= 1.0 and closing**2 <= 8.0 * max(gap - 0.75 * closing, 0.0)
+    return False
+
+
+def last_of(failure):
+    """Return the last of all steps at which the FSM driver may take over; None without one."""
+    steps = range(len(failure.motion) - 1)
+    passing = [step for step in steps if passes(failure, REFERENCES["fsm"](1), step)]
+    return max(passing, default=None)
+
+
+class DiesAt(InProcess):
+    """A worker that is ended by one failure, each time."""
+
+    def __init__(self, index):
+        self.index = index
+
+    def submit(self, fn, /, *args, **kwargs):
+        if self.index not in [index for index, _ in args[0]]:
+            return super().submit(fn, *args, **kwargs)
+        future: Future = Future()
+        future.set_exception(BrokenExecutor())
+        return future
+
+
+class TestEveryFailure:
+    def test_has_its_line_in_the_order_of_cases(self, run, found):
+        assert [one.index for one in found] == sorted(o.index for o in failures(run.outcomes))
+        assert found
+
+    def test_names_the_drivers_that_pass_it(self, run, found):
+        for one in found[:3]:
+            failure = run.trajectory(one.index)
+            names = [n for n, make in REFERENCES.items() if passes(failure, make(1), 0)]
+            assert list(one.avoided_by) == names
+
+    def test_says_at_which_step_the_driver_may_take_over_at_last(self, run, found):
+        for one in found[:3]:
+            last = last_of(run.trajectory(one.index))
+            assert one.latest_takeover_s == (None if last is None else last / 10.0)
+        assert any(one.latest_takeover_s is not None for one in found)
+
+    def test_says_whether_a_careful_driver_on_the_mainline_avoids_it(self, run, found):
+        for one in found[:3]:
+            failure = run.trajectory(one.index)
+            avoids = passes(failure, CarefulPov(1), 0, in_the_povs_place=True)
+            assert one.pov_careful == avoids
+
+
+FOLLOWED_UP = {"levels": (0,), "cases": 200, "follow_up_s": 3.0, "fail_when": "unsafe"}
+DRIVEN = [
+    pytest.param("design1", "us23", {"levels": (0,), "cases": 60}, 10),
+    pytest.param("design1", "us23", {"levels": (0, 1, 2), "cases": 400}, 100, marks=LONG),
+    pytest.param("design2", "us23", {"levels": (1, 2), "cases": 400}, 60, marks=LONG),
+    pytest.param("level0", "us23-traffic", {"levels": (0, 2), "cases": 200}, 60, marks=LONG),
+    pytest.param("level0", "roundabout", {"levels": (0, 1), "cases": 200}, 60, marks=LONG),
+    pytest.param("sumo:IDM", "us23", FOLLOWED_UP, 30, marks=LONG),
+]
+
+
+@pytest.mark.parametrize(("vut", "scenario", "settings", "at_least"), DRIVEN)
+def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_least):
+    settings, scenario = dict(settings), named_scenario(scenario)
+    if "follow_up_s" in settings:
+        scenario = replace(scenario, follow_up_s=settings.pop("follow_up_s"))
+    settings = CampaignSettings(vut=vut, scenario=scenario, batch=20, seed=1, **settings)
+    net = road_for(scenario)
+    run = run_campaign(settings, tmp_path / "run", net)
+    failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
+    assert len(failing) >= at_least
+    plan = plan_of(settings, net, vut=vut_factory("careful"))
+    with opened_simulator(plan) as ground:
+        in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
+    assert drive_again(plan, failing) == in_sumo
+    assert len({one.latest_takeover_s for one in in_sumo}) > 3
+
+
+def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
+    path = tmp_path / "keeps.py"
+    path.write_text("def keeps(seen):\n    return 0.0\n", encoding="utf-8")
+    povs = Povs(own=own_pov(f"{path}:keeps", VutOptions(in_process=True)))
+    failing = []
+    for one in found[:4]:
+        failure = run.trajectory(one.index)
+        failing.append((one.index, replace(failure, case=replace(failure.case, level=OWN))))
+    assert drive_again(plan_for("careful", povs=povs), failing) == found[:4]
+
+
+class TestWorkers:
+    def test_of_any_number_find_the_same(self, run, found):
+        with open_workers(2) as two:
+            assert avoidance_of(run, two) == found
+        with Workers(InProcess, 3) as three:
+            assert avoidance_of(run, three) == found
+
+    def test_that_die_at_a_failure_leave_out_that_one_and_no_other(self, run, found):
+        left_out = found[1].index
+        with Workers(lambda: DiesAt(left_out), 1) as workers:
+            assert avoidance_of(run, workers) == [one for one in found if one.index != left_out]
+
+    def test_are_asked_in_between_whether_to_stop(self, run, found):
+        class EnoughError(Exception):
+            pass
+
+        def stop():
+            raise EnoughError
+
+        with Workers(InProcess, 3) as workers, pytest.raises(EnoughError):
+            avoidance_of(run, workers, check=stop)
+
+
+class TestTheFile:
+    def test_is_read_as_it_was_written_and_leaves_the_outcomes_alone(self, folder, found):
+        before = (folder / "outcomes.jsonl").read_bytes()
+        assert read_avoidance(Run(folder)) == {}
+        write_avoidance(folder, found)
+        assert list(read_avoidance(Run(folder)).values()) == found
+        assert (folder / "outcomes.jsonl").read_bytes() == before
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"index": 10_000},
+            {"index": True},
+            {"avoided_by": ["nobody"]},
+            {"avoided_by": "careful"},
+            {"latest_takeover_s": "<b>"},
+            {"latest_takeover_s": 1e9},
+            {"pov_careful": 1},
+            {"more": 1},
+        ],
+    )
+    def test_of_somebody_else_is_refused_where_it_is_not_as_it_is_written(
+        self, folder, found, change
+    ):
+        write_avoidance(folder, found)
+        path = folder / AVOIDANCE
+        lines = path.read_text().splitlines()
+        lines[0] = json.dumps(json.loads(lines[0]) | change)
+        path.write_text("\n".join(lines) + "\n")
+        with pytest.raises(UserError, match=r"line 1 of .* is of no failure of the campaign"):
+            read_avoidance(Run(folder))
+
+    def test_of_an_older_version_is_read(self, folder, found):
+        write_avoidance(folder, found)
+        path = folder / AVOIDANCE
+        path.write_text(path.read_text().replace("latest_takeover_s", "careful_until_s"))
+        # In that version another driver took over.
+        without = [replace(one, latest_takeover_s=None) for one in found]
+        assert list(read_avoidance(Run(folder)).values()) == without
+
+    def test_has_no_failure_twice(self, folder, found):
+        write_avoidance(folder, [found[0], found[0]])
+        with pytest.raises(UserError, match="line 2"):
+            read_avoidance(Run(folder))
+
+
+class TestItIsShown:
+    def test_in_a_sentence(self):
+        four = [
+            Avoidance(0, ("careful", "fsm", "rss"), 8.0, pov_careful=True),
+            Avoidance(1, ("careful", "fsm"), 6.0, pov_careful=False),
+            Avoidance(2, ("fsm", "rss"), 7.0, pov_careful=False),
+            Avoidance(3, (), None, pov_careful=False),
+        ]
+        assert in_a_sentence(four) == (
+            "2 of 4 failures would have been avoided by a careful and competent driver, 3 by the "
+            "fuzzy safety model (which may take over until 7.0 s, in the median), and 1 by a "
+            "careful driver on the mainline."
+        )
+        assert in_a_sentence([]) is None
+
+    def test_in_the_report_with_a_filter(self, folder, found):
+        assert "avoided-by" not in report_page(Run(folder)).split("<script")[0]
+        write_avoidance(folder, found)
+        page = report_page(Run(folder))
+        assert in_a_sentence(found) in page
+        assert '<option value="careful">avoided by careful</option>' in page
+        assert "no claim of compliance follows" in page
+
+    def test_by_campaign_and_compare_runs(self, command_line, tmp_path):
+        plan = ("campaign", "--vut", "design1", "--level", 0, "--cases", 40, "--batch", 20)
+        code, out, err = command_line(*plan, "--seed", 1, "--out", tmp_path / "a", "-q")
+        assert code == 0, err
+        assert "would have been avoided by a careful and competent driver" in out
+        kept = read_avoidance(Run(tmp_path / "a"))
+        assert in_a_sentence(kept.values()) in out
+        a = tmp_path / "a"
+        code, out, err = command_line("compare-runs", a, a, "--no-rerun")
+        assert out.count("would have been avoided by a careful and competent driver") == 2
+
+    def test_by_python(self, tmp_path):
+        made = ms.campaign("design1", level=0, cases=40, batch=20, seed=1, out=tmp_path / "run")
+        assert read_avoidance(Run(tmp_path / "run"))
+        assert 'id="avoided-by"' in made.report().read_text()

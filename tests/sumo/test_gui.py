@@ -1,0 +1,248 @@
+"""An exported folder opens in a real sumo-gui, and what it shows is the road and two cars."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_nets import corridor_of
+from lxml import etree
+from PIL import Image
+from processes import marked, none_left
+
+import merge_sumo
+from merge_sumo.campaigns.campaign import export_case
+from merge_sumo.campaigns.run import failures
+from merge_sumo.sumo.replay_folder import (
+    LABELS,
+    SURROUNDINGS_COLOUR,
+    VIEW,
+    write_scenario,
+)
+from merge_sumo.sumo.replay_labels import COLOURS
+
+PICTURE_TIMES_S = (2.0, 7.0)
+LABELS_SHARE = 0.2
+"""Of the height of a picture, from the top: there are the labels."""
+NEAR = 40
+"""Distance in each channel of 255 below which a pixel has a colour."""
+
+SHOW = """
+from lxml import etree
+from merge_sumo.cli import main
+from merge_sumo.sumo import replay_folder
+
+view, config = replay_folder._view, replay_folder._config
+
+def with_pictures(*arguments):
+    root = view(*arguments)
+    root.find("delay").set("value", "0")
+    for file, time in {times}.items():
+        etree.SubElement(root, "snapshot", file=file, time=time)
+    return root
+
+def that_ends(*arguments):
+    root = config(*arguments)
+    root.find("gui_only/delay").set("value", "0")
+    etree.SubElement(root.find("gui_only"), "quit-on-end", value="true")
+    root.find("gui_only").remove(root.find("gui_only/breakpoints"))
+    return root
+
+replay_folder._view, replay_folder._config = with_pictures, that_ends
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
+    """Return pictures of an exported failure at two times as arrays.
+
+    The folder asks for a picture, too: it must not be taken.
+    """
+    scratch = tmp_path_factory.mktemp("gui")
+    folder, hostile = scratch / "case", scratch / "hostile.png"
+    export_case(run, failures(run.outcomes)[0].index, folder)
+    view = etree.parse(folder / VIEW)
+    etree.SubElement(view.getroot(), "snapshot", file=str(hostile), time="1")
+    view.write(folder / VIEW)
+    taken = taken_of(folder, display, scratch)
+    assert not hostile.exists()
+    return taken
+
+
+@pytest.fixture(scope="module")
+def foreign_pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
+    """Return pictures of the same motion on a road with curves."""
+    scratch = tmp_path_factory.mktemp("gui")
+    road, outcome = corridor_of("curved", scratch), failures(run.outcomes)[0]
+    write_scenario(scratch / "case", road, outcome, run.trajectory(outcome.index))
+    return taken_of(scratch / "case", display, scratch)
+
+
+def taken_of(folder: Path, display: str, scratch: Path) -> list[np.ndarray]:
+    """Open a folder with `replay --gui` and return its pictures at two times as arrays.
+
+    The view and the configuration that merge-sumo writes are made to take pictures and to end by
+    themselves.
+    """
+    files = [scratch / f"at-{time_s:g}-s.png" for time_s in PICTURE_TIMES_S]
+    times = {str(file): str(time_s) for file, time_s in zip(files, PICTURE_TIMES_S, strict=True)}
+    (scratch / "show.py").write_text(SHOW.format(times=times))
+    window = subprocess.Popen(
+        [sys.executable, scratch / "show.py", "replay", str(folder), "--gui"],
+        env={**os.environ, "DISPLAY": display},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        said, _ = window.communicate(timeout=120)
+    finally:
+        if window.poll() is None:
+            os.killpg(window.pid, signal.SIGKILL)
+    assert window.returncode == 0, said
+    return [picture(file) for file in files]
+
+
+def picture(file: Path) -> np.ndarray:
+    with Image.open(file) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def places(image: np.ndarray, colour: tuple[float, ...]) -> np.ndarray:
+    """Return the pixels near a colour as rows of (y, x)."""
+    return np.argwhere((np.abs(image - np.array(colour)) < NEAR).all(axis=2))
+
+
+def car(image: np.ndarray, who: str) -> np.ndarray:
+    """Return the pixels of a car, which is below the labels."""
+    labels = round(LABELS_SHARE * image.shape[0])
+    return np.array([labels, 0]) + places(
+        image[labels:], tuple(255.0 * float(part) for part in COLOURS[who].split(","))
+    )
+
+
+NEVER_CONNECTED = """
+import time
+from merge_sumo.cli import main
+from merge_sumo.sumo.child import Channel
+
+Channel.receive = lambda *_, **__: time.sleep(600)
+main()
+"""
+STOPS = {"SIGTERM": 143, "SIGHUP": 129, "SIGKILL": -9, "SIGINT": 1}
+"""How the command ends by a signal; typer says "Aborted!" and 1 by SIGINT."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["SIGTERM", *(pytest.param(name, marks=pytest.mark.long) for name in list(STOPS)[1:])],
+)
+def test_no_window_is_left_of_a_command_that_is_stopped_before_it_is_connected(
+    name, display, tmp_path
+):
+    (tmp_path / "script.py").write_text(NEVER_CONNECTED)
+    case = ("--vut", "level0", "--x", "-300", "--v", "30", "--gui")
+    with none_left() as mark:
+        command = subprocess.Popen(
+            [sys.executable, tmp_path / "script.py", "run", *case],
+            env={**os.environ, "DISPLAY": display, "TMPDIR": str(tmp_path)},
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            while not any("merge_sumo.sumo.live" in program for program in marked(mark)):
+                assert command.poll() is None
+                time.sleep(0.05)
+            command.send_signal(signal.Signals[name])
+            assert command.wait(60) == STOPS[name]
+        finally:
+            if command.poll() is None:
+                os.killpg(command.pid, signal.SIGKILL)
+    if name != "SIGKILL":
+        assert [file.name for file in tmp_path.iterdir()] == ["script.py"]
+
+
+def test_the_picture_has_background_and_a_road_across_it(pictures):
+    for image in pictures:
+        height, width, _ = image.shape
+        assert min(height, width) > 300
+        road = places(image, (0.0, 0.0, 0.0))
+        assert np.unique(road[:, 1]).size > 0.9 * width, "the main road runs from side to side"
+        assert np.unique(road[:, 0]).size > 0.1 * height, "the ramp climbs towards it"
+        assert len(road) < 0.2 * height * width
+
+
+@pytest.mark.parametrize("who", ["pov", "vut"])
+def test_the_picture_has_a_car_in_its_colour(pictures, who):
+    for image in pictures:
+        pixels = car(image, who)
+        assert len(pixels) > 30
+        assert np.ptp(pixels, axis=0).max() < 0.1 * image.shape[1], "one car, in one place"
+
+
+@pytest.mark.parametrize("who", ["pov", "vut"])
+def test_the_car_moves_towards_the_merge_point(pictures, who):
+    early, late = (car(image, who)[:, 1].mean() for image in pictures)
+    assert late > early + 50
+
+
+def test_the_cars_meet(pictures):
+    apart = [
+        np.linalg.norm(car(image, "pov").mean(axis=0) - car(image, "vut").mean(axis=0))
+        for image in pictures
+    ]
+    assert apart[1] < apart[0]
+
+
+def test_on_a_foreign_road_the_picture_has_lanes_those_beside_them_and_both_cars(foreign_pictures):
+    for image in foreign_pictures:
+        height, width, _ = image.shape
+        for colour in (
+            (0.0, 0.0, 0.0),
+            tuple(255.0 * float(part) for part in SURROUNDINGS_COLOUR.split(",")),
+        ):
+            road = places(image, colour)
+            assert np.unique(road[:, 1]).size > 0.5 * width
+            assert len(road) < 0.3 * height * width
+        for who in ("pov", "vut"):
+            assert len(car(image, who)) > 30
+    early, late = (
+        np.linalg.norm(car(image, "pov").mean(axis=0) - car(image, "vut").mean(axis=0))
+        for image in foreign_pictures
+    )
+    assert late < early
+
+
+def test_the_window_has_the_case_the_verdict_and_the_colours_of_the_report(run, pictures, tmp_path):
+    outcome = failures(run.outcomes)[0]
+    export_case(run, outcome.index, tmp_path / "case")
+    labels = etree.parse(tmp_path / "case" / LABELS).getroot()
+    case, verdict, *legend = [str(param.get("value")) for param in labels.iter("param")]
+    assert case.startswith(f"case {outcome.index}, POV level {outcome.case.level}: x_POV0 ")
+    assert verdict.startswith(f"{outcome.measures.severity}, fails: ")
+    assert legend == ["POV", "VUT"]
+    css = (Path(merge_sumo.__file__).parent / "reports" / "templates" / "report.css").read_text()
+    for image in pictures:
+        top = image[: round(LABELS_SHARE * image.shape[0])]
+        assert len(places(top, (26.0, 26.0, 26.0))) > 100, "a text"
+        for who in ("pov", "vut"):
+            (named,) = set(re.findall(f"--{who}: #([0-9a-f]{{6}})", css.partition("@media")[0]))
+            rgb = tuple(255.0 * float(part) for part in COLOURS[who].split(","))
+            assert rgb == pytest.approx(tuple(bytes.fromhex(named)), abs=2.0)
+            assert len(places(top, rgb)) > 20, "a dot of the legend"
+
+
+def test_no_text_lies_on_the_cars(run, tmp_path):
+    export_case(run, failures(run.outcomes)[0].index, tmp_path / "case")
+    view = etree.parse(tmp_path / "case" / VIEW).getroot()
+    (vehicles,) = view.iter("vehicles")
+    assert not any(str(name).endswith("_show") for name in vehicles.attrib)

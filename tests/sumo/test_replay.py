@@ -1,0 +1,518 @@
+"""Exported folders replay in real SUMO with nothing else running, and a replay tells the truth."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lxml import etree
+
+from merge_sumo.campaigns.campaign import export_case
+from merge_sumo.campaigns.run import failures
+from merge_sumo.errors import UserError
+from merge_sumo.road.merge import road_of
+from merge_sumo.sumo import replay as replay_module
+from merge_sumo.sumo.binding import run_program, sumo_program
+from merge_sumo.sumo.replay import MAX_TIMESTEPS, open_gui, replay
+from merge_sumo.sumo.replay_folder import (
+    CASE,
+    CONFIG,
+    HOLD_STEPS,
+    HOSTED_NET,
+    LABELS,
+    NET,
+    RECORD,
+    SURROUNDINGS,
+    TYPES,
+    VIEW,
+    write_scenario,
+)
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S, V_VUT0_MAX_MPS, X_VUT0_M
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
+
+SHIPPED = sorted(path.parent for path in Path(__file__).parents[2].glob(f"scenarios/*/{CONFIG}"))
+FILES = {CONFIG, NET, TYPES, LABELS, RECORD, VIEW, CASE}
+ROW = 40
+"""A row of the record in the middle of the episode, at 4.0 s."""
+
+Command = Callable[[int], float]
+"""The acceleration that a vehicle is given at a step, m/s2."""
+
+
+def drive(case: Case, pov: Command, vut: Command, steps: int, end: End) -> Trajectory:
+    """Return the motion of eq. (4) under given accelerations; speeds do not fall below 0."""
+    x = np.array([case.x_pov0_m, X_VUT0_M])
+    v = np.array([case.v_pov0_mps, case.v_vut0_mps])
+    rows = []
+    for step in range(steps):
+        a = np.maximum([pov(step), vut(step)], -v / DT_S)
+        rows.append([x[0], v[0], a[0], x[1], v[1], a[1]])
+        x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
+    rows.append([x[0], v[0], 0.0, x[1], v[1], 0.0])
+    return Trajectory(case, np.array(rows).reshape(-1, 2, 3), end)
+
+
+def constant(_: int) -> float:
+    return 0.0
+
+
+def brake_then_go(step: int) -> float:
+    """Stand from 7.5 s at the latest until 12 s, then accelerate."""
+    return -4.0 if step < 120 else 2.0
+
+
+def at_level_0(x_pov0_m: float, v_pov0_mps: float, v_vut0_mps: float = 18.0) -> Case:
+    return Case(level=0, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, v_vut0_mps=v_vut0_mps)
+
+
+def write(folder: Path, trajectory: Trajectory) -> Path:
+    write_scenario(
+        folder, road_of(), Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory
+    )
+    return folder
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def edit_number(path: Path, who: str, column: str, by: float, row: int = ROW) -> None:
+    """Add to one number of one row of an FCD file."""
+    tree = etree.parse(path)
+    vehicle = [v for v in tree.iter("vehicle") if v.get("id") == who][row]
+    vehicle.set(column, f"{float(vehicle.get(column)) + by:.9f}")
+    tree.write(path)
+
+
+def assert_identical(folder: Path, steps: int | None = None) -> None:
+    result = replay(folder)
+    assert (result.diverged_at_s, result.detail) == (None, "")
+    if steps is None:
+        assert result.rows > 0
+    else:
+        assert result.rows == 2 * (steps + 1 + HOLD_STEPS)
+
+
+def refusal(folder: Path) -> str:
+    """Return the sentence with which a replay is refused."""
+    with pytest.raises(UserError) as error:
+        replay(folder)
+    message = str(error.value)
+    assert "\n" not in message
+    assert str(folder) in message
+    return message
+
+
+@pytest.fixture(scope="module")
+def collision(run, tmp_path_factory) -> Path:
+    """Return an exported collision; tests copy it before they change it."""
+    folder = tmp_path_factory.mktemp("replay") / "collision"
+    export_case(run, failures(run.outcomes)[0].index, folder)
+    return folder
+
+
+@pytest.fixture
+def folder(collision, tmp_path) -> Path:
+    return Path(shutil.copytree(collision, tmp_path / "case"))
+
+
+@pytest.fixture
+def sumo_plays(monkeypatch):
+    """Return a function that has SUMO play something else than what the folder says.
+
+    It takes the change, which is applied to the temporary folder where SUMO is started.
+    """
+
+    def otherwise(change: Callable[[Path], object]) -> None:
+        def changed(name, arguments, stage, **options):
+            change(stage)
+            return run_program(name, arguments, stage, **options)
+
+        monkeypatch.setattr(replay_module, "run_program", changed)
+
+    return otherwise
+
+
+class TestAnExport:
+    def test_is_exactly_these_files(self, collision):
+        assert {path.name for path in collision.iterdir()} == FILES
+
+    def test_returns_the_configuration_to_open(self, run, tmp_path):
+        assert export_case(run, 0, tmp_path / "case") == tmp_path / "case" / CONFIG
+
+    def test_holds_the_record_of_its_case(self, run, collision):
+        record = json.loads((collision / CASE).read_text())
+        assert record == failures(run.outcomes)[0].to_record()
+
+    def test_names_no_path_outside_itself(self, collision):
+        for name in FILES - {NET}:
+            text = (collision / name).read_text()
+            assert str(collision.parent) not in text
+            assert 'value="/' not in text
+            assert ".." not in text
+
+    def test_replays_after_it_was_moved_to_a_folder_with_an_awkward_name(self, folder, tmp_path):
+        assert_identical(folder.rename(tmp_path / "fälle & <mehr> 'hier'"))
+
+    def test_replays_from_a_relative_path(self, folder, monkeypatch):
+        monkeypatch.chdir(folder)
+        assert_identical(Path())
+
+    def test_is_not_changed_by_its_replay(self, folder):
+        before = contents(folder)
+        replay(folder)
+        assert contents(folder) == before
+
+    @pytest.mark.parametrize("kept", [(), ("notes.txt",), (CONFIG, RECORD)])
+    def test_refuses_a_folder_that_exists_and_leaves_it_alone(self, run, tmp_path, kept):
+        target = tmp_path / "case"
+        target.mkdir()
+        for name in kept:
+            (target / name).write_text("mine")
+        with pytest.raises(UserError, match="case exists"):
+            export_case(run, 0, target)
+        assert contents(tmp_path) == {target / name: b"mine" for name in kept}
+
+    def test_says_when_its_folder_cannot_be_made(self, run, tmp_path):
+        (tmp_path / "file").write_text("mine")
+        with pytest.raises(UserError, match="cannot write"):
+            export_case(run, 0, tmp_path / "file" / "case")
+        assert contents(tmp_path) == {tmp_path / "file": b"mine"}
+
+
+class TestAnHonestRecordReplaysIdentically:
+    @pytest.mark.parametrize("failed", [False, True])
+    def test_of_a_campaign(self, run, tmp_path, failed):
+        outcome = next(o for o in run.outcomes if o.failed is failed)
+        export_case(run, outcome.index, tmp_path / "case")
+        steps = len(run.trajectory(outcome.index).motion) - 1
+        assert_identical(tmp_path / "case", steps)
+
+    @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
+    def test_that_is_shipped(self, folder):
+        found = {path.name for path in folder.iterdir()}
+        assert found >= FILES - {NET}
+        assert NET in found or {HOSTED_NET, SURROUNDINGS} <= found
+        assert_identical(folder)
+
+    def test_of_a_vehicle_that_stands_and_goes_on(self, tmp_path):
+        case = at_level_0(-340.0, 25.0)
+        trajectory = drive(case, brake_then_go, brake_then_go, 245, End.MERGED)
+        assert (trajectory.v_vut_mps == 0.0).sum() > 50
+        assert (trajectory.v_pov_mps == 0.0).sum() > 50
+        assert trajectory.x_vut_m[-1] >= 0.0
+        assert_identical(write(tmp_path / "case", trajectory), 245)
+
+    def test_of_a_timeout(self, tmp_path):
+        trajectory = drive(at_level_0(-250.0, 30.0), constant, lambda _: -4.0, 300, End.TIMEOUT)
+        assert_identical(write(tmp_path / "case", trajectory), 300)
+
+    def test_of_vehicles_that_start_from_a_stand(self, tmp_path):
+        case = at_level_0(-200.0, 0.0, v_vut0_mps=0.0)
+        trajectory = drive(case, lambda _: 1.0, lambda _: 2.0, 136, End.MERGED)
+        assert_identical(write(tmp_path / "case", trajectory), 136)
+
+    def test_of_vehicles_that_overlap_all_the_way(self, tmp_path):
+        trajectory = drive(at_level_0(-182.0, 18.0), constant, constant, 102, End.MERGED)
+        assert_identical(write(tmp_path / "case", trajectory), 102)
+
+    def test_of_a_pov_that_accelerates_until_the_timeout(self, tmp_path):
+        case = at_level_0(-180.0, 35.0)
+        trajectory = drive(case, lambda _: 2.0, lambda _: -4.0, 300, End.TIMEOUT)
+        assert_identical(write(tmp_path / "case", trajectory), 300)
+
+    def test_of_an_episode_that_ended_before_its_first_step(self, tmp_path):
+        trajectory = drive(at_level_0(-250.0, 30.0), constant, constant, 0, End.VUT_ERROR)
+        assert_identical(write(tmp_path / "case", trajectory), 0)
+
+    def test_of_a_case_at_level_2(self, tmp_path):
+        case = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6)
+        trajectory = drive(case, lambda s: (s // 5) % 7 - 4.0, lambda _: 1.0, 83, End.MERGED)
+        assert_identical(write(tmp_path / "case", trajectory), 83)
+
+    def test_of_the_fastest_vut_that_a_campaign_may_have(self, tmp_path):
+        case = at_level_0(-300.0, 30.0, v_vut0_mps=V_VUT0_MAX_MPS)
+        trajectory = drive(case, constant, constant, 41, End.MERGED)
+        assert_identical(write(tmp_path / "case", trajectory), 41)
+
+    @pytest.mark.parametrize("beyond_m", [-0.0005, 0.0, 0.0005])
+    def test_of_a_pov_that_is_at_the_merge_point_at_a_step(self, tmp_path, beyond_m):
+        trajectory = drive(at_level_0(-240.0 + beyond_m, 30.0), constant, constant, 110, End.MERGED)
+        assert abs(trajectory.x_pov_m[80]) < 0.001
+        assert_identical(write(tmp_path / "case", trajectory), 110)
+
+
+def test_at_least_one_scenario_is_shipped():
+    assert SHIPPED, "scenarios/ has no folder with a replay.sumocfg"
+
+
+class TestAReplayThatIsNotTheRecord:
+    """What SUMO plays is made to differ from the record that the replay is compared with."""
+
+    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("column", ["x", "y", "speed"])
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_diverges_where_a_vehicle_is_elsewhere_or_at_another_speed(
+        self, folder, sumo_plays, who, column, by
+    ):
+        sumo_plays(lambda stage: edit_number(stage / RECORD, who, column, by))
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx(ROW * DT_S)
+        assert result.detail.startswith(f"{column} of {who} ")
+
+    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_diverges_where_a_position_along_the_lane_differs(self, folder, who, by):
+        # SUMO takes that position from x and y, so only the record can have another.
+        edit_number(folder / RECORD, who, "pos", by)
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx(ROW * DT_S)
+        assert result.detail.startswith(f"pos of {who} ")
+
+    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("row", [0, -1])
+    def test_diverges_in_the_first_row_and_in_the_last(self, folder, sumo_plays, row, by):
+        as_exported = (folder / RECORD).read_bytes()
+        sumo_plays(lambda stage: (stage / RECORD).write_bytes(as_exported))
+        edit_number(folder / RECORD, "vut", "x", by, row)
+        rows = len(etree.parse(folder / RECORD).findall("timestep"))
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx((row % rows) * DT_S)
+        assert result.detail.startswith("x of vut is ")
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_may_differ_by_rounding_and_no_more(self, folder, sign):
+        edit_number(folder / RECORD, "vut", "pos", sign * 0.5e-6)
+        assert replay(folder).diverged_at_s is None
+        edit_number(folder / RECORD, "vut", "pos", sign * 1.0e-6)
+        assert replay(folder).diverged_at_s == pytest.approx(ROW * DT_S)
+
+    def test_diverges_where_it_stops_early(self, folder, sumo_plays):
+        def stop_early(stage: Path) -> None:
+            config = etree.parse(stage / CONFIG)
+            config.find("time/end").set("value", "3.0")
+            config.write(stage / CONFIG)
+
+        sumo_plays(stop_early)
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx(3.0)
+        assert "not there" in result.detail
+
+    def test_diverges_where_nobody_drives(self, folder, sumo_plays):
+        sumo_plays(lambda stage: (stage / RECORD).write_text("<fcd-export/>"))
+        assert replay(folder).diverged_at_s == 0.0
+
+    def test_that_sumo_does_not_end_is_refused(self, folder, monkeypatch):
+        monkeypatch.setattr(replay_module, "run_program", partial(run_program, limit_s=0.0))
+        assert "did not end within 0 s" in refusal(folder)
+
+
+class TestARecordThatSumoPlays:
+    """The record itself is changed, and so what SUMO plays and what the replay compares."""
+
+    @pytest.mark.parametrize("by", [0.5, -0.5])
+    @pytest.mark.parametrize("column", ["x", "y", "pos", "speed"])
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_is_not_identical_when_a_number_of_it_was_changed(self, folder, who, column, by):
+        edit_number(folder / RECORD, who, column, by)
+        assert_not_identical(folder)
+
+    @pytest.mark.parametrize("steps", [0, HOLD_STEPS, MAX_TIMESTEPS + 1])
+    def test_is_refused_when_it_is_too_short_or_too_long_for_an_episode(self, folder, steps):
+        record = etree.parse(folder / RECORD).getroot()
+        first = record[0]
+        record[:] = [copy.deepcopy(first) for _ in range(steps)]
+        for step, timestep in enumerate(record):
+            timestep.set("time", f"{step * DT_S:.2f}")
+        (folder / RECORD).write_bytes(etree.tostring(record))
+        assert "must have from 11 to 1211 timesteps" in refusal(folder)
+
+    @pytest.mark.parametrize("time", ["4.05", "3.9", "400.0"])
+    def test_is_refused_when_a_row_is_off_the_grid_of_time(self, folder, time):
+        record = etree.parse(folder / RECORD)
+        record.findall("timestep")[ROW].set("time", time)
+        record.write(folder / RECORD)
+        assert "every 0.1 s" in refusal(folder)
+
+    @pytest.mark.parametrize("column", ["x", "y", "pos", "speed", "angle"])
+    @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e8", "", "0x10", "1_0", "\u0661"])
+    def test_is_refused_when_a_number_is_none(self, folder, column, value):
+        record = etree.parse(folder / RECORD)
+        record.findall("timestep")[ROW][0].set(column, value)
+        record.write(folder / RECORD, encoding="UTF-8")
+        assert f"vehicle whose {column} is not a number" in refusal(folder)
+
+    def test_is_refused_when_a_vehicle_is_there_twice(self, folder):
+        record = etree.parse(folder / RECORD)
+        row = record.findall("timestep")[ROW]
+        row.append(copy.deepcopy(row[1]))
+        record.write(folder / RECORD)
+        assert "two rows of vut at 4 s" in refusal(folder)
+
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_is_not_identical_when_the_end_is_not_held(self, folder, who):
+        record = etree.parse(folder / RECORD)
+        rows = record.findall("timestep")
+        place = {v.get("id"): v for v in rows[-4]}[who]
+        before = {v.get("id"): v for v in rows[-12]}[who]
+        for name in ("x", "y", "pos", "speed"):
+            place.set(name, before.get(name))
+        record.write(folder / RECORD)
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx((len(rows) - 4) * DT_S)
+        assert result.detail == f"{who} is not held where the episode ended"
+
+    @pytest.mark.parametrize("who", ["pov", "vut"])
+    def test_is_refused_when_a_vehicle_is_missing(self, folder, who):
+        record = etree.parse(folder / RECORD)
+        for vehicle in record.findall(f".//vehicle[@id='{who}']"):
+            vehicle.getparent().remove(vehicle)
+        record.write(folder / RECORD)
+        assert "must have every vehicle in every timestep" in refusal(folder)
+
+    def test_is_not_identical_when_its_end_is_missing(self, folder):
+        record = etree.parse(folder / RECORD)
+        for timestep in record.findall("timestep")[ROW:]:
+            record.getroot().remove(timestep)
+        record.write(folder / RECORD)
+        assert_not_identical(folder)
+
+
+def assert_not_identical(folder: Path) -> None:
+    """The replay diverges, or the folder is refused with a sentence."""
+    try:
+        result = replay(folder)
+    except UserError as error:
+        assert "\n" not in str(error)  # noqa: PT017 (either answer is honest)
+    else:
+        assert result.diverged_at_s is not None
+
+
+class TestAFolderThatCannotBeReplayed:
+    @pytest.mark.parametrize("name", [NET, TYPES, RECORD])
+    def test_lacks_a_file(self, folder, name):
+        (folder / name).unlink()
+        assert name in refusal(folder)
+
+    @pytest.mark.parametrize("name", [CONFIG, RECORD])
+    def test_is_missing_or_something_else(self, tmp_path, name):
+        assert "is not a replay folder" in refusal(tmp_path / "nowhere")
+        (tmp_path / name).mkdir()
+        assert "is not a replay folder" in refusal(tmp_path)
+
+    @pytest.mark.parametrize("text", [b"", b"\x00\x01", b"<fcd-export><timestep", b"not XML"])
+    @pytest.mark.parametrize("name", [NET, TYPES, RECORD])
+    def test_has_a_file_that_is_no_xml(self, folder, name, text):
+        (folder / name).write_bytes(text)
+        assert refusal(folder)
+
+    def test_has_a_record_that_is_cut_off(self, folder):
+        text = (folder / RECORD).read_bytes()
+        (folder / RECORD).write_bytes(text[: len(text) // 2])
+        assert RECORD in refusal(folder)
+
+    @pytest.mark.parametrize(
+        ("old", "new"),
+        [(' pos="', ' position="'), (' speed="', ' speed="fast '), (' time="', ' at="')],
+    )
+    def test_has_a_record_with_other_columns(self, folder, old, new):
+        text = (folder / RECORD).read_text()
+        assert old in text
+        (folder / RECORD).write_text(text.replace(old, new))
+        assert RECORD in refusal(folder)
+
+    def test_has_types_that_its_record_does_not_use(self, folder):
+        text = (folder / TYPES).read_text()
+        (folder / TYPES).write_text(text.replace('id="vut"', 'id="tuv"'))
+        assert "vType whose id is not one of pov, vut, ahead, behind" in refusal(folder)
+        (folder / TYPES).write_text(text.replace('id="vut"', 'id="pov"'))
+        assert "one vType pov and one vType vut" in refusal(folder)
+
+    def test_has_a_net_with_a_junction_that_sumo_has_not(self, folder):
+        text = (folder / NET).read_text()
+        (folder / NET).write_text(text.replace('type="zipper"', 'type="chaos"'))
+        assert "SUMO has no junctions of type chaos" in refusal(folder)
+
+
+class TestAConfigurationThatCameAlong:
+    """Configuration, view and case of a folder are for people and for plain sumo."""
+
+    @pytest.mark.parametrize("name", [CONFIG, VIEW, CASE])
+    def test_may_be_missing_or_no_file_or_nonsense(self, folder, name):
+        (folder / name).unlink()
+        assert_identical(folder)
+        (folder / name).mkdir()
+        assert_identical(folder)
+        (folder / name).rmdir()
+        (folder / name).write_bytes(b"\x00<configuration><")
+        assert_identical(folder)
+
+
+@pytest.mark.parametrize("folder", SHIPPED[:1], ids=lambda folder: folder.name)
+def test_plain_sumo_replays_a_folder_that_is_shipped(folder, tmp_path):
+    assert_plain_sumo_replays(folder, tmp_path)
+
+
+def test_plain_sumo_replays_a_folder_that_was_exported(folder, tmp_path):
+    assert_plain_sumo_replays(folder, tmp_path)
+
+
+def assert_plain_sumo_replays(folder: Path, tmp_path: Path) -> None:
+    """Start sumo from elsewhere, on the configuration of a folder; the record must come out."""
+    output = tmp_path / "plain.fcd.xml"
+    command = [sumo_program("sumo"), "-c", str(folder / CONFIG), "--fcd-output", str(output)]
+    subprocess.run([*command, "--precision", "9"], check=True, cwd=tmp_path, capture_output=True)
+    recorded, played = (
+        [
+            (float(step.get("time")), car.get("id"), float(car.get("x")), float(car.get("speed")))
+            for step in etree.parse(path).getroot()
+            for car in sorted(step, key=lambda car: car.get("id"))
+        ]
+        for path in (folder / RECORD, output)
+    )
+    assert len(recorded) > 100
+    assert [row[:2] for row in played] == [row[:2] for row in recorded]
+    assert np.allclose([row[2:] for row in played], [row[2:] for row in recorded], 0.0, 1e-6)
+
+
+def test_a_record_shows_no_file_that_an_external_entity_names(folder, tmp_path):
+    secret = tmp_path / "secret.xml"
+    secret.write_text(
+        '<timestep time="999"><vehicle id="vut" x="1" y="2" pos="3" speed="4"/></timestep>'
+    )
+    text = (folder / RECORD).read_text()
+    doctype = f'<!DOCTYPE fcd-export [<!ENTITY e SYSTEM "{secret.as_uri()}">]>\n<fcd-export>&e;'
+    assert "<fcd-export>" in text
+    (folder / RECORD).write_text(text.replace("<fcd-export>", doctype))
+    assert "declares a document type" in refusal(folder)
+
+
+def test_the_gui_needs_a_display(folder, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(UserError, match="DISPLAY") as error:
+        open_gui(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_in_sumo_gui_it_takes_its_own_time_and_halts_before_sumo_ends_with_a_dialog(tmp_path):
+    folder = write(
+        tmp_path / "case", drive(at_level_0(-300.0, 30.0), constant, constant, 102, End.MERGED)
+    )
+    config = etree.parse(folder / CONFIG)
+    # SUMO 1.28 delays by this many milliseconds for each simulated second.
+    assert config.find("gui_only/delay").get("value") == "1000"
+    end_s = float(config.find("time/end").get("value"))
+    assert float(config.find("gui_only/breakpoints").get("value")) == pytest.approx(end_s - 0.2)
+    assert end_s == pytest.approx((102 + 1 + HOLD_STEPS) * DT_S)

@@ -1,0 +1,82 @@
+"""The shadow SUMO beside ours: its vehicles are where ours are, on whatever road."""
+
+from __future__ import annotations
+
+import pytest
+from foreign_nets import corridor_of
+from traci_pair import ToSession, close_shadow, shadow
+
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.scenario import DT_S, US23, VEHICLES
+from merge_sumo.vuts.traci.session import Session
+
+
+@pytest.fixture(autouse=True)
+def _closed_in_the_end():
+    yield
+    close_shadow()
+
+
+@pytest.mark.parametrize("name", ["roundabout", "us23-traffic"])
+def test_the_sumo_that_answers_has_every_vehicle_where_it_is(name, tmp_path):
+    scenario = named_scenario(name)
+    road = road_for(scenario)
+    sumo = shadow(tmp_path, scenario, road)
+    names = VEHICLES[: scenario.vehicles]
+    for episode in range(2):  # they may come again
+        for step in range(60):
+            states = {who: (-40.0 - 30.0 * n + step, 10.0, 0.5) for n, who in enumerate(names)}
+            if step:
+                sumo.step()
+                sumo.put(states)
+            else:
+                sumo.enter(states)
+            for who, (x_m, v_mps, a_mps2) in states.items():
+                point = road.lane_point(x_m, on_ramp=who == "vut")
+                assert sumo.call("vehicle.getLaneID", who) == point.lane
+                at_m = sumo.call("vehicle.getLanePosition", who)
+                assert at_m == pytest.approx(point.position_m, abs=1e-9)
+                assert sumo.call("vehicle.getSpeed", who) == v_mps
+                assert sumo.call("vehicle.getAcceleration", who) == a_mps2
+        assert sumo.time_s == pytest.approx(6.0 * (episode + 1))
+        sumo.clear()
+        assert sumo.call("vehicle.getIDList") == ()
+
+
+def test_who_drives_beyond_the_end_of_the_net_arrives_and_the_others_are_answered_for(tmp_path):
+    scenario = named_scenario("roundabout")
+    session = Session(shadow(tmp_path, scenario, road_for(scenario)))
+    for number, x_m in enumerate((-50.0, 100.0, 600.0, 610.0)):
+        states = {"pov": (x_m, 10.0, 0.0), "vut": (-40.0, 10.0, 0.0)}
+        if number:
+            session.step()
+            session.put(states)
+        else:
+            session.enter(states)
+    vehicle = ToSession(session).vehicle
+    assert vehicle.getIDList() == ("vut",)
+    assert vehicle.getSpeed("vut") == 10.0
+    assert session.arrived == ["pov"]
+    session.step()
+    session.clear()
+    session.enter({"pov": (-50.0, 10.0, 0.0), "vut": (240.0, 10.0, 0.0)})
+    assert set(vehicle.getIDList()) == {"pov", "vut"}
+    session.step()
+    session.put({"pov": (-49.0, 10.0, 0.0), "vut": (250.0, 10.0, 0.0)})
+    assert session.step() is None, "the VUT is beyond the end: it cannot be commanded"
+    assert vehicle.getIDList() == ("pov",)
+
+
+def test_who_leaves_a_lane_that_ends_at_m_goes_on_as_commanded(tmp_path):
+    road = corridor_of("lane drop", tmp_path)
+    sumo = shadow(tmp_path, US23, road)
+    assert sumo._road.drops == "ramp"
+    sumo.enter({"pov": (-100.0, 10.0, 0.0), "vut": (-5.0, 10.0, 0.0)})
+    x_m = -5.0
+    for _ in range(12):
+        assert sumo.step() == 10.0
+        x_m += 10.0 * DT_S
+        sumo.put({"pov": (-100.0, 10.0, 0.0), "vut": (x_m, 10.0, 0.0)})
+        point = road.lane_point(x_m, on_ramp=True)
+        assert sumo.call("vehicle.getLaneID", "vut") == point.lane

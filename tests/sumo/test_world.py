@@ -1,0 +1,278 @@
+"""The SUMO world against the paper's equations of motion, and episodes in it."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import some
+
+from merge_sumo.drivers.base import Driver
+from merge_sumo.drivers.level0 import Level0Vut
+from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.rollout import rollout
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.world import SimulationError, World
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, POV, VUT
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.registry import vut_factory
+
+EXACT = 1e-9
+
+
+def random_cases(count: int, seed: int = 0) -> list[Case]:
+    return from_unit(np.random.default_rng(seed).random((count, 2)), level=0)
+
+
+class RandomDriver(Driver):
+    """Answers random accelerations that depend on case and step only, not on the corridor."""
+
+    def __init__(self, corridors, brake_first_steps=0):
+        super().__init__(corridors)
+        self.rngs: list[np.random.Generator] = [None] * corridors
+        self.brake_first_steps = brake_first_steps
+
+    def begin(self, corridor, case):
+        self.rngs[corridor] = np.random.default_rng(int(case.x_pov0_m * -1e9))
+
+    def act(self, scene):
+        answer = np.zeros(self.corridors)
+        for k in np.flatnonzero(scene.active):
+            answer[k] = self.rngs[k].uniform(A_MIN_MPS2, A_MAX_MPS2)
+            if scene.step[k] < self.brake_first_steps:
+                answer[k] = A_MIN_MPS2
+            elif self.brake_first_steps:
+                answer[k] = abs(answer[k]) / 2
+        return answer
+
+
+def run_all(world, pov, vut, cases):
+    trajectories: list[Trajectory] = [None] * len(cases)
+    for index, trajectory in rollout(world, pov, vut, cases):
+        assert trajectories[index] is None
+        trajectories[index] = trajectory
+    return trajectories
+
+
+def assert_eq4(trajectory):
+    """Integrate eq. (4) with the recorded accelerations and compare every row."""
+    for row in range(trajectory.motion.shape[1]):
+        x, v, a = trajectory.motion[:, row].T
+        expected_x, expected_v = x[0], v[0]
+        for t in range(len(x) - 1):
+            expected_x, expected_v = expected_x + expected_v * DT_S, expected_v + a[t] * DT_S
+            assert abs(x[t + 1] - expected_x) < EXACT
+            assert abs(v[t + 1] - expected_v) < EXACT
+
+
+@pytest.mark.parametrize("corridors", some([1, 32], 32))
+def test_sumo_moves_random_episodes_by_eq_4_at_every_step_with_refills(corridors):
+    cases = random_cases(300)
+    with World(corridors) as world:
+        trajectories = run_all(world, RandomDriver(corridors), RandomDriver(corridors), cases)
+    lengths = {len(t.motion) for t in trajectories}
+    assert len(lengths) > 5, "refills happen at different times"
+    assert any((t.v_vut_mps == 0).any() or (t.v_pov_mps == 0).any() for t in trajectories)
+    for trajectory in trajectories:
+        assert_eq4(trajectory)
+
+
+def test_a_vehicle_brakes_to_a_stand_stays_there_and_starts_again():
+    case = random_cases(1)[0]
+    with World(2) as world:
+        (trajectory,) = run_all(world, PovLibrary(2), RandomDriver(2, brake_first_steps=60), [case])
+    stand = trajectory.v_vut_mps == 0.0
+    assert stand.sum() >= 10
+    assert not stand[-1]
+    assert np.ptp(trajectory.x_vut_m[stand]) == 0.0
+    assert_eq4(trajectory)
+
+
+def test_episodes_are_the_same_in_1_and_in_32_corridors():
+    cases = random_cases(300, seed=1)
+    outcomes = []
+    for corridors in (1, 32):
+        with World(corridors) as world:
+            vut = vut_factory("design2")(corridors)
+            outcomes.append(run_all(world, PovLibrary(corridors), vut, cases))
+    for one, many in zip(*outcomes, strict=True):
+        assert np.array_equal(one.motion, many.motion)
+        assert measure(one) == measure(many)
+
+
+@pytest.mark.parametrize("model", [None, "sumo:IDM", "sumo:Krauss"])
+def test_sumo_holds_the_very_speeds_that_it_was_told(model):
+    """They are not read back: to the last bit it would give the same numbers."""
+    rng = np.random.default_rng(2)
+    vut_type = None if model is None else vut_factory(model).vut.vut_type
+    with World(16, vut_type=vut_type) as world:
+        for case in random_cases(200):
+            world.place(int(rng.integers(16)), case.starts())
+            for _ in range(3):
+                world.step(rng.uniform(A_MIN_MPS2, A_MAX_MPS2, (2, 16)) * (rng.random(16) < 0.7))
+                told_mps, x_m = world.v_mps.tolist(), world.x_m.tolist()
+                world.read()
+                assert (world.v_mps.tolist(), world.x_m.tolist()) == (told_mps, x_m)
+    assert len({speed for row in told_mps for speed in row}) > 16, "speeds of all kinds"
+
+
+@pytest.mark.parametrize("speed_mps", [29.0, 31.0])
+def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps):
+    with World(1) as world:
+        world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
+        world.step(np.zeros((2, 1)))
+        world._set_speed("pov.0", speed_mps)
+        with pytest.raises(SimulationError, match=r"0\.1.* m away from where it drives"):
+            world.step(np.zeros((2, 1)))
+
+
+def test_sumo_reports_the_acceleration_that_was_commanded():
+    with World(3) as world:
+        for k in range(3):
+            world.place(k, [(-300.0, 30.0), (-182.0, 18.0)])
+        command = np.array([[0.0, 1.0, -4.0], [2.0, -1.5, 0.0]])
+        world.step(command)
+        assert world.acceleration_mps2() == pytest.approx(command, abs=EXACT)
+
+
+def test_a_constant_speed_pov_covers_33_m_in_a_second():
+    with World(1) as world:
+        world.place(0, [(-273.0, 33.0), (-182.0, 18.0)])
+        for _ in range(10):
+            world.step(np.zeros((2, 1)))
+        assert world.x_m[POV, 0] == pytest.approx(-240.0, abs=EXACT)
+        assert world.x_m[VUT, 0] == pytest.approx(-164.0, abs=EXACT)
+
+
+def test_lane_coordinates_go_on_behind_the_merge_point():
+    with World(1) as world:
+        world.place(0, [(-1.0, 30.0), (-2.0, 25.0)])
+        world.step(np.zeros((2, 1)))
+        assert world.x_m[:, 0] == pytest.approx([2.0, 0.5], abs=EXACT)
+        world.place(0, [(-100.0, 30.0), (-50.0, 25.0)])
+        assert world.x_m[:, 0] == pytest.approx([-100.0, -50.0], abs=EXACT)
+        assert world.v_mps[:, 0] == pytest.approx([30.0, 25.0], abs=EXACT)
+
+
+def test_a_pov_that_accelerates_until_the_timeout_stays_on_the_road():
+    class Fastest(Driver):
+        def act(self, scene):
+            return np.full(self.corridors, A_MAX_MPS2)
+
+    class Stop(Driver):
+        def act(self, scene):
+            return np.full(self.corridors, A_MIN_MPS2)
+
+    case = Case(level=0, x_pov0_m=-180.0, v_pov0_mps=35.0)
+    with World(1) as world:
+        (trajectory,) = run_all(world, Fastest(1), Stop(1), [case])
+    assert trajectory.end is End.TIMEOUT
+    assert len(trajectory.motion) == MAX_STEPS + 1
+    assert trajectory.t_end_s == 30.0
+    assert trajectory.v_pov_mps[-1] == pytest.approx(95.0)
+    assert_eq4(trajectory)
+
+
+def test_the_episode_ends_at_the_first_step_at_which_the_vut_is_at_m():
+    with World(4) as world:
+        for trajectory in run_all(world, PovLibrary(4), Level0Vut(4), random_cases(20)):
+            assert trajectory.x_vut_m[-1] >= 0.0
+            assert (trajectory.x_vut_m[:-1] < 0.0).all()
+
+
+def test_a_second_open_world_is_refused_and_the_first_goes_on():
+    with World(1) as world:
+        with pytest.raises(UserError, match="one simulation per process"):
+            World(1)
+        world.step(np.zeros((2, 1)))
+
+
+class Broken(Driver):
+    """Drives as level 0, but does something wrong in the cases with v_POV0 above 30 m/s."""
+
+    def __init__(self, corridors, answer):
+        super().__init__(corridors)
+        self.answer = answer
+        self.bad = np.zeros(corridors, dtype=bool)
+
+    def begin(self, corridor, case):
+        self.bad[corridor] = case.v_pov0_mps > 30.0
+        if self.bad[corridor] and self.answer == "raise":
+            raise RuntimeError("no start")
+
+    def act(self, scene):
+        wrong = np.nan if self.answer == "raise" else self.answer
+        return np.where(self.bad & (scene.step == 3), wrong, 1.0)
+
+
+@pytest.mark.parametrize(("answer", "reason"), [(np.nan, "nan"), (-np.inf, "inf")])
+def test_an_answer_that_is_no_number_ends_only_its_own_case(answer, reason):
+    cases = random_cases(40)
+    with World(8) as world:
+        trajectories = run_all(world, PovLibrary(8), Broken(8, answer), cases)
+    for case, trajectory in zip(cases, trajectories, strict=True):
+        if case.v_pov0_mps > 30.0:
+            assert trajectory.end is End.VUT_ERROR
+            assert reason in trajectory.error
+            assert len(trajectory.motion) == 4
+            assert measure(trajectory).score is None
+        else:
+            assert trajectory.end is End.MERGED
+
+
+def test_a_vut_that_raises_when_it_is_reset_is_an_outcome():
+    cases = random_cases(20)
+    with World(4) as world:
+        trajectories = run_all(world, PovLibrary(4), Broken(4, "raise"), cases)
+    for case, trajectory in zip(cases, trajectories, strict=True):
+        failed = case.v_pov0_mps > 30.0
+        assert (trajectory.end is End.VUT_ERROR) == failed
+        assert (trajectory.error == "reset raised RuntimeError: no start") == failed
+
+
+@pytest.mark.parametrize("answer", ["text", [1.0], None])
+def test_a_wrong_shape_or_type_is_a_vut_error_and_no_case_is_lost(answer):
+    class Wrong(Driver):
+        def act(self, scene):
+            return answer
+
+    with World(4) as world:
+        trajectories = run_all(world, PovLibrary(4), Wrong(4), random_cases(9))
+    assert all(t.end is End.VUT_ERROR and t.error for t in trajectories)
+
+
+def test_answers_outside_the_limits_are_clipped_and_counted():
+    class Strong(Driver):
+        def act(self, scene):
+            return np.full(self.corridors, 7.0)
+
+    with World(4) as world:
+        for trajectory in run_all(world, PovLibrary(4), Strong(4), random_cases(6)):
+            assert trajectory.clipped_steps == len(trajectory.motion) - 1
+            assert (trajectory.a_vut_mps2[:-1] == A_MAX_MPS2).all()
+
+
+@pytest.mark.parametrize("half_step", ["advance", "command"])
+def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
+    monkeypatch, half_step
+):
+    cases = random_cases(30)
+    with World(4) as world:
+        call, calls = getattr(world, half_step), iter(range(10_000))
+
+        def failing(*arguments):
+            if next(calls) == 100:
+                raise SimulationError("the simulation broke")
+            call(*arguments)
+
+        monkeypatch.setattr(world, half_step, failing)
+        trajectories = run_all(world, PovLibrary(4), Level0Vut(4), cases)
+    broken = [t for t in trajectories if t.end is End.SIM_ERROR]
+    assert len(broken) == 4
+    assert all("the simulation broke" in t.error for t in broken)
+    assert all(len(t.motion) > 0 for t in broken)
+    assert all(measure(t).score is None for t in broken)
+    assert sum(t.end is End.MERGED for t in trajectories) == 26

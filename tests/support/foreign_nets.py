@@ -1,0 +1,207 @@
+"""Nets that are not ours, built by netconvert: what people draw, download and convert."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from merge_sumo.road.finder import find_corridor
+from merge_sumo.road.netfile import NetFile
+from merge_sumo.sumo.binding import sumo_program
+
+
+def netconvert(*arguments: str | Path) -> None:
+    command = [sumo_program("netconvert"), *map(str, arguments)]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+def plain(folder: Path, nodes: str, edges: str, connections: str = "", *options: str) -> Path:
+    """Build a net from plain XML, with the defaults of netconvert."""
+    for name, text in (("nodes", nodes), ("edges", edges), ("connections", connections)):
+        (folder / f"{name}.xml").write_text(f"<{name}>{text}</{name}>")
+    files = ("-n", folder / "nodes.xml", "-e", folder / "edges.xml", "-x")
+    out = folder / "built.net.xml"
+    netconvert(*files, folder / "connections.xml", *options, "-o", out)
+    return out
+
+
+def edge(name: str, begin: str, end: str, lanes: int, speed: float, **more: object) -> str:
+    extra = "".join(f' {key}="{value}"' for key, value in more.items())
+    return (
+        f'<edge id="{name}" from="{begin}" to="{end}" numLanes="{lanes}" speed="{speed}"{extra}/>'
+    )
+
+
+def node(name: str, x: float, y: float, kind: str = "priority") -> str:
+    return f'<node id="{name}" x="{x}" y="{y}" type="{kind}"/>'
+
+
+def lane(source: str, source_lane: int, target: str, target_lane: int) -> str:
+    return (
+        f'<connection from="{source}" to="{target}" fromLane="{source_lane}" '
+        f'toLane="{target_lane}"/>'
+    )
+
+
+def curved(folder: Path) -> Path:
+    """Everything bends, and two edges are longer than they are drawn."""
+    return plain(
+        folder,
+        node("a", -600, 300) + node("m", 0, 0) + node("b", 500, 250) + node("r", -300, -200),
+        edge(
+            *("in", "a", "m", 2, 33),
+            priority=9,
+            shape="-600,300 -500,150 -400,60 -300,15 -200,-5 -100,-8 0,0",
+            length=770,
+        )
+        + edge("out", "m", "b", 2, 33, priority=9, shape="0,0 150,30 300,90 500,250")
+        + edge(
+            *("slip", "r", "m", 1, 14),
+            priority=3,
+            shape="-300,-200 -250,-100 -180,-50 -90,-28 0,0",
+            length=420,
+        ),
+    )
+
+
+def straight(folder: Path, kind: str) -> Path:
+    """Edges in a row with internal lanes of 0.1 m in between, and a merge of a kind."""
+    return plain(
+        folder,
+        node("a", -700, 0) + node("m", 0, 0, kind) + node("b", 600, 0) + node("c", 1200, 20)
+        + node("r0", -500, -120) + node("r1", -150, -40),
+        edge("in", "a", "m", 2, 30, priority=9) + edge("out", "m", "b", 2, 30, priority=9)
+        + edge("out2", "b", "c", 2, 30, priority=9) + edge("r0", "r0", "r1", 1, 14, priority=3)
+        + edge("r1", "r1", "m", 1, 14, priority=3),
+        lane("r1", 0, "out", 0) + lane("in", 0, "out", 0) + lane("in", 1, "out", 1),
+    )  # fmt: skip
+
+
+def lane_drop(folder: Path, kind: str = "priority") -> Path:
+    """An auxiliary lane beside two lanes: it ends, or at a zipper it is led into the next one."""
+    into = lane("acc", 0, "out", 0) if kind == "zipper" else ""
+    return plain(
+        folder,
+        node("a", -800, 0) + node("n", -200, 0) + node("d", 0, 0, kind) + node("b", 700, 0)
+        + node("r", -500, -90),
+        edge("in", "a", "n", 2, 36, priority=9) + edge("acc", "n", "d", 3, 36, priority=9)
+        + edge("out", "d", "b", 2, 36, priority=9) + edge("ramp", "r", "n", 1, 22, priority=3),
+        lane("in", 0, "acc", 1) + lane("in", 1, "acc", 2) + lane("ramp", 0, "acc", 0)
+        + lane("acc", 1, "out", 0) + lane("acc", 2, "out", 1) + into,
+    )  # fmt: skip
+
+
+OSM_NODES_M = {1: (-900, 0), 2: (-500, 10), 3: (-200, 5), 4: (0, 0), 5: (300, -20)} | {
+    6: (900, -100), 7: (-450, -160), 8: (-300, -90), 9: (-150, -30), 10: (1500, -200),
+}  # fmt: skip
+"""Nodes of the OpenStreetMap piece, in metres east and north of 42.3 N 83.7 W."""
+
+
+def osm(folder: Path, *options: str) -> Path:
+    """Return a motorway with a link, as OpenStreetMap writes it and its import makes a net."""
+    east = 111_320 * math.cos(math.radians(42.3))
+    nodes = "".join(
+        f'<node id="{n}" version="1" visible="true" '
+        f'lat="{42.3 + y / 111_320:.9f}" lon="{-83.7 + x / east:.9f}"/>'
+        for n, (x, y) in OSM_NODES_M.items()
+    )
+
+    def way(number: int, through: list[int], **tags: object) -> str:
+        refs = "".join(f'<nd ref="{n}"/>' for n in through)
+        values = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        return f'<way id="{number}" version="1" visible="true">{refs}{values}</way>'
+
+    main = way(4711, [1, 2, 3, 4, 5, 6, 10], highway="motorway", lanes=2, maxspeed="70 mph")
+    link = way(4712, [7, 8, 9, 4], highway="motorway_link", lanes=1, oneway="yes")
+    (folder / "piece.osm").write_text(f'<osm version="0.6">{nodes}{main}{link}</osm>')
+    out = folder / "osm.net.xml"
+    netconvert("--osm-files", folder / "piece.osm", *options, "-o", out)
+    return out
+
+
+def opendrive(folder: Path, of: Path) -> Path:
+    """Convert a net to OpenDRIVE, and that to a net, with the names that this makes."""
+    out = folder / "xodr.net.xml"
+    netconvert("-s", of, "--opendrive-output", folder / "road.xodr")
+    netconvert("--opendrive-files", folder / "road.xodr", "-o", out)
+    return out
+
+
+def left_turn(folder: Path, kind: str = "priority") -> Path:
+    """A side road, from which one turns left over two internal lanes, or right into a light."""
+    ends = {"w": (-500, 0), "e": (500, 0), "s": (0, -400)}
+    arms = "".join(
+        edge(f"{n}2m", n, "m", 1, 20, priority=3 if n == "s" else 9, sidewalkWidth=2)
+        + edge(f"m2{n}", "m", n, 1, 20, priority=3 if n == "s" else 9, sidewalkWidth=2)
+        for n in ends
+    )
+    nodes = node("m", 0, 0, kind) + "".join(node(n, *place) for n, place in ends.items())
+    return plain(folder, nodes, arms, "", "--crossings.guess")
+
+
+def roundabout(folder: Path, radius_m: float = 20.0) -> Path:
+    """Four arms and a ring of short edges."""
+    turns = (0, 90, 180, 270)
+
+    def on(angle: float, r: float) -> tuple[float, float]:
+        return r * math.cos(math.radians(angle)), r * math.sin(math.radians(angle))
+
+    def arc(begin: int) -> str:
+        points = (on(begin + 90 * i / 8, radius_m) for i in range(9))
+        return " ".join(f"{x:.3f},{y:.3f}" for x, y in points)
+
+    nodes = "".join(node(f"r{a}", *on(a, radius_m)) + node(f"o{a}", *on(a, 240)) for a in turns)
+    edges = "".join(
+        edge(f"ring{a}", f"r{a}", f"r{(a + 90) % 360}", 1, 9, priority=9, shape=arc(a))
+        + edge(f"in{a}", f"o{a}", f"r{a}", 1, 14, priority=3)
+        + edge(f"out{a}", f"r{a}", f"o{a}", 1, 14, priority=3)
+        for a in turns
+    )
+    rings = " ".join(f"ring{a}" for a in turns)
+    round_it = f'<roundabout nodes="{" ".join(f"r{a}" for a in turns)}" edges="{rings}"/>'
+    return plain(folder, nodes, edges + round_it)
+
+
+AUXILIARY = "4711#1-AddedOnRampEdge"
+FOREIGN = {
+    "curved": (curved, "in out", "slip out"),
+    "priority": (lambda f: straight(f, "priority"), "in out out2", "r0 r1 out"),
+    "zipper": (lambda f: straight(f, "zipper"), "in out", "r0 r1 out out2"),
+    "lane drop": (lane_drop, "in acc out", "ramp acc out"),
+    "OSM": (
+        lambda f: osm(f, "--ramps.guess", "--geometry.remove"),
+        f"4711#0 {AUXILIARY} 4711#1",
+        f"4712 {AUXILIARY} 4711#1",
+    ),
+    "OpenDRIVE": (lambda f: opendrive(f, curved(f)), "-40 -41", "-42 -41"),
+    "zipper with an auxiliary lane": (
+        lambda f: lane_drop(f, "zipper"),
+        "in acc out",
+        "ramp acc out",
+    ),
+    "mainline that ends": (
+        lambda f: opendrive(f, lane_drop(f, "zipper")),
+        "-51 -50 -52",
+        "-53 -50 -52",
+    ),
+    "OSM without an auxiliary lane": (osm, "4711#0 4711#1", "4712 4711#1"),
+    "left turn": (left_turn, "e2m m2w", "s2m m2w"),
+    "traffic light": (lambda f: left_turn(f, "traffic_light"), "w2m m2e", "s2m m2e"),
+    "roundabout": (roundabout, "in180 ring180 ring270 ring0 out90", "in270 ring270 ring0"),
+    "ring": (roundabout, "ring270 ring0 ring90 ring180 ring270 ring0", "in270 ring270"),
+}
+"""Name, builder, edges of the mainline and of the ramp; the first six are the kinds that count."""
+
+SIX = list(FOREIGN)[:6]
+OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(FOREIGN)[6:]]
+ALL = [*SIX, *OTHERS]
+"""Names for tests of each kind of road; those that vary another one take longer in all."""
+
+
+def corridor_of(name: str, folder: Path):
+    """Build a net and find its merge."""
+    build, mainline, ramp = FOREIGN[name]
+    return find_corridor(NetFile(build(folder)), mainline.split(), ramp.split())

@@ -1,0 +1,337 @@
+"""Ours and a real SUMO side by side, for a client's questions: who answers what."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import os
+import socket
+import struct
+import subprocess
+import warnings
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import traci
+from traci.connection import Connection
+from traci.storage import Storage
+
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import road_of
+from merge_sumo.sumo.binding import sumo_environment, sumo_program
+from merge_sumo.sumo.shadow_sumo import (
+    COLOURS,
+    COMMANDED_VUT,
+    NET,
+    OPTIONS,
+    TYPES,
+    ShadowRoad,
+    ShadowSumo,
+    _edges,
+    write_files,
+)
+from merge_sumo.system.landlock import lock_in
+from merge_sumo.values.scenario import DT_S, US23, VEHICLES, Scenario
+from merge_sumo.vuts.traci import protocol as tp
+from merge_sumo.vuts.traci.session import Session
+
+STEPS = 30
+IDS = {
+    "vehicle": "vut",
+    "vehicletype": "vut",
+    "route": "route.vut",
+    "edge": "ramp",
+    "lane": "ramp_0",
+    "junction": "M",
+}
+"""Objects that are asked about, by their domain."""
+ARGUMENTS = {
+    "typeID": "vut",
+    "edgeID": "ramp",
+    "edgeID1": "main_in",
+    "edgeID2": "main_out",
+    "fromEdge": "main_in",
+    "toEdge": "main_out",
+    "laneID": "ramp_0",
+    "toLaneID": "main_out_0",
+    "vehID": "vut",
+    "key": "k",
+    "param": "k",
+    "direction": 0,
+    "mode": 0,
+    "laneIndex": 0,
+    "time": 1.0,
+    "speed": 20.0,
+    "gap": 30.0,
+    "leaderSpeed": 20.0,
+    "leaderMaxDecel": 4.0,
+    "leaderID": "pov",
+    "routeEdges": ["main_in", "main_out"],
+    "pos": 10.0,
+    "pos1": 10.0,
+    "pos2": 20.0,
+    "edges": ["main_in"],
+    "x": 100.0,
+    "y": 0.0,
+    "x1": 0.0,
+    "y1": 0.0,
+    "x2": 10.0,
+    "y2": 0.0,
+}
+"""What functions are given, by the names of their arguments."""
+
+
+OBJECTS = {
+    *("vehID", "typeID", "routeID", "edgeID", "laneID", "junctionID", "objID", "objectID", "detID"),
+    *("stopID", "loopID", "poiID", "polygonID", "personID", "tlsID", "viewID", "probeID"),
+}
+"""Names of the first argument where that is the object that is asked about."""
+
+
+class ToSession(Connection):
+    """A client's connection that leads to a session, without a socket."""
+
+    def __init__(self, session: Session) -> None:
+        import threading
+
+        self._string = b""
+        self._queue: list[Any] = []
+        self._subscriptionMapping: dict[Any, Any] = {}
+        self._lock = threading.Lock()
+        self._session = session
+        for domain in traci.domain.DOMAINS:
+            domain._register(self, self._subscriptionMapping)
+
+    def _sendExact(self):  # noqa: N802 (TraCI's name)
+        (command,) = tp.commands_of(self._string)
+        result = Storage(self._session.handle(command))
+        self._string, self._queue = b"", []
+        _, _, code = result.read("!BBB")
+        said = result.readString()
+        if code or said:
+            raise traci.TraCIException(said, command.identifier, str(code))
+        return result
+
+
+def open_program(folder: Path) -> tuple[subprocess.Popen[bytes], Any]:
+    """Start a real SUMO behind its own TraCI server; return it and a client's connection.
+
+    Its port is open to all of this machine and beyond, so it may touch no file but in its folder.
+    """
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
+    program = sumo_program("sumo")
+    read = [Path(program).parents[2], Path("/usr"), Path("/lib"), Path("/lib64"), Path("/etc")]
+    process = subprocess.Popen(
+        [program, *files, *OPTIONS, "--remote-port", str(port)],
+        env=sumo_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: lock_in([folder], read, ports=True),  # noqa: PLW1509
+    )
+    try:
+        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+            return process, traci.connect(port, 240, proc=process, waitBetweenRetries=0.05)
+    except BaseException:
+        end_program(process)
+        raise
+
+
+def end_program(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+
+
+_shadows: list[ShadowSumo] = []
+"""libsumo holds one simulation per process."""
+
+
+def shadow(folder: Path, scenario: Scenario = US23, road: Corridor | None = None) -> ShadowSumo:
+    """Return the shadow SUMO of this process, with an empty road at time 0."""
+    road = road or road_of()
+    write_files(folder, road, scenario)
+    sumo = ShadowSumo(folder, ShadowRoad.of(road), VEHICLES[: scenario.vehicles])
+    sumo._started = bool(_shadows)
+    sumo.load()
+    _shadows[:] = [sumo]
+    return sumo
+
+
+def close_shadow() -> None:
+    if _shadows:
+        _shadows.pop()._libsumo.close()
+
+
+class Pair:
+    """A session and a SUMO program in the same state: both cars on their way to M."""
+
+    def __init__(self, folder: Path) -> None:
+        road = road_of()
+        self.session = Session(shadow(folder))
+        self.process, self.real = open_program(folder)
+        vehicle = self.real.vehicle
+        starts = {"pov": (road.mainline, -300.0, 30.0), "vut": (road.ramp, -182.0, 18.0)}
+        for name, (path, x_m, v_mps) in starts.items():
+            self.real.route.add(f"route.{name}", _edges(path))
+            point = path.point(x_m)
+            lane = point.lane.rpartition("_")[2]
+            place = {"departPos": str(point.position_m), "departSpeed": str(v_mps)}
+            vehicle.add(name, f"route.{name}", typeID=name, departLane=lane, **place)
+            vehicle.setColor(name, COLOURS[name == "vut"])
+        begin = {
+            name: {piece.lane: piece.start_m for piece in path.pieces}
+            for name, (path, _, _) in starts.items()
+        }
+        before = {name: v_mps for name, (_, _, v_mps) in starts.items()}
+        for step in range(STEPS):
+            self.session.answered()
+            self.real.simulationStep()
+            states = {}
+            for name in starts:
+                vehicle.setSpeedMode(name, COMMANDED_VUT if name == "vut" else 32)
+                vehicle.setLaneChangeMode(name, 0)
+                vehicle.setSpeed(name, vehicle.getSpeed(name) + (0.05 if name == "vut" else -0.05))
+                v_mps = vehicle.getSpeed(name)
+                x_m = begin[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
+                states[name] = x_m, v_mps, (v_mps - before[name]) / DT_S
+                before[name] = v_mps
+            if step:
+                self.session.sumo.call("vehicle.setSpeed", "vut", states["vut"][1])
+                self.session.step()
+                self.session.put(states)
+            else:
+                self.session.enter(states)
+        self.ours = ToSession(self.session)
+
+    def close(self) -> None:
+        close_shadow()
+        end_program(self.process)
+
+
+class Drive:
+    """A session and a SUMO program in which the VUT drives as it is commanded, step by step.
+
+    The session's VUT is moved by eq. (4) and the scenario's limits. Both start anew in `begin`, but
+    for the programs.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.road, self.folder = road_of(), folder
+        write_files(folder, self.road, US23)
+        self.process, self.real = open_program(folder)
+        self.real.route.add("route.vut", _edges(self.road.ramp))
+
+    def begin(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
+        """Let the vehicles depart; `pov` is (x in m, v in m/s) of the session's POV."""
+        self.pov = pov
+        self.session = Session(shadow(self.folder))
+        self.ours = ToSession(self.session)
+        _as_at_first(self.real)
+        if "vut" in self.real.vehicle.getIDList():
+            self.real.vehicle.remove("vut")
+        self.real.vehicle.add("vut", "route.vut", typeID="vut", departSpeed="18")
+        self.real.simulationStep()
+        self.real.vehicle.setSpeedMode("vut", COMMANDED_VUT)
+        self.real.vehicle.setLaneChangeMode("vut", 0)
+        self.real.vehicle.setColor("vut", COLOURS[1])
+        self.real.vehicle.setSpeed("vut", 18.0)
+        self.again()
+
+    def again(self) -> None:
+        """Let the vehicles of the session depart, after they have arrived."""
+        if self.session.driving:
+            self.session.step()
+            self.session.clear()
+        (x_m, v_mps) = self.pov
+        self.x_m, self.v_mps = [x_m, -182.0], [v_mps, 18.0]
+        self.session.enter(self._states(0.0))
+
+    def both(self, ask):
+        return ask(self.ours), ask(self.real)
+
+    def step(self) -> None:
+        wanted_mps = self.session.step()
+        assert wanted_mps is not None
+        a_mps2 = (wanted_mps - self.v_mps[1]) / DT_S
+        a_mps2 = min(max(a_mps2, US23.a_min_mps2), US23.a_max_mps2)
+        self.x_m = [x + v * DT_S for x, v in zip(self.x_m, self.v_mps, strict=True)]
+        self.v_mps[1] = max(self.v_mps[1] + a_mps2 * DT_S, 0.0)
+        self.session.put(self._states(a_mps2))
+        self.real.simulationStep()
+
+    def place(self, x_m: list[float], v_mps: list[float]) -> None:
+        """Put the vehicles of the session somewhere else."""
+        self.x_m, self.v_mps = x_m, v_mps
+        self.session.step()
+        self.session.put(self._states(0.0))
+
+    def speeds(self) -> tuple[float, float]:
+        ours, real = self.both(lambda c: c.vehicle.getSpeed("vut"))
+        return ours, real
+
+    def _states(self, a_mps2: float) -> dict[str, tuple[float, float, float]]:
+        return {
+            name: (x_m, v_mps, a_mps2 if name == "vut" else 0.0)
+            for name, x_m, v_mps in zip(VEHICLES, self.x_m, self.v_mps, strict=False)
+        }
+
+    def close(self) -> None:
+        close_shadow()
+        end_program(self.process)
+
+
+def _as_at_first(connection: Any) -> None:
+    """Give the VUT's type the numbers that it had."""
+    vehicletype = connection.vehicletype
+    vehicletype.setMaxSpeed("vut", road_of().speed_limit_mps)
+    vehicletype.setAccel("vut", US23.a_max_mps2)
+    vehicletype.setDecel("vut", -US23.a_min_mps2)
+    vehicletype.setEmergencyDecel("vut", -US23.a_min_mps2)
+
+
+def questions() -> Iterator[tuple[str, str, tuple[Any, ...]]]:
+    """Yield (domain, function, arguments) of everything that a client can ask."""
+    for name, domain in sorted(vars(traci).items()):
+        if not isinstance(domain, traci.domain.Domain):
+            continue
+        for function, call in inspect.getmembers(domain, inspect.ismethod):
+            if not function.startswith(("get", "is", "find", "convert", "could", "wants")):
+                continue
+            if "Subscription" in function:
+                continue
+            parameters = inspect.signature(call).parameters.values()
+            needed = [p.name for p in parameters if p.default is p.empty]
+            values = [ARGUMENTS.get(parameter, "x") for parameter in needed]
+            of_object = domain is not traci.simulation and needed and needed[0] in OBJECTS
+            if of_object:
+                values[0] = IDS.get(name, "nothing")
+            yield name, function, tuple(values)
+
+
+def answer(connection: Any, domain: str, function: str, values: tuple[Any, ...]) -> str:
+    """Return an answer as text; of a refusal what is said."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return shown(getattr(getattr(connection, domain), function)(*values))
+        except traci.TraCIException as error:
+            return f"refused: {error}"
+        except (TypeError, AttributeError, ValueError, KeyError, struct.error) as error:
+            return f"not asked: {type(error).__name__} {error}"
+        finally:
+            connection._string, connection._queue = b"", []
+
+
+def shown(value: Any) -> str:
+    """Return an answer as text, numbers to 9 digits: state goes by the sum of many steps."""
+    if isinstance(value, float):
+        return "nan" if math.isnan(value) else f"{value:.9g}"
+    if isinstance(value, (tuple, list)):
+        return f"({', '.join(map(shown, value))})"
+    if isinstance(value, dict):
+        return str({key: shown(of) for key, of in value.items()})
+    return repr(value) if not hasattr(value, "__dict__") else shown(vars(value))

@@ -1,0 +1,38 @@
+"""What the tests of all kinds of VUT share: cases, and running them in a real SUMO world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from plans import plan_for
+
+from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.registry import VutFactory, vut_factory
+
+LEVEL0_CLASS = """
+class Level0:
+    def act(self, seen):
+        return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
+"""
+
+
+def cases_of(count: int, seed: int = 0) -> list[Case]:
+    return from_unit(np.random.default_rng(seed).random((count, 2)), level=0)
+
+
+def factory(spec: object, **options: Any) -> VutFactory:
+    return vut_factory(str(spec), VutOptions(**options))
+
+
+def run_cases(vut: VutFactory, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
+    """Return what became of every case, in order; every case must come back exactly once."""
+    found: dict[int, Trajectory] = {}
+    with plan_for(vut, corridors=corridors).open() as ground:
+        for index, trajectory in ground.run(cases):
+            assert index not in found
+            found[index] = trajectory
+    assert sorted(found) == list(range(len(cases)))
+    return [found[index] for index in range(len(cases))]

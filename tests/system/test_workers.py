@@ -1,0 +1,340 @@
+"""Workers of every kind give the same results, and lose none of them when a worker dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plans import plan_for
+from processes import wait_for
+
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import OUTCOMES
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.simulator import lost_case, run_cases, runs_on
+from merge_sumo.engine.versions import software
+from merge_sumo.errors import UserError
+from merge_sumo.system.workers import (
+    InProcess,
+    LocalProcesses,
+    Workers,
+    dask_workers,
+    open_workers,
+    when_worker_ends,
+    workers_or_cores,
+)
+from merge_sumo.values.case import from_unit
+from merge_sumo.values.trajectory import End
+
+KINDS = [1, 2]
+SETTINGS = CampaignSettings(
+    vut="design1", levels=(0, 1, 2), sampler="gpr", cases=60, batch=20, seed=3
+)
+
+
+def squares(items):
+    return [item * item for item in items]
+
+
+def process_ids(items):
+    return [os.getpid() for _ in items]
+
+
+def imported_beside(items):
+    """Have a process started that imports what lies in the working directory."""
+    command = [sys.executable, "-c", "import beside"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return [done.stdout for _ in items]
+
+
+def refuse(items):
+    raise UserError(f"nothing like {items[0]} here")
+
+
+def slowly(items):
+    time.sleep(0.3)
+    return squares(items)
+
+
+def killed_once_at(flag: Path, deadly: int, items):
+    """Square, but let the worker die the first time that it comes to one item."""
+    if deadly in items and not flag.exists():
+        flag.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return squares(items)
+
+
+def killed_always_at(deadly: set[int], items):
+    if deadly & set(items):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return squares(items)
+
+
+def run_but_die_at(plan, deadly, cases):
+    if any(case.x_pov0_m in deadly for case in cases):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return run_cases(plan, cases)
+
+
+def no_loss(item):
+    pytest.fail(f"{item} was given up")
+
+
+@pytest.fixture(scope="module", params=KINDS, ids=["in process", "2 processes"])
+def workers(request):
+    with open_workers(request.param) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory) -> bytes:
+    """Return the outcomes of a campaign that ran in this process."""
+    folder = tmp_path_factory.mktemp("one") / "run"
+    run_campaign(SETTINGS, folder)
+    return (folder / OUTCOMES).read_bytes()
+
+
+class TestAnyWorkers:
+    @pytest.mark.parametrize(
+        ("count", "chunk"), [(0, None), (1, None), (2, 1), (7, 1), (7, 3), (1003, None)]
+    )
+    def test_give_the_result_of_every_item_once_and_at_its_place(self, workers, count, chunk):
+        found = sorted(workers.run(squares, range(count), no_loss, chunk=chunk))
+        assert found == [(place, place * place) for place in range(count)]
+
+    def test_raise_what_the_function_raises_and_work_on(self, workers):
+        with pytest.raises(UserError, match=r"nothing like [56] here"):
+            list(workers.run(refuse, [5, 6], no_loss))
+        assert sorted(workers.run(squares, [5, 6], no_loss)) == [(0, 25), (1, 36)]
+
+    def test_may_be_left_before_the_end(self, workers):
+        results = workers.run(squares, range(20), no_loss, chunk=1)
+        next(results)
+        results.close()
+        assert sorted(workers.run(squares, [3], no_loss)) == [(0, 9)]
+
+
+class TestAWorkerThatDies:
+    def test_once_loses_nothing(self, tmp_path):
+        with open_workers(2) as workers:
+            work = partial(killed_once_at, tmp_path / "flag", 7)
+            found = sorted(workers.run(work, range(20), no_loss, chunk=4))
+        assert (tmp_path / "flag").exists()
+        assert found == [(place, place * place) for place in range(20)]
+
+    def test_each_time_at_one_item_loses_that_one_and_no_other(self):
+        with open_workers(2) as workers:
+            work = partial(killed_always_at, {7})
+            found = sorted(workers.run(work, range(20), lambda item: -item, chunk=10))
+        assert found == [(place, -7 if place == 7 else place * place) for place in range(20)]
+
+    def test_at_a_case_makes_it_a_sim_error_with_a_reason(self):
+        cases = from_unit(np.random.default_rng(0).random((4, 2)), 0)
+        plan = plan_for("design1", corridors=4)
+        with open_workers(2) as workers:
+            work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
+            ran = dict(workers.run(work, cases, lost_case, chunk=1))
+        ends = [ran[place].measures.end for place in range(4)]
+        assert ends[2] is End.SIM_ERROR
+        assert "worker process died 2 times" in ran[2].measures.error
+        assert ran[2].measures.score is None
+        assert End.SIM_ERROR not in ends[:2] + ends[3:]
+
+
+class TestWhatTravels:
+    def test_arrives_as_it_was_sent(self):
+        cases = from_unit(np.random.default_rng(0).random((1, 3)), 2)
+        plan = plan_for("level0", corridors=1)
+        (sent,) = run_cases(plan, cases)
+        came = pickle.loads(pickle.dumps(sent))  # noqa: S301 (our own)
+        assert came.trajectory.case == sent.trajectory.case == cases[0]
+        assert came.measures == sent.measures
+        assert (came.trajectory.motion == sent.trajectory.motion).all()
+        assert came.trajectory.end is sent.trajectory.end
+
+
+class TestLocalProcesses:
+    def test_are_replaced_after_a_number_of_chunks(self):
+        with Workers(lambda: LocalProcesses(1), 1, recycle_after=2) as workers:
+            found = dict(workers.run(process_ids, range(6), no_loss, chunk=1))
+        assert len(set(found.values())) == 3
+        assert os.getpid() not in found.values()
+
+    def test_do_not_hear_ctrl_c(self):
+        with open_workers(2) as workers:
+            ids = set(dict(workers.run(process_ids, range(8), no_loss, chunk=1)).values())
+            results = workers.run(slowly, range(4), no_loss, chunk=1)
+            first = next(results)
+            for process in ids:
+                os.kill(process, signal.SIGINT)
+            assert sorted([first, *results]) == [(place, place * place) for place in range(4)]
+
+    def test_end_with_a_parent_that_is_killed(self, tmp_path):
+        script = tmp_path / "parent.py"
+        script.write_text(
+            "import os, sys\n"
+            "from merge_sumo.system.workers import open_workers\n"
+            "sys.path.insert(0, sys.argv[1])\n"
+            "from test_workers import process_ids\n"
+            "if __name__ == '__main__':\n"
+            "    with open_workers(2) as workers:\n"
+            "        found = workers.run(process_ids, range(4), None, chunk=1)\n"
+            "        print(*{pid for _, pid in found}, flush=True)\n"
+            "        os.kill(os.getpid(), 9)\n"
+        )
+        here = str(Path(__file__).parent)
+        parent = subprocess.run(
+            [sys.executable, str(script), here], capture_output=True, text=True, check=False
+        )
+        assert parent.returncode == -signal.SIGKILL, parent.stderr
+        orphans = [int(word) for word in parent.stdout.split()]
+        assert orphans
+        assert wait_for(lambda: not any(running(orphan) for orphan in orphans))
+
+
+def running(process: int) -> bool:
+    """Return whether a process is there and is no zombie."""
+    try:
+        status = Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return False
+    return status.rpartition(")")[2].split()[0] != "Z"
+
+
+class TestACampaign:
+    def test_has_the_same_outcomes_on_two_workers(self, expected, tmp_path):
+        with open_workers(2) as workers:
+            run_campaign(SETTINGS, tmp_path / "run", workers=workers)
+        assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("count", [3, 5])
+    def test_has_the_same_outcomes_on_more(self, expected, tmp_path, count):
+        with open_workers(count) as workers:
+            run_campaign(SETTINGS, tmp_path / "run", workers=workers)
+        assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
+
+    def test_closes_its_simulation_in_this_process(self, tmp_path):
+        for name in ("first", "second"):
+            settings = CampaignSettings(vut="level0", levels=(0,), cases=2, batch=2)
+            run_campaign(settings, tmp_path / name)
+
+    def test_is_refused_by_workers_with_other_software(self):
+        other = {**software(), "libsumo": "1.0"}
+        plan = replace(plan_for("design1", corridors=2), software=other)
+        with open_workers(1) as workers, pytest.raises(UserError, match="a worker has libsumo"):
+            runs_on(workers, plan)
+
+
+def test_an_ending_is_called_once():
+    called = []
+
+    def ending() -> None:
+        called.append(1)
+
+    for _ in range(2):
+        when_worker_ends(ending)
+    InProcess().shutdown()
+    InProcess().shutdown()
+    assert called == [1]
+
+
+def test_no_workers_are_refused_in_a_sentence():
+    with pytest.raises(UserError, match="--workers is 0"):
+        workers_or_cores(0)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """Start a Dask scheduler and two workers on loopback; give its address and the workers."""
+    pytest.importorskip("distributed", reason="needs merge-sumo[dask]")
+    contact = tmp_path / "scheduler.json"
+    dask = [sys.executable, "-m", "dask"]
+    on_loopback = ("--host", "127.0.0.1", "--no-dashboard")
+    scheduler = [*dask, "scheduler", *on_loopback, "--port", "0", "--scheduler-file", str(contact)]
+    worker = [*dask, "worker", "--scheduler-file", str(contact), *on_loopback]
+    worker += ["--nthreads", "2", "--no-nanny", "--local-directory", str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([p for p in sys.path if p])}
+    log = (tmp_path / "log").open("wb")
+    start = partial(subprocess.Popen, stdout=log, stderr=log, env=environment)
+    processes = [start(scheduler)]
+    try:
+        assert wait_for(lambda: contact.exists() and contact.stat().st_size > 0)
+        processes += [start(worker), start(worker)]
+        address = json.loads(contact.read_text())["address"]
+        assert address.startswith("tcp://127.0.0.1:")
+        assert wait_for(lambda: workers_at(address) == 2)
+        yield address, processes[1:]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+        log.close()
+
+
+def workers_at(address: str) -> int:
+    try:
+        with dask_workers(address) as workers:
+            return workers.count
+    except UserError:
+        return 0
+
+
+class TestADaskCluster:
+    def test_gives_the_same_outcomes_although_a_worker_is_killed(self, cluster, expected, tmp_path):
+        address, (first, _) = cluster
+        seen = []
+
+        def on_case(outcome) -> None:
+            seen.append(outcome.index)
+            if len(seen) == 30:  # in the middle of the second batch of three
+                first.kill()
+
+        with dask_workers(address) as workers:
+            assert workers.count == 2
+            run_campaign(SETTINGS, tmp_path / "run", on_case=on_case, workers=workers)
+        assert first.wait() == -signal.SIGKILL
+        assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
+
+    def test_that_is_not_there_is_refused_in_a_sentence(self, monkeypatch):
+        pytest.importorskip("distributed", reason="needs merge-sumo[dask]")
+        monkeypatch.setattr("merge_sumo.system.workers.DASK_TIMEOUT_S", 1.0)
+        with pytest.raises(UserError, match=r"no scheduler at tcp://127\.0\.0\.1:1"):
+            dask_workers("tcp://127.0.0.1:1")
+        with pytest.raises(UserError, match="no scheduler at"):
+            dask_workers("nonsense://")
+
+
+class TestFolderWhereAPersonIs:
+    """A folder that somebody sent is data, also where one works in it."""
+
+    SHADOWED = ("multiprocessing", "json", "numpy", "threadpoolctl", "merge_sumo")
+
+    def test_brings_no_modules(self, tmp_path):
+        for name in self.SHADOWED:
+            (tmp_path / f"{name}.py").write_text("raise SystemExit('it was run')\n")
+        script = Path(sysconfig.get_path("scripts")) / "merge-sumo"
+        command = [str(script), "campaign", "--vut", "design2", "--level", "0", "--cases", "8"]
+        command += ["--sampler", "uniform", "--workers", "2", "--out", "run"]
+        ended = subprocess.run(command, check=False, cwd=tmp_path, capture_output=True, text=True)
+        assert ended.returncode == 0, ended.stderr
+        assert "it was run" not in ended.stdout + ended.stderr
+
+    def test_is_searched_by_what_a_worker_starts(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "beside.py").write_text("print('mine')\n")
+        with open_workers(2) as workers:
+            found = dict(workers.run(imported_beside, [None, None], lambda _: None, chunk=1))
+        assert set(found.values()) == {"mine\n"}
+        assert "PYTHONSAFEPATH" not in os.environ

@@ -1,0 +1,365 @@
+"""The twin of the VUT: it plays as SUMO does, learns, and is believed by its record."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import some
+from plans import plan_for
+
+from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.run import OUTCOMES, Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.policies import policies_of
+from merge_sumo.engine.povs import Povs
+from merge_sumo.engine.simulator import road_for, run_cases
+from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.samplers.coverage import CoverageSampler
+from merge_sumo.samplers.prediction_skill import PredictionSkill
+from merge_sumo.studies.prediction_quality import Expected, foretold_in_words, off_m, surprises
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.twin.observation import NOW, Observation
+from merge_sumo.twin.rollout import TwinRollout
+from merge_sumo.twin.twin import Twin
+from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
+
+NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
+SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2)
+SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
+
+
+def ran(vut: str, level: int, points, scenario=US23):
+    plan = plan_for(vut, scenario=scenario, corridors=16)
+    pool = Pool(levels=(level,), scenario=scenario)
+    done = run_cases(plan, pool.cases(points, level))
+    return [
+        Outcome(index, index // 10, one.trajectory.case, one.measures)
+        for index, one in enumerate(done)
+    ], {index: one.trajectory.motion for index, one in enumerate(done)}
+
+
+def gaps_of(outcomes) -> np.ndarray:
+    return np.array([outcome.measures.dx_m for outcome in outcomes], dtype=np.float64)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return ran("design1", 0, np.random.default_rng(3).random((60, 2)))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Run:
+    return run_campaign(SETTINGS, tmp_path_factory.mktemp("whole") / "run")
+
+
+class TestGames:
+    @pytest.mark.parametrize(
+        ("name", "level"),
+        [("us23", 0), ("us23", 1), ("us23", 2), ("us23-traffic", 1), ("roundabout", 2)],
+    )
+    def test_end_as_sumo_ends_them(self, name, level, tmp_path):
+        (tmp_path / "slows.py").write_text(SLOWS)
+        scenario = named_scenario(name)
+        dims = len(scenario.dimensions(level))
+        points = np.random.default_rng(level).random((24, dims))
+        outcomes, _ = ran(f"{tmp_path / 'slows.py'}:vut", level, points, scenario)
+        games = TwinRollout(
+            Pool(levels=(level,), scenario=scenario), Povs(policies=policies_of(scenario))
+        )
+
+        def slows(inputs, now, rows):
+            return np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
+
+        found = games.play(points, level, slows)
+        assert np.isfinite(found).any()
+        # The POV decides in float32 here: one that has no preference may choose otherwise.
+        off = np.abs(found - gaps_of(outcomes)) > 1e-6
+        assert off.sum() <= 1
+
+    def test_go_on_until_the_timeout_for_a_vut_that_stops(self):
+        pool = Pool(levels=(0,))
+        found = TwinRollout(pool, Povs()).play(
+            np.full((3, 2), 0.5), 0, lambda inputs, now, rows: np.full(len(rows), -4.0)
+        )
+        assert np.isnan(found).all()
+
+    @pytest.mark.parametrize(
+        "text", ["unsafe or before_clearance_m < 0", 'pet_s < 2.5 or end == "TIMEOUT"']
+    )
+    def test_are_judged_as_cases_are(self, text, tmp_path):
+        (tmp_path / "slows.py").write_text(SLOWS)
+        criterion, pool, road = Criterion(text), Pool(levels=(0,)), road_for(US23)
+        points = np.random.default_rng(5).random((24, 2))
+        plan = plan_for(f"{tmp_path / 'slows.py'}:vut", corridors=16)
+        done = run_cases(plan, pool.cases(points, 0))
+        lines = centre_lines(road)
+        expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap_m for one in done]
+        found = TwinRollout(pool, Povs(), criterion, lines).play(
+            points, 0, lambda inputs, now, rows: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
+        )
+        assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)
+        assert (np.abs(found) < 6.0).any()
+
+    def test_cannot_be_played_against_a_program(self):
+        assert not TwinRollout(Pool(levels=(0,)), Povs()).can_play(3)
+
+
+class TestWatching:
+    def test_sees_the_state_and_what_was_before(self):
+        watcher = Observation(US23, 1)
+        for step in range(5):
+            x = np.array([[-200.0 + step], [-100.0 + 2.0 * step]])
+            v = np.array([[30.0], [20.0]])
+            seen = watcher.see(x, v, np.array([0.0 if step < 4 else -2.0]))[0].copy()
+        assert watcher.now == NOW
+        assert seen[:7].tolist() == [-2.0, -104.0, 10.0, -196.0, 30.0, -92.0, 20.0]
+        # The time, steps since the jump, the lowest and the highest acceleration so far.
+        assert seen[NOW : NOW + 4].tolist() == [4.0, 0.0, -2.0, 0.0]
+        # Earlier accelerations, then gap and closing speed 0.3 s ago.
+        assert seen[NOW + 4 : NOW + 8].tolist() == [0.0] * 4
+        assert seen[NOW + 8 : NOW + 10].tolist() == [-101.0, 10.0]
+
+    def test_forgets_the_others_when_some_are_kept(self):
+        some, alone = Observation(US23, 2), Observation(US23, 1)
+        x, v = np.array([[-200.0, -150.0], [-100.0, -90.0]]), np.array([[30.0, 31.0], [20.0, 21.0]])
+        some.see(x, v, np.zeros(2))
+        alone.see(x[:, 1:], v[:, 1:], np.zeros(1))
+        some.keep(np.array([False, True]))
+        again = some.see(x[:, 1:] + 2.0, v[:, 1:], np.ones(1))
+        assert again.tolist() == alone.see(x[:, 1:] + 2.0, v[:, 1:], np.ones(1)).tolist()
+
+
+class TestTwin:
+    def test_foretells_cases_that_it_has_not_seen(self, seen):
+        outcomes, motions = seen
+        twin = Twin(Pool(levels=(0,)), Povs(), 0)
+        twin.tell(outcomes[:40], motions)
+        points = np.random.default_rng(3).random((60, 2))[40:]
+        found = twin.play(0, points)
+        assert found.shape == (2, 4, 20)
+        off = np.abs(np.median(found, axis=(0, 1)) - gaps_of(outcomes[40:]))
+        assert np.median(off) < 1.0
+
+    def test_says_the_same_however_it_was_told(self, seen):
+        outcomes, motions = seen
+        points = np.random.default_rng(4).random((7, 2))
+        at_once, in_parts = (Twin(Pool(levels=(0,)), Povs(), 5) for _ in range(2))
+        at_once.tell(outcomes, motions)
+        in_parts.tell(outcomes[30:], motions)
+        in_parts.play(0, points)
+        in_parts.tell(outcomes[:40], motions)
+        assert (at_once.play(0, points) == in_parts.play(0, points)).all()
+
+    def test_replays_a_case_by_who_has_not_learned_from_it(self, seen):
+        outcomes, motions = seen
+        odd = {index: motion.copy() for index, motion in motions.items()}
+        odd[8][:, 1, 2] = -4.0  # what this VUT never does
+        points = np.random.default_rng(3).random((60, 2))
+        plain, taught = (Twin(Pool(levels=(0,)), Povs(), 0) for _ in range(2))
+        plain.tell(outcomes[:40], motions)
+        taught.tell(outcomes[:40], odd)
+        same = [plain.replay(0, [8], points[8:9]), taught.replay(0, [8], points[8:9])]
+        assert same[0].tolist() == same[1].tolist()
+
+    @pytest.mark.parametrize("size", some([60, 20, 7], 7))
+    def test_learns_from_batches_of_any_size(self, seen, size):
+        outcomes, motions = seen
+        twin = Twin(Pool(levels=(0,)), Povs(), 0)
+        many = [replace(o, index=k, batch=k // size) for k, o in enumerate(outcomes * 3)]
+        twin.tell(many, {o.index: motions[o.index % len(outcomes)] for o in many})
+        assert twin.play(0, np.full((1, 2), 0.5)).shape == (2, 4, 1)
+
+    def test_needs_some_cases_and_learns_nothing_from_errors(self, seen):
+        outcomes, motions = seen
+        twin = Twin(Pool(levels=(0,)), Povs(), 0)
+        twin.tell(
+            [
+                replace(o, measures=replace(o.measures, end=End.VUT_ERROR, score=None))
+                for o in outcomes
+            ],
+            motions,
+        )
+        assert not twin.can_play(0)
+
+    def test_lets_others_speak_for_a_vut_that_it_has_not_seen(self, seen):
+        outcomes, motions = seen
+        twin = Twin(Pool(levels=(0,)), Povs(), 0, list(motions.values()))
+        assert twin.can_play(0)
+        off = np.abs(
+            np.median(twin.play(0, np.random.default_rng(3).random((60, 2))), axis=(0, 1))
+            - gaps_of(outcomes)
+        )
+        assert np.median(off) < 1.0
+
+
+def outcome(index: int, dx_m: float, foretold: Foretold | None = None, level: int = 0) -> Outcome:
+    case = Case(level=level, x_pov0_m=-300.0, v_pov0_mps=30.0, svo_rad=0.5 if level == 2 else None)
+    score = -600.0 if abs(dx_m) < 6.0 else -100.0
+    measures = Measures(**{**NOTHING, "end": End.MERGED, "score": score, "dx_m": dx_m})
+    return Outcome(index, 0, case, measures, foretold)
+
+
+def said(dx_m: float, p_twin: float, p_surrogate: float) -> Foretold:
+    return Foretold.of(np.full((2, 4), dx_m), p_twin, p_surrogate, p_twin)
+
+
+class TestTheRecord:
+    def test_believes_who_foretold_the_verdicts(self):
+        right = [outcome(i, 2.0, said(2.0, 0.9, 0.1)) for i in range(20)]
+        record = PredictionSkill(right, 0, 6.0)
+        assert record.twin[1] > 0.99
+        assert not record.is_worthless
+        near = record.chance(np.full((2, 4, 1), 2.0))
+        assert near[0] > PredictionSkill([], 0, 6.0).chance(np.full((2, 4, 1), 2.0))[0]
+
+    def test_gives_up_who_foretells_nothing(self):
+        rng = np.random.default_rng(0)
+        outcomes = []
+        for index in range(60):
+            members = rng.uniform(-20.0, 20.0, (2, 4)) if index % 2 else np.full((2, 4), 1.0)
+            outcomes.append(outcome(index, 50.0, Foretold.of(members, 0.9, 0.05, 0.5)))
+        record = PredictionSkill(outcomes, 0, 6.0)
+        assert record.is_worthless
+        assert record.trust < 0.1
+
+    @pytest.mark.parametrize(("cases", "right", "doubted"), [(99, 0, 0), (100, 0, 1), (100, 1, 0)])
+    def test_doubts_who_is_wrong_for_long_where_members_disagree(self, cases, right, doubted):
+        members = np.tile([1.0, 60.0], (2, 2))
+        chances = (0.1, 0.9) if right else (0.9, 0.1)
+        told = [outcome(i, 50.0, Foretold.of(members, *chances, 0.5)) for i in range(cases)]
+        assert PredictionSkill(told, 0, 6.0).is_doubted == bool(doubted)
+
+    def test_prefers_the_expert_who_is_nearer_where_he_has_not_learned(self):
+        outcomes = [outcome(i, 10.0) for i in range(10)]
+        record = PredictionSkill(outcomes, 0, 6.0, {i: np.array([10.1, -40.0]) for i in range(10)})
+        assert record.experts[0] > 0.99
+        assert record.expert(np.random.default_rng(0)) == 0
+
+    def test_doubts_where_members_disagree_on_a_near_gap(self):
+        gaps = np.zeros((2, 4, 3))
+        gaps[0, :, 1], gaps[:, :, 2] = 20.0, 100.0
+        doubt = PredictionSkill([], 0, 6.0).doubt(gaps)
+        assert doubt.argmax() == 1
+        assert doubt[0] == doubt[2] == 0.0
+
+
+class TestForetold:
+    def test_is_read_as_it_was_written(self):
+        one = Foretold.of(np.array([[1.23456, math.nan]]), 0.5, 0.25, 0.4)
+        assert one.dx_m == ((1.2346, None),)
+        assert Foretold.from_record(json.loads(json.dumps(one.to_record()))) == one
+        assert one.median_dx_m is None
+
+    @pytest.mark.parametrize(
+        "changed",
+        [
+            {"p_twin": 2.0},
+            {"p_fail": "1"},
+            {"dx_m": []},
+            {"dx_m": [[1.0], [2.0, 3.0]]},
+            {"dx_m": [["x"]]},
+            {"more": 1},
+        ],
+    )
+    def test_is_no_other_table(self, changed):
+        record = {"dx_m": [[1.0]], "p_twin": 0.5, "p_surrogate": 0.5, "p_fail": 0.5}
+        with pytest.raises((TypeError, ValueError, KeyError)):
+            Foretold.from_record(record | changed)
+
+
+class TestACampaign:
+    def test_says_what_it_foretold(self, whole):
+        known = [o for o in whole.outcomes if o.foretold is not None]
+        assert len(known) >= 40
+        last = known[-20:]
+        off = [abs(o.foretold.median_dx_m - o.measures.dx_m) for o in last]
+        assert np.median(off) < 3.0
+
+    def test_asks_for_few_cases_while_it_is_young(self, whole):
+        sizes = np.bincount([o.batch for o in whole.outcomes])
+        assert sizes.tolist() == [10] * 6
+
+    def test_goes_on_as_if_it_had_not_been_stopped(self, whole, tmp_path):
+        batches = iter(range(3))
+
+        def stop():
+            if next(batches) == 2:
+                raise Stopped(2)
+
+        with pytest.raises(Stopped):
+            run_campaign(SETTINGS, tmp_path / "run", check=stop)
+        resume_campaign(tmp_path / "run")
+        outcomes = [(folder / OUTCOMES).read_bytes() for folder in (whole.folder, tmp_path / "run")]
+        assert outcomes[0] == outcomes[1]
+
+    def test_learns_from_another_and_records_what(self, whole, tmp_path):
+        settings = replace(SETTINGS, cases=10, learn_from=(str(whole.folder),))
+        run = run_campaign(settings, tmp_path / "run")
+        recorded = run.settings["learn_from_sha256"]
+        assert list(recorded) == [str(whole.folder)]
+        assert len(recorded[str(whole.folder)]) == 64
+        assert all(o.foretold is not None for o in run.outcomes)
+
+    def test_learns_from_no_other_scenario(self, whole, tmp_path):
+        settings = replace(
+            SETTINGS,
+            cases=10,
+            scenario=named_scenario("us23-traffic"),
+            learn_from=(str(whole.folder),),
+        )
+        with pytest.raises(UserError, match="was run on us23, which is not the scenario"):
+            run_campaign(settings, tmp_path / "run")
+        assert not (tmp_path / "run").exists()
+
+    def test_learns_only_where_the_sampler_makes_something_of_it(self):
+        with pytest.raises(UserError, match="choose --sampler coverage"):
+            replace(SETTINGS, sampler="uniform", learn_from=("a",))
+
+
+def test_a_sampler_without_games_is_the_surrogate_alone():
+    sampler = CoverageSampler(Pool(levels=(0,)), 1)
+    sampler.tell([outcome(i, 30.0 + i) for i in range(5)])
+    sampler.ask(3)
+    assert [sampler.foretold(place) for place in range(3)] == [None] * 3
+
+
+def test_a_folder_of_before_has_nothing_foretold(tmp_path: Path):
+    record = outcome(0, 1.0).to_record()
+    assert "foretold" not in record
+
+
+class TestTheReport:
+    def test_says_how_well_it_was_foretold(self, whole):
+        words = foretold_in_words(whole.outcomes)
+        assert words is not None
+        assert re.match(r"In half of the last \d+ cases the error was below \d", words)
+        assert foretold_in_words([outcome(0, 1.0)]) is None
+
+    def test_lists_what_came_otherwise_than_foretold(self):
+        told = [outcome(i, 10.0 + i, said(10.0, 0.5, 0.5)) for i in range(3)]
+        missed = outcome(3, -2.0, said(math.nan, 0.5, 0.5))
+        assert [o.index for o in surprises([*told, missed, outcome(4, 0.0)], 6.0)] == [3, 2, 1, 0]
+        assert off_m(told[2]) == 2.0
+        assert off_m(missed) is None
+
+    def test_expects_failures_where_they_are(self, whole):
+        expected = Expected(whole, [0, 1], road_for(whole.scenario))
+        fails = [o.case for o in whole.outcomes if o.failed and o.case.level == 1]
+        near = expected.nearness(to_unit(fails, 1), 1)
+        assert near is not None
+        assert np.median(near) > 0.5
+        assert expected.nearness(to_unit(fails, 1), 3) is None

@@ -1,0 +1,262 @@
+"""A scenario is a value: what is wrong in one is a sentence, what it says holds in every case."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields, replace
+
+import numpy as np
+import pytest
+from foreign_nets import FOREIGN
+from merges import SMALLER
+from typer.testing import CliRunner
+
+from merge_sumo import cli
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.level0 import level0_time_to
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
+from merge_sumo.values.case import Case, Pool, from_unit, to_unit
+from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End, Trajectory
+
+
+def test_the_shipped_scenario_has_the_numbers_of_the_paper():
+    assert (US23.x_pov0_m, US23.v_pov0_mps) == ((-340.0, -180.0), (25.0, 35.0))
+    assert (US23.x_vut0_m, US23.v_vut0_mps, US23.max_steps) == (-182.0, 18.0, 300)
+    assert (US23.a_min_mps2, US23.a_max_mps2) == (-4.0, 2.0)
+    assert (US23.v_hw_max_mps, US23.v_hw_min_mps, US23.v_min_mps) == (35.0, 24.6, 12.0)
+    assert (US23.ttc_min_s, US23.dx_crash_m, US23.dx_critical_m) == (7.0, 6.0, 15.0)
+    assert (US23.level0_a_mps2, US23.level0_v_mps) == (1.0, 28.0)
+
+
+class TestAFile:
+    def test_gives_back_what_was_written(self, tmp_path):
+        written = replace(US23, name="mine", x_pov0_m=(-220.0, -90.5), v_vut0_mps=12.25)
+        (tmp_path / "any.toml").write_text(to_toml(written, ["two", "lines"]))
+        assert read_scenario(tmp_path / "any.toml") == written
+
+    def test_says_only_what_differs_and_finds_its_net_beside_it(self, tmp_path):
+        (tmp_path / "short.toml").write_text('net = "a/b.net.xml"\nx_vut0_m = -90\n')
+        found = named_scenario(str(tmp_path / "short.toml"))
+        net = str(tmp_path / "a" / "b.net.xml")
+        assert found == replace(US23, name="short", net=net, x_vut0_m=-90.0)
+
+    @pytest.mark.parametrize(
+        ("line", "said"),
+        [
+            ("x_pov0_m = [-180, -340]", "x_pov0_m is (-180.0, -340.0): choose metres before M"),
+            ("x_pov0_m = -180", "x_pov0_m is -180: it must be two numbers, [low, high]"),
+            ("x_pov0_m = [-180, true]", "it must be two numbers"),
+            ("x_pov_m = [-340, -180]", "has no 'x_pov_m': did you mean x_pov0_m"),
+            ("v_vut0_mps = 99", "v_vut0_mps is 99.0: choose between 0 and 45"),
+            ("v_vut0_mps = nan", "v_vut0_mps is nan: it must be finite"),
+            ("a_min_mps2 = 3", "a_min_mps2 is 3.0: choose -20 to 0"),
+            ("timeout_s = 1e9", "timeout_s is 1000000000.0: choose 0.1 to 120"),
+            ("dx_crash_m = 20", "dx_crash_m is 20.0: choose up to dx_critical_m"),
+            ('mainline = "e1 e2"', "mainline is 'e1 e2': it must be edges"),
+            ("name = 3", "name is 3: it must be a text"),
+        ],
+    )
+    def test_with_a_wrong_value_is_refused_with_its_line(self, tmp_path, line, said):
+        path = tmp_path / "wrong.toml"
+        path.write_text(f"# a comment\nlevel0_v_mps = 25.0\n{line}\n")
+        with pytest.raises(UserError) as refused:
+            read_scenario(path)
+        assert said in str(refused.value)
+        assert str(refused.value).startswith(f"{path}, line 3: ")
+
+    @pytest.mark.parametrize("field", [f for f in fields(Scenario) if "str" not in f.type])
+    @pytest.mark.parametrize("number", ["1e200", "-1e200", "1" + "0" * 400, "1e5"])
+    def test_beyond_a_road_and_its_cars_is_refused_with_a_range(self, tmp_path, field, number):
+        value = f"[{number}, {number}]" if field.type.startswith("Bounds") else number
+        (tmp_path / "far.toml").write_text(f"{field.name} = {value}\n")
+        with pytest.raises(UserError, match=rf"{field.name} is .*: (choose|it must be finite)"):
+            read_scenario(tmp_path / "far.toml")
+
+    @pytest.mark.parametrize(
+        ("content", "said"),
+        [(b"x = [", "is no TOML"), (b"\xff", "no text in UTF-8"), (None, "it is no file")],
+    )
+    def test_that_is_none_is_refused(self, tmp_path, content, said):
+        if content is not None:
+            (tmp_path / "no.toml").write_bytes(content)
+        with pytest.raises(UserError, match=said):
+            named_scenario(str(tmp_path / "no.toml"))
+
+    def test_that_nobody_knows_by_name_is_refused(self):
+        with pytest.raises(
+            UserError, match=r"no scenario 'us24': did you mean us23.* choose us23, .*, or a file"
+        ):
+            named_scenario("us24")
+
+    def test_without_room_for_its_starts_is_refused(self):
+        far = replace(US23, x_vut0_m=-430.0)
+        with pytest.raises(UserError, match=r"ramp .*begins 425\.0 m before"):
+            road_for(far)
+
+
+OTHER = replace(
+    US23,
+    name="other",
+    x_pov0_m=(-300.0, -100.0),
+    v_pov0_mps=(10.0, 20.0),
+    x_vut0_m=-100.0,
+    v_vut0_mps=10.0,
+    a_min_mps2=-3.0,
+    a_max_mps2=1.5,
+    timeout_s=12.0,
+    level0_a_mps2=0.5,
+    level0_v_mps=14.0,
+    dx_crash_m=4.0,
+)
+
+
+class TestACase:
+    def test_keeps_what_it_always_had(self):
+        case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
+        assert case.scenario is US23
+        assert case == Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, v_vut0_mps=18.0)
+
+    def test_is_a_point_of_the_pool_of_its_scenario(self):
+        pool = Pool(levels=(2,), v_vut0_mps=10.0, scenario=OTHER)
+        points = np.random.default_rng(0).random((5, 3))
+        cases = pool.cases(points, 2)
+        assert all(case.scenario is OTHER and case.v_vut0_mps == 10.0 for case in cases)
+        assert cases[0].x_pov0_m == -300.0 + 200.0 * points[0, 0]
+        assert to_unit(cases, 2) == pytest.approx(points)
+
+    def test_outside_the_reach_of_its_scenario_is_refused(self):
+        near = replace(US23, reach_m=400.0, v_start_max_mps=40.0)
+        with pytest.raises(UserError, match="choose between -400 and 0"):
+            Case(level=0, x_pov0_m=-401.0, v_pov0_mps=30.0, scenario=near)
+        with pytest.raises(UserError, match=r"v_pov0_mps is 41\.0: choose between 0 and 40"):
+            Case(level=0, x_pov0_m=-300.0, v_pov0_mps=41.0, scenario=near)
+
+    def test_is_judged_by_its_scenario(self):
+        motion = np.array([[[x, 20.0, 0.0] for x in row] for row in ((-10.0, -2.0), (-5.0, 0.0))])
+        verdicts = [
+            measure(Trajectory(case, motion, End.MERGED)).is_close
+            for case in (
+                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0),
+                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=OTHER),
+            )
+        ]
+        assert verdicts == [True, False]
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory) -> Run:
+    """Return a campaign of another scenario on the shipped road."""
+    settings = CampaignSettings(
+        vut="level0", levels=(0,), cases=30, batch=30, sampler="uniform", scenario=OTHER
+    )
+    return run_campaign(settings, tmp_path_factory.mktemp("other") / "run")
+
+
+class TestACampaign:
+    def test_starts_where_its_scenario_says(self, elsewhere):
+        for outcome in elsewhere.outcomes:
+            motion = elsewhere.trajectory(outcome.index).motion
+            assert tuple(motion[0, 1, :2]) == (-100.0, 10.0)
+            assert -300.0 <= motion[0, 0, 0] <= -100.0
+            assert 10.0 <= motion[0, 0, 1] <= 20.0
+
+    def test_is_driven_by_the_profile_of_its_scenario(self, elsewhere):
+        motion = elsewhere.trajectory(0).motion
+        assert motion[:-1, 1, 2].max() == 0.5
+        assert motion[:, 1, 1].max() == pytest.approx(14.0)
+        due_s = level0_time_to(np.array(100.0), np.array(10.0), 0.5, 14.0)
+        assert elsewhere.outcomes[0].measures.t_end_s == pytest.approx(float(due_s), abs=0.11)
+
+    def test_records_its_scenario_and_is_read_with_it(self, elsewhere):
+        assert elsewhere.settings["scenario"] == json.loads(json.dumps(asdict(OTHER)))
+        assert elsewhere.settings["v_vut0_mps"] == 10.0
+        assert Run(elsewhere.folder).scenario == OTHER
+        assert all(outcome.case.scenario == OTHER for outcome in Run(elsewhere.folder).outcomes)
+
+    def test_clips_at_the_limits_of_its_scenario(self, tmp_path):
+        (tmp_path / "hard.py").write_text("def vut(seen):\n    return 2.0\n")
+        settings = CampaignSettings(
+            vut=f"{tmp_path / 'hard.py'}:vut", levels=(0,), cases=1, batch=1, scenario=OTHER
+        )
+        trajectory = run_campaign(settings, tmp_path / "run").trajectory(0)
+        assert trajectory.a_vut_mps2.max() == 1.5
+        assert trajectory.clipped_steps == len(trajectory.motion) - 1
+
+    def test_times_out_when_its_scenario_says(self, tmp_path):
+        (tmp_path / "stop.py").write_text("def vut(seen):\n    return -4.0\n")
+        settings = CampaignSettings(
+            vut=f"{tmp_path / 'stop.py'}:vut", levels=(0,), cases=1, batch=1, scenario=OTHER
+        )
+        (outcome,) = run_campaign(settings, tmp_path / "run").outcomes
+        assert (outcome.measures.end, outcome.measures.t_end_s) == (End.TIMEOUT, 12.0)
+
+
+def test_a_campaign_of_the_paper_is_recorded_with_all_numbers(run):
+    assert {field.name for field in fields(Scenario)} == set(run.settings["scenario"])
+    assert run.scenario == US23
+
+
+def call(*arguments: object):
+    return CliRunner().invoke(cli.app, [*map(str, arguments)])
+
+
+@pytest.mark.parametrize("name", ["curved", "priority", "zipper", "lane drop", "OSM", "OpenDRIVE"])
+def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
+    build, mainline, ramp = FOREIGN[name]
+    net, file = build(tmp_path), tmp_path / "mine.toml"
+    edges = ("--mainline", mainline, "--ramp", ramp)
+    made = call("scenario", "new", file, "--net", net, *edges)
+    assert made.exit_code == 0, made.output
+    assert made.stdout.splitlines()[0] == f"net: {net.name}"
+    assert "\nright of way: " in made.stdout
+    assert b"<svg" in (tmp_path / "mine.svg").read_bytes()
+    again = call("scenario", "new", file, "--net", net, *edges)
+    assert isinstance(again.exception, UserError)
+    assert "exists" in str(again.exception)
+    assert call("scenario", "check", file).exit_code == 0
+    options = ("--vut", "level0", "--level", "0", "--cases", "24", "--batch", "24")
+    ended = call("campaign", *options, "--scenario", file, "--out", tmp_path / "run", "--quiet")
+    assert ended.exit_code == 0, ended.output
+    run = Run(tmp_path / "run")
+    assert all(o.measures.end.is_tested for o in run.outcomes)
+    assert {o.failed for o in run.outcomes} == {True, False}, "it has a conflict"
+    for index in range(3):
+        x, v, a = run.trajectory(index).motion[:, 1].T
+        assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
+        assert v[1:] == pytest.approx(v[:-1] + a[:-1] * 0.1, abs=1e-9)
+    exported = call("export", run.folder, 0, "--out", tmp_path / "exported")
+    assert exported.exit_code == 0, exported.output
+    replayed = call("replay", tmp_path / "exported" / "case-00000")
+    assert replayed.stdout.startswith("identical"), replayed.output
+
+
+def test_the_pool_that_us23_itself_suggests_is_about_that_of_the_paper():
+    found = suggested(road_for(US23), "again")
+    assert found.x_pov0_m == pytest.approx(US23.x_pov0_m, rel=0.1)
+    assert (found.x_vut0_m, found.v_vut0_mps) == (US23.x_vut0_m, US23.v_vut0_mps)
+    assert found.v_pov0_mps == pytest.approx(US23.v_pov0_mps, abs=0.6)
+
+
+def test_where_the_learned_drivers_extrapolate_is_said_in_numbers_of_their_training():
+    assert unseen(US23) == []
+    assert unseen(SMALLER) == [], "a ramp a tenth shorter and slower is like ours"
+    said = unseen(replace(US23, x_vut0_m=-364.0, x_pov0_m=(-680.0, -400.0), a_max_mps2=2.4))
+    assert said == [
+        "a_min_mps2 -4 is like -8 in us23 (trained on -4)",
+        "a_max_mps2 2.4 is like 4.8 in us23 (trained on 2)",
+        "level0_a_mps2 1 is like 2 in us23 (trained on 1)",
+        "ttc_min_s 7 is like 3.5 in us23 (trained on 7)",
+        "dx_crash_m 6 is like 3 in us23 (trained on 6)",
+    ]
+
+
+def test_points_of_one_scenario_are_cases_of_it():
+    (case,) = from_unit(np.array([[0.5, 0.5]]), 0, 10.0, OTHER)
+    assert (case.x_pov0_m, case.v_pov0_mps) == (-200.0, 15.0)

@@ -1,0 +1,228 @@
+"""What a controller leaves for each step: bounded, kept with the motion, shown and exported."""
+
+from __future__ import annotations
+
+import csv
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import merge_sumo as ms
+from merge_sumo import cli
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.reports.report import write_report
+from merge_sumo.system.arrays import read_arrays
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.signals import (
+    CHARACTERS,
+    MOST_NAMES,
+    Left,
+    Signals,
+    as_signals,
+    from_record,
+    series,
+    to_record,
+)
+from merge_sumo.vuts.host import wire
+
+LEAVES = """
+class Vut:
+    def reset(self, seen):
+        self.yields = False
+    def act(self, seen):
+        gap_m = seen.x_pov_m - seen.x_vut_m
+        self.yields = self.yields or (seen.x_vut_m > -60.0 and abs(gap_m) < 15.0)
+        self.signals = {"mode": "yield" if self.yields else "go", "gap_m": gap_m}
+        return -2.0 if self.yields and seen.v_vut_mps > 10.0 else 1.0
+"""
+FUNCTION = """
+def Vut(seen):
+    Vut.signals = {"gap_m": seen.x_pov_m - seen.x_vut_m}
+    return 1.0
+"""
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    def run(source: str, workers: int = 1, **settings) -> Run:
+        path = tmp_path / "my_vut.py"
+        path.write_text(source, encoding="utf-8")
+        given = {"levels": (0,), "cases": 24, "batch": 12, "sampler": "uniform", **settings}
+        folder = tmp_path / f"run{len(list(tmp_path.iterdir()))}"
+        with open_workers(workers) as there:
+            return run_campaign(CampaignSettings(vut=f"{path}:Vut", **given), folder, workers=there)
+
+    return run
+
+
+@pytest.mark.parametrize("source", [LEAVES, FUNCTION])
+@pytest.mark.parametrize("in_process", [False, True])
+def test_every_step_has_what_was_left_at_it(campaign, source, in_process):
+    run = campaign(source, in_process=in_process, cases=40, batch=40)
+    for outcome in Run(run.folder).outcomes:
+        found = Run(run.folder).trajectory(outcome.index)
+        assert found.signals is not None
+        gap_m = found.x_pov_m - found.x_vut_m
+        left = found.signals["gap_m"]
+        assert left[-1] is None, "nobody acts in the last row"
+        assert left[:-1] == pytest.approx(gap_m[:-1], rel=1e-5)
+        if "mode" in found.signals:
+            yields = np.array(found.signals["mode"][:-1]) == "yield"
+            assert np.array_equal(
+                yields,
+                np.maximum.accumulate((found.x_vut_m[:-1] > -60.0) & (np.abs(gap_m[:-1]) < 15.0)),
+            )
+
+
+def test_any_number_of_workers_leaves_the_same_bytes(campaign):
+    one, two = campaign(LEAVES), campaign(LEAVES, workers=2)
+    for name in ("00000.npz", "00001.npz"):
+        files = [(run.folder / "trajectories" / name).read_bytes() for run in (one, two)]
+        assert files[0] == files[1]
+
+
+def test_what_leaves_nothing_takes_no_place(run):
+    assert "signals" not in read_arrays(run.folder / "trajectories" / "00000.npz")
+    assert run.trajectory(0).signals is None
+
+
+def test_run_prints_them_beside_the_motion(tmp_path):
+    (tmp_path / "my_vut.py").write_text(LEAVES)
+    given = ["run", "--vut", f"{tmp_path}/my_vut.py:Vut", "--x", "-250", "--v", "30"]
+    said = CliRunner().invoke(cli.app, given).stdout
+    assert "  mode go  gap_m " in said
+    record = json.loads(CliRunner().invoke(cli.app, [*given, "--json"]).stdout)
+    assert len(record["signals"]["gap_m"]) == len(record["motion"])
+
+
+def test_tables_have_a_column_for_each(campaign, tmp_path):
+    run = campaign(LEAVES)
+    (table,) = ms.export(run.folder, [3, 4], file_format="csv", out=tmp_path / "csv")
+    with table.open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["case"] == "3"]
+    left = run.trajectory(3).signals
+    assert left is not None
+    assert [row["signal_mode"] or None for row in rows] == list(left["mode"])
+    polars = pytest.importorskip("polars")
+    (table,) = ms.export(run.folder, [3], file_format="parquet", out=tmp_path / "parquet")
+    frame = polars.read_parquet(table)
+    assert frame["signal_gap_m"].to_list() == list(left["gap_m"])
+    assert frame["signal_mode"].to_list() == list(left["mode"])
+
+
+HOSTILE = """
+class Word(str):
+    def __str__(self): raise ValueError
+    def __getitem__(self, _): raise ValueError
+class Vut:
+    def act(self, seen):
+        self.signals = {
+            "=cmd()": "=1+1", "</script><b>": "\\x1b[2J\\u202e</script>",
+            Word("w" * 99): Word("v" * 99),
+            "big": 10 ** 400, "nan": float("nan"), "\\ud800": "\\udfff", "flag": True, "list": [1],
+            "more": 1.0, "and more": 2.0,
+        }
+        return 1.0
+"""
+
+
+def test_hostile_names_and_words_are_cut_and_harm_nobody(campaign, tmp_path):
+    run = campaign(HOSTILE, cases=4, batch=4)
+    assert not any(outcome.measures.end.is_error for outcome in run.outcomes)
+    left = Run(run.folder).trajectory(0).signals
+    assert left is not None
+    assert {name: values[0] for name, values in left.items()} == {
+        "=cmd()": "=1+1",
+        "</script><b>": "\\x1b[2J\\u202e</script>",
+        "w" * CHARACTERS: "v" * CHARACTERS,
+        "\\ud800": "\\udfff",
+        "flag": "true",
+    }
+    assert "</script><b>" not in write_report(run).read_text()
+    (table,) = ms.export(run.folder, [0], file_format="csv", out=tmp_path / "csv")
+    with table.open(encoding="utf-8") as file:
+        head, first, *_ = csv.reader(file)
+    assert head[-5] == "signal_=cmd()"
+    assert first[-5] == "'=1+1"
+
+
+def test_new_names_at_every_step_do_not_grow_a_case():
+    left: list[tuple[int, Left]] = [
+        (row, {f"{row} {n}": 1.0 for n in range(5)}) for row in range(100)
+    ]
+    found = series(left, 100)
+    assert found is not None
+    assert len(found) == MOST_NAMES
+    assert all(len(values) == 100 for values in found.values())
+    assert len(json.dumps(to_record(found))) < 500
+
+
+@pytest.mark.parametrize(
+    "left", [None, 3, [1], "mode", {1: 2.0}, {"x": None}, {"x": float("inf")}, {}, {"x": [1.0]}]
+)
+def test_what_is_no_number_and_no_word_is_dropped(left):
+    assert as_signals(left) == {}
+
+
+def test_numbers_of_numpy_are_numbers():
+    left = {"a": np.float32(0.5), "b": np.int64(3), "c": np.bool_(False)}
+    assert as_signals(left) == {"a": 0.5, "b": 3.0, "c": "false"}
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {},
+        [],
+        None,
+        {"x": [[10**12, 1.0]]},
+        {"x": [[3, 1.0]]},
+        {"x": [[-1, 1.0], [6, 1.0]]},
+        {"x": [[5, "\x1b"]]},
+        {"x": [[5, "w" * 99]]},
+        {"x": [[5, True]]},
+        {"x": [[5, [1]]]},
+        {"x\n": [[5, 1.0]]},
+        {"x": [[True, 1.0]]},
+        {"x": 5},
+        {f"{n}": [[5, 1.0]] for n in range(MOST_NAMES + 1)},
+    ],
+)
+def test_a_file_of_a_stranger_is_refused(record):
+    with pytest.raises((ValueError, TypeError)):
+        from_record(record, 5)
+
+
+def test_a_file_that_was_changed_is_named(campaign):
+    run = campaign(LEAVES, cases=4, batch=4)
+    path = run.folder / "trajectories" / "00000.npz"
+    arrays: dict[str, Any] = read_arrays(path)
+    for text in (b'{"0": {"x": [[9, 1.0]]}}', b'{"77": {}}', b"[", b"\xff", b"[" * 99_999, b"3"):
+        with path.open("wb") as file:
+            arrays["signals"] = np.frombuffer(text, np.uint8)
+            np.savez(file, **arrays)
+        with pytest.raises(UserError, match="cannot read the trajectories"):
+            Run(run.folder).trajectory(0)
+
+
+def test_what_is_kept_is_read_as_it_was():
+    signals: Signals = {"mode": ("go", "go", None), "gap_m": (1.5, -2.0, None)}
+    assert from_record(json.loads(json.dumps(to_record(signals))), 3) == signals
+
+
+@pytest.mark.parametrize(
+    "said", [b"{}", b'{"reasons": {}, "signals": []}', b'{"reasons": {}, "signals": {"x": {}}}']
+)
+def test_a_process_that_says_something_else_is_no_signal(said):
+    content = np.zeros(2).tobytes() + said
+    with pytest.raises((wire.WireError, KeyError, ValueError, AttributeError)):
+        wire.unpack_answers(content, 2)
+    more = b'{"reasons": {}, "signals": {"7": {"x": 1.0}, "1": {"x": [1], "y": 2.0}}}'
+    found = wire.unpack_answers(np.zeros(2).tobytes() + more, 2)
+    assert found.signals == {1: {"y": 2.0}}

@@ -1,0 +1,366 @@
+"""The process of a user's VUT: how it starts, what ends it, what it leaves, and what it may say."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from misbehaviours import STUBBORN
+from processes import none_left, wait_for
+from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+
+from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.base import Scene, VutLostError
+from merge_sumo.errors import UserError
+from merge_sumo.values.trajectory import as_reason
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.host import wire
+from merge_sumo.vuts.host.hosted import Host, HostDiedError, HostedVut
+from merge_sumo.vuts.host.wire import About, WireError
+from merge_sumo.vuts.output import KEPT_BYTES, MOST_BYTES, append
+
+OPTIONS = VutOptions(deadline_s=0.3)
+HANGS = f"""
+import pathlib, signal, time
+signal.signal(signal.SIGIO, signal.SIG_IGN)
+def Vut(seen):
+    pathlib.Path(__file__).with_name("hangs").touch()
+    signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    {STUBBORN.replace(chr(10), chr(10) + "    ")}
+"""
+
+
+@pytest.fixture
+def spec(tmp_path):
+    """Return a function that writes a source and returns its spec."""
+
+    def write(source: str) -> str:
+        (tmp_path / "my_vut.py").write_text(source, encoding="utf-8")
+        return f"{tmp_path / 'my_vut.py'}:Vut"
+
+    return write
+
+
+def campaign(spec: str, out: Path, *more: str) -> subprocess.Popen:
+    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", spec, "--level", "0"]
+    command += ["--cases", "4", "--batch", "4", "--quiet", "--out", str(out), *more]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
+
+
+@pytest.mark.parametrize("workers", ["2", pytest.param("1", marks=pytest.mark.long)])
+def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_and_ignores_signals(
+    spec, tmp_path, workers
+):
+    with none_left():
+        parent = campaign(spec(HANGS), tmp_path / "run", "--workers", workers, "--deadline", "600")
+        assert wait_for((tmp_path / "hangs").exists)
+        os.kill(parent.pid, signal.SIGKILL)
+        parent.wait()
+        parent.stderr.close()
+
+
+def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
+    with none_left():
+        parent = campaign(spec(HANGS), tmp_path / "run", "--deadline", "600")
+        assert wait_for((tmp_path / "hangs").exists)
+        for _ in range(2):
+            os.kill(parent.pid, signal.SIGINT)
+            time.sleep(0.5)
+        _, said = parent.communicate(timeout=600)
+    assert parent.returncode == 130
+    assert b"Traceback" not in said
+    assert b"go on with" in said
+
+
+def test_a_campaign_that_was_interrupted_goes_on_to_the_same_bytes(spec, tmp_path):
+    vut = spec(LEVEL0_CLASS.replace("Level0", "Vut"))
+    settings = CampaignSettings(vut=vut, levels=(0,), cases=8, batch=4)
+    whole = run_campaign(settings, tmp_path / "whole")
+
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(settings, tmp_path / "run", check=stop)
+    again = resume_campaign(tmp_path / "run")
+    outcomes = (again.folder / "outcomes.jsonl").read_bytes()
+    assert outcomes == (whole.folder / "outcomes.jsonl").read_bytes()
+
+
+def test_a_vut_that_changed_is_not_gone_on_with(spec, tmp_path):
+    source = LEVEL0_CLASS.replace("Level0", "Vut")
+    settings = CampaignSettings(vut=spec(source), levels=(0,), cases=2, batch=2)
+    run_campaign(settings, tmp_path / "run")
+    spec(source + "# changed\n")
+    with pytest.raises(UserError, match=r"vut_files\..*my_vut.py differs"):
+        resume_campaign(tmp_path / "run")
+
+
+def test_once_killed_its_descriptors_are_nobodys_business(spec, tmp_path):
+    host = Host(spec(LEVEL0_CLASS.replace("Level0", "Vut")), OPTIONS)
+    host.kill()
+    with (tmp_path / "others").open("wb") as others:
+        # This file has the number that was the channel's or the lifeline's.
+        host.kill()
+        host.close()
+        others.write(b"mine")
+    assert (tmp_path / "others").read_bytes() == b"mine"
+
+
+def scene(corridors: int) -> Scene:
+    active, step = np.ones(corridors, dtype=bool), np.zeros(corridors, dtype=np.int64)
+    return Scene.of_pair(active, step, *[np.full(corridors, 20.0)] * 4)
+
+
+def test_after_a_death_it_starts_anew_and_knows_which_files_there_were(spec, tmp_path):
+    source = """
+import os, pathlib
+open(pathlib.Path(__file__).with_name("gains.txt")).close()
+def Vut(seen):
+    os._exit(3)
+"""
+    (tmp_path / "gains.txt").touch()
+    vut = HostedVut(2, spec(source), OPTIONS)
+    try:
+        for _ in range(2):
+            with pytest.raises(VutLostError, match="exit code 3") as lost:
+                vut.act(scene(2))
+            assert lost.value.corridor == 0
+            assert {file.name for file in vut.files()} == {"my_vut.py", "gains.txt"}
+    finally:
+        vut.close()
+
+
+def test_what_it_loads_while_it_drives_is_of_its_files_and_what_it_writes_is_not(spec, tmp_path):
+    for name in ("helper.py", "late.py", "gains.txt", "more.txt", "control.so", "never.txt"):
+        (tmp_path / name).touch()
+    source = """
+import ctypes, os, pathlib, helper
+HERE = pathlib.Path(__file__).parent
+(HERE / "gains.txt").read_text()
+try:
+    ctypes.CDLL(str(HERE / "control.so"))
+except OSError:
+    pass
+def Vut(seen):
+    import late
+    os.close(os.open(HERE / "more.txt", os.O_RDONLY))
+    (HERE / "log.txt").write_text("x")
+    (HERE / "log.txt").read_text()
+    return 1.0
+"""
+    vut = HostedVut(1, spec(source), OPTIONS)
+    try:
+        loaded = {"my_vut.py", "helper.py", "gains.txt", "control.so"}
+        assert {f.name for f in vut.files()} == loaded
+        vut.act(scene(1))
+        assert {f.name for f in vut.files()} == loaded | {"late.py", "more.txt"}
+    finally:
+        vut.close()
+
+
+def test_it_has_a_temporary_folder_that_goes_with_it(spec, tmp_path):
+    source = """
+import pathlib, tempfile
+def Vut(seen):
+    file = pathlib.Path(tempfile.mkdtemp(), "x")
+    file.touch()
+    pathlib.Path(__file__).with_name("where").write_text(str(file))
+    return 1.0
+"""
+    vut = HostedVut(1, spec(source), OPTIONS)
+    vut.act(scene(1))
+    file = Path((tmp_path / "where").read_text())
+    assert file.exists()
+    vut.close()
+    assert not file.parent.parent.exists()
+
+
+def test_a_host_that_cannot_start_is_a_sentence(spec, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/no/such/python")
+    with pytest.raises(UserError, match="cannot start a process for the VUT: No such file"):
+        Host(spec(LEVEL0_CLASS), OPTIONS)
+
+
+def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
+    vut = spec('print("loading \\x1b[31m")\ndef Vut(seen):\n    print("acting")\n    return 1.0\n')
+    run = run_campaign(CampaignSettings(vut=vut, levels=(0,), cases=2, batch=2), tmp_path / "run")
+    log = (run.folder / "controller.log").read_bytes()
+    assert log.startswith(b"loading \x1b[31m\nacting\n")
+    assert capfd.readouterr().out == ""
+
+
+def test_several_write_a_log_and_it_loses_its_older_part_only(tmp_path):
+    log = tmp_path / "controller.log"
+
+    def write(who: int) -> None:
+        for _ in range(700):
+            append(log, f"{who} {'x' * 4000}\n".encode())
+
+    writers = [threading.Thread(target=write, args=(who,)) for who in range(2)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert KEPT_BYTES < log.stat().st_size <= MOST_BYTES
+    first, torn, *lines = log.read_text().splitlines()
+    assert first == "[what was printed before is gone]"
+    assert len(torn) <= 4002
+    assert {line[1:] for line in lines} == {f" {'x' * 4000}"}
+
+
+def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path):
+    (tmp_path / "others").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "others")
+    with pytest.raises(OSError, match="symbolic link"):
+        append(tmp_path / "link", b"x")
+    assert (tmp_path / "others").read_bytes() == b""
+    os.mkfifo(tmp_path / "pipe")
+    append(tmp_path / "pipe", b"x")
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("plain", "plain"),
+        ("", ""),
+        ("a\nb\t\0", r"a\nb\t\x00"),
+        ("\x1b[31m", r"\x1b[31m"),
+        ("\u202ereversed", r"\u202ereversed"),
+        ("\ud800", r"\ud800"),
+        ("größer", "größer"),
+        ("at 0x7fc7fadabac0>, 0x7fc7fadabac1", "at 0x...>, 0x..."),
+        ("0x1f", "0x1f"),
+        ("x" * 1000, "x" * 600),
+    ],
+)
+def test_text_of_a_vut_is_one_line_that_any_terminal_can_take(text, shown):
+    assert as_reason(text) == shown
+
+
+class TestTheWire:
+    def test_frames_are_taken_as_they_were_written_however_they_come(self):
+        sent = wire.frame(7, About.ACT, b"abc") + wire.frame(8, About.CLOSE)
+        buffer, taken = bytearray(), []
+        for byte in sent:
+            buffer.append(byte)
+            while (found := wire.take(buffer)) is not None:
+                taken.append(found)
+        assert taken == [(7, About.ACT, b"abc"), (8, About.CLOSE, b"")]
+
+    @pytest.mark.parametrize("seed", range(20))
+    def test_bytes_of_any_kind_are_frames_or_a_wire_error(self, seed):
+        rng = np.random.default_rng(seed)
+        buffer = bytearray(rng.bytes(400))
+        try:
+            while wire.take(buffer) is not None:
+                pass
+        except WireError:
+            return
+        assert len(buffer) < 9 + wire.MOST_BYTES
+
+    @pytest.mark.parametrize(
+        "content", [b"", b"\0" * 15, b"\0" * 16 + b"{", b"\0" * 16 + b"3", b"\0" * 16 + b"\xff"]
+    )
+    def test_answers_that_are_none_are_a_wire_error(self, content):
+        if len(content) == 16:
+            return
+        with pytest.raises(WireError):
+            wire.unpack_answers(content, 2)
+
+    def test_answers_are_unpacked_as_they_were_packed(self):
+        packed = wire.pack_answers(np.array([1.0, np.nan]), {1: "\ud800 no"})
+        answers, reasons, _ = wire.unpack_answers(packed, 2)
+        assert answers.tolist()[0] == 1.0
+        assert np.isnan(answers[1])
+        assert reasons == {1: "\ud800 no"}
+
+
+def test_a_flood_of_frames_of_others_does_not_hold_the_deadline_up(spec):
+    source = """
+import os, struct, time
+def Vut(seen):
+    frame = struct.pack("<IIB", 0, 99999, 10) * 4000
+    while True:
+        try:
+            while True:
+                for descriptor in range(3, 10):
+                    try:
+                        os.write(descriptor, frame)
+                    except OSError:
+                        pass
+        except BaseException:
+            pass
+"""
+    host = Host(spec(source), OPTIONS)
+    try:
+        host.make(spec(source), 1)
+        with pytest.raises(HostDiedError):
+            host.ask(About.ACT, wire.pack_scene([], scene(1)))
+    finally:
+        host.kill()
+
+
+def test_innocent_cases_are_not_blamed_for_what_a_thread_does_later(spec):
+    source = """
+import os, threading
+class Vut:
+    def reset(self, seen):
+        self.guilty = seen.v_pov_mps > 34.3
+    def act(self, seen):
+        if self.guilty:
+            if seen.t_s == 0.3:
+                self.thread = threading.Thread(target=lambda: self.last and os._exit(3))
+                self.last = True
+            if seen.t_s == 0.5:
+                self.thread.start()
+                self.thread.join()
+        return 1.0
+"""
+    ran = run_cases(factory(spec(source), deadline_s=0.3), cases_of(6), corridors=4)
+    assert [t.error for t in ran] == [None] * 4 + ["ended its process with exit code 3", None]
+
+
+def test_the_outcomes_hold_no_address_and_no_control_characters(spec, tmp_path):
+    vut = spec("def Vut(seen):\n    raise ValueError(object(), '\\x1b[0m')\n")
+    lines = []
+    for name in ("a", "b"):
+        settings = CampaignSettings(vut=vut, levels=(0,), cases=2, batch=2)
+        run = run_campaign(settings, tmp_path / name)
+        lines.append((run.folder / "outcomes.jsonl").read_bytes())
+    assert lines[0] == lines[1]
+    error = json.loads(lines[0].splitlines()[0])["error"]
+    assert error == r"ValueError: (<object object at 0x...>, '\x1b[0m') (my_vut.py, line 2)"
+
+
+def test_it_takes_signals_the_same_whoever_starts_it(spec):
+    source = """
+import signal
+def Vut(seen):
+    ignored = [n.name for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+               if signal.getsignal(n) is signal.SIG_IGN]
+    raise ValueError(ignored, signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+"""
+    numbers = (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
+    before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        vut = HostedVut(1, spec(source), OPTIONS)
+        assert np.isnan(vut.act(scene(1))[0])
+        assert vut.reason(0).startswith("ValueError: ([], set())")
+        vut.close()
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

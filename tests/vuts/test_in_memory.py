@@ -1,0 +1,244 @@
+"""VUTs as Python has them: classes, functions, lambdas and objects; and where they may drive."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import types
+import warnings
+from importlib import import_module
+from typing import Any
+
+import pytest
+
+import merge_sumo as ms
+from merge_sumo.system.spawning import without_main
+from merge_sumo.vuts.in_memory import is_here, keep, object_of, spec_of, travels
+
+SMALL: dict[str, Any] = {"level": 0, "cases": 4, "seed": 1}
+
+
+class Steady:
+    """Keeps its speed."""
+
+    def act(self, _seen):
+        return 0.0
+
+
+class Batched:
+    """Accelerates by what it was made with, in all corridors."""
+
+    def __init__(self, a_mps2: float) -> None:
+        self.a_mps2, self.asked = a_mps2, 0
+
+    def act_batch(self, seen):
+        self.asked += 1
+        return 0.0 * seen.t_s + self.a_mps2
+
+
+def steady(_seen):
+    return 0.0
+
+
+class TestASpec:
+    @pytest.mark.parametrize("vut", [Steady, steady])
+    def test_of_what_can_be_imported_is_its_name(self, vut):
+        assert spec_of(vut) == f"{__name__}:{vut.__name__}"
+        assert travels(spec_of(vut))
+
+    def test_of_a_text_is_that_text(self):
+        assert spec_of("sumo:IDM") == "sumo:IDM"
+
+    def test_of_another_object_of_the_same_name_is_another(self):
+        specs = [spec_of(lambda _: 0.0), spec_of(lambda _: 1.0)]
+        assert len(set(specs)) == 2
+        assert all(map(is_here, specs))
+
+    def test_of_the_same_object_is_the_same(self):
+        vut = Batched(0.0)
+        assert spec_of(vut) == spec_of(vut)
+
+    @pytest.mark.parametrize("thing", [3, None, object(), type("Nothing", (), {}), print])
+    def test_of_what_is_no_vut_is_refused(self, thing):
+        if thing is print:
+            thing = lambda: 0.0  # noqa: E731 (a function of nothing)
+        with pytest.raises(ms.UserError, match=r"a VUT is a class|is no VUT|takes 0 arguments"):
+            spec_of(thing)
+
+    def test_that_was_an_object_of_another_process_says_so(self):
+        with pytest.raises(ms.UserError, match="was an object of a Python process"):
+            ms.run_case("here:gone", x_pov0_m=-300, v_pov0_mps=30)
+
+
+class TestWhatTravels:
+    def test_an_object_whose_class_can_be_imported_does(self):
+        assert travels(spec_of(Batched(1.0)))
+
+    def test_a_lambda_an_object_with_a_lock_and_what_is_of_the_main_module_do_not(self):
+        with_lock, of_main = Batched(1.0), Batched(1.0)
+        vars(with_lock).update(lock=threading.Lock())
+        main = types.new_class(
+            "Main", (Steady,), exec_body=lambda n: n.update(__module__="__main__")
+        )
+        vars(of_main).update(part=main)
+        for vut in (lambda _: 0.0, with_lock, main, of_main):
+            assert not travels(spec_of(vut))
+
+    def test_an_object_that_came_is_kept_under_its_name(self):
+        vut = Batched(2.0)
+        keep("here:came", vut)
+        assert object_of("here:came") is vut
+
+
+class TestACampaign:
+    def test_of_a_class_is_that_of_its_name(self, tmp_path, monkeypatch):
+        monkeypatch.syspath_prepend(tmp_path)
+        (tmp_path / "steadily.py").write_text(
+            "class Steady:\n    def act(self, seen):\n        return 0.0\n"
+        )
+        by_class = ms.campaign(import_module("steadily").Steady, **SMALL, out=tmp_path / "class")
+        assert by_class.settings["vut"] == "steadily:Steady"
+        with pytest.warns(UserWarning, match="known to this process alone"):
+            by_lambda = ms.campaign(lambda _: 0.0, **SMALL, out=tmp_path / "lambda")
+        assert list(by_class.cases) == list(by_lambda.cases)
+
+    def test_asks_the_very_object_that_it_was_given(self, tmp_path):
+        vut = Batched(1.0)
+        with pytest.warns(UserWarning, match=r"Batched\S* is an object, so it drives in this"):
+            run = ms.campaign(vut, **SMALL, out=tmp_path / "run")
+        assert vut.asked > 50
+        assert run.trajectory(0).a_vut_mps2[0] == 1.0
+
+    def test_gives_each_corridor_a_copy_of_an_object_that_acts_alone(self, tmp_path):
+        class Counts:
+            asked = 0
+
+            def act(self, _seen):
+                self.asked += 1
+                return 0.1 * self.asked
+
+        vut = Counts()
+        with pytest.warns(UserWarning, match="drives"):
+            run = ms.campaign(vut, **SMALL, out=tmp_path / "run")
+        assert vut.asked == 0
+        assert all(run.trajectory(n).a_vut_mps2[0] == pytest.approx(0.1) for n in range(4))
+
+    def test_of_what_cannot_travel_runs_without_workers(self, tmp_path):
+        with pytest.warns(UserWarning, match="and without workers"):
+            ms.campaign(lambda _: 0.0, **SMALL, workers=2, out=tmp_path / "run")
+
+    def test_that_was_interrupted_goes_on_and_takes_more_cases(self, tmp_path):
+        def stop(outcome):
+            if outcome.index == 3:
+                raise KeyboardInterrupt
+
+        small = {**SMALL, "batch": 2, "sampler": "subset"}
+        folder, whole = tmp_path / "run", ms.campaign("level0", **small, out=tmp_path / "whole")
+        with pytest.raises(KeyboardInterrupt) as stopped:
+            ms.campaign("level0", **small, out=folder, on_case=stop)
+        assert stopped.value.__notes__ == [f"stopped; go on with ms.resume({str(folder)!r})"]
+        assert len(ms.open_run(folder).cases) == 2
+        again = []
+        done = ms.resume(folder, on_case=lambda outcome: again.append(outcome.index))
+        assert again == [2, 3]
+        assert list(done.cases) == list(whole.cases)
+        assert len(ms.resume(done, cases=6).cases) == 6
+        with pytest.raises(ms.UserError, match="vut"):
+            ms.resume(folder, vut="design2", cases=8)
+
+    def test_takes_a_pov_of_the_same_kinds(self, tmp_path):
+        with pytest.warns(UserWarning, match="drives"):
+            run = ms.campaign(
+                "design2", level="own", pov=lambda _: -0.5, cases=4, out=tmp_path / "run"
+            )
+        assert run.trajectory(0).a_pov_mps2[0] == -0.5
+
+
+@pytest.mark.parametrize(
+    "way", ["standard input", pytest.param("a script", marks=pytest.mark.long)]
+)
+def test_workers_need_no_main_guard_and_no_file(way, tmp_path):
+    """Without a guard, a worker that imported the script would run the campaign again."""
+    script = (
+        "import merge_sumo as ms\n"
+        "run = ms.campaign('design2', level=0, cases=4, batch=4, workers=2, out='run')\n"
+        "print(repr(run))\n"
+    )
+    (tmp_path / "script.py").write_text(script)
+    from_input = way == "standard input"
+    done = subprocess.run(
+        [sys.executable, "-" if from_input else "script.py"],
+        input=script if from_input else None,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "<campaign run: 0 failures in 4 cases>\n"
+
+
+def test_the_main_module_is_whole_again_after_processes_have_started():
+    main = sys.modules["__main__"].__dict__
+    before = {name: main.get(name) for name in ("__file__", "__spec__")}
+    with without_main():
+        assert main["__spec__"] is None
+        assert "__file__" not in main
+    assert {name: main.get(name) for name in before} == before
+
+
+class TestTheOtherFunctions:
+    def test_one_case_shows_itself(self):
+        found = ms.run_case("design2", level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6)
+        assert found.failed
+        assert repr(found).startswith("<case: MERGED at 9.3 s, contact")
+        assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
+
+    def test_one_case_takes_a_row_of_a_campaign(self, run):
+        row = ms.open_run(run.folder).failures[0]
+        again = ms.run_case("design1", row)
+        assert again.outcome.measures.score == row["score"]
+        assert not ms.run_case("design2", row, v_pov0_mps=25).failed
+
+    @pytest.mark.parametrize(
+        ("values", "part"),
+        [({"x": -300}, "a case has no x"), ({"x_pov0_m": -300}, "v_pov0_mps"), ({"level": 7}, "7")],
+    )
+    def test_one_case_is_refused(self, values, part):
+        with pytest.raises(ms.UserError, match=part):
+            ms.run_case("design2", **values)
+
+    def test_cases_run_again_with_another_vut(self, run):
+        worst = ms.open_run(run.folder).failures[0]["index"]
+        found = ms.rerun(run.folder, [worst], vut="design2")
+        assert [(c.before.index, c.change) for c in found.changed] == [(worst, "fixed")]
+        assert repr(found) == "<Rerun: recorded: 1 failure (1 contact) in 1 case>"
+        assert str(found).endswith(f"  case {worst}: contact -> safe (fixed)")
+        assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
+
+    def test_campaigns_are_compared_by_their_folders(self, run):
+        found = ms.compare_runs(run.folder, ms.open_run(run.folder))
+        assert found.worse(0.0) == []
+        (level,) = found.levels.values()
+        fmc = f"{level.fmc_a:.4f}"
+        assert repr(found) == f"<RunComparison: level 0: FMC {fmc} -> {fmc}>"
+        assert str(found).splitlines()[1].split()[:3] == ["0", fmc, fmc]
+
+    def test_cases_are_exported(self, run, tmp_path):
+        (config,) = ms.export(run.folder, [3], out=tmp_path / "sumo")
+        assert config.is_file()
+        (table,) = ms.export(run.folder, file_format="csv", out=tmp_path / "table")
+        assert len(table.read_text().splitlines()) > 60 * 50
+        with pytest.raises(ms.UserError, match="no format 'pdf'"):
+            ms.export(run.folder, [3], file_format="pdf")
+
+    def test_the_truth_of_an_object_is_not_kept(self, tmp_path, monkeypatch):
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = ms.truth(lambda _: 0.0, 0, cases=20)
+        assert found.points.shape == (20, 2)
+        assert [*tmp_path.glob("*.npz")] == []
+        ms.truth("level0", 0, cases=20)
+        assert len([*tmp_path.glob("*.npz")]) == 1

@@ -1,0 +1,203 @@
+"""A VUT as an ONNX network, and the export of the shipped ones."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from merges import HALF, SMALLER
+from plans import plan_for
+from typer.testing import CliRunner
+from vut_contract import cases_of, factory, run_cases
+
+from merge_sumo.cli import app
+from merge_sumo.drivers.levelk import features
+from merge_sumo.drivers.policies import NETWORKS, load_network
+from merge_sumo.errors import UserError
+from merge_sumo.studies.truth import ground_truth
+from merge_sumo.values.case import from_unit
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.trajectory import End
+from merge_sumo.vuts.onnx_export import export_onnx
+
+onnx = pytest.importorskip("onnx")
+ort = pytest.importorskip("onnxruntime")
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("onnx")
+    for name in NETWORKS:
+        export_onnx(name, folder / f"{name}.onnx")
+    return folder
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_an_exported_policy_gives_the_values_of_the_policy(exported, name):
+    rng = np.random.default_rng(0)
+    state = rng.uniform((-340, 0, -182, 0), (100, 40, 0, 40), (300, 4))
+    svo = rng.uniform(0.0, 1.57, 300)
+    network = load_network(name)
+    fed = {"state": state} | ({"svo_rad": svo[:, None]} if network.sees_svo else {})
+    (values,) = ort.InferenceSession(exported / f"{name}.onnx").run(None, fed)
+    x_pov, v_pov, x_vut, v_vut = state.T
+    seen = features(x_pov, v_pov, x_vut, v_vut, svo if network.sees_svo else None)
+    expected = network.values(seen)
+    assert values == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("scenario", [US23, SMALLER], ids=["us23", "smaller"])
+def test_an_exported_policy_as_vut_drives_like_the_built_in_one(tmp_path, scenario):
+    export_onnx("vut1", tmp_path / "vut1.onnx", scenario=scenario)
+    cases = from_unit(np.random.default_rng(1).random((40, 3)), level=2, scenario=scenario)
+    by_onnx, built_in = (
+        run_cases(factory(vut), cases) for vut in (f"onnx:{tmp_path / 'vut1.onnx'}", "level1")
+    )
+    for one, other in zip(by_onnx, built_in, strict=True):
+        assert np.array_equal(one.motion, other.motion)
+
+
+def test_an_export_says_for_which_scenario_it_is_and_what_its_actions_are(exported, tmp_path):
+    done = CliRunner().invoke(app, ["policies", "export", "vut1", "--out", str(tmp_path / "a")])
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "a").read_bytes() == (exported / "vut1.onnx").read_bytes()
+    export_onnx("vut1", tmp_path / "b", scenario=HALF)
+    for path, expected in (("a", "-4 -3 -2 -1 0 1 2"), ("b", "-2 -1.5 -1 -0.5 0 0.5 1")):
+        said = ort.InferenceSession(tmp_path / path).get_modelmeta().custom_metadata_map
+        assert said["actions_mps2"] == expected
+        assert said["scenario"] == ("us23" if path == "a" else "multiple")
+
+
+def network(path, *, answer, dtype=None, width=4):
+    """Write a network that answers numbers whatever it sees, times its first input's 0."""
+    helper, proto = onnx.helper, onnx.TensorProto
+    kind = proto.FLOAT if dtype == np.float32 else proto.DOUBLE
+    weight = np.zeros((width, len(answer)), dtype=dtype or np.float64)
+    bias = np.array(answer, dtype=weight.dtype)
+    graph = helper.make_graph(
+        [
+            helper.make_node("MatMul", ["in", "w"], ["m"]),
+            helper.make_node("Add", ["m", "b"], ["out"]),
+        ],
+        "g",
+        [helper.make_tensor_value_info("in", kind, [1, width])],
+        [helper.make_tensor_value_info("out", kind, [1, len(answer)])],
+        [onnx.numpy_helper.from_array(v, n) for v, n in ((weight, "w"), (bias, "b"))],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.long)])
+def test_one_number_is_an_acceleration_and_seven_are_values_of_actions(tmp_path, dtype):
+    one = network(tmp_path / "one.onnx", answer=[0.5], dtype=dtype)
+    seven = network(tmp_path / "seven.onnx", answer=[0, 0, 0, 0, 0, 3, 1], dtype=dtype)
+    for path, expected in ((one, 0.5), (seven, 1.0)):
+        (trajectory,) = run_cases(factory(f"onnx:{path}"), cases_of(1))
+        assert (trajectory.a_vut_mps2[:-1] == expected).all()
+
+
+def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
+    path = network(tmp_path / "here.onnx", answer=[0.5])
+    model = onnx.load(path)
+    for name, size in (("a.onnx", 0), ("b.onnx", 0)):
+        onnx.save_model(
+            onnx.load_from_string(model.SerializeToString()),
+            tmp_path / name,
+            save_as_external_data=True,
+            all_tensors_to_one_file=name == "a.onnx",
+            location="weights.bin" if name == "a.onnx" else None,
+            size_threshold=size,
+        )
+    assert [Path(f).name for f in factory(f"onnx:{path}").files] == ["here.onnx"]
+    vut = f"onnx:{tmp_path / 'a.onnx'}"
+    assert sorted(Path(f).name for f in factory(vut).files) == ["a.onnx", "weights.bin"]
+    separate = sorted(Path(f).name for f in factory(f"onnx:{tmp_path / 'b.onnx'}").files)
+    assert separate == ["b", "b.onnx", "w"]
+    truth = [ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").score]
+    weights = tmp_path / "weights.bin"
+    half, one = np.float64(0.5).tobytes(), np.float64(1.0).tobytes()
+    assert weights.read_bytes().count(half) == 1
+    weights.write_bytes(weights.read_bytes().replace(half, one))
+    truth.append(ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").score)
+    before, after = truth
+    assert not np.array_equal(before, after)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        [np.nan],
+        pytest.param([np.inf], marks=pytest.mark.long),
+        [0, 0, 0, 0, np.nan, 0, 0],
+    ],
+)
+def test_an_answer_that_is_no_number_is_a_vut_error(tmp_path, answer):
+    path = network(tmp_path / "bad.onnx", answer=np.zeros(len(answer)))
+    model = onnx.load(path)
+    model.graph.output[0].name = "shown"
+    model.graph.node.append(
+        onnx.helper.make_node("Log", ["negative"], ["spoilt"])
+        if np.isnan(answer).any()
+        else onnx.helper.make_node("Reciprocal", ["zero"], ["spoilt"])
+    )
+    for name, value in (("negative", -1.0), ("zero", 0.0)):
+        model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([value]), name))
+    model.graph.node.append(onnx.helper.make_node("Add", ["out", "spoilt"], ["shown"]))
+    path.write_bytes(model.SerializeToString())
+    assert run_cases(factory(f"onnx:{path}"), cases_of(1))[0].end is End.VUT_ERROR
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_weights_that_are_not_finite_are_refused(tmp_path, value):
+    path = network(tmp_path / "bad.onnx", answer=[0.5])
+    model = onnx.load(path)
+    weight = onnx.numpy_helper.to_array(model.graph.initializer[0]).copy()
+    weight[0, 0] = value
+    model.graph.initializer[0].CopyFrom(onnx.numpy_helper.from_array(weight, "w"))
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(UserError, match=r"bad\.onnx has weights that are not finite, in 'w'"):
+        factory(f"onnx:{path}")
+
+
+def test_infinity_as_a_limit_is_no_weight(tmp_path):
+    path = network(tmp_path / "clipped.onnx", answer=[0.5])
+    model = onnx.load(path)
+    model.graph.output[0].name = "clipped"
+    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(-np.inf), "low"))
+    model.graph.node.append(onnx.helper.make_node("Clip", ["out", "low"], ["clipped"]))
+    path.write_bytes(model.SerializeToString())
+    (trajectory,) = run_cases(factory(f"onnx:{path}"), cases_of(1))
+    assert (trajectory.a_vut_mps2[:-1] == 0.5).all()
+
+
+def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
+    (tmp_path / "text.onnx").write_text("no network")
+    network(tmp_path / "wide.onnx", answer=[0.0], width=5)
+    network(tmp_path / "two.onnx", answer=[0.0, 1.0])
+    good = network(tmp_path / "good.onnx", answer=[0.0])
+    for spec, said in {
+        tmp_path / "nothing.onnx": "there is no ONNX file",
+        tmp_path / "text.onnx": "is no ONNX network that can be run",
+        tmp_path / "wide.onnx": "a VUT has one of floats",
+        tmp_path / "two.onnx": "gives 2 numbers",
+        f"{good}?decision_period_s=0": "decision_period_s is '0'",
+        f"{good}?decision_period_s=often": "decision_period_s is 'often'",
+        f"{good}?period=1": "there is no option 'period'",
+    }.items():
+        with pytest.raises(UserError, match=r"onnx|ONNX") as refused:
+            factory(f"onnx:{spec}")
+        assert said in str(refused.value)
+
+
+def test_an_export_overwrites_nothing_and_knows_its_policies(exported, tmp_path):
+    with pytest.raises(UserError, match="exists: choose another name"):
+        export_onnx("vut1", exported / "vut1.onnx")
+    with pytest.raises(UserError, match="there is no policy 'vut9'"):
+        export_onnx("vut9", tmp_path / "x.onnx")
+    with pytest.raises(UserError, match="there is no folder"):
+        export_onnx("vut1", tmp_path / "no-folder" / "x.onnx")

@@ -1,0 +1,324 @@
+"""A VUT in Python: the tutorial's example, what it may see, and what it may do wrong."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import some
+from processes import at_most_cpu_s
+from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.errors import UserError
+from merge_sumo.road.merge import road_of
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import MAX_STEPS
+from merge_sumo.values.trajectory import End
+from merge_sumo.vuts.registry import vut_factory
+
+LONG = partial(pytest.param, marks=pytest.mark.long)
+
+
+@pytest.fixture
+def vut(tmp_path):
+    """Return a function that writes a source and returns the spec of a name in it."""
+
+    def write(source: str, name: str = "Vut", file: str = "my_vut.py") -> str:
+        (tmp_path / file).write_text(source, encoding="utf-8")
+        return f"{tmp_path / file}:{name}"
+
+    return write
+
+
+BATCHED = """
+import numpy as np
+class Vut:
+    def __init__(self, corridors):
+        self.resets = [0] * corridors
+    def reset(self, corridor, seen):
+        self.resets[corridor] += 1
+    def act_batch(self, seen):
+        return np.clip((28.0 - seen.v_vut_mps) / 0.1, 0.0, 1.0)
+"""
+FUNCTION = """
+def Vut(seen):
+    return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
+"""
+
+
+@pytest.mark.parametrize(
+    ("source", "name"), [(LEVEL0_CLASS, "Level0"), LONG(FUNCTION, "Vut"), (BATCHED, "Vut")]
+)
+def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
+    vut, tmp_path, source, name
+):
+    lines: list = []
+    for spec in ("level0", vut(source, name)):
+        settings = CampaignSettings(vut=spec, levels=(0, 2), cases=60, batch=20, seed=3)
+        folder = tmp_path / f"run{len(lines)}"
+        run_campaign(settings, folder)
+        lines.append((folder / "outcomes.jsonl").read_bytes())
+    assert lines[0] == lines[1]
+
+
+def test_a_module_in_the_working_folder_is_found(vut, tmp_path, monkeypatch):
+    vut(LEVEL0_CLASS, file="module_of_a_user.py")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
+    assert run_cases(factory("module_of_a_user:Level0"), cases_of(3))[0].end is End.MERGED
+
+
+def test_an_installed_package_can_register_a_name(tmp_path, monkeypatch):
+    (tmp_path / "registered_vut.py").write_text(LEVEL0_CLASS)
+    info = tmp_path / "registered_vut-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: registered-vut\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(
+        "[merge_sumo.vuts]\nmine = registered_vut:Level0\nbad = registered_vut:Nothing\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run_cases(factory("mine"), cases_of(3))[0].end is End.MERGED
+    with pytest.raises(UserError, match="cannot load the VUT bad"):
+        factory("bad")
+    with pytest.raises(UserError, match=r"choose one of .*mine"):
+        factory("nobody")
+
+
+def test_a_factory_travels_to_another_process_as_plain_values(vut):
+    made = factory(vut(LEVEL0_CLASS, "Level0"), deadline_s=2.0)
+    assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301 (our own bytes)
+
+
+WATCHER = """
+import json, pathlib
+class Vut:
+    def reset(self, seen):
+        self.seen = [seen._asdict()]
+    def act(self, seen):
+        self.seen.append(seen._asdict())
+        pathlib.Path(__file__).with_name("seen.json").write_text(json.dumps(self.seen))
+        return 0.5
+"""
+
+
+def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(vut, tmp_path):
+    case = Case(level=2, x_pov0_m=-250.0, v_pov0_mps=30.0, svo_rad=0.5, v_vut0_mps=17.0)
+    (trajectory,) = run_cases(factory(vut(WATCHER)), [case])
+    at_reset, *steps = json.loads((tmp_path / "seen.json").read_text())
+    start = {"t_s": 0.0, "x_pov_m": -250.0, "v_pov_mps": 30.0, "x_vut_m": -182.0, "v_vut_mps": 17.0}
+    assert at_reset == start
+    assert steps[0] == pytest.approx(start)
+    assert [s["t_s"] for s in steps] == [round(i * 0.1, 1) for i in range(len(steps))]
+    for name in ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps"):
+        assert [s[name] for s in steps] == getattr(trajectory, name)[:-1].tolist()
+
+
+def test_each_corridor_has_an_object_of_its_own(vut):
+    source = """
+class Vut:
+    def reset(self, seen):
+        self.count = 0
+    def act(self, seen):
+        self.count += 1
+        assert self.count == round(seen.t_s * 10) + 1, self.count
+        return 1.0
+"""
+    assert {t.end for t in run_cases(factory(vut(source)), cases_of(40))} == {End.MERGED}
+
+
+WRONG_ANSWERS = {
+    "float('nan')": "nan",
+    "-float('inf')": "inf",
+    "None": "answered None (NoneType) instead of a number",
+    "'1.0'": "answered '1.0' (str) instead of a number",
+    "[1.0]": "answered [1.0] (list) instead of a number",
+    "True": "answered True (bool) instead of a number",
+    "1 / 0": "ZeroDivisionError: division by zero (my_vut.py, line 6)",
+    "__import__('sys').exit(3)": "SystemExit: 3",
+    "breakpoint()": "a debugger was left; breakpoints work with `merge-sumo run --debug`",
+    "__import__('time').sleep(60)": "took longer than the deadline of 0.3 s",
+    "exec('while True: pass')": "took longer than the deadline of 0.3 s",
+}
+SOMETIMES = """
+class Vut:
+    def reset(self, seen):
+        self.bad = seen.v_pov_mps > 30.0
+    def act(self, seen):
+        return {answer} if self.bad and seen.t_s == 0.3 else 1.0
+"""
+
+
+@pytest.mark.parametrize(
+    "answer", some(WRONG_ANSWERS, "float('nan')", "[1.0]", "1 / 0", "exec('while True: pass')")
+)
+def test_what_it_does_wrong_is_the_outcome_of_its_own_case(vut, answer):
+    cases = cases_of(8)
+    spec = vut(SOMETIMES.format(answer=answer))
+    with at_most_cpu_s(20.0):
+        trajectories = run_cases(factory(spec, deadline_s=0.3), cases)
+    for case, trajectory in zip(cases, trajectories, strict=True):
+        if case.v_pov0_mps > 30.0:
+            assert trajectory.end is End.VUT_ERROR
+            assert WRONG_ANSWERS[answer] in trajectory.error
+            assert len(trajectory.motion) == 4
+        else:
+            assert trajectory.end is End.MERGED
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ("raise KeyError('x')", "reset: KeyError: 'x'"),
+        ("import time; time.sleep(9)", "reset: took longer than the deadline of 0.3 s"),
+    ],
+)
+@pytest.mark.parametrize("batched", some([False, True], True))
+def test_a_reset_that_fails_is_the_outcome_of_its_own_case(vut, body, reason, batched):
+    source = f"""
+class Vut:
+    def __init__(self, *corridors):
+        pass
+    def reset(self, *arguments):
+        if arguments[-1].v_pov_mps > 30.0:
+            {body}
+    def {"act_batch" if batched else "act"}(self, seen):
+        return 0.0 * seen.v_vut_mps + 1.0
+"""
+    cases = cases_of(8)
+    for case, trajectory in zip(
+        cases, run_cases(factory(vut(source), deadline_s=0.3), cases), strict=True
+    ):
+        if case.v_pov0_mps > 30.0:
+            assert trajectory.error.startswith(reason)
+        else:
+            assert trajectory.end is End.MERGED
+
+
+def test_an_object_that_failed_is_made_anew(vut):
+    source = """
+class Vut:
+    broken = False
+    def act(self, seen):
+        if self.broken:
+            raise RuntimeError("still broken")
+        self.broken = seen.t_s > 0.2
+        return 1.0
+"""
+    errors = [t.error for t in run_cases(factory(vut(source)), cases_of(3), corridors=1)]
+    assert errors == ["RuntimeError: still broken (my_vut.py, line 6)"] * 3
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [("np.zeros(3)", "shape (3,)"), LONG("None", "shape ()"), LONG("1 / 0", "ZeroDivisionError")],
+)
+def test_a_wrong_batch_fails_its_cases_and_none_is_lost(vut, answer, reason):
+    source = BATCHED.replace("np.clip((28.0 - seen.v_vut_mps) / 0.1, 0.0, 1.0)", answer)
+    trajectories = run_cases(factory(vut(source)), cases_of(9))
+    assert all(t.end is End.VUT_ERROR and reason in t.error for t in trajectories)
+
+
+def test_a_batched_vut_cannot_move_the_cars(vut):
+    source = BATCHED.replace("return ", "seen.x_vut_m[:] = 5.0; seen.v_vut_mps[:] = 1.0; return ")
+    assert {t.end for t in run_cases(factory(vut(source)), cases_of(4))} == {End.MERGED}
+
+
+def test_answers_outside_the_limits_are_clipped_and_counted_but_rounding_is_not(vut):
+    for answer, clipped in ((7.0, True), (2.0 + 1e-12, False), (2, False)):
+        source = f"def Vut(seen):\n    return {answer}\n"
+        (trajectory,) = run_cases(factory(vut(source, file=f"v{answer}.py")), cases_of(1))
+        assert trajectory.clipped_steps == (len(trajectory.motion) - 1) * clipped
+        assert (trajectory.a_vut_mps2[:-1] == 2.0).all()
+
+
+def test_a_vut_that_stands_is_a_timeout(vut):
+    (trajectory,) = run_cases(factory(vut("def Vut(seen):\n    return -4.0\n")), cases_of(1))
+    assert trajectory.end is End.TIMEOUT
+    assert len(trajectory.motion) == MAX_STEPS + 1
+
+
+def test_what_it_prints_goes_to_standard_error_and_close_is_called(vut, capsys):
+    source = """
+class Vut:
+    def act(self, seen):
+        print("hello")
+        return 1.0
+    def close(self):
+        print("goodbye")
+        raise ValueError("too late")
+"""
+    (trajectory,) = run_cases(factory(vut(source)), cases_of(1), corridors=1)
+    said = capsys.readouterr()
+    assert trajectory.end is End.MERGED
+    assert said.out == ""
+    assert "hello" in said.err
+    assert "closing the VUT: ValueError: too late" in said.err
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "said"),
+    [
+        ("", "Vut", "has no 'Vut'"),
+        ("Vut = 3", "Vut", "a VUT is a class with `act"),
+        ("Vut = object()", "Vut", "a VUT is a class with `act"),
+        ("class Vut: pass", "Vut", "a VUT is a class with `act"),
+        ("def Vut(): pass", "Vut", "Vut() takes 0 arguments, Vut(seen) is called"),
+        ("1 / 0", "Vut", "ZeroDivisionError"),
+        ("import sys; sys.exit(1)", "Vut", "SystemExit"),
+        ("def Vut(:", "Vut", "SyntaxError"),
+        ("import not_a_module_at_all", "Vut", "No module named"),
+    ],
+)
+def test_what_cannot_be_a_vut_is_refused_in_a_sentence(vut, source, name, said):
+    with pytest.raises(UserError, match=r"(?i)vut") as refused:
+        factory(vut(source, name))
+    assert said in str(refused.value)
+
+
+def test_what_cannot_be_found_or_made_is_refused_in_a_sentence(vut, tmp_path):
+    with pytest.raises(UserError, match=r"cannot read the VUT .*No such file"):
+        factory(tmp_path / "nothing.py:Vut")
+    with pytest.raises(UserError, match="cannot load the VUT no_such_module_here"):
+        factory("no_such_module_here:Vut")
+    source = "class Vut:\n    def __init__(self, x): ...\n    def act(self, seen): return 1.0\n"
+    with pytest.raises(UserError, match="cannot be made without arguments: TypeError"):
+        run_cases(factory(vut(source)), cases_of(1))
+    for deadline in (0.0, -1.0, float("nan")):
+        with pytest.raises(UserError, match="--deadline is"):
+            factory("level0", deadline_s=deadline)
+    with pytest.raises(UserError, match="--vut-command goes with --vut traci"):
+        factory("level0", command="python x.py")
+
+
+def test_built_in_names_still_work():
+    assert np.isfinite(run_cases(vut_factory("design2"), cases_of(2))[0].motion).all()
+
+
+def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
+    page = Path(__file__).parents[2] / "docs" / "tutorials" / "python-vut.md"
+    text = page.read_text(encoding="utf-8")
+    (source,) = re.findall(r"```python\n(class MyVut.*?)```", text, flags=re.DOTALL)
+    assert len(source.strip().splitlines()) <= 10
+    trajectories = run_cases(factory(vut(source, "MyVut")), cases_of(20))
+    assert {t.end for t in trajectories} == {End.MERGED}
+    assert any(t.a_vut_mps2.min() == -2.0 for t in trajectories)
+
+
+def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
+    hashes = []
+    for source in (FUNCTION, FUNCTION + "# changed"):
+        settings = CampaignSettings(vut=vut(source), levels=(0,), cases=2, batch=2)
+        (sha256,) = record_of(settings, road_of())["vut_files"].values()
+        hashes.append(sha256)
+    assert hashes[0] != hashes[1]
+    assert record_of(CampaignSettings(vut="level0", levels=(0,)), road_of())["vut_files"] is None

@@ -1,0 +1,97 @@
+"""SUMO's own drivers as VUT: their motion, their options, and that they react to the POV."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from vut_contract import cases_of, factory, run_cases
+
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.replay import replay
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import DT_S, VUT
+from merge_sumo.values.trajectory import End
+from merge_sumo.vuts.sumo_model import MODELS
+
+FREE = Case(level=0, x_pov0_m=0.0, v_pov0_mps=45.0)
+"""The POV is gone before the VUT arrives."""
+
+
+@pytest.fixture(scope="module", params=sorted(MODELS))
+def model(request) -> str:
+    return f"sumo:{request.param}"
+
+
+def test_every_model_drives_the_same_in_1_and_in_8_corridors_and_by_eq_4(model):
+    cases = cases_of(25)
+    alone, many = (run_cases(factory(model), cases, corridors=k) for k in (1, 8))
+    for one, other in zip(alone, many, strict=True):
+        assert one.end is End.MERGED
+        assert np.array_equal(one.motion, other.motion)
+        x, v, a = one.motion[:, VUT].T
+        assert x[1:] == pytest.approx(x[:-1] + v[:-1] * DT_S, abs=1e-9)
+        assert v[1:] == pytest.approx(v[:-1] + a[:-1] * DT_S, abs=1e-9)
+
+
+def test_every_model_reacts_to_the_pov(model):
+    """The same start with a POV that meets the VUT at M, and with none near."""
+    meeting = Case(level=0, x_pov0_m=-253.0, v_pov0_mps=34.4)
+    free, met = run_cases(factory(model), [FREE, meeting])
+    assert met.v_vut_mps[-1] < free.v_vut_mps[-1] - 0.5
+
+
+def test_a_campaign_finds_failures_that_replay_identically(model, tmp_path):
+    settings = CampaignSettings(
+        vut=model, levels=(0,), sampler="uniform", cases=120, batch=40, seed=2
+    )
+    run = run_campaign(settings, tmp_path / "run")
+    assert {o.measures.end for o in run.outcomes} <= {End.MERGED}
+    (worst, *_) = failures(run.outcomes)
+    result = replay(tmp_path / "run" / "scenarios" / f"case-{worst.index:05d}")
+    assert result.diverged_at_s is None
+
+
+def test_a_free_driver_follows_what_sumo_drives_by_itself(model):
+    """SUMO moves by the new speed and eq. (4) by the old: less than a metre apart at M."""
+    (ours,) = run_cases(factory(model), [FREE], corridors=1)
+    with World(1, vut_type=factory(model).vut.vut_type) as world:
+        world.place(0, [(0.0, 45.0), (-182.0, 18.0)])
+        x_m, speeds = [], []
+        for _ in range(len(ours.motion) - 1):
+            world._step_simulation()
+            world.read()
+            x_m.append(world.x_m[VUT, 0])
+            speeds.append(world.v_mps[VUT, 0])
+    assert ours.v_vut_mps[1:] == pytest.approx(speeds, abs=0.05)
+    gained = (speeds[-1] - 18.0) * DT_S
+    assert np.abs(ours.x_vut_m[1:] - x_m).max() <= gained + 0.05
+
+
+def test_options_reach_sumo():
+    slow, fast = (run_cases(factory(f"sumo:IDM?maxSpeed={v}"), [FREE])[0] for v in (19, 30))
+    assert slow.v_vut_mps.max() <= 19.0 + 1e-9
+    assert fast.v_vut_mps.max() > 22.0
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("sumo:", "choose one of sumo:Krauss"),
+        ("sumo:idm", "choose one of sumo:Krauss"),
+        ("sumo:IDM?taw=1", "IDM has no option 'taw'"),
+        ("sumo:IDM?sigma=1", "IDM has no option 'sigma'"),
+        ("sumo:IDM?tau", "'tau' is not an option: write NAME=VALUE"),
+        ("sumo:IDM?tau=fast", "tau is 'fast': give a number"),
+        ("sumo:IDM?tau=-1", "tau is '-1': give a number from 0 up"),
+        ("sumo:IDM?tau=nan", "tau is 'nan': give a number"),
+        ("sumo:IDM?tau=1&tau=2", "the option tau is there twice"),
+    ],
+)
+def test_what_sumo_does_not_have_is_refused_in_a_sentence(spec, said):
+    with pytest.raises(UserError, match="sumo:") as refused:
+        factory(spec)
+    assert said in str(refused.value)

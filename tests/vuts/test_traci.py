@@ -1,0 +1,912 @@
+"""A controller behind TraCI: what it sees, what it may do, and what it may do wrong."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import os
+import random
+import re
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import traci
+from conftest import require, some
+from raw_traci import GET_LANE, MISDEEDS, STEP, Client, GoneError, command, text
+from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.base import Scene
+from merge_sumo.errors import UserError
+from merge_sumo.road.merge import road_of
+from merge_sumo.sumo.binding import sumo_program
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
+from merge_sumo.values.trajectory import End
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.traci.vut import TraciVut
+
+LONG = partial(pytest.param, marks=pytest.mark.long)
+SUPPORT = Path(__file__).parents[1] / "support"
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
+PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
+    encoding="utf-8"
+)
+(CONTROLLER,) = re.findall(r"```python\n(import sys, traci.*?)```", PAGE, flags=re.DOTALL)
+"""The tutorial's controller; its law is that of level 0."""
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+class Played:
+    """Episodes of eq. (4) with a client in a thread: speeds, clipped or not, and reasons."""
+
+    def __init__(self, client, episodes=1, steps=30, deadline_s=5.0, port=None):
+        self.port = port or free_port()
+        self.result = self.error = None
+        self.speeds, self.accelerations, self.reasons = [], [], []
+        thread = threading.Thread(target=self._client, args=(client,))
+        thread.start()
+        options = VutOptions(deadline_s=deadline_s, connect_s=10.0)
+        vut = TraciVut(1, road_of(), US23, self.port, None, options)
+        try:
+            for _ in range(episodes):
+                self._episode(vut, steps)
+        finally:
+            vut.close()
+            thread.join()
+        if self.error is not None:
+            raise self.error
+
+    def _client(self, client):
+        try:
+            self.result = client(self.port)
+        except (Exception, SystemExit) as error:
+            self.error = error
+
+    def _episode(self, vut, steps):
+        vut.begin(0, CASE)
+        x_pov, v_pov, x, v = -250.0, 30.0, -182.0, 18.0
+        for step in range(steps):
+            columns = (np.array([value]) for value in (x_pov, v_pov, x, v))
+            a = vut.act(Scene.of_pair(np.array([True]), np.array([step]), *columns))[0]
+            if not np.isfinite(a):
+                self.reasons.append(vut.reason(0))
+                return
+            self.accelerations.append(a)
+            a = min(max(a, A_MIN_MPS2), A_MAX_MPS2)
+            x_pov, x, v = x_pov + v_pov * DT_S, x + v * DT_S, max(v + a * DT_S, 0.0)
+            self.speeds.append(v)
+        self.reasons.append(None)
+
+
+def stock(function):
+    """Return a client that speaks by the stock package: a function of its connection."""
+
+    def client(port):
+        connection = traci.connect(port, numRetries=200, waitBetweenRetries=0.02)
+        try:
+            return function(connection)
+        finally:
+            connection.close()
+
+    return client
+
+
+class TestAStockClient:
+    def test_sees_vehicles_depart_and_arrive_episode_after_episode_while_time_runs_on(self):
+        def drive(c):
+            seen: list[tuple] = [
+                (c.simulation.getTime(), c.vehicle.getIDList(), c.vehicle.getIDCount())
+            ]
+            while c.simulation.getMinExpectedNumber() > 0:
+                c.simulationStep()
+                seen.append(
+                    (
+                        c.simulation.getTime(),
+                        c.vehicle.getIDList(),
+                        c.simulation.getDepartedIDList(),
+                        c.simulation.getArrivedIDList(),
+                    )
+                )
+            return seen
+
+        first, *others = Played(stock(drive), episodes=2, steps=3).result
+        assert first == (0.0, (), 0)
+        both, none = ("pov", "vut"), ()
+        episode = [(both, both, none), (both, none, none), (both, none, none), (none, none, both)]
+        assert [(ids, departed, arrived) for _, ids, departed, arrived in others] == episode * 2
+        assert [round(time_s, 6) for time_s, *_ in others] == [
+            round(0.1 * (i + 1), 6) for i in range(8)
+        ]
+
+    def test_reads_both_vehicles(self):
+        def read(c):
+            c.simulationStep()
+            c.simulationStep()
+            v = c.vehicle
+            ramp = c.lane.getLength("ramp_0")
+            return {
+                "speeds": (v.getSpeed("pov"), v.getSpeed("vut")),
+                "x_vut": v.getLanePosition("vut") - ramp,
+                "x_pov": v.getLanePosition("pov") - c.lane.getLength("main_in_0"),
+                "lanes": (v.getLaneID("pov"), v.getLaneID("vut"), v.getRoadID("vut")),
+                "route": (v.getRoute("vut"), v.getRouteIndex("vut"), v.getRouteID("vut")),
+                "type": (v.getTypeID("vut"), v.getVehicleClass("vut"), v.getLength("vut")),
+                "distance": np.hypot(*v.getPosition("vut")),
+                "height": v.getPosition3D("vut")[2],
+                "lane": (v.getLaneIndex("vut"), v.getLateralLanePosition("vut")),
+                "limits": (v.getAccel("vut"), v.getDecel("vut"), v.getMaxSpeed("vut")),
+                "acceleration": v.getAcceleration("vut"),
+                "colour": v.getColor("vut"),
+                "leader": v.getLeader("vut", 100.0),
+                "junction": c.junction.getPosition("M"),
+                "on lane": c.lane.getLastStepVehicleIDs("ramp_0"),
+                "lanes of the net": c.lane.getIDList(),
+                "shape": c.lane.getShape("main_out_0")[0],
+                "times": (c.simulation.getTime(), c.simulation.getDeltaT()),
+                "version": c.getVersion(),
+                "gui": c.hasGUI(),
+                "angle": v.getAngle("pov"),
+            }
+
+        seen = Played(stock(read), steps=2).result
+        assert seen["speeds"] == (30.0, 18.0)
+        assert seen["x_vut"] == pytest.approx(-180.2, abs=1e-9)
+        assert seen["x_pov"] == pytest.approx(-247.0, abs=1e-9)
+        assert seen["lanes"] == ("main_in_0", "ramp_0", "ramp")
+        assert seen["route"] == (("ramp", "main_out"), 0, "route.vut")
+        assert seen["type"] == ("vut", "passenger", 5.0)
+        assert seen["distance"] == pytest.approx(180.2, abs=1e-6)
+        assert seen["height"] == 0.0
+        assert seen["lane"] == (0, 0.0)
+        assert seen["limits"] == (2.0, 4.0, 45.0)
+        assert seen["acceleration"] == 0.0
+        assert seen["colour"] == (26, 89, 230, 255)
+        assert seen["leader"] is None
+        assert seen["junction"] == (0.0, 1.6)
+        assert seen["on lane"] == ("vut",)
+        assert seen["lanes of the net"] == (
+            *("main_in_0", "main_in_1", "main_out_0", "main_out_1", "ramp_0"),
+        )
+        assert seen["shape"] == pytest.approx((0.0, 0.0), abs=1e-6)
+        assert seen["times"] == (0.2, 0.1)
+        assert seen["version"][0] == traci.constants.TRACI_VERSION
+        assert "1.28.0" in seen["version"][1]
+        assert seen["gui"] is False
+        assert seen["angle"] == pytest.approx(90.0, abs=1e-6)
+
+    def test_holds_the_speed_it_set_until_it_sets_another(self):
+        def drive(c):
+            c.simulationStep()
+            c.vehicle.setSpeedMode("vut", 0)
+            c.vehicle.setSpeed("vut", 18.3)
+            c.simulationStep(c.simulation.getTime() + 0.35)
+            c.vehicle.setSpeed("vut", 18.1)
+            c.simulationStep(c.simulation.getTime() + 0.15)
+
+        played = Played(stock(drive), steps=6)
+        # Clipped to 2 m/s2 by who moves the vehicle; the wish itself is 3 m/s2.
+        assert played.accelerations[:2] == pytest.approx([3.0, 1.0])
+        assert played.speeds == pytest.approx([18.2, 18.3, 18.3, 18.3, 18.1, 18.1])
+
+    def test_that_steps_to_a_time_of_the_past_makes_no_step(self):
+        def drive(c):
+            c.simulationStep()
+            c.simulationStep()
+            before = c.simulation.getTime()
+            c.simulationStep(0.05)
+            return before, c.simulation.getTime()
+
+        before, after = Played(stock(drive), steps=3).result
+        assert before == after == 0.2
+
+    def test_that_steps_far_ahead_is_told_who_came_and_went(self):
+        def drive(c):
+            c.simulationStep(0.75)
+            return (
+                c.simulation.getTime(),
+                c.simulation.getDepartedIDList(),
+                c.simulation.getArrivedIDList(),
+            )
+
+        time_s, departed, arrived = Played(stock(drive), episodes=2, steps=4).result
+        assert time_s == pytest.approx(0.8)
+        assert departed == ("pov", "vut", "pov", "vut")
+        assert arrived == ("pov", "vut")
+
+    def test_subscribes_to_a_vehicle_to_the_simulation_and_to_what_is_around(self):
+        speed, time_id = traci.constants.VAR_SPEED, traci.constants.VAR_TIME
+        leader, domain = traci.constants.VAR_LEADER, traci.constants.CMD_GET_VEHICLE_VARIABLE
+
+        def drive(c):
+            c.simulation.subscribe([time_id, traci.constants.VAR_DEPARTED_VEHICLES_IDS])
+            c.simulationStep()
+            seen = [c.simulation.getSubscriptionResults()]
+            c.vehicle.subscribe("vut", [speed])
+            c.vehicle.subscribe("pov", [leader], parameters={leader: ("d", 50.0)})
+            c.vehicle.subscribeContext("vut", domain, 1000.0, [speed])
+            seen.append(c.vehicle.getSubscriptionResults("vut"))
+            c.vehicle.setSpeed("vut", 18.1)
+            c.simulationStep()
+            seen.append(dict(c.vehicle.getAllSubscriptionResults()))
+            seen.append(c.vehicle.getContextSubscriptionResults("vut"))
+            c.vehicle.subscribeContext("vut", domain, 1.0, [speed])
+            seen.append(set(c.vehicle.getContextSubscriptionResults("vut")))
+            c.vehicle.unsubscribe("vut")
+            c.simulationStep()
+            seen.append(dict(c.vehicle.getSubscriptionResults("vut")))
+            for _ in range(2):  # the road is empty, then the vehicles are new
+                c.simulationStep()
+                seen.append(dict(c.vehicle.getAllSubscriptionResults()))
+            return seen
+
+        seen = Played(stock(drive), episodes=2, steps=3).result
+        assert seen[0] == {
+            time_id: 0.1,
+            traci.constants.VAR_DEPARTED_VEHICLES_IDS: ("pov", "vut"),
+        }
+        assert seen[1] == {speed: 18.0}
+        assert seen[2]["vut"] == {speed: pytest.approx(18.1)}
+        assert "pov" in seen[2]
+        assert seen[3] == {"pov": {speed: 30.0}, "vut": {speed: pytest.approx(18.1)}}
+        assert seen[4] >= {"vut"}
+        assert seen[5] == {}
+        assert seen[6] == seen[7] == {}
+
+    def test_is_refused_what_is_not_its_own_and_goes_on(self):
+        def refused(call, *arguments):
+            with pytest.raises(traci.TraCIException) as error:
+                call(*arguments)
+            return str(error.value)
+
+        def drive(c):
+            said = [refused(c.vehicle.getSpeed, "vut")]
+            c.simulationStep()
+            said += [
+                refused(c.vehicle.setSpeed, "pov", 10.0),
+                refused(c.vehicle.slowDown, "pov", 10.0, 2.0),
+                refused(c.vehicle.setSpeed, "nobody", 10.0),
+                refused(c.vehicle.moveTo, "vut", "main_out_0", 5.0),
+                refused(c.vehicle.setPreviousSpeed, "vut", 50.0),
+                refused(c.vehicle.getCO2Emission, "nobody"),
+                refused(c.lane.getLength, "lane_0"),
+                refused(c.vehicle.subscribe, "nobody", [0x40]),
+                refused(c.load, ["-c", "x.sumocfg"]),
+                refused(c.trafficlight.getPhase, "none"),
+            ]
+            c.vehicle.setSpeed("vut", 18.1)
+            c.simulationStep()
+            return said
+
+        played = Played(stock(drive), steps=1)
+        said = played.result
+        assert played.speeds == pytest.approx([18.1])
+        assert said[0] == "Vehicle 'vut' is not known."
+        assert "'pov' is not the controller's" in said[1]
+        assert "'pov' is not the controller's" in said[2]
+        assert "'nobody' is not known" in said[3]
+        assert "does not carry out" in said[4]
+        assert "does not carry out" in said[5]
+        assert "'nobody' is not known" in said[6]
+        assert "'lane_0' is not known" in said[7]
+        assert "'nobody' is not known" in said[8]
+        assert said[9].startswith("merge-sumo does not carry out CMD_LOAD: the campaign")
+        assert "'none' is not known" in said[10]
+
+    def test_may_close_when_the_vehicle_has_arrived_and_another_come(self):
+        def once(c):
+            c.simulationStep()
+            while "vut" in c.vehicle.getIDList():
+                c.vehicle.setSpeed("vut", 18.1)
+                c.simulationStep()
+
+        def client(port):
+            stock(once)(port)
+            stock(once)(port)
+
+        assert Played(client, episodes=2, steps=5).reasons == [None, None]
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "steps"),
+    [
+        ("setSpeed", (18.15,), 3),
+        ("slowDown", (17.0, 0.5), 5),
+        ("slowDown", (19.0, 1.0), 10),
+        ("slowDown", (17.95, 0.0), 1),
+        ("setAcceleration", (1.0, 0.6), 6),
+        ("setAcceleration", (-3.0, 0.1), 1),
+    ],
+)
+def test_the_speeds_that_follow_from_a_command_are_those_of_sumo(command, arguments, steps):
+    with World(1) as world:
+        world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
+        vehicle = world._libsumo.vehicle
+        vehicle.setSpeed("vut.0", -1.0)
+        getattr(vehicle, command)("vut.0", *arguments)
+        expected = []
+        for _ in range(steps):
+            world.advance()
+            expected.append(vehicle.getSpeed("vut.0"))
+
+    def drive(c):
+        c.simulationStep()
+        getattr(c.vehicle, command)("vut", *arguments)
+        c.simulationStep(c.simulation.getTime() + steps * DT_S + 0.05)
+
+    assert Played(stock(drive), steps=steps).speeds == pytest.approx(expected, abs=1e-9)
+
+
+def measures_of(folder: Path) -> list[dict]:
+    from merge_sumo.campaigns.run import Run
+
+    return [outcome.to_record() for outcome in Run(folder).outcomes]
+
+
+def assert_same_to_1e9(one: list[dict], other: list[dict]) -> None:
+    assert len(one) == len(other)
+    for a, b in zip(one, other, strict=True):
+        assert a.keys() == b.keys()
+        for name, value in a.items():
+            if isinstance(value, float):
+                assert b[name] == pytest.approx(value, abs=1e-9, rel=0), name
+            else:
+                assert b[name] == value, name
+
+
+@pytest.mark.parametrize("count", [40, pytest.param(400, marks=pytest.mark.long)])
+def test_the_same_law_by_traci_and_in_process_gives_the_same_measures(tmp_path, count):
+    (tmp_path / "controller.py").write_text(CONTROLLER)
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    command = f"{sys.executable} {tmp_path / 'controller.py'} {{port}}"
+    shared = {"levels": (0,), "sampler": "uniform", "cases": count, "batch": 20, "seed": 4}
+    by_traci = CampaignSettings(vut="traci", vut_command=command, **shared)
+    in_process = CampaignSettings(vut=f"{tmp_path / 'law.py'}:Level0", **shared)
+    run_campaign(by_traci, tmp_path / "traci")
+    run_campaign(in_process, tmp_path / "python")
+    found = measures_of(tmp_path / "traci")
+    assert_same_to_1e9(found, measures_of(tmp_path / "python"))
+    assert sum(m["severity"] in ("contact", "conflict") for m in found) > 0
+
+
+CPP = r"""
+#include <libsumo/libtraci.h>
+#include <algorithm>
+#include <cstdlib>
+#include <iostream>
+using namespace libtraci;
+int main(int, char** argv) {
+    Simulation::init(std::atoi(argv[1]), 100, "localhost");
+    while (Simulation::getMinExpectedNumber() > 0) {
+        Simulation::step();
+        for (const std::string& id : Simulation::getDepartedIDList()) {
+            if (id == "vut") {
+                Vehicle::subscribe("vut", {libsumo::VAR_SPEED, libsumo::VAR_LANEPOSITION});
+                Vehicle::subscribeContext("vut", libsumo::CMD_GET_VEHICLE_VARIABLE, 300,
+                                          {libsumo::VAR_SPEED, libsumo::VAR_POSITION});
+                Junction::subscribeContext("M", libsumo::CMD_GET_VEHICLE_VARIABLE, 2000,
+                                           {libsumo::VAR_SPEED});
+                if (Junction::getContextSubscriptionResults("M").count("vut") != 1) return 8;
+                Vehicle::setSpeedMode("vut", 6);
+                Vehicle::setMaxSpeed("vut", 45.0);
+                if (Vehicle::getMaxSpeed("vut") != 45.0) return 9;
+                try {
+                    Vehicle::moveTo("vut", "main_out_0", 1.0);
+                    return 10;
+                } catch (const libsumo::TraCIException&) {
+                }
+            }
+        }
+        const auto ids = Vehicle::getIDList();
+        if (std::find(ids.begin(), ids.end(), "vut") == ids.end()) continue;
+        const double v = Vehicle::getSpeed("vut");
+        const double a = std::min(std::max((28.0 - v) / 0.1, 0.0), 1.0);
+        Vehicle::setSpeed("vut", v + a * 0.1);
+        try {
+            Vehicle::setSpeed("pov", 5.0);
+            return 7;
+        } catch (const libsumo::TraCIException&) {
+        }
+    }
+    Simulation::close();
+    return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def cpp_client(tmp_path_factory) -> Path:
+    """Return a controller in C++, built on the libtraci of SUMO's wheel."""
+    compiler, home = shutil.which("g++"), Path(sumo_program("sumo")).parents[1]
+    require(compiler is not None, "g++ is not on the PATH")
+    folder = tmp_path_factory.mktemp("cpp")
+    (folder / "client.cpp").write_text(CPP)
+    library = next(home.glob("lib*/libtracicpp.so"), None)
+    require(library is not None, f"SUMO's wheel has no libtracicpp.so in {home}")
+    assert library is not None
+    subprocess.run(
+        [
+            *(compiler, "-std=c++17", "-O1", str(folder / "client.cpp")),
+            *("-I", str(home / "include"), "-o", str(folder / "client"), str(library)),
+            f"-Wl,-rpath,{library.parent}",
+        ],
+        check=True,
+    )
+    return folder / "client"
+
+
+def test_a_controller_in_cpp_on_libtraci_drives_like_the_same_law_in_process(cpp_client, tmp_path):
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    cases = cases_of(20)
+    by_cpp = run_cases(factory("traci", command=f"{cpp_client} {{port}}"), cases)
+    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_cpp, by_python, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+
+
+LIBTRACI = CONTROLLER.replace("import sys, traci", "import sys\nimport libtraci as traci").replace(
+    "    traci.simulationStep()\n",
+    """    traci.simulationStep()
+    if "vut" in traci.simulation.getDepartedIDList():
+        traci.vehicle.subscribe("vut", [traci.constants.VAR_SPEED])
+        context = traci.constants.CMD_GET_VEHICLE_VARIABLE, 300.0, [traci.constants.VAR_SPEED]
+        traci.vehicle.subscribeContext("vut", *context)
+        seen = traci.vehicle.getContextSubscriptionResults("vut")["vut"]
+        assert seen == traci.vehicle.getSubscriptionResults("vut")
+        traci.vehicle.setMaxSpeed("vut", 45.0)
+        try:
+            traci.vehicle.moveTo("vut", "main_out_0", 1.0)
+            sys.exit(7)
+        except traci.TraCIException:
+            pass
+""",
+)
+
+
+def test_a_controller_on_the_package_libtraci_drives_like_the_same_law_in_process(tmp_path):
+    """Its wheels end at SUMO 1.18 and bring a libsumo of that, so it lives in another Python."""
+    interpreter = os.environ.get("LIBTRACI_PYTHON") or (
+        sys.executable if importlib.util.find_spec("libtraci") else None
+    )
+    if interpreter is None:
+        pytest.skip("libtraci is not here: set LIBTRACI_PYTHON to a Python that has it")
+    (tmp_path / "client.py").write_text(LIBTRACI)
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    cases = cases_of(20)
+    command = f"{interpreter} {tmp_path / 'client.py'} {{port}}"
+    by_libtraci = run_cases(factory("traci", command=command), cases)
+    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_libtraci, by_python, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+
+
+def test_traci_start_with_our_port_connects_to_us_and_not_to_the_sumo_it_starts(tmp_path):
+    program = tmp_path / "starts.py"
+    head = 'import sys, traci\ntraci.start(["sumo", "-n", "no.net.xml"], port=int(sys.argv[1]))'
+    program.write_text(CONTROLLER.replace("import sys, traci\ntraci.init(int(sys.argv[1]))", head))
+    trajectories = run_cases(
+        factory("traci", command=f"{sys.executable} {program} {{port}}"), cases_of(2)
+    )
+    assert [t.error for t in trajectories] == [None, None]
+
+
+EPISODES = """import sys, traci
+for _ in range({episodes}):
+    traci.init(int(sys.argv[1]))
+    traci.simulationStep()
+    while "vut" in traci.vehicle.getIDList():
+        traci.vehicle.setSpeed("vut", min(traci.vehicle.getSpeed("vut") + 0.1, 28.0))
+        traci.simulationStep()
+    traci.close()
+"""
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 10])
+def test_a_program_may_connect_for_every_episode_and_is_started_again_when_it_has_ended(
+    tmp_path, episodes
+):
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    program = tmp_path / "episodes.py"
+    head = f"open({str(tmp_path / 'started')!r}, 'a').write('.')\n"
+    program.write_text(head + EPISODES.format(episodes=episodes))
+    cases = cases_of(4)
+    command = f"{sys.executable} {program} {{port}}"
+    by_traci = run_cases(factory("traci", command=command), cases)
+    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_traci, by_python, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+    assert len((tmp_path / "started").read_text()) == -(-len(cases) // episodes)
+
+
+def descriptors() -> int:
+    gc.collect()
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def children() -> set[str]:
+    """Return the running processes whose command names our test client."""
+    found = set()
+    for status in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if b"raw_traci.py" in status.read_bytes():
+                found.add(status.parent.name)
+        except OSError:
+            continue
+    return found
+
+
+ENDS = """
+from raw_traci import Client
+Client(int(sys.argv[1])).drive(4)
+sys.exit({words!r})
+"""
+
+
+def program(misdeed: str) -> str:
+    return f"{sys.executable} {SUPPORT / 'raw_traci.py'} {{port}} '{misdeed}'"
+
+
+@pytest.mark.parametrize(
+    ("misdeed", "reason"),
+    [
+        ("exits", "the controller closed the connection; the controller ended with exit code 0"),
+        ("crashes", "ended with exit code 1: ZeroDivisionError: division by zero"),
+        LONG("is killed", "the controller was ended by signal 9"),
+        LONG("hangs", "the controller made no step within the deadline of 0.5 s"),
+        ("will not be stopped", "made no step within the deadline of 0.5 s"),
+        ("says goodbye", "the controller closed the connection during the episode"),
+        LONG("half a message", "sent half a message and no more within the deadline of 0.5 s"),
+        ("a huge message", "bytes that are no TraCI: a message of 2147483647 bytes was announced"),
+        LONG("steps to nan", "the controller stepped to time nan"),
+        ("nan", "the controller commanded vehicle.setSpeed(nan)"),
+    ],
+)
+def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(misdeed, reason):
+    before = descriptors()
+    vut = factory("traci", command=program(misdeed), deadline_s=0.5)
+    trajectories = run_cases(vut, cases_of(2))
+    for trajectory in trajectories:
+        assert trajectory.end is End.VUT_ERROR
+        assert reason in trajectory.error
+        assert len(trajectory.motion) == 4
+    assert descriptors() <= before
+    assert children() == set()
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("no-such-program {port}", "there is no program 'no-such-program'"),
+        ("'unclosed", "--vut-command cannot be read"),
+        ("", "there is no program"),
+        (f"{sys.executable} -c 'raise SystemExit(3)'", "ended with exit code 3 (before it"),
+    ],
+)
+def test_a_command_that_cannot_work_is_refused_in_a_sentence(command, said):
+    with pytest.raises(UserError, match=r"controller|--vut-command") as refused:
+        run_cases(factory("traci", command=command), cases_of(1))
+    assert said in str(refused.value)
+
+
+def test_a_command_that_never_connects_is_told_how():
+    command = f"{sys.executable} -c 'import time; time.sleep(9)'"
+    with pytest.raises(UserError, match=r"in 0\.3 s: --vut-command is told the port as {port}"):
+        run_cases(factory("traci", command=command, connect_s=0.3), cases_of(1))
+
+
+def test_the_reason_of_an_end_is_not_that_of_a_sumo_which_the_controller_started(tmp_path):
+    words = "KeyError: 64\nError: Could not access configuration 'm.sumocfg'.\nQuitting (on error)."
+    ends = tmp_path / "ends.py"
+    ends.write_text(
+        f"import sys\nsys.path.insert(0, {str(SUPPORT)!r})\n" + ENDS.format(words=words)
+    )
+    (trajectory,) = run_cases(
+        factory("traci", command=f"{sys.executable} {ends} {{port}}"), cases_of(1)
+    )
+    assert trajectory.error.endswith("the controller ended with exit code 1: KeyError: 64")
+
+
+def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):
+    for port in ("0", "70000", "x"):
+        with pytest.raises(UserError, match="the port is a number"):
+            factory(f"traci:{port}")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1:{port}"):
+            run_cases(factory(f"traci:{port}"), cases_of(1))
+    with pytest.raises(UserError, match=r"no TraCI client connected .* in 0.2 s"):
+        run_cases(factory(f"traci:{free_port()}", connect_s=0.2), cases_of(1))
+    assert "waiting up to 0.2 s for a TraCI client on 127.0.0.1:" in capfd.readouterr().err
+
+
+def test_the_server_listens_on_the_loopback_interface_only():
+    def client(port):
+        raw = Client(port)
+        inodes = Path("/proc/net/tcp").read_text().splitlines()[1:]
+        listening = [line.split() for line in inodes if line.split()[3] == "0A"]
+        raw.drive(2)
+        return [local for _, local, *_ in listening if local.endswith(f":{port:04X}")]
+
+    played = Played(client, steps=1)
+    assert played.result == [f"0100007F:{played.port:04X}"]
+
+
+class Monkey:
+    """Connects again and again, drives for a while, and does something wrong."""
+
+    def __init__(self, port: int, seed: int, misdeeds=MISDEEDS) -> None:
+        self.port, self.rng, self.misdeeds = port, random.Random(seed), misdeeds  # noqa: S311
+        self.done: list[str] = []
+        self.stopped = False
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def run(self) -> None:
+        while not self.stopped:
+            try:
+                client = Client(self.port, 1.0)
+            except OSError:
+                continue
+            with client.socket:
+                try:
+                    client.drive(self.rng.randint(0, 60))
+                    misdeed = self.rng.choice(sorted(self.misdeeds))
+                    self.done.append(misdeed)
+                    self.misdeeds[misdeed](client, self.rng)
+                except (GoneError, OSError, struct.error):
+                    continue
+
+    def stop(self) -> None:
+        self.stopped = True
+        self.thread.join()
+
+
+@pytest.mark.parametrize("count", [50, pytest.param(1000, marks=pytest.mark.long)])
+def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count):
+    before, port, deadline_s = descriptors(), free_port(), 0.2
+    monkey = Monkey(port, count)
+    cases, misdeeds, ran = cases_of(200, seed=9), 0, 0
+    try:
+        while misdeeds < count:
+            vut = factory(f"traci:{port}", deadline_s=deadline_s, connect_s=5.0)
+            trajectories = run_cases(vut, cases[: min(len(cases), count - misdeeds)])
+            for trajectory in trajectories:
+                assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
+                assert trajectory.error != ""
+            ran += len(trajectories)
+            misdeeds += sum(t.end is End.VUT_ERROR for t in trajectories)
+    finally:
+        monkey.stop()
+    assert len(set(monkey.done)) > min(count, len(MISDEEDS)) // 2
+    assert descriptors() <= before
+
+
+class Recorder:
+    """A client's socket that remembers what was sent."""
+
+    def __init__(self, real: socket.socket) -> None:
+        self.real = real
+        self.sent: list[bytes] = []
+
+    def send(self, content: bytes) -> int:
+        self.sent.append(bytes(content))
+        return self.real.send(content)
+
+    def __getattr__(self, name: str):
+        return getattr(self.real, name)
+
+
+def recorded_session() -> list[bytes]:
+    """Return the messages of a stock client that reads, subscribes and drives."""
+
+    def drive(c):
+        c._socket = recorder = Recorder(c._socket)
+        c.simulation.subscribe([traci.constants.VAR_DEPARTED_VEHICLES_IDS])
+        c.simulationStep()
+        c.vehicle.subscribe("vut", [traci.constants.VAR_SPEED])
+        domain = traci.constants.CMD_GET_VEHICLE_VARIABLE
+        c.vehicle.subscribeContext("vut", domain, 300.0, [traci.constants.VAR_POSITION])
+        c.vehicle.setSpeedMode("vut", 0)
+        c.vehicle.getLeader("vut", 100.0)
+        c.lane.getShape("main_out_0")
+        c.vehicle.slowDown("vut", 19.0, 1.0)
+        c.vehicle.setAcceleration("vut", 1.0, 0.5)
+        c.vehicle.setSpeed("vut", 18.1)
+        c.vehicle.setColor("vut", (1, 2, 3, 4))
+        c.simulationStep(c.simulation.getTime() + 0.2)
+        return recorder.sent
+
+    return Played(stock(drive), steps=4).result
+
+
+def mutated(message: bytes, rng: random.Random) -> bytes:
+    """Return a message with bytes changed, taken out, put in, or with another length."""
+    content = bytearray(message)
+    for _ in range(rng.randint(1, 4)):
+        at = rng.randrange(len(content))
+        match rng.randrange(5):
+            case 0:
+                content[at] = rng.randrange(256)
+            case 1:
+                content[at] ^= 1 << rng.randrange(8)
+            case 2:
+                del content[at : at + rng.randint(1, 8)]
+                content = content or bytearray(b"\0")
+            case 3:
+                content[at:at] = rng.randbytes(rng.randint(1, 8))
+            case 4:
+                length = rng.choice((-1, 0, 3, 1 << 20, 1 << 24, 2**31 - 1, -(2**31)))
+                content[at : at + 4] = struct.pack("!i", length)
+    if rng.random() < 0.7:  # else the length is wrong, too, and nothing behind it is looked at
+        content[:4] = struct.pack("!i", max(len(content), 4))
+    return bytes(content)
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(2000, marks=pytest.mark.long)])
+def test_of_mutated_messages_of_a_session_every_case_has_its_verdict_or_its_reason(count):
+    session = recorded_session()
+    assert len(session) > 10
+
+    def misbehave(client, rng):
+        client.socket.sendall(mutated(rng.choice(session), rng))
+        client.read(1)
+
+    before, port, ran = descriptors(), free_port(), 0
+    monkey = Monkey(port, count, {"mutated": misbehave})
+    cases = cases_of(50, seed=9)
+    try:
+        while len(monkey.done) < count:
+            vut = factory(f"traci:{port}", deadline_s=0.1, connect_s=5.0)
+            for trajectory in run_cases(vut, cases):
+                assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
+                assert trajectory.error is None or trajectory.error.startswith("the controller ")
+                ran += 1
+    finally:
+        monkey.stop()
+    assert ran >= count // 2
+    assert descriptors() <= before
+
+
+def bytewise(pause_s: float):
+    """Return a client that sends its messages byte by byte, and what it does at last."""
+
+    def client(port):
+        slow = Client(port)
+        content = command(STEP, bytes(8))
+        message = struct.pack("!i", len(content) + 4) + content
+        with suppress(GoneError, OSError):
+            for _ in range(4):
+                for byte in message:
+                    slow.socket.sendall(bytes((byte,)))
+                    time.sleep(pause_s)
+                slow.read(struct.unpack("!i", slow.read(4))[0] - 4)
+
+    return client
+
+
+def test_who_writes_slowly_has_until_the_deadline():
+    assert Played(bytewise(0.0), steps=3).reasons == [None]
+    (reason,) = Played(bytewise(0.1), steps=3, deadline_s=0.5).reasons
+    assert reason == "the controller sent half a message and no more within the deadline of 0.5 s"
+
+
+def test_who_asks_and_asks_and_makes_no_step_has_until_the_deadline():
+    def client(port):
+        curious = Client(port)
+        curious.step()
+        with suppress(GoneError):
+            while True:
+                curious.speed()
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason.endswith("within the deadline of 0.3 s")
+
+
+def test_who_asks_very_much_at_a_time_is_answered_or_dropped():
+    def client(port):
+        greedy = Client(port)
+        greedy.step()
+        ask = command(GET_LANE, bytes((0,)) + text(""))
+        with suppress(GoneError):
+            greedy.send(*[ask] * ((1 << 20) // len(ask) - 1))
+            greedy.socket.settimeout(20.0)
+            greedy.read(10_000_000)
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason is not None
+
+
+def test_of_two_clients_the_second_waits_and_changes_nothing():
+    def client(port):
+        first = Client(port)
+        first.step()
+        second = Client(port)
+        with suppress(GoneError):
+            second.send(command(STEP, bytes(8)))
+        with suppress(GoneError):
+            first.drive(10)
+
+    def alone(port):
+        first = Client(port)
+        first.step()
+        with suppress(GoneError):
+            first.drive(10)
+
+    both, one = (Played(c, steps=8) for c in (client, alone))
+    assert both.reasons == one.reasons == [None]
+    assert both.speeds == one.speeds
+
+
+def test_who_waits_for_a_second_client_of_its_own_is_told_that_one_is_served():
+    def client(port):
+        first = Client(port)
+        first.step()
+        second = Client(port)
+        with suppress(GoneError):
+            second.step()  # as a second connection does that is made before the first step
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason == (
+        "the controller made no step within the deadline of 0.3 s; another client waits, but one "
+        "at a time is served"
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", some(range(3), 0))
+def test_a_storm_of_connections_ends_with_a_verdict_or_a_reason_for_every_case(seed):
+    before, port = descriptors(), free_port()
+    stopped = threading.Event()
+    rng = random.Random(seed)  # noqa: S311
+
+    def storm():
+        while not stopped.is_set():
+            crowd = []
+            for _ in range(200):
+                with suppress(OSError):
+                    one = socket.socket()
+                    crowd.append(one)
+                    one.setblocking(False)
+                    with suppress(BlockingIOError):
+                        one.connect(("127.0.0.1", port))
+            time.sleep(0.1)
+            rng.shuffle(crowd)
+            for one in crowd:
+                with suppress(OSError):
+                    one.send(rng.randbytes(20))
+                one.close()
+
+    storming = threading.Thread(target=storm)
+    monkey = Monkey(port, seed, {"none": lambda c, r: c.drive(10_000)})
+    storming.start()
+    try:
+        for trajectory in run_cases(
+            factory(f"traci:{port}", deadline_s=0.2, connect_s=5.0), cases_of(50)
+        ):
+            assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
+    finally:
+        stopped.set()
+        storming.join()
+        monkey.stop()
+    assert descriptors() <= before

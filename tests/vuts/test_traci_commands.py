@@ -1,0 +1,350 @@
+"""What a TraCI client commands, and what SUMO does with the same commands on an open road."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import struct
+import warnings
+
+import pytest
+import traci
+from traci_pair import Drive
+
+from merge_sumo.sumo.traci_names import DUMMIES, named
+from merge_sumo.values.scenario import US23
+from merge_sumo.vuts.traci.calls import Kind, NotFiniteError, kind_of
+from merge_sumo.vuts.traci.session import ASKS
+
+V, T = "vehicle", "vehicletype"
+SCRIPTS: dict[str, list[tuple]] = {
+    "a limit of acceleration": [(0, V, "setAccel", 1.0), (0, V, "setSpeed", 19.0)],
+    "a limit of deceleration": [(0, V, "setDecel", 1.0), (0, V, "setSpeed", 17.0)],
+    "limits above the scenario's": [
+        (0, V, "setAccel", 1.5),
+        (1, V, "setDecel", 3.5),
+        (1, V, "setSpeed", 20.0),
+        (5, V, "setSpeed", 12.0),
+    ],
+    "a maximum speed below": [(0, V, "setMaxSpeed", 17.0), (4, V, "setSpeed", 19.0)],
+    "a maximum speed above, and lifted": [
+        (0, V, "setMaxSpeed", 18.1),
+        (0, V, "setSpeed", 25.0),
+        (5, V, "setMaxSpeed", 40.0),
+    ],
+    "all three": [
+        (0, V, "setAccel", 0.7),
+        (0, V, "setDecel", 1.3),
+        (0, V, "setMaxSpeed", 18.5),
+        (0, V, "setSpeed", 30.0),
+        (8, V, "setSpeed", 10.0),
+        (12, V, "setMaxSpeed", 17.9),
+    ],
+    "slowing down within a limit": [(0, V, "setDecel", 2.5), (0, V, "slowDown", 16.0, 1.5)],
+    "slowing down beyond a limit": [(0, V, "setDecel", 0.5), (0, V, "slowDown", 17.0, 1.5)],
+    "speeding up beyond a limit": [(0, V, "setAccel", 0.5), (0, V, "slowDown", 20.0, 1.5)],
+    "an acceleration beyond a limit": [
+        (0, V, "setAccel", 0.5),
+        (0, V, "setAcceleration", 1.0, 1.5),
+    ],
+    "an acceleration after another": [
+        (0, V, "setAcceleration", 1.0, 0.5),
+        (3, V, "setAcceleration", -2.0, 1.5),
+    ],
+    "no limits in mode 0": [
+        (0, V, "setAccel", 0.5),
+        (0, V, "setDecel", 0.5),
+        (0, V, "setMaxSpeed", 18.0),
+        (0, V, "setSpeedMode", 0),
+        (0, V, "setSpeed", 18.2),
+        (4, V, "setSpeed", 17.9),
+    ],
+    "one limit in mode 4": [
+        (0, V, "setAccel", 0.5),
+        (0, V, "setDecel", 0.5),
+        (0, V, "setSpeedMode", 4),
+        (0, V, "setSpeed", 18.2),
+        (4, V, "setSpeed", 17.9),
+    ],
+    "numbers of the car-following model": [
+        (0, V, "setTau", 3.0),
+        (0, V, "setMinGap", 9.0),
+        (0, V, "setImperfection", 0.5),
+        (0, V, "setApparentDecel", 2.0),
+        (0, V, "setEmergencyDecel", 9.0),
+        (0, V, "setSpeedFactor", 0.3),
+        (1, V, "setSpeed", 18.3),
+    ],
+    "limits of the type": [
+        (0, T, "setMaxSpeed", 18.4),
+        (0, T, "setAccel", 0.8),
+        (0, T, "setDecel", 0.9),
+        (1, V, "setSpeed", 25.0),
+        (9, V, "setSpeed", 10.0),
+    ],
+    "limits of the type behind its own": [
+        (0, T, "setAccel", 0.8),
+        (0, V, "setDecel", 1.1),
+        (1, T, "setAccel", 0.1),
+        (1, T, "setDecel", 0.1),
+        (1, V, "setSpeed", 25.0),
+        (7, V, "setSpeed", 10.0),
+    ],
+    "a factor of speed leaves it its type": [
+        (0, V, "setSpeedFactor", 0.5),
+        (1, T, "setAccel", 0.4),
+        (1, V, "setSpeed", 25.0),
+    ],
+}
+READS = (
+    *("getMaxSpeed", "getAccel", "getDecel", "getEmergencyDecel", "getApparentDecel", "getTau"),
+    *("getMinGap", "getImperfection", "getSpeedFactor", "getAllowedSpeed", "getTypeID"),
+    *("getSpeedMode", "getLaneChangeMode", "getSpeed", "getColor"),
+)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    made = Drive(tmp_path_factory.mktemp("drive"))
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_the_speeds_and_the_answers_that_follow_are_those_of_sumo(drive, name):
+    drive.begin()
+    for step in range(14):
+        for at, domain, function, *values in SCRIPTS[name]:
+            if at == step:
+                drive.both(
+                    lambda c, d=domain, f=function, v=values: getattr(getattr(c, d), f)("vut", *v)
+                )
+        drive.step()
+        ours, real = drive.speeds()
+        assert ours == pytest.approx(real, abs=1e-9), step
+    for question in READS:
+        ours, real = drive.both(lambda c, q=question: getattr(c.vehicle, q)("vut"))
+        assert ours == pytest.approx(real, abs=1e-9) if isinstance(real, float) else ours == real
+    for question in ("getMaxSpeed", "getAccel", "getDecel", "getTau"):
+        ours, real = drive.both(lambda c, q=question: getattr(c.vehicletype, q)("vut"))
+        assert ours == real
+
+
+@pytest.mark.parametrize("value", [-1.0, float("inf")])
+@pytest.mark.parametrize(
+    "function",
+    [
+        *("setMaxSpeed", "setAccel", "setDecel", "setEmergencyDecel", "setApparentDecel"),
+        *("setTau", "setMinGap", "setImperfection"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused_as_by_sumo(drive, function, value):
+    drive.begin()
+
+    def refused(c):
+        with pytest.raises(traci.TraCIException) as error:
+            getattr(c.vehicle, function)("vut", value)
+        return str(error.value)
+
+    ours, real = drive.both(refused)
+    assert ours == real
+    drive.both(lambda c: c.vehicle.setSpeed("vut", 18.1))
+    drive.step()
+    assert drive.speeds() == pytest.approx((18.1, 18.1))
+
+
+class TestWhatWasSet:
+    def test_is_gone_with_the_vehicle_and_that_of_its_type_stays(self, drive):
+        drive.begin()
+        c = drive.ours
+        c.vehicle.setAccel("vut", 0.5)
+        c.vehicletype.setMaxSpeed("vut", 18.1)
+        drive.again()
+        assert c.vehicle.getAccel("vut") == 2.0
+        assert c.vehicle.getMaxSpeed("vut") == 18.1
+        c.vehicle.setSpeed("vut", 30.0)
+        drive.step()
+        assert drive.speeds()[0] == pytest.approx(18.1)
+
+    def test_is_known_to_a_sumo_that_is_asked_later(self, drive):
+        drive.begin()
+        follow = []
+        for tau_s in (1.0, 3.0):
+            drive.ours.vehicle.setTau("vut", tau_s)
+            follow.append(drive.ours.vehicle.getFollowSpeed("vut", 18.0, 30.0, 10.0, 4.0))
+        assert follow[0] > follow[1] + 1.0
+
+    def test_of_the_gap_counts_in_the_distance_to_the_leader_as_in_sumo(self, drive):
+        drive.begin()
+        drive.place([60.0, 20.0], [20.0, 18.0])
+        assert drive.ours.vehicle.getLeader("vut", 100.0) == ("pov", pytest.approx(35.0))
+        drive.ours.vehicle.setMinGap("vut", 1.5)
+        assert drive.ours.vehicle.getLeader("vut", 100.0) == ("pov", pytest.approx(33.5))
+
+    def test_of_looks_and_parameters_can_be_read_back(self, drive):
+        drive.begin()
+        c = drive.ours
+        assert c.vehicle.getColor("vut") == (26, 89, 230, 255)
+        c.vehicle.setColor("vut", (1, 2, 3, 4))
+        c.vehicle.setParameter("vut", "mine", "7")
+        c.vehicle.setSpeedMode("vut", 31)
+        c.vehicle.setLaneChangeMode("vut", 512)
+        assert c.vehicle.getColor("vut") == (1, 2, 3, 4)
+        assert c.vehicle.getParameter("vut", "mine") == "7"
+        assert c.vehicle.getSpeedMode("vut") == 31
+        assert c.vehicle.getLaneChangeMode("vut") == 512
+
+
+class TestWhatSumoDecides:
+    """What the emulation of commands could not do: SUMO's own models drive the VUT."""
+
+    FOLLOWS = (
+        ("car-following in mode 31", ("setSpeedMode", 31), ("setSpeed", -1.0)),
+        ("a headway", ("setSpeedMode", 31), ("setTau", 3.0), ("setSpeed", -1.0)),
+        ("a gap that is opened", ("openGap", 3.0, 30.0, 5.0, 1.0), ("setSpeed", -1.0)),
+        ("a stop", ("setStop", "main_out", 60.0, 0, 2.0), ("setSpeed", -1.0)),
+        ("an acceleration that runs out", ("setAcceleration", 1.0, 0.3)),
+        ("slowing down that runs out", ("slowDown", 17.0, 0.5)),
+    )
+
+    @pytest.mark.parametrize(("name", "commands"), [(n, c) for n, *c in FOLLOWS])
+    def test_moves_the_vut_as_the_same_commands_move_a_car_of_sumo(self, drive, name, commands):
+        """What differs is eq. (4), which moves by the speed before the step."""
+        drive.begin((-900.0, 1.0))
+        for function, *values in commands:
+            drive.both(lambda c, f=function, v=values: getattr(c.vehicle, f)("vut", *v))
+        apart = []
+        for _ in range(60):
+            drive.step()
+            ours, real = drive.speeds()
+            apart.append(abs(ours - real))
+        # A stop ends a step sooner or later.
+        assert max(apart) < (2.0 if name == "a stop" else 0.4)
+        assert ours != pytest.approx(18.0, abs=1e-3)
+
+    def test_is_said_in_no_note(self, drive):
+        drive.begin()
+        drive.ours.vehicle.setSpeedMode("vut", 31)
+        drive.ours.vehicle.setTau("vut", 2.0)
+        drive.ours.vehicle.setSpeed("vut", -1.0)
+        assert drive.session.notes == []
+
+    def test_stops_before_a_car_that_stands(self, drive):
+        drive.begin()
+        drive.place([100.0, 10.0], [0.0, 18.0])
+        drive.ours.vehicle.setSpeedMode("vut", 31)
+        drive.ours.vehicle.setSpeed("vut", -1.0)
+        for _ in range(120):
+            drive.step()
+        assert drive.v_mps[1] == pytest.approx(0.0, abs=0.1)
+        assert 0.0 < drive.x_m[0] - US23.pov_length_m - drive.x_m[1] < 5.0
+
+
+def test_what_can_change_nothing_here_is_noted_once(drive):
+    drive.begin()
+    for _ in range(2):
+        drive.ours.vehicle.changeLane("vut", 0, 1.0)
+    assert drive.session.notes == [
+        "vehicle.changeLane or vehicle.changeLaneRelative is accepted and changes nothing here"
+    ]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("function", ["setSpeed", "slowDown", "setAcceleration"])
+def test_a_speed_that_is_no_number_is_a_fault(drive, function, value):
+    drive.begin()
+    values = (value,) if function == "setSpeed" else (value, 1.0)
+    with pytest.raises(NotFiniteError, match=rf"vehicle\.{function}\("):
+        getattr(drive.ours.vehicle, function)("vut", *values)
+
+
+@pytest.mark.parametrize(
+    ("domain", "function", "arguments", "reason"),
+    [
+        ("vehicle", "setPreviousSpeed", ("vut", 10.0), "as the scenario says"),
+        ("vehicle", "add", ("new", "route.vut"), "as the scenario says"),
+        ("vehicle", "moveTo", ("vut", "main_out_0", 5.0), "as the scenario says"),
+        ("vehicle", "remove", ("vut",), "as the scenario says"),
+        ("vehicle", "setRoute", ("vut", ["ramp"]), "the route is the scenario's"),
+        ("vehicle", "setActionStepLength", ("vut", 1.0), "the VUT acts in every step of 0.1 s"),
+        ("vehicle", "setLength", ("vut", 1.0), "what the vehicles are is the scenario's"),
+        ("vehicle", "setTau", ("pov", 1.0), "the vehicle 'pov' is not the controller's to command"),
+        ("vehicle", "openGap", ("pov", 1.0, 1.0, 1.0, 1.0), "the vehicle 'pov' is not the"),
+        ("vehicle", "setStop", ("pov", "main_out"), "the vehicle 'pov' is not the controller's"),
+        ("vehicletype", "setTau", ("pov", 1.0), "the type 'pov' is not the controller's"),
+        ("vehicletype", "copy", ("vut", "other"), "what the vehicles are is the scenario's"),
+        ("edge", "setMaxSpeed", ("ramp", 5.0), "the road is the scenario's"),
+        ("simulation", "saveState", ("x.xml",), "the campaign runs the simulation"),
+        ("simulation", "loadState", ("x.xml",), "the campaign runs the simulation"),
+        ("simulation", "writeMessage", ("x",), "the campaign runs the simulation"),
+        ("calibrator", "setFlow", ("c", 0.0, 1.0, 1.0, 1.0, "t", "r"), "none of that kind here"),
+    ],
+)
+def test_what_is_refused_is_named_with_its_reason(drive, domain, function, arguments, reason):
+    drive.begin()
+    with pytest.raises(traci.TraCIException) as error:
+        getattr(getattr(drive.ours, domain), function)(*arguments)
+    assert reason in str(error.value)
+    assert "'" in reason or f"{domain}." in str(error.value)
+    assert drive.ours.vehicle.getSpeed("vut") == 18.0
+
+
+@pytest.mark.parametrize("key", ["has.ssm.device", "device.ssm.file", "device.toc.file"])
+@pytest.mark.parametrize("domain", ["vehicle", "vehicletype"])
+def test_devices_that_would_write_files_are_refused(drive, domain, key, tmp_path):
+    drive.begin()
+    with pytest.raises(traci.TraCIException, match="gives vehicles no devices"):
+        getattr(drive.ours, domain).setParameter("vut", key, str(tmp_path / "written"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def commanded(connection, function: str) -> str | None:
+    """Return what is said to a command of the client on "vut"; None where it takes no dummies."""
+    domain, _, name = function.partition(".")
+    call = getattr(getattr(connection, domain), name)
+    parameters = inspect.signature(call).parameters.values()
+    needed = sum(p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters)
+    off = {p.name: False for p in parameters if p.default is True}
+    for dummy in DUMMIES:
+        try:
+            call(*["vut", *[dummy] * (needed - 1)][:needed], **off)
+        except traci.TraCIException as error:
+            return str(error)
+        except (TypeError, ValueError, LookupError, AttributeError, struct.error):
+            connection._string, connection._queue = b"", []
+        else:
+            return ""
+    return None
+
+
+def test_every_command_that_the_client_has_goes_to_sumo_or_changes_nothing_or_is_refused(drive):
+    """No command but those on the VUT and its type reaches SUMO, and none moves the VUT away."""
+    kinds = {f: kind_of(n.functions) for n in named().values() for f in n.functions}
+    functions = [f for n in named().values() if n.command not in ASKS for f in n.functions]
+    tried, called = 0, []
+    for function in functions:
+        drive.begin()
+        sumo = drive.session.sumo
+        call = sumo.call
+
+        def noted(name, *arguments, call=call):
+            called.append((name, arguments[0]))
+            return call(name, *arguments)
+
+        with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
+            warnings.simplefilter("ignore")
+            patch.setattr(sumo, "call", noted)
+            said = commanded(drive.ours, function)
+        if said is None:
+            continue
+        tried += 1
+        if kinds[function] is Kind.REFUSED:
+            assert said.startswith("merge-sumo does not carry out ")
+            assert function in said
+        elif kinds[function] is Kind.NOTHING:
+            assert said == "", function
+        assert drive.ours.vehicle.getLanePosition("vut") == pytest.approx(425.0 - 182.0)
+    assert tried > 200
+    assert {name.partition(".")[0] for name, _ in called} <= {"vehicle", "vehicletype"}
+    assert {object_id for _, object_id in called} == {"vut"}
+    assert not any(kinds[name] is not Kind.CARRIED_OUT for name, _ in called)

@@ -1,0 +1,520 @@
+"""Who may drive the VUT by TraCI: the controller, and nobody else on the machine."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import os
+import pwd
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import traci
+from conftest import require, some
+from processes import none_left, ports_of
+from raw_traci import Client, GoneError
+from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+
+from merge_sumo.errors import UserError
+from merge_sumo.system import landlock
+from merge_sumo.values.trajectory import End
+from merge_sumo.vuts.process import TOKEN_VARIABLE
+from merge_sumo.vuts.traci import peer as traci_peer
+from merge_sumo.vuts.traci.peer import TOKEN_KEY, descends, owner_of
+
+SUPPORT = Path(__file__).parents[1] / "support"
+RAW = SUPPORT / "raw_traci.py"
+OURS = f"{sys.executable} {RAW} {{port}}"
+CAMPAIGN = sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", "traci"
+GIVES = (
+    "import sys, traci\n"
+    "traci.init(int(sys.argv[1]), numRetries=600)\n"
+    f"traci.simulation.setParameter('', '{TOKEN_KEY}', sys.argv[2])\n"
+    "while traci.simulation.getMinExpectedNumber() > 0:\n"
+    "    traci.simulationStep()\n"
+    "    if 'vut' in traci.vehicle.getIDList():\n"
+    "        traci.vehicle.setSpeed('vut', min(traci.vehicle.getSpeed('vut') + 0.1, 28.0))\n"
+    "traci.close()\n"
+)
+"""A stock client that gives a token first; its law is that of level 0."""
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@contextmanager
+def strangers(port: int, behave, count: int = 3):
+    """Let threads of this process connect again and again; it is no program of --vut-command."""
+    stopped = threading.Event()
+    served: list[bool] = []
+
+    def come() -> None:
+        while not stopped.is_set():
+            with suppress(OSError, GoneError):
+                client = Client(port, 0.5)
+                client.socket.settimeout(0.5)
+                with client.socket:
+                    served.append(bool(behave(client)))
+            time.sleep(0.01)
+
+    threads = [threading.Thread(target=come) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield served
+    finally:
+        stopped.set()
+        for thread in threads:
+            thread.join()
+
+
+def drives(client: Client) -> bool:
+    client.drive(3)
+    return True
+
+
+STRANGERS = {
+    "drives": drives,
+    "says nothing": lambda c: c.read(1),
+    "writes slowly": lambda c: slowly(c),  # noqa: PLW0108 (it stands below)
+    "sends garbage": lambda c: c.socket.sendall(os.urandom(200)) or c.read(1),
+    "announces much": lambda c: c.socket.sendall(b"\x7f\xff\xff\xff") or c.read(1),
+    "asks for the version for ever": lambda c: [c.ask(b"\x02\x00") for _ in range(100_000)],
+    "guesses a token": lambda c: guess(c),  # noqa: PLW0108 (it stands below)
+    "closes": lambda c: None,
+}
+
+
+def slowly(client: Client) -> None:
+    for _ in range(4):
+        client.socket.send(b"\0")
+        time.sleep(0.1)
+
+
+def guess(client: Client) -> None:
+    stock = traci.connection.Connection.__new__(traci.connection.Connection)
+    pair = stock._pack("tss", 2, TOKEN_KEY, "0" * 32)
+    payload = b"\x7e" + b"\0\0\0\0" + pair
+    client.ask(bytes((0, *(len(payload) + 6).to_bytes(4), 0xCB)) + payload)
+    client.step()
+
+
+class TestAProgram:
+    @pytest.mark.parametrize("name", some(STRANGERS, "drives", "guesses a token"))
+    def test_is_served_whoever_of_the_same_user_connects_besides(self, name, tmp_path):
+        port = free_port()
+        (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+        log = tmp_path / "controller.log"
+        cases = cases_of(2)
+        with strangers(port, STRANGERS[name]) as served:
+            by_traci = run_cases(factory(f"traci:{port}", command=OURS, log=log), cases)
+        by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
+        for one, other in zip(by_traci, by_python, strict=True):
+            assert one.error is None
+            assert one.motion == pytest.approx(other.motion, abs=1e-9)
+        assert not any(served)
+        if name == "drives":
+            assert "a process that --vut-command did not start connected" in log.read_text()
+
+    def test_may_have_a_child_that_connects(self):
+        command = f"sh -c '{sys.executable} {RAW} {{port}} & wait'"
+        (trajectory,) = run_cases(factory("traci", command=command), cases_of(1))
+        assert trajectory.error is None
+
+    def test_may_have_a_child_in_a_session_of_its_own(self):
+        command = f"sh -c 'setsid {sys.executable} {RAW} {{port}} & wait'"
+        (trajectory,) = run_cases(factory("traci", command=command), cases_of(1))
+        assert trajectory.error is None
+
+    def test_that_ends_while_its_client_goes_on_is_an_error_of_every_case(self, tmp_path):
+        program = tmp_path / "leaves.py"
+        program.write_text(
+            "import os, sys, time\n"
+            f"sys.path.insert(0, {str(SUPPORT)!r})\n"
+            "from raw_traci import Client\n"
+            "client = Client(int(sys.argv[1]))\n"
+            "client.step()\n"
+            "if os.fork():\n"
+            "    os._exit(0)\n"
+            "client.drive(10_000)\n"
+        )
+        command = f"{sys.executable} {program} {{port}}"
+        with none_left():
+            trajectories = run_cases(factory("traci", command=command), cases_of(3))
+        for trajectory in trajectories:
+            assert trajectory.end is End.VUT_ERROR
+            assert "ended with exit code 0, and its connection goes on" in trajectory.error
+
+    def test_is_told_a_token_by_which_another_process_is_served(self, tmp_path):
+        """As one in a container is, which is no child of `docker run`."""
+        port, file = free_port(), tmp_path / "token"
+        (tmp_path / "gives.py").write_text(GIVES)
+        tells = (
+            f"import os, time; open('{file}.new', 'w').write(os.environ['{TOKEN_VARIABLE}']); "
+            f"os.rename('{file}.new', '{file}'); time.sleep(600)"
+        )
+        command = f'{sys.executable} -c "{tells}"'
+        ran = []
+
+        def outside() -> None:
+            while not file.exists():
+                time.sleep(0.02)
+            program = [sys.executable, tmp_path / "gives.py", str(port), file.read_text()]
+            ran.append(subprocess.run(program, check=False).returncode)
+
+        thread = threading.Thread(target=outside)
+        thread.start()
+        trajectories = run_cases(factory(f"traci:{port}", command=command), cases_of(2))
+        thread.join()
+        assert [t.error for t in trajectories] == [None, None]
+        assert ran == [0]
+
+    @pytest.mark.parametrize("campaign", ["that ends", "that is late"])
+    def test_that_we_end_leaves_no_traceback(self, campaign, tmp_path):
+        log, program = tmp_path / "controller.log", tmp_path / "for_ever.py"
+        late = "    if 'vut' in traci.vehicle.getIDList(): time.sleep(600)\n"
+        program.write_text(
+            "import sys, time, traci\n"
+            "traci.init(int(sys.argv[1]))\n"
+            "print('begun', flush=True)\n"
+            "while True:\n"
+            "    traci.simulationStep()\n" + (late if campaign == "that is late" else "")
+        )
+        command = f"{sys.executable} {program} {{port}}"
+        vut = factory("traci", command=command, log=log, deadline_s=1.0)
+        (trajectory,) = run_cases(vut, cases_of(1))
+        assert (trajectory.error is None) == (campaign == "that ends")
+        assert "begun" in log.read_text()
+        assert "Traceback" not in log.read_text()
+
+
+class TestWithoutACommand:
+    def test_a_client_gives_the_token_where_one_is_asked_for(self, tmp_path, monkeypatch):
+        monkeypatch.setenv(TOKEN_VARIABLE, "mine alone")
+        port = free_port()
+        (tmp_path / "gives.py").write_text(GIVES)
+        client = subprocess.Popen([sys.executable, tmp_path / "gives.py", str(port), "mine alone"])
+        with strangers(port, drives) as served:
+            trajectories = run_cases(factory(f"traci:{port}", connect_s=20.0), cases_of(2))
+        assert client.wait(20) == 0
+        assert [t.error for t in trajectories] == [None, None]
+        assert not any(served)
+
+    def test_no_other_is_served_then(self, monkeypatch):
+        monkeypatch.setenv(TOKEN_VARIABLE, "mine alone")
+        port = free_port()
+        with (
+            strangers(port, STRANGERS["guesses a token"]) as served,
+            pytest.raises(UserError, match="no TraCI client connected"),
+        ):
+            run_cases(factory(f"traci:{port}", connect_s=1.0), cases_of(1))
+        assert not any(served)
+
+
+class TestAnotherUser:
+    """A second account of this machine; it needs root to become one."""
+
+    @pytest.fixture
+    def nobody(self) -> int:
+        require(hasattr(os, "geteuid") and os.geteuid() == 0, "needs root to be another user")
+        require(os.access(sys.executable, os.X_OK), "needs a Python that others may run")
+        return pwd.getpwnam("nobody").pw_uid
+
+    @staticmethod
+    def as_other(user: int, port: int) -> subprocess.Popen[bytes]:
+        """Drive as another user, who knows of nothing but the port."""
+        code = "import sys; exec(sys.stdin.read())"
+        source = RAW.read_text().rpartition("\nif __name__")[0]
+        process = subprocess.Popen(
+            ["/usr/bin/env", "python3", "-c", code],
+            user=user,
+            group=user,
+            extra_groups=(),
+            cwd="/",
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={"PATH": "/usr/local/bin:/usr/bin:/bin"},
+        )
+        drive = (
+            "\nwhile True:\n"
+            "    try:\n"
+            f"        Client({port}, 0.2).drive(5)\n"
+            "        print('drove', flush=True)\n"
+            "    except (OSError, GoneError):\n"
+            "        time.sleep(0.01)\n"
+        )
+        process.stdin.write((source + drive).encode())
+        process.stdin.close()
+        return process
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("given", ["a command", "no command"])
+    def test_is_refused_and_changes_no_case(self, nobody, given, tmp_path):
+        port, log = free_port(), tmp_path / "controller.log"
+        other = self.as_other(nobody, port)
+        mine = None
+        try:
+            time.sleep(1.0)
+            assert other.poll() is None, "it goes on trying"
+            if given == "no command":
+                mine = subprocess.Popen(
+                    [sys.executable, "-c", f"import time; time.sleep(2)\n{self.later(port)}"]
+                )
+            options = {"command": OURS} if given == "a command" else {}
+            vut = factory(f"traci:{port}", log=log, connect_s=20.0, **options)
+            trajectories = run_cases(vut, cases_of(5))
+        finally:
+            other.kill()
+            drove = other.stdout.read()
+            if mine is not None:
+                mine.kill()
+                mine.wait()
+        assert [t.error for t in trajectories] == [None] * 5
+        assert drove == b""
+        assert f"a process of the user {nobody} connected" in log.read_text()
+
+    @staticmethod
+    def later(port: int) -> str:
+        return (
+            f"import runpy, sys; sys.argv = ['x', '{port}']\n"
+            f"runpy.run_path({str(RAW)!r}, run_name='__main__')"
+        )
+
+
+def test_the_sumo_that_a_controller_asks_has_no_port(tmp_path):
+    """Of all sockets by TCP or UDP, its process has the client's connection alone."""
+    port, seen, stopped = free_port(), list[list[str]](), threading.Event()
+    asks = tmp_path / "asks.py"
+    asks.write_text(
+        "import sys, time, traci\n"
+        "traci.init(int(sys.argv[1]))\n"
+        "while traci.simulation.getMinExpectedNumber() > 0:\n"
+        "    traci.simulationStep()\n"
+        "    if 'vut' in traci.vehicle.getIDList():\n"
+        "        traci.vehicle.getNextLinks('vut')\n"
+        "        time.sleep(0.02)\n"
+        "traci.close()\n"
+    )
+
+    def look() -> None:
+        while not stopped.is_set():
+            for process in shadows():
+                with suppress(OSError):
+                    seen.append(ports_of(process))
+            time.sleep(0.02)
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        command = f"{sys.executable} {asks} {{port}}"
+        (trajectory,) = run_cases(factory(f"traci:{port}", command=command), cases_of(1))
+    finally:
+        stopped.set()
+        thread.join()
+    assert trajectory.error is None
+    assert {tuple(found) for found in seen} == {(), (f"0100007F:{port:04X}",)}
+
+
+@pytest.mark.skipif(not traci_peer.KNOWN_HERE, reason="needs /proc/net/tcp")
+class TestWhoseAConnectionIs:
+    @pytest.mark.parametrize(
+        ("family", "address"),
+        [
+            (socket.AF_INET, "127.0.0.1"),
+            (socket.AF_INET, "127.0.0.2"),
+            (socket.AF_INET6, "::ffff:127.0.0.1"),
+        ],
+    )
+    def test_is_known_by_user_and_process(self, family, address):
+        with socket.socket() as listener, socket.socket(family) as client:
+            listener.bind(("127.0.0.1", 0))
+            listener.listen()
+            if address == "127.0.0.2":
+                client.bind((address, 0))
+                address = "127.0.0.1"
+            client.connect((address, listener.getsockname()[1]))
+            with listener.accept()[0] as connection:
+                user, inode = owner_of(connection)
+                assert user == os.geteuid()
+                assert inode == os.fstat(client.fileno()).st_ino
+                assert descends(inode, os.getpid())
+                waits = [sys.executable, "-c", "input()"]
+                with subprocess.Popen(waits, stdin=subprocess.PIPE) as other:
+                    assert not descends(inode, other.pid)
+                    other.kill()
+
+    def test_is_unknown_when_it_is_gone(self):
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            with socket.create_connection(listener.getsockname()):
+                connection = listener.accept()[0]
+            with connection:
+                assert owner_of(connection) is None
+
+    def test_is_asked_where_the_system_does_not_say_by_the_token_alone(self, monkeypatch):
+        monkeypatch.setattr("merge_sumo.vuts.traci.door.KNOWN_HERE", False)
+        (trajectory,) = run_cases(factory("traci", command=OURS), cases_of(1))
+        assert trajectory.error is None
+        monkeypatch.setenv(TOKEN_VARIABLE, "mine alone")
+        port = free_port()
+        with (
+            strangers(port, drives) as served,
+            pytest.raises(UserError, match="no TraCI client connected"),
+        ):
+            run_cases(factory(f"traci:{port}", connect_s=0.5), cases_of(1))
+        assert not any(served)
+
+
+LOCKED = """
+import socket, sys
+from pathlib import Path
+from merge_sumo.system.landlock import lock_in
+inside, outside = map(Path, sys.argv[1:])
+(outside / "old").write_text("kept")
+assert lock_in([inside], [])
+(inside / "new").write_text("written")
+for tried in (
+    lambda: (outside / "new").write_text("x"),
+    lambda: (outside / "old").read_text(),
+    lambda: (outside / "old").unlink(),
+    lambda: (outside / "old").rename(inside / "old"),
+    lambda: list(outside.iterdir()),
+    lambda: socket.create_server(("127.0.0.1", 0)),
+):
+    try:
+        tried()
+    except PermissionError:
+        continue
+    print("not held")
+"""
+
+
+class TestTheLock:
+    def test_holds_files_and_ports(self, tmp_path):
+        require(landlock.version() >= 4, "the kernel has no Landlock that holds ports")
+        inside, outside = tmp_path / "inside", tmp_path / "outside"
+        inside.mkdir()
+        outside.mkdir()
+        ran = subprocess.run(
+            [sys.executable, "-c", LOCKED, inside, outside], capture_output=True, check=False
+        )
+        assert (ran.returncode, ran.stdout, ran.stderr) == (0, b"", b"")
+        assert [file.name for file in inside.iterdir()] == ["new"]
+        assert [file.read_text() for file in outside.iterdir()] == ["kept"]
+
+    def test_is_silently_left_out_where_the_kernel_has_none(self, monkeypatch, tmp_path):
+        monkeypatch.setattr(landlock, "version", lambda: 0)
+        assert not landlock.lock_in([tmp_path], [])
+        (tmp_path.parent / "written").write_text("as before")
+
+
+def shadows() -> list[int]:
+    """Return the processes that serve TraCI clients of this process."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            of_us = f"\nPPid:\t{os.getpid()}\n" in (process / "status").read_text()
+            if of_us and b"traci_server" in (process / "cmdline").read_bytes():
+                found.append(int(process.name))
+    return found
+
+
+@pytest.mark.parametrize(("signal", "times", "errors"), [(9, 1, 0), (15, 2, 1)])
+def test_a_sumo_that_is_ended_once_is_nobodys_fault(tmp_path, signal, times, errors):
+    """A controller may bring SUMO down by a question, and would again; here somebody else does."""
+    ended: list[int] = []
+
+    def end() -> None:
+        while len(ended) < times:
+            time.sleep(0.05)
+            for process in shadows() if (tmp_path / "drives").exists() else ():
+                (tmp_path / "drives").unlink()
+                os.kill(process, signal)
+                ended.append(process)
+
+    slow = tmp_path / "slow.py"
+    slow.write_text(
+        "import sys, time\n"
+        f"sys.path.insert(0, {str(SUPPORT)!r})\n"
+        "from raw_traci import Client\n"
+        "client = Client(int(sys.argv[1]))\n"
+        "client.drive(10)\n"
+        f"open({str(tmp_path / 'drives')!r}, 'w').close()\n"
+        "while True:\n"
+        "    client.drive(1)\n"
+        "    time.sleep(0.01)\n"
+    )
+    thread = threading.Thread(target=end)
+    thread.start()
+    try:
+        command = f"{sys.executable} {slow} {{port}}"
+        trajectories = run_cases(factory("traci", command=command), cases_of(3))
+    finally:
+        ended.extend([0] * times)
+        thread.join()
+    found = [t.error for t in trajectories if t.error]
+    assert found == ["the SUMO that answers the controller was ended by signal 15"] * errors
+
+
+def test_who_serves_is_locked_and_keeps_no_file_of_its_own(tmp_path):
+    require(landlock.version() > 0, "the kernel has no Landlock")
+    asks = tmp_path / "asks.py"
+    asks.write_text(
+        "import sys, traci\n"
+        "traci.init(int(sys.argv[1]))\n"
+        "traci.simulationStep()\n"
+        "try:\n"
+        f"    traci.simulation.saveState({str(tmp_path / 'state.xml')!r})\n"
+        "except traci.TraCIException as error:\n"
+        "    print(error, flush=True)\n"
+        "while traci.simulation.getMinExpectedNumber() > 0:\n"
+        "    traci.simulationStep()\n"
+    )
+    log = tmp_path / "controller.log"
+    (trajectory,) = run_cases(
+        factory("traci", command=f"{sys.executable} {asks} {{port}}", log=log), cases_of(1)
+    )
+    assert trajectory.error is None
+    assert "does not carry out simulation.saveState" in log.read_text()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["asks.py", "controller.log"]
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", pytest.param("SIGINT", marks=pytest.mark.long)])
+def test_a_campaign_that_is_stopped_while_a_controller_thinks_ends_at_once(name, tmp_path):
+    """And not when the controller's deadline of ten minutes has passed; nothing is left."""
+    thinks, begun = tmp_path / "thinks.py", tmp_path / "begun"
+    thinks.write_text(
+        "import sys, time\n"
+        f"sys.path.insert(0, {str(SUPPORT)!r})\n"
+        "from raw_traci import Client\n"
+        "Client(int(sys.argv[1])).drive(4)\n"
+        f"open({str(begun)!r}, 'w').close()\n"
+        "time.sleep(600)\n"
+    )
+    asked = ("--cases", "5", "--deadline", "600", "--out", str(tmp_path / "run"))
+    command = f"{sys.executable} {thinks} {{port}}"
+    with none_left():
+        campaign = subprocess.Popen(
+            [*CAMPAIGN, "--vut-command", command, *asked],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+        try:
+            while not begun.exists():
+                assert campaign.poll() is None
+                time.sleep(0.05)
+            campaign.send_signal(signal.Signals[name])
+            _, said = campaign.communicate(timeout=120)
+        finally:
+            campaign.kill()
+    assert campaign.returncode != 0
+    assert b"Traceback" not in said

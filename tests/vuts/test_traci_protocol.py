@@ -1,0 +1,114 @@
+"""The bytes of TraCI: whatever comes is answered, refused, or no TraCI."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import traci
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from traci_pair import close_shadow, shadow
+
+from merge_sumo.sumo.shadow_sumo import ShadowSumo
+from merge_sumo.vuts.traci import protocol as tp
+from merge_sumo.vuts.traci.calls import NotFiniteError
+from merge_sumo.vuts.traci.session import Session
+
+SUMO: list[ShadowSumo] = []
+"""The one that answers; Hypothesis knows no fixtures."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _sumo(tmp_path_factory):
+    SUMO[:] = [shadow(tmp_path_factory.mktemp("sumo"))]
+    yield
+    close_shadow()
+
+
+def reference_commands() -> list[bytes]:
+    """Return contents of messages that the stock package sends."""
+    sent: list[bytes] = []
+    kept = traci.connection.Connection.__new__(traci.connection.Connection)
+    for form, values in (("d", (3.0,)), ("tdd", (2, 1.0, 2.0)), ("s", ("a",)), ("i", (5,))):
+        payload = bytes((0x40,)) + tp.raw_string("vut") + kept._pack(form, *values)
+        sent.append(tp.command(bytes((0xC4,)) + payload))
+    sent.append(tp.command(bytes((0x02,)) + struct.pack("!d", 0.0)))
+    sent.append(
+        tp.command(bytes((0xD4,)) + struct.pack("!dd", 0, 9) + tp.raw_string("vut") + b"\1@")
+    )
+    context = tp.raw_string("vut") + b"\xa4" + struct.pack("!d", 50.0) + b"\1@"
+    sent.append(tp.command(bytes((0x84,)) + struct.pack("!dd", 0, 9) + context))
+    sent.append(tp.command(b"\xa4\x68" + tp.raw_string("vut") + tp.double(9.0)))
+    return sent
+
+
+class TestTheProtocol:
+    @settings(max_examples=300, deadline=None)
+    @given(st.binary(max_size=200))
+    def test_bytes_of_any_kind_are_commands_or_a_protocol_error(self, data):
+        self.handle_all(data)
+
+    @settings(max_examples=500, deadline=None)
+    @given(st.data())
+    def test_a_mutated_message_is_answered_refused_or_a_protocol_error(self, data):
+        content = bytearray(b"".join(data.draw(st.lists(st.sampled_from(reference_commands())))))
+        for _ in range(data.draw(st.integers(0, 5))):
+            if content:
+                content[data.draw(st.integers(0, len(content) - 1))] = data.draw(
+                    st.integers(0, 255)
+                )
+        self.handle_all(bytes(content)[: data.draw(st.integers(0, 400))])
+
+    def handle_all(self, data: bytes) -> None:
+        try:
+            commands = tp.commands_of(data)
+        except tp.ProtocolError:
+            return
+        SUMO[0].load()
+        session = Session(SUMO[0])
+        session.enter({"pov": (-250.0, 30.0, 0.0), "vut": (-182.0, 18.0, 0.0)})
+        for one in commands:
+            try:
+                answer = session.handle(one)
+            except (tp.ProtocolError, NotFiniteError):
+                continue
+            # Status first, and nothing that is not a command of a stated length.
+            first, *_ = tp.commands_of(answer)
+            assert first.identifier == one.identifier
+            assert answer[0] > 0, "clients read the length of a status as one byte"
+        session.results()
+        session.step()
+        assert "vut" in session.sumo.at_m
+
+    @given(st.binary(min_size=4, max_size=4))
+    def test_a_length_is_one_that_can_be_or_a_protocol_error(self, head):
+        announced = int.from_bytes(head, signed=True)
+        if 4 <= announced <= tp.MAX_MESSAGE_BYTES + 4:
+            assert tp.message_length(head) == announced - 4
+        else:
+            with pytest.raises(tp.ProtocolError, match=f"{announced} bytes was announced"):
+                tp.message_length(head)
+
+    @given(
+        st.recursive(
+            st.floats(allow_nan=False) | st.integers(-(2**31), 2**31 - 1) | st.text(max_size=20),
+            lambda inner: st.tuples(inner, inner),
+            max_leaves=3,
+        )
+    )
+    def test_typed_values_are_read_as_they_were_written(self, value):
+        def written(v):
+            if isinstance(v, tuple):
+                return tp.compound(*map(written, v))
+            forms: dict[type, Callable[[Any], bytes]]
+            forms = {float: tp.double, int: tp.integer, str: tp.string}
+            return forms[type(v)](v)
+
+        assert tp.Reader(written(value)).typed() == value
+
+    def test_compounds_that_are_nested_without_end_are_a_protocol_error(self):
+        with pytest.raises(tp.ProtocolError, match="nested too deeply"):
+            tp.Reader(b"\x0f\0\0\0\1" * 50).typed()
