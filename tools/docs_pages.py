@@ -15,8 +15,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 SHOWN = (
-    *("CHANGELOG.md", "CONTRIBUTING.md", "policies/README.md", "policies/roundabout/README.md"),
-    *("scenarios/README.md", "sumo_net/README.md", "tests/README.md"),
+    *("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "tests/README.md"),
+    *("policies/README.md", "policies/roundabout/README.md"),
+    *("scenarios/README.md", "sumo_net/README.md"),
 )
 """Pages that stand beside what they are about, and not in docs/."""
 PICTURES = "scenarios/**/*.png"
@@ -100,13 +101,13 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Return a page whose links out of docs/ lead to where the site has it (MkDocs calls this).
+    """Return a page whose links out of and into docs/ hold in the site (MkDocs calls this).
 
     They are written as they hold in a checkout.
     """
-    if page.file.src_uri in SHOWN:
-        return markdown
     up = "../" * page.file.src_uri.count("/")
+    if page.file.src_uri in SHOWN:
+        return markdown.replace(f"]({up}docs/", f"]({up}")
     return markdown.replace(f"]({up}../", f"]({up}")
 
 

@@ -29,4 +29,6 @@ def test_the_site_has_what_lies_outside_of_docs_one_folder_nearer():
     start = SimpleNamespace(file=SimpleNamespace(src_uri="index.md"))
     assert on_page_markdown("[a](../README.md)", start) == "[a](README.md)"
     shown = SimpleNamespace(file=SimpleNamespace(src_uri="policies/README.md"))
-    assert on_page_markdown("[a](../docs/faq.md)", shown) == "[a](../docs/faq.md)"
+    assert on_page_markdown("[a](../docs/faq.md)", shown) == "[a](../faq.md)"
+    root = SimpleNamespace(file=SimpleNamespace(src_uri="SECURITY.md"))
+    assert on_page_markdown("[a](docs/faq.md)", root) == "[a](faq.md)"
