@@ -19,6 +19,8 @@ from merge_sumo.errors import UserError
 
 DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
 """Shared libraries that SUMO's wheels load, even without a window."""
+LOADER_FAILED: Final = 127
+"""Exit code of a program whose shared libraries are missing."""
 SUMO_VERSION: Final = "1.28.0"
 """The one whose motions are known; pyproject.toml pins the same."""
 PROGRAM_LIMIT_S: Final = 15.0
@@ -60,10 +62,7 @@ def load_libsumo() -> Any:
             raise
         raise UserError("libsumo is not installed: run `pip install libsumo==1.28.0`") from error
     except ImportError as error:
-        raise UserError(
-            f"libsumo cannot be loaded ({error}): on Debian or Ubuntu run "
-            f"`apt-get install {DEBIAN_PACKAGES}`"
-        ) from error
+        raise _library_missing("libsumo", str(error)) from error
     found = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
     if found != SUMO_VERSION:
         raise UserError(
@@ -72,6 +71,13 @@ def load_libsumo() -> Any:
             "and keep packages that bring another SUMO (older libtraci) out of this environment"
         )
     return libsumo
+
+
+def _library_missing(name: str, reason: str) -> UserError:
+    return UserError(
+        f"{name} cannot be loaded ({reason}): on Debian or Ubuntu run "
+        f"`apt-get update && apt-get install -y {DEBIAN_PACKAGES}` as root"
+    )
 
 
 def sumo_program(name: str) -> str:
@@ -133,7 +139,7 @@ def run_program(
     """Run a SUMO program in a folder of ours, and kill it and what it started after `limit_s`.
 
     What SUMO takes from the environment is that of the installation. Without a limit, what the
-    program says goes to the terminal.
+    program says goes to the terminal. Raises `UserError` where a shared library is missing.
     """
     command = [sumo_program(name), *arguments]
     with subprocess.Popen(
@@ -155,6 +161,8 @@ def run_program(
                 return Ended(-1, f"it did not end within {limit_s:g} s")
             raise
     reason = ((said or "").strip() or "no message").splitlines()[0]
+    if process.returncode == LOADER_FAILED:
+        raise _library_missing(name, reason.rpartition("libraries: ")[2])
     return Ended(process.returncode, reason.removeprefix("Error: ") if process.returncode else "")
 
 
