@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,10 @@ LAYERS = (
     *("twin", "campaigns", "studies", "training", "reports", "api", "testing", "commands"),
 )
 """The rooms, from the ground up: each imports from itself and from those before it."""
+
+
+OBJECT = re.compile(r"merge_sumo(\.\w+)+:\w+")
+"""An object that a registry imports by its name."""
 
 
 def layer_of(module: str) -> str:
@@ -59,6 +64,8 @@ def imports(source: str, module: str = "merge_sumo.here", *, is_package: bool = 
         elif isinstance(node, ast.Call) and called(node) in ("import_module", "__import__"):
             names = [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
             found |= {str(name) for name in names}
+        elif isinstance(node, ast.Constant) and OBJECT.fullmatch(str(node.value)):
+            found.add(str(node.value).partition(":")[0])
     return found
 
 
@@ -258,6 +265,9 @@ class TestTheChecksThemselves:
     )
     def test_see_an_import_relative_to_the_file(self, source, module):
         assert imports_any(imports(source, module), {"merge_sumo.sumo"})
+
+    def test_see_what_a_registry_imports_by_name(self):
+        assert imports_any(imports("R({'a': 'merge_sumo.sumo.world:World'})"), {"merge_sumo.sumo"})
 
     def test_do_not_mistake_a_name_for_its_beginning(self):
         assert not imports_any(imports("import sumolibrary, merge_sumo.sumo"), {"sumolib", "sumo"})

@@ -1,0 +1,150 @@
+"""Registries: named objects of this package, and of installed packages by entry points.
+
+A registry names what it holds without importing it: names of this package stand in the registry,
+names of others in the metadata of installed packages. An object is imported when it is asked for.
+Only installed packages, which the user chose, are searched; the working folder is data.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
+from importlib.metadata import EntryPoint, distributions
+from pathlib import Path
+from typing import Final, Generic, TypeVar
+
+from merge_sumo.errors import UserError
+from merge_sumo.system.suggestions import meant
+
+T = TypeVar("T")
+
+OURS: Final = "merge-sumo"
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """Objects of one kind by name: those of this package in their order, then installed ones.
+
+    It is read like a dictionary, but an unknown name, a name that two packages bring, and an
+    object that cannot be loaded or is of another kind raise `UserError`.
+
+    Attributes:
+        group: group of entry points by which installed packages add to it.
+        noun: what it holds, in the singular, for sentences.
+    """
+
+    def __init__(
+        self,
+        group: str,
+        noun: str,
+        ours: Mapping[str, str] | None = None,
+        *,
+        accepts: Callable[[object], bool] = lambda _: True,
+        contract: str = "",
+    ) -> None:
+        """Make a registry.
+
+        Args:
+            group: group of entry points, as `merge_sumo.samplers`.
+            noun: what it holds, in the singular.
+            ours: objects of this package as `module:attribute`, by name.
+            accepts: whether a loaded object is of the kind.
+            contract: what it must be, for the sentence where it is not, as "a subclass of Sampler".
+        """
+        self.group, self.noun = group, noun
+        self._accepts, self._contract = accepts, contract
+        self._ours = {name: EntryPoint(name, at, group) for name, at in (ours or {}).items()}
+        self._objects: dict[tuple[str, str], T] = {}
+        self._registered: dict[str, T] = {}
+
+    def register(self, name: str, item: T) -> T:
+        """Add an object in this process; `UserError` where the name is taken.
+
+        Processes that this one starts do not know it: an entry point reaches them, too.
+        """
+        if name in self:
+            raise UserError(f"the {self.noun} {name!r} is registered already: choose another name")
+        self._registered[name] = self._checked(name, item, "this process")
+        return item
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names; nothing is imported."""
+        return iter(dict.fromkeys((*self._ours, *self._registered, *self._entries())))
+
+    def __len__(self) -> int:
+        """Return the number of names."""
+        return len(list(iter(self)))
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether a name is known; nothing is imported."""
+        return name in self._ours or name in self._registered or name in self._entries()
+
+    def __getitem__(self, name: str) -> T:
+        """Return the object of a name, which is imported if need be."""
+        bringers = dict(self._entries().get(name, {}))
+        if name in self._ours:
+            bringers[OURS] = self._ours[name]
+        if len(bringers) + (name in self._registered) > 1:
+            packages = " and ".join(sorted(bringers))
+            raise UserError(
+                f"{packages} bring a {self.noun} {name!r}: uninstall all but one of them"
+            )
+        if name in self._registered:
+            return self._registered[name]
+        if not bringers:
+            raise UserError(
+                f"there is no {self.noun} {name!r}: {meant(name, self)}choose one of "
+                f"{', '.join(self)}"
+            )
+        ((package, entry),) = bringers.items()
+        key = name, entry.value
+        if key not in self._objects:
+            self._objects[key] = self._loaded(entry, package)
+        return self._objects[key]
+
+    def _entries(self) -> dict[str, dict[str, EntryPoint]]:
+        """Return the installed entries, by name and then by package."""
+        return installed_entries(self.group, tuple(sys.path), str(Path.cwd()))
+
+    def _loaded(self, entry: EntryPoint, package: str) -> T:
+        try:
+            item = entry.load()
+        except (Exception, SystemExit) as error:
+            raise UserError(
+                f"the {self.noun} {entry.name!r} of {package} cannot be loaded from "
+                f"{entry.value}: {type(error).__name__}: {error}"
+            ) from error
+        return self._checked(entry.name, item, package)
+
+    def _checked(self, name: str, item: T, package: str) -> T:
+        if not self._accepts(item):
+            raise UserError(f"the {self.noun} {name!r} of {package} is not {self._contract}")
+        return item
+
+
+@lru_cache(maxsize=64)
+def installed_entries(
+    group: str, folders: tuple[str, ...], working_folder: str
+) -> dict[str, dict[str, EntryPoint]]:
+    """Return the entry points of a group, by name and then by package; nothing is imported.
+
+    Args:
+        group: group of entry points.
+        folders: folders in which packages are installed; those that are the working folder, in
+            which lies what somebody sent, are left out.
+        working_folder: absolute path of the working folder.
+    """
+    here = os.path.realpath(working_folder)
+    searched = [folder for folder in folders if folder and os.path.realpath(folder) != here]
+    entries: dict[str, dict[str, EntryPoint]] = {}
+    packages: set[str] = set()
+    for package in distributions(path=searched):
+        selected = package.entry_points.select(group=group)
+        # The name takes most of the time; the first package of a name shadows others.
+        if not selected or (name := str(package.metadata["Name"])) in packages:
+            continue
+        packages.add(name)
+        for entry in selected:
+            entries.setdefault(entry.name, {})[name] = entry
+    return entries
