@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.analysis.in_lines import InLines
+from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import Summary, summarise
 from merge_sumo.analysis.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
 from merge_sumo.campaigns.one_case import Ended
@@ -160,7 +160,7 @@ class CampaignRun:
         )
 
 
-class CaseRun(InLines):
+class CaseRun(Result):
     """One case that was run."""
 
     def __init__(self, ended: Ended) -> None:
@@ -185,6 +185,11 @@ class CaseRun(InLines):
     def __repr__(self) -> str:
         """Return the verdict in a line."""
         return f"<case: {self.verdict}>"
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `merge-sumo run --json` prints: outcome, motion and signals of the VUT."""
+        record = {**self.outcome.to_record(), "motion": self.trajectory.motion.tolist()}
+        return record | ({"signals": self.trajectory.signals} if self.trajectory.signals else {})
 
     def lines(self) -> list[str]:
         """Return verdict, measures and motion, as `merge-sumo run` prints them."""

@@ -8,7 +8,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.analysis.in_lines import InLines
+from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import counted
 from merge_sumo.studies.benchmark import Comparison, Quartiles
 from merge_sumo.studies.certificate import Certificate
@@ -24,7 +24,7 @@ NAMED: Final = 5
 
 
 @dataclass(frozen=True, repr=False)
-class TruthResult(InLines):
+class TruthResult(Result):
     """The ground truth of a VUT at one or more POV levels.
 
     Attributes:
@@ -104,7 +104,7 @@ HEADINGS: Final = (
 
 
 @dataclass(frozen=True, repr=False)
-class Benchmark(InLines):
+class Benchmark(Result):
     """Samplers beside each other, and beside the ground truth, over several seeds.
 
     Attributes:
@@ -194,7 +194,7 @@ def _spread(median: float | None, quartiles: Quartiles, form: str) -> str:
 
 
 @dataclass(frozen=True, repr=False)
-class CertificateResult(InLines):
+class CertificateResult(Result):
     """A certificate that is complete.
 
     Attributes:
@@ -233,7 +233,7 @@ class CertificateResult(InLines):
 
 
 @dataclass(frozen=True, repr=False)
-class ProbabilityResult(InLines):
+class ProbabilityResult(Result):
     """How likely a VUT is to fail.
 
     Attributes:
@@ -277,7 +277,7 @@ class ProbabilityResult(InLines):
 
 
 @dataclass(frozen=True, repr=False)
-class CheckResult(InLines):
+class CheckResult(Result):
     """What `check_vut` found wrong with a VUT.
 
     Attributes:

@@ -5,11 +5,11 @@ Volumes are failure mode coverages of what is known of both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 
-from merge_sumo.analysis.in_lines import InLines
+from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import counted
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import level_name
@@ -109,7 +109,7 @@ class LevelChange:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class RunComparison(InLines):
+class RunComparison(Result):
     """What changed from campaign A to campaign B.
 
     Attributes:
@@ -133,6 +133,10 @@ class RunComparison(InLines):
         return [
             why for level, found in self.levels.items() for why in _worse(level, found, tolerance)
         ]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return asdict(self)
 
     def lines(self) -> list[str]:
         """Return a table of what changed, level by level, and how that is known."""

@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import Any
 
 from merge_sumo.analysis.diagnosis import Kind, diagnose
-from merge_sumo.analysis.in_lines import InLines
+from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import severities_of
 from merge_sumo.analysis.verdict import Verdict, in_words, judge
 from merge_sumo.campaigns.run import SETTINGS, Run
@@ -84,7 +84,7 @@ class Version:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class History(InLines):
+class History(Result):
     """Versions in the order in which they were named, and the steps between neighbours.
 
     At a level the neighbour of a version is the next one that has that level.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.analysis.in_lines import InLines
+from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import counted, judge
 from merge_sumo.campaigns.campaign import workers_or_here
 from merge_sumo.campaigns.plan import plan_of
@@ -56,7 +56,7 @@ MOST_CHANGED: Final = 40
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Rerun(InLines):
+class Rerun(Result):
     """Recorded cases and what the VUT of today makes of them.
 
     Attributes:
@@ -83,6 +83,16 @@ class Rerun(InLines):
             for a, b in pairs
             if (a.measures.end, a.failed) != (b.measures.end, b.failed)
         ]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {
+            "vut": self.vut,
+            "cases": len(self.before),
+            "changed": [one.to_record() for one in self.changed],
+            "levels": self.compared.to_record()["levels"],
+            "unrepeated": self.unrepeated,
+        }
 
     def lines(self) -> list[str]:
         """Return both verdicts, and which cases changed theirs."""

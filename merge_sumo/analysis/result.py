@@ -1,21 +1,26 @@
-"""Results that say themselves in lines: as a command prints them, and so in a notebook."""
+"""The base of what the verbs of the API return: a JSON record, and lines for a terminal."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from html import escape
+from typing import Any
 
 from merge_sumo.system.printable import printable
 
 
-class InLines:
-    """What `print` and a notebook show as lines; `repr` is the first of them."""
+class Result:
+    """A result: `print` and a notebook show its lines, `repr` the first of them."""
 
     __slots__ = ()
 
     @abstractmethod
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+
+    @abstractmethod
     def lines(self) -> list[str]:
-        """Return what a person reads, line by line."""
+        """Return what a command prints."""
 
     def __str__(self) -> str:
         """Return the lines as a text; control characters are escaped."""
