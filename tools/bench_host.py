@@ -24,6 +24,7 @@ from pathlib import Path
 import libsumo
 import numpy as np
 import traci
+from bench_record import add_record_option, append_record
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.engine.pov_library import PovLibrary
@@ -193,6 +194,7 @@ def main() -> None:
     """Print a table, or with --json one object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_record_option(parser)
     parser.add_argument("--cases", type=int, default=1280, help="cases per round and K")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--processes", type=int, default=5, help="cases with a process each")
@@ -209,18 +211,19 @@ def main() -> None:
         k: {name: statistics.median(x) for name, x in row.items()} for k, row in rows.items()
     }
     ratio_to_process = process * medians[2, 32]["cases_per_s"]
+    alone = {k: row for (vehicles, k), row in medians.items() if vehicles == 2}
+    result = {
+        "us_per_pair_step": {k: row["us"] for k, row in alone.items()},
+        "cases_per_s": {k: row["cases_per_s"] for k, row in alone.items()},
+        "ratio_to_bare": alone[32]["to_bare"],
+        "ratio_to_bare_by_k": {k: row["to_bare"] for k, row in alone.items()},
+        "ratio_to_step_by_k": {k: row["to_step"] for k, row in alone.items()},
+        "in_traffic": medians[traffic.vehicles, 32],
+        "ratio_to_traci_process": ratio_to_process,
+        "s_per_traci_process_case": process,
+    }
+    append_record(options.record, "host", result)
     if options.json:
-        alone = {k: row for (vehicles, k), row in medians.items() if vehicles == 2}
-        result = {
-            "us_per_pair_step": {k: row["us"] for k, row in alone.items()},
-            "cases_per_s": {k: row["cases_per_s"] for k, row in alone.items()},
-            "ratio_to_bare": alone[32]["to_bare"],
-            "ratio_to_bare_by_k": {k: row["to_bare"] for k, row in alone.items()},
-            "ratio_to_step_by_k": {k: row["to_step"] for k, row in alone.items()},
-            "in_traffic": medians[traffic.vehicles, 32],
-            "ratio_to_traci_process": ratio_to_process,
-            "s_per_traci_process_case": process,
-        }
         print(json.dumps(result))
         return
     print(

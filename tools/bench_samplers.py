@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench_record import add_record_option, append_record
 
 from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.campaigns.plan import resolve
@@ -119,15 +120,24 @@ def search(
 
 def bench(
     name: str, level: int, seeds: int, plan: SimulationPlan, truth: Truth, first: int = 0
-) -> str:
-    """Return a line of medians over the seeds, from the first one on."""
+) -> dict[str, float]:
+    """Return the figures of a sampler over the seeds, from the first one on, by name."""
     runs = [search(name, level, seed, plan, truth) for seed in range(first, first + seeds)]
     shares = np.median([run[0] for run in runs], axis=0)
-    lowest = min(run[0][-1] for run in runs)
-    whole = sum(run[1] == len(truth.real_regions()) for run in runs)
-    seconds = float(np.median([run[2] for run in runs]))
-    columns = " ".join(f"{share:7.2f}" for share in [*shares, lowest])
-    return f"{columns}   {whole:2d} of {seeds:2d}   {seconds:6.1f}"
+    return {
+        **{f"share after {n}": float(share) for n, share in zip(SHOWN, shares, strict=True)},
+        "lowest": min(run[0][-1] for run in runs),
+        "all regions": sum(run[1] == len(truth.real_regions()) for run in runs),
+        "seeds": seeds,
+        "sampler s": float(np.median([run[2] for run in runs])),
+    }
+
+
+def cells(figures: dict[str, float]) -> str:
+    """Return the figures of a sampler as cells of a table."""
+    *shares, whole, seeds, seconds = figures.values()
+    columns = " ".join(f"{share:7.2f}" for share in shares)
+    return f"{columns}   {whole:2.0f} of {seeds:2.0f}   {seconds:6.1f}"
 
 
 def outcome(index: int, case: Any) -> Outcome:
@@ -141,25 +151,28 @@ def outcome(index: int, case: Any) -> Outcome:
     return Outcome(index, index // BATCH, case, measures)
 
 
-def print_times(names: list[str]) -> None:
-    """Print the seconds of one core for a batch after N cases at level 2."""
+def print_times(names: list[str]) -> dict[str, dict[int, float]]:
+    """Print and return the seconds of one core for a batch after N cases at level 2."""
     sizes = (100, 200, 400, 1000, 2000, 5000)
     print(f"{'seconds for a batch after N =':30s}" + " ".join(f"{n:7d}" for n in sizes))
     cases = make_sampler("uniform", Pool(levels=(2,)), 0).ask(sizes[-1])
     outcomes = [outcome(index, case) for index, case in enumerate(cases)]
+    figures: dict[str, dict[int, float]] = {}
     for name in names:
-        seconds = []
+        seconds = figures[name] = {}
         for size in sizes:
             sampler = make_sampler(name, Pool(levels=(2,)), 0)
             sampler.tell(outcomes[:size])
             start = time.process_time()
             sampler.ask(BATCH)
-            seconds.append(time.process_time() - start)
-        print(f"{name:30s}" + " ".join(f"{s:7.2f}" for s in seconds), flush=True)
+            seconds[size] = time.process_time() - start
+        print(f"{name:30s}" + " ".join(f"{s:7.2f}" for s in seconds.values()), flush=True)
+    return figures
 
 
-def print_trials(trials: Sequence[str], seeds: int, first: int) -> None:
-    """Print how samplers search VUTs on which nothing was tuned."""
+def print_trials(trials: Sequence[str], seeds: int, first: int) -> dict[str, dict[str, float]]:
+    """Print and return how samplers search VUTs on which nothing was tuned."""
+    figures = {}
     print("FMC / truth" + " ".join(f"{f'N={n}':>7s}" for n in SHOWN) + " lowest   all regions")
     for trial in trials:
         vut = f"{Path(__file__).with_name('trial_vuts.py')}:{trial}"
@@ -169,8 +182,10 @@ def print_trials(trials: Sequence[str], seeds: int, first: int) -> None:
             if len(truth.failures) < FEWEST_FAILURES:
                 continue
             for name in ("coverage", WITHOUT, "gpr"):
-                line = bench(name, level, seeds, plan, truth, first)
-                print(f"{f'{trial}, level {level}: {name}':45s}{line}", flush=True)
+                search_name = f"{trial}, level {level}: {name}"
+                figures[search_name] = bench(name, level, seeds, plan, truth, first)
+                print(f"{search_name:45s}{cells(figures[search_name])}", flush=True)
+    return figures
 
 
 def main() -> None:
@@ -190,14 +205,22 @@ def main() -> None:
         help=f"search VUTs unlike ours: all, or some of {', '.join(TRIALS)}",
     )
     parser.add_argument("--time", action="store_true", help="time batches up to N = 5,000")
+    add_record_option(parser)
     options = parser.parse_args()
     names = options.samplers.split(",")
     if options.time:
-        print_times(names)
-        return
-    if options.trials is not None:
-        print_trials(options.trials or TRIALS, options.seeds, options.first)
-        return
+        append_record(options.record, "samplers, time", print_times(names))
+    elif options.trials is not None:
+        figures = print_trials(options.trials or TRIALS, options.seeds, options.first)
+        append_record(options.record, "samplers, trials", figures)
+    else:
+        figures = print_searches(options, names)
+        what = f"samplers, {options.vut}, level {options.level}"
+        append_record(options.record, what + ", ablated" * options.ablate, figures)
+
+
+def print_searches(options: argparse.Namespace, names: list[str]) -> dict[str, dict[str, float]]:
+    """Print and return what samplers, or `gpr` with other constants, find of one VUT's failures."""
     plan = resolve(options.vut, scenario=US23, criterion=Criterion(), corridors=BATCH)
     truth = ground_truth(plan, options.level)
     print(f"{options.vut}, level {options.level}, FMC of the truth {fmc(truth.failures):.4f}")
@@ -205,15 +228,15 @@ def main() -> None:
     print(
         f"{'FMC / truth':30s}" + " ".join(f"{h:>7s}" for h in heads) + "   all regions   sampler s"
     )
-    if options.ablate:
-        for label, constants in ABLATIONS.items():
-            with changed(constants):
-                line = bench("gpr", options.level, options.seeds, plan, truth, options.first)
-            print(f"{label:30s}{line}", flush=True)
-    else:
-        for name in names:
-            line = bench(name, options.level, options.seeds, plan, truth, options.first)
-            print(f"{name:30s}{line}", flush=True)
+    rows = {label: ("gpr", constants) for label, constants in ABLATIONS.items()}
+    if not options.ablate:
+        rows = {name: (name, {}) for name in names}
+    figures = {}
+    for label, (name, constants) in rows.items():
+        with changed(constants):
+            figures[label] = bench(name, options.level, options.seeds, plan, truth, options.first)
+        print(f"{label:30s}{cells(figures[label])}", flush=True)
+    return figures
 
 
 if __name__ == "__main__":

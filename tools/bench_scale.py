@@ -36,6 +36,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from bench_record import add_record_option, append_record
 
 from merge_sumo.campaigns.campaign import conduct, run_campaign
 from merge_sumo.campaigns.journal import Journal
@@ -274,7 +275,8 @@ def main() -> None:
     parser.add_argument("--history", type=int, default=10_000, help="longest history of a sampler")
     parser.add_argument("--outcomes", type=int, default=1_000_000, help="outcomes of a report")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="what to measure")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_record_option(parser)
     chosen = parser.parse_args()
 
     def tell(text: str) -> None:
@@ -307,6 +309,7 @@ def main() -> None:
         tell_spread("parent", result["parent"])
     if {"samplers", "files"} & set(chosen.only):
         result |= of_campaigns(chosen, tell)
+    append_record(chosen.record, "scale", result)
     if chosen.json:
         print(json.dumps(result))
 

@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import traci
+from bench_record import add_record_option, append_record
 from build_fmu import build_fmu
 
 from merge_sumo.drivers.base import Driver, Scene
@@ -161,6 +162,7 @@ def main() -> None:
     """Print a table, or with --json one object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_record_option(parser)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=20, help="episodes per round and kind")
     options = parser.parse_args()
@@ -212,10 +214,13 @@ def main() -> None:
         kind: [a / b for a, b in zip(found[kind], found[peer], strict=True)]
         for kind, peer in peers.items()
     }
+    result = {
+        "us_per_step": {kind: statistics.median(us) for kind, us in found.items()},
+        "ratio": {kind: statistics.median(values) for kind, values in ratios.items()},
+    }
+    append_record(options.record, "vuts", result)
     if options.json:
-        medians = {kind: statistics.median(us) for kind, us in found.items()}
-        by_kind = {kind: statistics.median(all_) for kind, all_ in ratios.items()}
-        print(json.dumps({"us_per_step": medians, "ratio": by_kind}))
+        print(json.dumps(result))
         return
     for kind, us in found.items():
         print(f"{kind:24} {statistics.median(us):8.1f} us a step [{min(us):.1f}, {max(us):.1f}]")
