@@ -30,7 +30,7 @@ def test_the_container_runs_the_first_campaign_and_not_as_root():
     steps = dict(line.split(" ", 1) for line in lines if re.match(r"[A-Z]+ ", line))
     assert steps["USER"] != "root"
     command = [*json.loads(steps["ENTRYPOINT"]), *json.loads(steps["CMD"])]
-    assert f"\n{' '.join(command)}\n" in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"&& {' '.join(command)}\n" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_the_devcontainer_installs_and_runs_it():
