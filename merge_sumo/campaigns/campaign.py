@@ -80,9 +80,9 @@ def conduct(
     while first < cases and not (stop is not None and stop(sampler.told())):
         ran: list[tuple[Outcome, Trajectory]] = []
         for place, done in run(sampler.ask(min(batch or sampler.batch_size(), cases - first))):
-            case, foretold = done.trajectory.case, sampler.foretold(place)
+            case, prediction = done.trajectory.case, sampler.prediction(place)
             index, margin = first + place, done.margin
-            outcome = Outcome(index, number, case, done.measures, foretold, margin)
+            outcome = Outcome(index, number, case, done.measures, prediction, margin)
             ran.append((outcome, done.trajectory))
             if on_case is not None:
                 on_case(outcome)

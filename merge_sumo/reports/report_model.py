@@ -27,7 +27,7 @@ from merge_sumo.reports.report_maps import GRID
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.studies.avoidance import read_avoidance
-from merge_sumo.studies.prediction_quality import Expected, is_foretold, surprises
+from merge_sumo.studies.prediction_quality import Expected, has_predictions, surprises
 from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey, read_truth
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, LEVELS, OWN
@@ -159,7 +159,7 @@ def _surfaces(
 
 def _expected(run: Run, levels: Sequence[int], road: Corridor) -> Expected | None:
     """Return where the twin of a run expects failures, if the run had one."""
-    if not is_foretold(run.outcomes):
+    if not has_predictions(run.outcomes):
         return None
     try:
         return Expected(run, levels, road)

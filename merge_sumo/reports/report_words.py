@@ -21,7 +21,7 @@ from merge_sumo.reports.headline import Rule, after_words, avoidable_words, befo
 from merge_sumo.reports.report_levels import Level, levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
 from merge_sumo.studies.avoidance import in_a_sentence
-from merge_sumo.studies.prediction_quality import foretold_in_words
+from merge_sumo.studies.prediction_quality import prediction_in_words
 from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.printable import printable
 from merge_sumo.values.fmc import radius_for
@@ -60,7 +60,7 @@ def page_words(facts: ReportModel) -> dict[str, Any]:
         "unrepeatable": repeats.unrepeatable(facts.repeats),
         "careful": in_a_sentence(facts.avoidance.values()),
         "avoidance": _avoidance(facts),
-        "foretold": foretold_in_words(facts.run.outcomes),
+        "predicted": prediction_in_words(facts.run.outcomes),
         "counts": facts.verdict.counts,
         "found": facts.verdict,
         "troubles": facts.troubles(),

@@ -12,11 +12,11 @@ import numpy as np
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
-from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import Outcome
 
 if TYPE_CHECKING:
-    from merge_sumo.samplers.prediction_skill import Foreteller
+    from merge_sumo.samplers.prediction_skill import Predictor
 
 DEFAULT_BATCH: Final = 40
 """Cases of a batch where a sampler has no wish of its own."""
@@ -35,7 +35,7 @@ class Sampler(ABC):
     foresees: ClassVar[bool] = False
     """Whether it makes something of games that are played out before cases run."""
 
-    def __init__(self, pool: Pool, seed: int, games: Foreteller | None = None) -> None:
+    def __init__(self, pool: Pool, seed: int, games: Predictor | None = None) -> None:
         """Propose cases from `pool`; `seed` makes the proposals reproducible.
 
         `games` plays cases out, for samplers that make something of that.
@@ -50,8 +50,8 @@ class Sampler(ABC):
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases."""
 
-    def foretold(self, place: int) -> Foretold | None:
-        """Return what was foretold of a case that was asked for last, by its place there."""
+    def prediction(self, place: int) -> Prediction | None:
+        """Return what was predicted of a case that was asked for last, by its place there."""
         return None
 
     def batch_size(self) -> int:

@@ -9,7 +9,7 @@ ever fails. Three experts give P(fail):
   one side and jump to the other from there, or jump over the failures.
 
 A VUT that gives no trajectory has its score learned instead, by the first two. Every expert is
-judged by how well it foretold each case from all the others. Two things that no process knows are
+judged by how well it predicted each case from all the others. Two things that no process knows are
 learned with it. First, the odds of a case that is bracketed, the nearest safe case on either side
 being nearer than any failure, are lowered by h / (h + w): h is the width of the bracket, w the
 typical width of what fails. That bisects the curve where the order of merging flips, gives up
@@ -52,8 +52,8 @@ LOG_PRIOR_WIDTH: Final = (np.log(0.02), 1.5)
 """Widths w that are tried, and mean and standard deviation of log w before anything is known."""
 SURE: Final = 1e-3
 """Probabilities nearer to 0 or 1 than this are not told apart, nor are weights of evidence."""
-FORETOLD: Final = 100
-"""Cases, the last ones, that a belief without them foretells, to see how far it can be trusted."""
+PREDICTED: Final = 100
+"""Cases, the last ones, that a belief without them predicts, to see how far it can be trusted."""
 FAR: Final = 2.0
 """Radii of the FMC from the nearest failure from which a case is far from all of them."""
 JUDGED_FROM: Final = 3
@@ -104,7 +104,7 @@ class Belief:
         return found if self._branches is None else [*found, self._branches.at(cases, smooth)]
 
     def _judge(self, learned: LevelHistory) -> None:
-        """Weigh the experts, and learn width and calibration, by how each foretold each case."""
+        """Weigh the experts, and learn width and calibration, by how each predicted each case."""
         distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
         log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
         self._judged: list[tuple[float, FloatArray]] = []
@@ -138,14 +138,14 @@ class Calibration:
         """Compare what became of the last cases with what those before them let one expect."""
         self._failing = history.points[history.failed]
         self.factors = np.ones(2)
-        first = len(history.points) - FORETOLD
-        if first < FORETOLD // 2:
+        first = len(history.points) - PREDICTED
+        if first < PREDICTED // 2:
             return
         before, since = history.take(slice(first)), history.take(slice(first, None))
         far = _far(since.points, before.points[before.failed])
-        foretold = np.bincount(far, Belief(before).of(since.points), minlength=2)
+        predicted = np.bincount(far, Belief(before).of(since.points), minlength=2)
         failed = np.bincount(far, since.failed, minlength=2)
-        self.factors = np.minimum((failed + 1.0) / (foretold + 1.0), 1.0)
+        self.factors = np.minimum((failed + 1.0) / (predicted + 1.0), 1.0)
 
     def of(self, belief: Belief, cases: FloatArray) -> FloatArray:
         """Return P(fail) of cases, (m, d), by a belief and what it has been worth."""
@@ -250,7 +250,7 @@ def _evidence(chance: FloatArray, distances: list[FloatArray], dims: int) -> Flo
 
 
 def _calibrated(evidence: FloatArray, failed: NDArray[np.bool_]) -> tuple[FloatArray, float]:
-    """Return the weights of the evidence, (4,), that foretell best, and their log posterior.
+    """Return the weights of the evidence, (4,), that predict best, and their log posterior.
 
     Logistic regression by Newton's method; a step that makes it worse is halved.
     """

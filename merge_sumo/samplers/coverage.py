@@ -24,7 +24,7 @@ from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.samplers.twin_guided import FEWEST, informed_batch
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import DX_CRASH_M
 
 FIRST_BATCH: Final = 10
@@ -60,10 +60,10 @@ class CoverageSampler(Sampler):
         """Return the next `n` cases, level by level."""
         proposals = self._proposals(n)
         shares = self._shares(proposals, n)
-        self._foretold = [
-            foretold
+        self._predictions = [
+            prediction
             for level, share in shares.items()
-            for foretold in proposals[level].foretold[:share]
+            for prediction in proposals[level].predictions[:share]
         ]
         return [
             case
@@ -71,9 +71,9 @@ class CoverageSampler(Sampler):
             for case in self.pool.cases(proposals[level].points[:share], level)
         ]
 
-    def foretold(self, place: int) -> Foretold | None:
-        """Return what was foretold of a case of the last batch, by its place in it."""
-        return self._foretold[place]
+    def prediction(self, place: int) -> Prediction | None:
+        """Return what was predicted of a case of the last batch, by its place in it."""
+        return self._predictions[place]
 
     def batch_size(self) -> int:
         """Return how many cases to ask for next: few while what they teach changes much."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.prediction import Prediction
 
 PICKED: Final = 0.8
 """Share of a pick's ball that counts as covered at least for the later picks of the batch."""
@@ -25,13 +25,13 @@ class Proposal:
         points: places in the unit cube, (n, d).
         gain: expected gain of each in balls, (n,).
         probability: P(fail) of each, (n,).
-        foretold: what was foretold of each; None where nobody foretells.
+        predictions: of each case; None without a predictor.
     """
 
     points: FloatArray
     gain: FloatArray
     probability: FloatArray
-    foretold: tuple[Foretold | None, ...]
+    predictions: tuple[Prediction | None, ...]
 
 
 def greedy(

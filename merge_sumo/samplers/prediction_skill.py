@@ -1,7 +1,7 @@
 """What is made of games that were played out before their cases run: P(fail), by the record.
 
-Somebody who knows the POVs and has watched the VUT, a *foreteller*, plays cases out and says which
-gap there will be at M. It has experts of several kinds, and of each several members who know
+A *predictor*, which knows the POVs and has observed the VUT, plays cases out and predicts the gap
+at M. It has experts of several kinds, and of each several members who know
 different things, so that they disagree where they guess. How much is to be made of what they say is
 in the record: what they had said of the cases that have run since.
 """
@@ -19,10 +19,10 @@ from scipy.special import expit, ndtr
 from merge_sumo.samplers.belief import NO_GAP_M
 from merge_sumo.samplers.greedy import Proposal
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import Outcome
 
-Known = Sequence[tuple[Outcome, Foretold]]
+Known = Sequence[tuple[Outcome, Prediction]]
 
 WIDTHS: Final = np.array([0.01, 0.03, 0.1, 0.35, 1.2])
 """How far gaps may be off, as standard deviations on the scale of `compressed`."""
@@ -33,7 +33,7 @@ PRIOR: Final = np.array([0.5, 0.5, 1.0, 1.0, 1.0, 0.5])
 EM_ROUNDS: Final = 12
 """Of expectation and maximisation, which learns how often gaps are how far off."""
 HALF_LIFE: Final = 40.0
-"""Cases after which what was foretold counts half: a foreteller learns."""
+"""Cases after which what was predicted counts half: a predictor learns."""
 OTHER_LEVELS: Final = 0.4
 """What a case at another level counts: it is the same VUT."""
 TEMPERED: Final = 0.5
@@ -44,16 +44,16 @@ TRUSTED_FROM: Final = 100
 """Cases, the last ones, by which gains are set right."""
 WORTHLESS: Final = 0.05
 JUDGED_FROM: Final = 40
-"""A foreteller with less weight than that, after so many cases, is not asked for candidates."""
+"""A predictor with less weight than that, after so many cases, is not asked for candidates."""
 EDGE: Final = float(np.arcsinh(1.0))
 """The limit of a failure on the scale of `compressed`."""
 
 
 Play = Callable[..., FloatArray]
-"""Plays cases of one level: see `Foreteller.play`."""
+"""Plays cases of one level: see `Predictor.play`."""
 
 
-class Foreteller(Protocol):
+class Predictor(Protocol):
     """Plays cases out; a pure function of what it was told."""
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
@@ -81,7 +81,7 @@ def compressed(gap_m: FloatArray, limit_m: float) -> FloatArray:
 
 
 class PredictionSkill:
-    """How well gaps and failures were foretold, and what that makes of the next ones.
+    """How well gaps and failures were predicted, and what that makes of the next ones.
 
     Attributes:
         experts: weight of each expert, (E,); (1,) for all of them before there is a record.
@@ -102,7 +102,7 @@ class PredictionSkill:
 
         `replayed` are gaps, (E,), by the index of a case, of who had not learned from it.
         """
-        known = [(o, o.foretold) for o in outcomes if o.foretold is not None]
+        known = [(o, o.prediction) for o in outcomes if o.prediction is not None]
         self._limit_m = limit_m
         self._mixture = (PRIOR / PRIOR.sum())[None]
         self.experts, self.twin, self.trust = np.ones(1), np.array([0.5, 0.5]), 1.0
@@ -110,13 +110,13 @@ class PredictionSkill:
         if known:
             self._learn_weights(known, self._weights([o for o, _ in known], level))
             last = [one for one in known if one[0].case.level == level][-TRUSTED_FROM:]
-            failed, foretold = (sum(o.failed for o, _ in last), sum(f.p_fail for _, f in last))
-            self.trust = min((failed + 1.0) / (foretold + 1.0), 1.0)
+            failed, predicted = (sum(o.failed for o, _ in last), sum(f.p_fail for _, f in last))
+            self.trust = min((failed + 1.0) / (predicted + 1.0), 1.0)
         self._learn_errors(outcomes, level, replayed or {})
 
     @property
     def is_worthless(self) -> bool:
-        """Whether the record says that nothing can be foretold of this VUT."""
+        """Whether the record says that nothing can be predicted of this VUT."""
         return self._cases >= JUDGED_FROM and bool((self.twin < WORTHLESS).all())
 
     @property
@@ -133,7 +133,7 @@ class PredictionSkill:
         return int(rng.choice(len(self.experts), p=self.experts))
 
     def chance(self, gaps_m: FloatArray, expert: int | None = None) -> FloatArray:
-        """Return P(fail), (n,), of cases with foretold gaps, (E, G, n), of one expert or all."""
+        """Return P(fail), (n,), of cases with predicted gaps, (E, G, n), of one expert or all."""
         said = compressed(gaps_m, self._limit_m)[..., None]
         failing = ndtr((EDGE - said) / WIDTHS) - ndtr((-EDGE - said) / WIDTHS)
         experts, _, n, _ = said.shape
@@ -163,15 +163,15 @@ class PredictionSkill:
         """Return a proposal of the surrogate's with what games say of it: that may change."""
         gaps_m = play(proposal.points)
         said = tuple(
-            Foretold.of(gaps_m[..., i], float(p), float(chance), float(chance))
+            Prediction.of(gaps_m[..., i], float(p), float(chance), float(chance))
             for i, (p, chance) in enumerate(
                 zip(self.chance(gaps_m), proposal.probability, strict=True)
             )
         )
-        return replace(proposal, foretold=said)
+        return replace(proposal, predictions=said)
 
     def _agreed(self, gaps_m: FloatArray) -> NDArray[np.bool_]:
-        """Return where all members foretell the same verdict, (n,), by gaps, (E, G, n)."""
+        """Return where all members predict the same verdict, (n,), by gaps, (E, G, n)."""
         gaps = np.abs(np.nan_to_num(gaps_m, nan=NO_GAP_M)).reshape(-1, gaps_m.shape[-1])
         failing = gaps < self._limit_m
         return np.asarray(failing.all(axis=0) | ~failing.any(axis=0))
@@ -181,14 +181,14 @@ class PredictionSkill:
     ) -> None:
         """Learn how far experts are off, and which of them is to be believed.
 
-        How far they are off is seen where they foretold; where nobody did, and to tell them from
+        How far they are off is seen where they predicted; where nobody did, and to tell them from
         each other, what they now make of cases that they have not learned from has to do.
         """
         off, own = [], []
         for outcome in outcomes:
             said = replayed.get(outcome.index)
-            if outcome.foretold is not None:
-                off.append((outcome, outcome.foretold.gaps_m))
+            if outcome.prediction is not None:
+                off.append((outcome, outcome.prediction.gaps_m))
             elif said is not None:
                 off.append((outcome, said[:, None]))
             if said is not None:
@@ -225,7 +225,7 @@ class PredictionSkill:
         return np.asarray(0.5 ** (age / HALF_LIFE) * np.where(own, 1.0, OTHER_LEVELS))
 
     def _learn_weights(self, known: Known, weight: FloatArray) -> None:
-        """Learn where the games, and where the surrogate, foretold the verdicts better."""
+        """Learn where the games, and where the surrogate, predicted the verdicts better."""
         failed = np.array([o.failed for o, _ in known])
         same = self._agreed(np.stack([told.gaps_m for _, told in known], axis=-1))
         chances = np.array([(told.p_twin, told.p_surrogate) for _, told in known])

@@ -9,7 +9,7 @@ from merge_sumo.samplers.annealing import AnnealingSampler
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.gpr import GprSampler
-from merge_sumo.samplers.prediction_skill import Foreteller
+from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.subset import SubsetSampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.system.suggestions import meant
@@ -24,7 +24,7 @@ SAMPLERS: Final[dict[str, type[Sampler]]] = {
 }
 
 
-def make_sampler(name: str, pool: Pool, seed: int, games: Foreteller | None = None) -> Sampler:
+def make_sampler(name: str, pool: Pool, seed: int, games: Predictor | None = None) -> Sampler:
     """Return the sampler of that name; `UserError` for a name nobody knows.
 
     `games` plays cases out, for samplers that make something of that.

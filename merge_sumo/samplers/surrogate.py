@@ -128,7 +128,7 @@ class Branches:
     """Two processes on the margin, one for each sign of it: the margin may jump in between.
 
     A process over both signs tells which one a case has. There it fails where the size of the
-    margin, which the cases of this sign foretell, is below 1. So a failure is expected where a
+    margin, which the cases of this sign predict, is below 1. So a failure is expected where a
     branch comes down to the failing interval before the other one takes over, and none where the
     margin jumps over it.
     """

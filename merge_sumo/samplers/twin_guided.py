@@ -22,7 +22,7 @@ from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import Play, PredictionSkill
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.prediction import Prediction
 
 ANYWHERE: Final = 1000
 ON_FACES: Final = 0.15
@@ -49,7 +49,7 @@ EXPLORES_FROM: Final = 5
 def informed_batch(
     history: LevelHistory, n: int, rng: np.random.Generator, play: Play, record: PredictionSkill
 ) -> Proposal:
-    """Return a batch of `n` cases at a level, of which a foreteller can play any.
+    """Return a batch of `n` cases at a level, all of which a predictor can play.
 
     P(fail) of a candidate is that of the games and that of the surrogate, weighed by the record.
     While nothing is known of the level, there is no surrogate, and half of the batch is spread out.
@@ -113,5 +113,5 @@ def informed_batch(
     curious = record.doubt(gaps_m) if explores else None
     picks, gain = greedy(ground, points, p_fail, p_fail, n - len(first), curious)
     picks, gain = first + picks, np.concatenate([np.ones(len(first)), gain])
-    said = tuple(Foretold.of(gaps_m[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks)
+    said = tuple(Prediction.of(gaps_m[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks)
     return Proposal(points[picks], gain * record.trust, p_fail[picks], said)

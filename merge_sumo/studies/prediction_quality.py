@@ -1,4 +1,4 @@
-"""How well a campaign's cases were foretold, and where its twin expects failures."""
+"""How well a campaign's cases were predicted, and where its twin expects failures."""
 
 from __future__ import annotations
 
@@ -21,49 +21,49 @@ from merge_sumo.values.scenario import DX_CRASH_M
 from merge_sumo.values.score import Outcome
 
 LAST: Final = 200
-"""Cases of which it is said how well they were foretold,"""
+"""Cases of which it is said how well they were predicted,"""
 LIKELY: Final = 0.5
 """and what chance of failing is a likely one."""
 MOST_CASES: Final = 1000
 """Cases, the last ones, that the twin of a report learns from."""
 
 
-def is_foretold(outcomes: Sequence[Outcome]) -> bool:
-    """Return whether anything was foretold of some of the cases."""
-    return any(outcome.foretold is not None for outcome in outcomes)
+def has_predictions(outcomes: Sequence[Outcome]) -> bool:
+    """Return whether anything was predicted of some of the cases."""
+    return any(outcome.prediction is not None for outcome in outcomes)
 
 
 def off_m(outcome: Outcome) -> float | None:
-    """Return how many metres the foretold gap was off; None where there was none to compare."""
-    if outcome.foretold is None or outcome.measures.score is None:
+    """Return how many metres the predicted gap was off; None where there was none to compare."""
+    if outcome.prediction is None or outcome.measures.score is None:
         return None
-    said, came = outcome.foretold.median_dx_m, outcome.signed_gap_m
+    said, came = outcome.prediction.median_dx_m, outcome.signed_gap_m
     return None if said is None or came is None else abs(said - came)
 
 
 def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:
-    """Return the cases that were foretold, those that came most otherwise first.
+    """Return the cases that were predicted, those that came most otherwise first.
 
     A metre counts more where the gap is small, and a case in which the VUT never arrived, or was
-    foretold not to, counts as one with a large gap.
+    predicted not to, counts as one with a large gap.
     """
 
     def surprise(outcome: Outcome) -> float:
-        assert outcome.foretold is not None, "only these are asked"  # noqa: S101
-        gaps = np.array([outcome.foretold.median_dx_m, outcome.signed_gap_m], dtype=np.float64)
+        assert outcome.prediction is not None, "only these are asked"  # noqa: S101
+        gaps = np.array([outcome.prediction.median_dx_m, outcome.signed_gap_m], dtype=np.float64)
         return abs(float(np.diff(compressed(gaps, limit_m))[0]))
 
-    told = [o for o in outcomes if o.foretold is not None and o.measures.score is not None]
+    told = [o for o in outcomes if o.prediction is not None and o.measures.score is not None]
     return sorted(told, key=lambda o: (-surprise(o), o.index))
 
 
-def foretold_in_words(outcomes: Sequence[Outcome]) -> str | None:
-    """Return how well the last cases were foretold; None where none was."""
-    last = [outcome for outcome in outcomes if outcome.foretold is not None][-LAST:]
+def prediction_in_words(outcomes: Sequence[Outcome]) -> str | None:
+    """Return how well the last cases were predicted; None where none was."""
+    last = [outcome for outcome in outcomes if outcome.prediction is not None][-LAST:]
     off = [gap for outcome in last if (gap := off_m(outcome)) is not None]
     if not off:
         return None
-    likely = [o for o in last if o.foretold is not None and o.foretold.p_fail >= LIKELY]
+    likely = [o for o in last if o.prediction is not None and o.prediction.p_fail >= LIKELY]
     failed = sum(outcome.failed for outcome in likely)
     middle, most = np.quantile(off, (0.5, 0.9)).tolist()
     words = f"In half of the last {len(last)} cases the error was below {_metres(middle)}, and in "

@@ -30,7 +30,7 @@ LEARNED: Final = 500
 
 
 class Twin:
-    """Learns from the motions of a campaign; see `Foreteller`.
+    """Learns from the motions of a campaign; see `Predictor`.
 
     What it says is a pure function of what it was told, however it was told. All levels of a
     campaign teach the same twin.
@@ -72,7 +72,7 @@ class Twin:
         return known and self._games.can_play(level)
 
     def play(self, level: int, points: FloatArray, screening: int | None = None) -> FloatArray:
-        """Return gaps at M, (E, G, n), of cases, (n, d), of the unit cube; see `Foreteller`."""
+        """Return gaps at M, (E, G, n), of cases, (n, d), of the unit cube; see `Predictor`."""
         experts = self._speakers()
         if screening is None:
             members = [(e, g) for e in experts for g in range(GROUPS)]

@@ -1,4 +1,4 @@
-"""What was foretold of a case before it ran."""
+"""What was predicted of a case before it ran."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DIGITS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Foretold:
+class Prediction:
     """The gaps at M that a twin of the VUT had in its games, and the chances of failing.
 
     Attributes:
@@ -63,14 +63,14 @@ class Foretold:
     def from_record(cls, record: Any) -> Self:
         """Return what a record says; KeyError, TypeError or ValueError where it is none."""
         if not isinstance(record, dict) or set(record) != set(cls.__slots__):
-            raise TypeError("what was foretold is a table of dx_m and three chances")
+            raise TypeError("what was predicted is a table of dx_m and three chances")
         gaps, chances = record["dx_m"], [record[name] for name in cls.__slots__[1:]]
         if not all(type(p) is float and 0.0 <= p <= 1.0 for p in chances):
             raise ValueError(f"chances are {chances}")
         rows = [tuple(row) for row in gaps]
         flat = [gap for row in rows for gap in row]
         if not flat or len({len(row) for row in rows}) != 1:
-            raise ValueError("every expert foretells the same number of gaps")
+            raise ValueError("every expert predicts the same number of gaps")
         if not all(gap is None or (type(gap) is float and math.isfinite(gap)) for gap in flat):
             raise TypeError("a gap is a number or null")
         return cls(tuple(rows), *chances)

@@ -20,7 +20,7 @@ from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
 from merge_sumo.values.former import take_from_0_1
 from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
-from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
 from merge_sumo.values.severity import Severity, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
@@ -130,14 +130,14 @@ class Measures:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A case that was run: its place in the campaign, its measures, and what was foretold of it.
+    """A case that was run: its place in the campaign, its measures, and what was predicted of it.
 
     Attributes:
         index: its place in the campaign.
         batch: the batch in which it ran.
         case: the case.
         measures: what was measured.
-        foretold: what was foretold of it; None where nothing was.
+        prediction: what was predicted of it; None without a prediction.
         margin: how far it is from failing under the campaign's criterion, below 0 where it fails;
             None under the paper's, which has the score P, and after an error.
     """
@@ -146,7 +146,7 @@ class Outcome:
     batch: int
     case: Case
     measures: Measures
-    foretold: Foretold | None = None
+    prediction: Prediction | None = None
     margin: float | None = None
 
     @property
@@ -193,7 +193,11 @@ class Outcome:
         record = place | {name: getattr(case, name) for name in names} | measures
         if self.margin is not None:
             record["margin"] = self.margin
-        return record if self.foretold is None else record | {"foretold": self.foretold.to_record()}
+        return (
+            record
+            if self.prediction is None
+            else record | {"foretold": self.prediction.to_record()}
+        )
 
     @classmethod
     def from_record(cls, record: dict[str, Any], scenario: Scenario = US23) -> Outcome:
@@ -208,7 +212,7 @@ class Outcome:
         in_traffic = scenario.vehicles > 2
         names = (*RECORDED, *RECORDED_IN_TRAFFIC) if in_traffic else RECORDED
         case = Case(**{name: values.pop(name) for name in names}, scenario=scenario)
-        foretold = values.pop("foretold", None)
+        prediction = values.pop("foretold", None)
         if "severity" not in values:
             take_from_0_1(values, scenario)
         values["end"] = End(values["end"])
@@ -225,7 +229,7 @@ class Outcome:
                 raise TypeError(f"{name} is {value!r}")
             if type(value) is float and not math.isfinite(value):
                 raise ValueError(f"{name} is {value!r}")
-        said = None if foretold is None else Foretold.from_record(foretold)
+        said = None if prediction is None else Prediction.from_record(prediction)
         return cls(index, batch, case, Measures(**values), said, margin)
 
 

@@ -107,7 +107,7 @@ def answer(read: Callable[[], T]) -> T | None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Run:
-    """Return a small campaign of which nothing was foretold: its report takes little time."""
+    """Return a small campaign of which nothing was predicted: its report takes little time."""
     settings = CampaignSettings(vut="design1", levels=(0,), sampler="uniform", cases=60, seed=4)
     return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
 

@@ -360,7 +360,7 @@ class TestARun:
         read = Run(run.folder)
         assert [o.to_record() for o in run.outcomes] == [o.to_record() for o in read.outcomes]
         assert run.outcomes == read.outcomes
-        assert any(o.foretold for o in run.outcomes)
+        assert any(o.prediction for o in run.outcomes)
 
     def test_scores_its_trajectories_as_it_scored_them_when_they_ran(self, run):
         assert len(run.outcomes) == 60

@@ -228,7 +228,7 @@ class TestTheCalibration:
         weights, _ = _calibrated(self.evidence(n), np.zeros(n, dtype=bool))
         assert (np.abs(weights - CALIBRATION[0]) < 2.0 * CALIBRATION[1]).all()
 
-    def test_does_not_run_away_where_failures_are_perfectly_foretold(self):
+    def test_does_not_run_away_where_failures_are_perfectly_predicted(self):
         evidence = self.evidence(400)
         evidence[:, 0] *= 20.0
         weights, posterior = _calibrated(evidence, evidence[:, 0] > 0.0)

@@ -185,7 +185,7 @@ class TestLocalProcesses:
         script.write_text(
             "import os, sys\n"
             "from merge_sumo.system.workers import open_workers\n"
-            "sys.path.insert(0, sys.argv[1])\n"
+            "sys.path[:0] = sys.argv[1:]\n"
             "from test_workers import process_ids\n"
             "if __name__ == '__main__':\n"
             "    with open_workers(2) as workers:\n"
@@ -193,9 +193,10 @@ class TestLocalProcesses:
             "        print(*{pid for _, pid in found}, flush=True)\n"
             "        os.kill(os.getpid(), 9)\n"
         )
-        here = str(Path(__file__).parent)
+        tests = Path(__file__).parents[1]
+        folders = [str(tests / name) for name in (".", "support", "system")]
         parent = subprocess.run(
-            [sys.executable, str(script), here], capture_output=True, text=True, check=False
+            [sys.executable, str(script), *folders], capture_output=True, text=True, check=False
         )
         assert parent.returncode == -signal.SIGKILL, parent.stderr
         orphans = [int(word) for word in parent.stdout.split()]

@@ -25,14 +25,14 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.prediction_skill import PredictionSkill
-from merge_sumo.studies.prediction_quality import Expected, foretold_in_words, off_m, surprises
+from merge_sumo.studies.prediction_quality import Expected, off_m, prediction_in_words, surprises
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.twin.observation import NOW, Observation
 from merge_sumo.twin.rollout import TwinRollout
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.prediction import Foretold
+from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
@@ -144,7 +144,7 @@ class TestWatching:
 
 
 class TestTwin:
-    def test_foretells_cases_that_it_has_not_seen(self, seen):
+    def test_predicts_cases_that_it_has_not_seen(self, seen):
         outcomes, motions = seen
         twin = Twin(Pool(levels=(0,)), Povs(), 0)
         twin.tell(outcomes[:40], motions)
@@ -206,19 +206,21 @@ class TestTwin:
         assert np.median(off) < 1.0
 
 
-def outcome(index: int, dx_m: float, foretold: Foretold | None = None, level: int = 0) -> Outcome:
+def outcome(
+    index: int, dx_m: float, prediction: Prediction | None = None, level: int = 0
+) -> Outcome:
     case = Case(level=level, x_pov0_m=-300.0, v_pov0_mps=30.0, svo_rad=0.5 if level == 2 else None)
     score = -600.0 if abs(dx_m) < 6.0 else -100.0
     measures = Measures(**{**NOTHING, "end": End.MERGED, "score": score, "dx_m": dx_m})
-    return Outcome(index, 0, case, measures, foretold)
+    return Outcome(index, 0, case, measures, prediction)
 
 
-def said(dx_m: float, p_twin: float, p_surrogate: float) -> Foretold:
-    return Foretold.of(np.full((2, 4), dx_m), p_twin, p_surrogate, p_twin)
+def said(dx_m: float, p_twin: float, p_surrogate: float) -> Prediction:
+    return Prediction.of(np.full((2, 4), dx_m), p_twin, p_surrogate, p_twin)
 
 
 class TestTheRecord:
-    def test_believes_who_foretold_the_verdicts(self):
+    def test_believes_who_predicted_the_verdicts(self):
         right = [outcome(i, 2.0, said(2.0, 0.9, 0.1)) for i in range(20)]
         record = PredictionSkill(right, 0, 6.0)
         assert record.twin[1] > 0.99
@@ -226,12 +228,12 @@ class TestTheRecord:
         near = record.chance(np.full((2, 4, 1), 2.0))
         assert near[0] > PredictionSkill([], 0, 6.0).chance(np.full((2, 4, 1), 2.0))[0]
 
-    def test_gives_up_who_foretells_nothing(self):
+    def test_gives_up_who_predicts_nothing(self):
         rng = np.random.default_rng(0)
         outcomes = []
         for index in range(60):
             members = rng.uniform(-20.0, 20.0, (2, 4)) if index % 2 else np.full((2, 4), 1.0)
-            outcomes.append(outcome(index, 50.0, Foretold.of(members, 0.9, 0.05, 0.5)))
+            outcomes.append(outcome(index, 50.0, Prediction.of(members, 0.9, 0.05, 0.5)))
         record = PredictionSkill(outcomes, 0, 6.0)
         assert record.is_worthless
         assert record.trust < 0.1
@@ -240,7 +242,7 @@ class TestTheRecord:
     def test_doubts_who_is_wrong_for_long_where_members_disagree(self, cases, right, doubted):
         members = np.tile([1.0, 60.0], (2, 2))
         chances = (0.1, 0.9) if right else (0.9, 0.1)
-        told = [outcome(i, 50.0, Foretold.of(members, *chances, 0.5)) for i in range(cases)]
+        told = [outcome(i, 50.0, Prediction.of(members, *chances, 0.5)) for i in range(cases)]
         assert PredictionSkill(told, 0, 6.0).is_doubted == bool(doubted)
 
     def test_prefers_the_expert_who_is_nearer_where_he_has_not_learned(self):
@@ -257,11 +259,11 @@ class TestTheRecord:
         assert doubt[0] == doubt[2] == 0.0
 
 
-class TestForetold:
+class TestPrediction:
     def test_is_read_as_it_was_written(self):
-        one = Foretold.of(np.array([[1.23456, math.nan]]), 0.5, 0.25, 0.4)
+        one = Prediction.of(np.array([[1.23456, math.nan]]), 0.5, 0.25, 0.4)
         assert one.dx_m == ((1.2346, None),)
-        assert Foretold.from_record(json.loads(json.dumps(one.to_record()))) == one
+        assert Prediction.from_record(json.loads(json.dumps(one.to_record()))) == one
         assert one.median_dx_m is None
 
     @pytest.mark.parametrize(
@@ -278,15 +280,15 @@ class TestForetold:
     def test_is_no_other_table(self, changed):
         record = {"dx_m": [[1.0]], "p_twin": 0.5, "p_surrogate": 0.5, "p_fail": 0.5}
         with pytest.raises((TypeError, ValueError, KeyError)):
-            Foretold.from_record(record | changed)
+            Prediction.from_record(record | changed)
 
 
 class TestACampaign:
-    def test_says_what_it_foretold(self, whole):
-        known = [o for o in whole.outcomes if o.foretold is not None]
+    def test_says_what_it_predicted(self, whole):
+        known = [o for o in whole.outcomes if o.prediction is not None]
         assert len(known) >= 40
         last = known[-20:]
-        off = [abs(o.foretold.median_dx_m - o.measures.dx_m) for o in last]
+        off = [abs(o.prediction.median_dx_m - o.measures.dx_m) for o in last]
         assert np.median(off) < 3.0
 
     def test_asks_for_few_cases_while_it_is_young(self, whole):
@@ -312,7 +314,7 @@ class TestACampaign:
         recorded = run.settings["learn_from_sha256"]
         assert list(recorded) == [str(whole.folder)]
         assert len(recorded[str(whole.folder)]) == 64
-        assert all(o.foretold is not None for o in run.outcomes)
+        assert all(o.prediction is not None for o in run.outcomes)
 
     def test_learns_from_no_other_scenario(self, whole, tmp_path):
         settings = replace(
@@ -334,22 +336,22 @@ def test_a_sampler_without_games_is_the_surrogate_alone():
     sampler = CoverageSampler(Pool(levels=(0,)), 1)
     sampler.tell([outcome(i, 30.0 + i) for i in range(5)])
     sampler.ask(3)
-    assert [sampler.foretold(place) for place in range(3)] == [None] * 3
+    assert [sampler.prediction(place) for place in range(3)] == [None] * 3
 
 
-def test_a_folder_of_before_has_nothing_foretold(tmp_path: Path):
+def test_a_folder_of_before_has_nothing_predicted(tmp_path: Path):
     record = outcome(0, 1.0).to_record()
     assert "foretold" not in record
 
 
 class TestTheReport:
-    def test_says_how_well_it_was_foretold(self, whole):
-        words = foretold_in_words(whole.outcomes)
+    def test_says_how_well_it_was_predicted(self, whole):
+        words = prediction_in_words(whole.outcomes)
         assert words is not None
         assert re.match(r"In half of the last \d+ cases the error was below \d", words)
-        assert foretold_in_words([outcome(0, 1.0)]) is None
+        assert prediction_in_words([outcome(0, 1.0)]) is None
 
-    def test_lists_what_came_otherwise_than_foretold(self):
+    def test_lists_what_came_otherwise_than_predicted(self):
         told = [outcome(i, 10.0 + i, said(10.0, 0.5, 0.5)) for i in range(3)]
         missed = outcome(3, -2.0, said(math.nan, 0.5, 0.5))
         assert [o.index for o in surprises([*told, missed, outcome(4, 0.0)], 6.0)] == [3, 2, 1, 0]

@@ -423,7 +423,7 @@ def shadows() -> list[int]:
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             of_us = f"\nPPid:\t{os.getpid()}\n" in (process / "status").read_text()
-            if of_us and b"traci_server" in (process / "cmdline").read_bytes():
+            if of_us and b"traci.server" in (process / "cmdline").read_bytes():
                 found.append(int(process.name))
     return found
 

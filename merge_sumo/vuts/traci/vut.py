@@ -1,7 +1,7 @@
 """A VUT behind TraCI: a controller written for SUMO, in any language, drives the vehicle `vut`.
 
 This process is the server's door: it listens, and looks whose a connection is. Who is served is
-handed to a process of its own with a shadow SUMO (`traci_server.py`), in which the client's
+handed to a process of its own with a shadow SUMO (`server.py`), in which the client's
 commands mean what they mean in SUMO. A client makes a step by `simulationStep`, so client and
 rollout go in lockstep: the speed that SUMO gives the VUT in that step becomes the acceleration of
 eq. (4), and the step is answered when ours has been made. Between two episodes the road is empty
