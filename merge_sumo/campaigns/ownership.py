@@ -13,7 +13,7 @@ from merge_sumo.campaigns.run import SETTINGS
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.trust import Code, doubt, note_own
-from merge_sumo.vuts.registry import runs_code
+from merge_sumo.vuts.registry import file_named, runs_code
 
 FILES: Final = ("vut_files", "pov_files")
 """Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
@@ -75,16 +75,7 @@ def _code(record: Mapping[str, Any]) -> Code:
 
 def _files_named(vut: str, command: str | None, pov: str | None) -> list[Path]:
     """Return the files that specs and the words of a command name."""
-    names = [path for spec in (vut, pov or "") if (path := _file_named(spec))]
+    names = [path for spec in (vut, pov or "") if (path := file_named(spec))]
     with suppress(ValueError):
         names += shlex.split(command or "")
     return [Path(name) for name in names if "\0" not in name]
-
-
-def _file_named(spec: str) -> str:
-    """Return the file of FILE.py:NAME, onnx:FILE?... or fmu:FILE?...; empty for another spec."""
-    kind, _, argument = spec.partition(":")
-    if kind in ("onnx", "fmu"):
-        return argument.partition("?")[0]
-    source = spec.rpartition(":")[0]
-    return source if source.endswith(".py") else ""

@@ -29,7 +29,7 @@ from merge_sumo.system.folders import replace_own
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VEHICLES
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.registry import built_in_vuts
+from merge_sumo.vuts.registry import built_in_vuts, waits_for_client
 
 REPEATS: Final = "repeats.jsonl"
 MOST: Final = 20
@@ -93,7 +93,7 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
     a slow machine's doing.
     """
     built_in, own = built_in_vuts(), settings.povs.own
-    if settings.vut.partition(":")[0] == "traci" and settings.vut_command is None:
+    if waits_for_client(settings.vut, settings.vut_command):
         return []
     tested = [
         outcome

@@ -31,7 +31,7 @@ def vuts(incomplete: str) -> Completions:
         return _beginning(incomplete, _names_in(incomplete.rpartition(":")[0]))
     named = [(name, "built in") for name in built_in_vuts()]
     named += [(name, "installed") for name in installed_vuts()]
-    named += [(_begun(name, kind.form), kind.what) for name, kind in KINDS.items()]
+    named += [(_begun(name, kind.form), kind.what) for name, kind in KINDS.items() if kind.form]
     return _beginning(incomplete, [*named, *_files(incomplete, (".py",), ":")])
 
 

@@ -41,7 +41,7 @@ def vuts(policies: PoliciesOption = None, as_json: JsonOption = False) -> None:
     trained = read_manifest(policies_of() if policies is None else policies_in(policies))
     built_in = [name for name in built_in_vuts() if LEARNED.get(name, name) in (name, *trained)]
     names = {"built in": built_in, "installed": list(installed_vuts())}
-    kinds = [PYTHON, *KINDS.values()]
+    kinds = [kind for kind in (PYTHON, *KINDS.values()) if kind.form]
     if as_json:
         listed = [{"form": kind.form, "what": kind.what, "example": kind.example} for kind in kinds]
         typer.echo(json.dumps({**names, "kinds": listed}))

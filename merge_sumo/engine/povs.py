@@ -11,7 +11,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.values.scenario import OWN
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.files import Files
-from merge_sumo.vuts.registry import LEARNED, VutFactory, vut_factory
+from merge_sumo.vuts.registry import VutFactory, kind_of, vut_factory
 
 POLICIES: Final = {1: "pov1", 2: "pov2"}
 """The learned POVs by their level."""
@@ -69,16 +69,8 @@ def own_pov(spec: str, options: VutOptions) -> VutFactory:
 
     It is any VUT but one behind TraCI, and is hosted with the same options.
     """
-    kind = spec.partition(":")[0]
-    if kind == "traci":
-        raise UserError(
-            f"--pov {spec}: a TraCI client drives the vehicle `vut` and no other; bring the POV as "
-            "Python, an FMU, a network or sumo:MODEL"
-        )
-    if kind in ("level0", *LEARNED):
-        raise UserError(
-            f"--pov {spec}: that is a VUT for the ramp; --level chooses the POVs of levels 0 to 2"
-        )
+    if why := kind_of(spec).no_pov:
+        raise UserError(f"--pov {spec}: {why}")
     try:
         return vut_factory(spec, replace(options, command=None))
     except UserError as error:

@@ -19,7 +19,7 @@ from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.in_memory import is_here
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.registry import VutFactory, waits_for_client
 
 CORRIDORS: Final = 4
 CASES: Final = tuple(
@@ -180,11 +180,9 @@ def _differences(
 
 def _why(factory: VutFactory, found: _Difference) -> str:
     """Return why a VUT drives differently; a case that runs first, twice, tells it."""
-    options, kind = factory.options, factory.spec.partition(":")[0]
-    begins_anew = not (options.in_process or is_here(factory.spec)) and (
-        kind != "traci" or options.command is not None
-    )
-    if not begins_anew:
+    options = factory.options
+    goes_on = waits_for_client(factory.spec, options.command)
+    if options.in_process or is_here(factory.spec) or goes_on:
         return (
             "It draws random numbers, reads a clock, or keeps something from earlier episodes, "
             "perhaps in its module or its class."

@@ -21,6 +21,7 @@ from typing import Any, Final
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import sumo_environment
 from merge_sumo.system.lifeline import end_with
+from merge_sumo.system.spawning import python_command
 
 MESSAGES: Final = "messages"
 """In the folder of a child: what it, and SUMO, write to standard error."""
@@ -92,24 +93,31 @@ class Channel:
 
 
 class SumoChild:
-    """A process of ours that runs code of ours with a SUMO; the code begins by `opened()`."""
+    """A process of this package with a SUMO.
 
-    def __init__(self, boot: str, folder: Path, settings: Mapping[str, Any]) -> None:
-        """Start it in a folder of its own; `UserError` where it cannot be started.
+    Args:
+        main: function that runs there, "MODULE:FUNCTION"; it is called with `settings`, and begins
+            by `channel_of(settings)`.
+        folder: folder of its own, where it runs.
+        settings: what JSON can hold.
 
-        `boot` is Python code that is told `settings`, as JSON, as its last argument.
-        """
+    Raises:
+        UserError: where it cannot be started.
+    """
+
+    def __init__(self, main: str, folder: Path, settings: Mapping[str, Any]) -> None:
+        """Start it."""
         ours, theirs = socket.socketpair()
         self.channel = Channel(ours)
         self._folder = folder
         unix = sys.platform != "win32"
         lifeline, self._lifeline = os.pipe() if unix else (-1, -1)
         descriptors = (theirs.fileno(), lifeline) if unix else ()
-        told = {**settings, "path": sys.path, "descriptors": descriptors, "folder": str(folder)}
+        settings = {**settings, "descriptors": descriptors, "folder": str(folder)}
         try:
             with (folder / MESSAGES).open("wb") as messages:
                 self.process = subprocess.Popen(  # noqa: S603 (our own code)
-                    [sys.executable, "-P", "-c", boot, json.dumps(told)],
+                    python_command(main, settings),
                     stdin=subprocess.DEVNULL if unix else subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=messages,
@@ -190,9 +198,8 @@ class SumoChild:
         return ChildDiedError("broke the channel")
 
 
-def opened() -> tuple[Channel, dict[str, Any]]:
-    """Return, in a child, its end of the channel and what it was told; it ends with its parent."""
-    settings: dict[str, Any] = json.loads(sys.argv[-1])
+def channel_of(settings: Mapping[str, Any]) -> Channel:
+    """Return the child's end of the channel; from now on the child ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "win32":
         end = socket.fromshare(sys.stdin.buffer.read())
@@ -200,4 +207,4 @@ def opened() -> tuple[Channel, dict[str, Any]]:
         descriptor, lifeline = settings["descriptors"]
         end_with(lifeline)
         end = socket.socket(fileno=descriptor)
-    return Channel(end), settings
+    return Channel(end)

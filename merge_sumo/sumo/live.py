@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
-from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, opened
+from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, channel_of
 from merge_sumo.sumo.replay_folder import WINDOW, view_settings
 from merge_sumo.sumo.replay_labels import COLOURS, TEXT, beside
 from merge_sumo.system.interrupt import stopping_in_order
@@ -49,10 +49,6 @@ LINE_LAYER: Final = 200
 LINE_M: Final = 0.1
 OPENS_S: Final = 60.0
 """Time that the window has to open."""
-BOOT: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[-1])['path']; "
-    "from merge_sumo.sumo.live import main; main()"
-)
 
 
 def check_display() -> None:
@@ -102,7 +98,7 @@ class Window:
             # The window reads the net behind our back, when the world has removed its files.
             files = [_kept(argument, stage) for argument in command[1:]]
             options = ["sumo-gui", *files, *look, "--start", "--delay", "0"]
-            self._child = SumoChild(BOOT, stage, {})
+            self._child = SumoChild(f"{__name__}:{main.__name__}", stage, {})
             opened.callback(self._child.kill)
             try:
                 self._call("start", options, patience_s=OPENS_S)
@@ -249,9 +245,9 @@ class _Domain:
         return partial(self._call, f"{self._name}.{name}")
 
 
-def main() -> None:
+def main(settings: Mapping[str, Any]) -> None:
     """Do in the window's process what the other one asks for, until it ends this one."""
-    channel, _ = opened()
+    channel = channel_of(settings)
     libsumo = load_libsumo()
     with suppress(EOFError, OSError):
         _serve(channel, libsumo)

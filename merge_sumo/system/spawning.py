@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final
 
+BOOT: Final = (
+    "import json, sys; settings = json.loads(sys.argv[-1]); sys.path[:] = settings['path']; "
+    f"from {__name__} import named; named(settings['main'])(settings)"
+)
 NAMES: Final = ("__file__", "__spec__")
 """By which `multiprocessing` finds the main module."""
 SAFE_PATH: Final = "PYTHONSAFEPATH"
@@ -55,3 +61,20 @@ def forget_safe_path() -> None:
     """Let what this process starts find its modules where it always does."""
     if os.environ.get(SAFE_PATH) == OURS:
         del os.environ[SAFE_PATH]
+
+
+def python_command(main: str, settings: Mapping[str, Any]) -> list[str]:
+    """Return a command that calls `main`, "MODULE:FUNCTION", with settings in a new interpreter.
+
+    It imports modules from where this process does and from nowhere else; the settings travel as
+    JSON.
+    """
+    told = {**settings, "main": main, "path": sys.path}
+    return [sys.executable, "-P", "-c", BOOT, json.dumps(told)]
+
+
+def named(name: str) -> Callable[..., Any]:
+    """Return the function "MODULE:FUNCTION"."""
+    module, _, function = name.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return found

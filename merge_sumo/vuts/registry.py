@@ -1,4 +1,4 @@
-"""The VUT: from what a person writes after `--vut` to a driver."""
+"""The kinds of VUT, and the way from a spec, as after `--vut`, to a driver."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from merge_sumo.vuts.base import Vut, VutOptions
 from merge_sumo.vuts.files import Files, hashed
 from merge_sumo.vuts.fmu import fmu_vut
 from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
-from merge_sumo.vuts.in_memory import here_vut, is_here, keep, object_of
+from merge_sumo.vuts.in_memory import HERE, here_vut, keep, object_of
 from merge_sumo.vuts.onnx import onnx_vut
 from merge_sumo.vuts.python import installed_vut, installed_vuts, python_vut
 from merge_sumo.vuts.sumo_model import sumo_vut
@@ -30,52 +30,100 @@ from merge_sumo.vuts.traci.vut import traci_vut
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Kind:
-    """A kind of VUT: what a person writes for it, what it is, and what prepares it."""
+class VutKind:
+    """A kind of VUT: all that the package asks of it.
 
-    form: str
-    what: str
-    example: str
+    Attributes:
+        form: what a person writes for it; "" for a kind that no list shows.
+        what: what it is, in a phrase.
+        example: an option `--vut` that names one.
+        prepare: makes the VUT of an argument, which is what stands behind the colon of a kind with
+            a name of its own, else the whole spec; raises `UserError`.
+        hosted: whether it runs a user's code in this process, unless that is hosted in one of its
+            own.
+        own_code: whether to test it is to run code that is neither of this package nor of SUMO.
+        by_command: whether it is a program that `--vut-command` starts; without, a person does.
+        in_memory: whether it is an object of this process.
+        file_of: returns the file that an argument names; "" for none.
+        no_pov: why it cannot drive a POV; "" where it can.
+    """
+
+    form: str = ""
+    what: str = ""
+    example: str = ""
     prepare: Callable[[str, VutOptions], Vut]
     hosted: bool = False
-    """Whether it runs a user's code in this process, unless that is hosted in one of its own."""
+    own_code: bool = True
+    by_command: bool = False
+    in_memory: bool = False
+    file_of: Callable[[str], str] = lambda _: ""
+    no_pov: str = ""
 
 
-PYTHON: Final = Kind(
+def _python_file(spec: str) -> str:
+    source = spec.rpartition(":")[0]
+    return source if source.endswith(".py") else ""
+
+
+def _file_before_options(argument: str) -> str:
+    return argument.partition("?")[0]
+
+
+def _built_in_vut(name: str, options: VutOptions) -> Vut:
+    make = built_in_vuts(options.policies)[name]
+    return Vut(make=lambda corridors, _world: make(corridors))
+
+
+PYTHON: Final = VutKind(
     form="MODULE:NAME or FILE.py:NAME",
     what="a class with act(seen), a function of seen, or a batched class",
     example="--vut my_vut.py:MyVut",
     prepare=python_vut,
     hosted=True,
+    file_of=_python_file,
 )
 INSTALLED: Final = replace(PYTHON, prepare=installed_vut)
-KINDS: Final[dict[str, Kind]] = {
-    "traci": Kind(
+BUILT_IN: Final = VutKind(prepare=_built_in_vut, own_code=False)
+RAMP_ONLY: Final = replace(
+    BUILT_IN,
+    no_pov="that is a VUT for the ramp; --level chooses the POVs of levels 0 to 2",
+)
+KINDS: Final[dict[str, VutKind]] = {
+    "traci": VutKind(
         form="traci[:PORT]",
         what="a program in any language that drives `vut` by TraCI, started by --vut-command",
         example='--vut traci --vut-command "python my_controller.py {port}"',
         prepare=traci_vut,
+        by_command=True,
+        no_pov=(
+            "a TraCI client drives the vehicle `vut` and no other; bring the POV as Python, an "
+            "FMU, a network or sumo:MODEL"
+        ),
     ),
-    "sumo": Kind(
+    "sumo": VutKind(
         form="sumo:MODEL[?OPTION=VALUE&...]",
         what="SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic",
         example='--vut "sumo:IDM?tau=1.2"',
         prepare=sumo_vut,
+        own_code=False,
     ),
-    "onnx": Kind(
+    "onnx": VutKind(
         form="onnx:FILE[?decision_period_s=SECONDS]",
         what="a network from the state to an acceleration, or to values of the 7 actions",
         example="--vut onnx:policy.onnx",
         prepare=onnx_vut,
         hosted=True,
+        file_of=_file_before_options,
     ),
-    "fmu": Kind(
+    "fmu": VutKind(
         form="fmu:FILE[?VARIABLE=NAME&...]",
         what="an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables",
         example='--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"',
         prepare=fmu_vut,
         hosted=True,
+        file_of=_file_before_options,
     ),
+    HERE: VutKind(prepare=here_vut, in_memory=True),
 }
 """The kinds that have a name of their own before the colon."""
 
@@ -159,12 +207,37 @@ def _arrived(spec: str, options: VutOptions, files: Files | None, vut: Any) -> V
     return VutFactory(spec, options, files)
 
 
+def kind_of(spec: str) -> VutKind:
+    """Return the kind of VUT that a spec names; a name that nobody knows counts as installed."""
+    prefix, colon, _ = spec.partition(":")
+    if prefix in KINDS:
+        return KINDS[prefix]
+    if spec in ("level0", *LEARNED):
+        return RAMP_ONLY
+    if spec in built_in_vuts():
+        return BUILT_IN
+    return PYTHON if colon else INSTALLED
+
+
 def runs_code(spec: str, command: str | None) -> bool:
     """Return whether to test a VUT is to run code that is not of this package or of SUMO."""
-    prefix = spec.partition(":")[0]
-    if prefix == "traci":
-        return command is not None
-    return prefix != "sumo" and spec not in built_in_vuts()
+    kind = kind_of(spec)
+    return kind.own_code and not (kind.by_command and command is None)
+
+
+def waits_for_client(spec: str, command: str | None) -> bool:
+    """Return whether a person starts the VUT's program, which then cannot be begun anew."""
+    return kind_of(spec).by_command and command is None
+
+
+def file_named(spec: str) -> str:
+    """Return the file that a spec names; "" for none."""
+    return kind_of(spec).file_of(_argument(spec))
+
+
+def _argument(spec: str) -> str:
+    prefix, _, argument = spec.partition(":")
+    return argument if prefix in KINDS else spec
 
 
 def vut_factory(spec: str, options: VutOptions | None = None) -> VutFactory:
@@ -173,35 +246,31 @@ def vut_factory(spec: str, options: VutOptions | None = None) -> VutFactory:
 
 
 def find_vut(spec: str, options: VutOptions) -> Vut:
-    """Return the VUT that a spec names; `UserError` for a name nobody knows."""
-    prefix, colon, argument = spec.partition(":")
-    if prefix in KINDS:
-        return _prepared(KINDS[prefix], argument, spec, options)
-    if is_here(spec):
-        return here_vut(argument, options)
-    if options.command is not None:
+    """Return the VUT that a spec names, hosted in a process of its own where its kind says so.
+
+    Raises:
+        UserError: for a name that nobody knows, and for a VUT that cannot be loaded.
+    """
+    kind = kind_of(spec)
+    if options.command is not None and not kind.by_command:
         raise UserError(f"--vut-command goes with --vut traci, not with {spec}")
-    built_in = built_in_vuts(options.policies)
-    if spec in built_in:
-        make = built_in[spec]
-        return Vut(make=lambda corridors, _world: make(corridors))
-    if colon:
-        return _prepared(PYTHON, spec, spec, options)
-    installed = installed_vuts()
-    if spec in installed:
-        return _prepared(INSTALLED, spec, spec, options)
+    if kind is INSTALLED and spec not in installed_vuts():
+        raise UserError(_why_unknown(spec))
+    if kind.hosted and not options.in_process and SUPPORTED:
+        return hosted_vut(FINDER, spec, options)
+    return kind.prepare(_argument(spec), options)
+
+
+def _why_unknown(spec: str) -> str:
     if spec.endswith(".py"):
-        raise UserError(f"{spec} is a file: name a class or a function of it, {spec}:NAME")
-    names = [*built_in, *installed]
+        return f"{spec} is a file: name a class or a function of it, {spec}:NAME"
+    names = [*built_in_vuts(), *installed_vuts()]
     choice = f"{', '.join(names)}, or bring your own (`merge-sumo vuts` lists the kinds)"
     if not spec:
-        raise UserError(f"name the vehicle under test, as in --vut design2: {choice}")
-    raise UserError(
-        f"there is no VUT {spec!r}: {meant(spec, (*names, *KINDS))}choose one of {choice}"
-    )
+        return f"name the vehicle under test, as in --vut design2: {choice}"
+    kinds = [name for name, kind in KINDS.items() if kind.form]
+    return f"there is no VUT {spec!r}: {meant(spec, (*names, *kinds))}choose one of {choice}"
 
 
-def _prepared(kind: Kind, argument: str, spec: str, options: VutOptions) -> Vut:
-    if kind.hosted and not options.in_process and SUPPORTED:
-        return hosted_vut(spec, options)
-    return kind.prepare(argument, options)
+FINDER: Final = f"{__name__}:{find_vut.__name__}"
+"""What finds a VUT in the process that hosts it."""

@@ -7,14 +7,12 @@ both share, and the episodes of the other corridors begin anew.
 
 from __future__ import annotations
 
-import json
 import math
 import mmap
 import os
 import select
 import signal
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -29,6 +27,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.blame import how_it_ended
 from merge_sumo.system.pulse import AwakeClock
+from merge_sumo.system.spawning import python_command
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.signals import Left
 from merge_sumo.vuts.base import Deadline, Vut, VutOptions
@@ -37,11 +36,8 @@ from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.wire import About, Frame, WireError
 from merge_sumo.vuts.output import Output
 
-BOOT: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1])['path']; "
-    "from merge_sumo.vuts.host.process import main; main()"
-)
-"""With `python -P -c`: modules are found where the other process finds them, and nowhere else."""
+HOSTING: Final = "merge_sumo.vuts.host.process:main"
+"""What runs in the process of a VUT."""
 SUPPORTED: Final = os.name == "posix"
 """Elsewhere descriptors do not pass to another process, and a VUT runs in this one."""
 GRACE: Final = 1.5
@@ -53,12 +49,21 @@ LOOK_S: Final = 0.25
 ENDING_S: Final = 2.0
 
 
-def hosted_vut(spec: str, options: VutOptions) -> Vut:
-    """Return a VUT whose code runs in a process of its own; `UserError` for one that cannot be."""
-    facts = _facts(spec, options)
+def hosted_vut(finder: str, spec: str, options: VutOptions) -> Vut:
+    """Return a VUT whose code runs in a process of its own.
+
+    Args:
+        finder: "MODULE:FUNCTION" that prepares the VUT there, from a spec and options.
+        spec: names the VUT.
+        options: how it is hosted.
+
+    Raises:
+        UserError: for a VUT that cannot be opened.
+    """
+    facts = _facts(finder, spec, options)
 
     def make(corridors: int, _world: World | None) -> Driver:
-        return HostedVut(corridors, spec, options)
+        return HostedVut(corridors, finder, spec, options)
 
     return Vut(
         make=make,
@@ -84,11 +89,11 @@ _known: dict[tuple[str, str, float], _Facts] = {}
 """By spec, working folder and memory: a process is not started again where no file has changed."""
 
 
-def _facts(spec: str, options: VutOptions) -> _Facts:
+def _facts(finder: str, spec: str, options: VutOptions) -> _Facts:
     key = spec, str(Path.cwd()), options.memory_gib
     known = _known.get(key)
     if known is None or any(_stamp(file) != stamp for file, stamp in known.stamps):
-        host = _first(lambda: Host(spec, options))
+        host = _first(lambda: Host(finder, spec, options))
         try:
             said = host.said
         finally:
@@ -142,7 +147,7 @@ class Host:
     `said` is what the VUT said of itself: "max_corridors", "max_workers" and "files".
     """
 
-    def __init__(self, spec: str, options: VutOptions) -> None:
+    def __init__(self, finder: str, spec: str, options: VutOptions) -> None:
         """Start the process and open the VUT; `UserError` when that cannot be."""
         self._options = options
         self._number = 0
@@ -151,7 +156,7 @@ class Host:
         self._buffer = bytearray()
         self._start()
         try:
-            told = {"spec": spec, "deadline_s": options.deadline_s}
+            told = {"finder": finder, "spec": spec, "deadline_s": options.deadline_s}
             self.said: Mapping[str, Any] = wire.from_json(
                 self._opened(spec, About.OPEN, wire.to_json(told)), dict
             )
@@ -225,14 +230,13 @@ class Host:
         with tempfile.TemporaryFile() as memory:
             memory.truncate(BlameCell.FORMAT.size)
             settings = {
-                "path": sys.path,
                 "memory_gib": self._options.memory_gib,
                 "lifeline": their_lifeline,
                 "asked": memory.fileno(),
             }
             try:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-c", BOOT, json.dumps(settings)],
+                    python_command(HOSTING, settings),
                     stdin=their_in,
                     stdout=their_out,
                     stderr=subprocess.PIPE,
@@ -323,10 +327,10 @@ def _end_strays(inherited: str) -> None:
 class HostedVut(Driver):
     """Passes every step on to the process of the VUT."""
 
-    def __init__(self, corridors: int, spec: str, options: VutOptions) -> None:
+    def __init__(self, corridors: int, finder: str, spec: str, options: VutOptions) -> None:
         """Start the process and make the VUT's driver there; `UserError` when that cannot be."""
         super().__init__(corridors)
-        self._spec, self._options = spec, options
+        self._finder, self._spec, self._options = finder, spec, options
         self._begun: list[tuple[int, Case]] = []
         self._reasons: dict[int, str] = {}
         self._signals: dict[int, Left] = {}
@@ -392,7 +396,7 @@ class HostedVut(Driver):
         self._host.close()
 
     def _started(self) -> Host:
-        host = Host(self._spec, self._options)
+        host = Host(self._finder, self._spec, self._options)
         self._files |= {Path(file) for file in host.said["files"]}
         host.make(self._spec, self.corridors)
         return host

@@ -6,11 +6,11 @@ channel at first and are then given to the VUT as nothing and as its log.
 
 from __future__ import annotations
 
-import json
 import mmap
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from merge_sumo.drivers.base import Driver, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.system.lifeline import end_with
+from merge_sumo.system.spawning import named
 from merge_sumo.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.vuts.blame_cell import BlameCell, asked
 from merge_sumo.vuts.host import wire
@@ -26,9 +27,8 @@ from merge_sumo.vuts.host.file_audit import LoadedFiles
 from merge_sumo.vuts.host.wire import About, Frame
 
 
-def main() -> None:
+def main(settings: Mapping[str, Any]) -> None:
     """Host a VUT until the channel ends."""
-    settings = json.loads(sys.argv[1])
     sys.argv[1:] = []
     channel = _Channel()
     _hear_signals()
@@ -113,15 +113,14 @@ class _Hosting:
         return About.DONE, self._act(self._driver, question.content)
 
     def _open(self, told: dict[str, Any]) -> dict[str, Any]:
-        # Only here: what is above starts this process, and imports this module.
-        from merge_sumo.vuts.registry import find_vut
-
+        find_vut = named(told["finder"])
         options = VutOptions(deadline_s=told["deadline_s"], in_process=True)
         self._loaded = LoadedFiles()
-        self._vut = find_vut(told["spec"], options)
+        vut: Vut = find_vut(told["spec"], options)
+        self._vut = vut
         return {
-            "max_corridors": self._vut.max_corridors,
-            "max_workers": self._vut.max_workers,
+            "max_corridors": vut.max_corridors,
+            "max_workers": vut.max_workers,
             "files": self._files(),
         }
 

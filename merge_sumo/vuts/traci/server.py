@@ -20,7 +20,7 @@ from typing import Any, Final, TypeVar
 import merge_sumo
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.child import Channel, opened
+from merge_sumo.sumo.child import Channel, channel_of
 from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, ShadowRoad, ShadowSumo, State
 from merge_sumo.sumo.traci_names import named
 from merge_sumo.system.landlock import lock_in
@@ -32,10 +32,6 @@ from merge_sumo.vuts.traci.session import CLOSE, SIMULATION_STEP, Session
 
 T = TypeVar("T")
 
-BOOT: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[-1])['path']; "
-    "from merge_sumo.vuts.traci.server import main; main()"
-)
 INSTALLED: Final = ("site-packages", "dist-packages")
 FAREWELL_STEPS: Final = 10
 """Steps on an empty road, with no vehicle to come, in which a client may end by itself."""
@@ -61,9 +57,9 @@ class ClosedError(Exception):
     """The client said goodbye while no vehicle was on the road."""
 
 
-def main() -> None:
+def main(settings: Mapping[str, Any]) -> None:
     """Serve clients, one after the other, until the channel ends."""
-    channel, settings = opened()
+    channel = channel_of(settings)
     folder, road = Path(settings["folder"]), ShadowRoad.from_record(settings["road"])
     _limit()
     try:

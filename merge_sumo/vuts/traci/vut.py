@@ -35,8 +35,9 @@ from merge_sumo.values.scenario import DT_S, POV, US23, VEHICLES, Scenario
 from merge_sumo.vuts.base import Seen, Vut, VutOptions, seen_in
 from merge_sumo.vuts.process import TOKEN_VARIABLE, Program, split_command
 from merge_sumo.vuts.traci.door import HOST, Door, Peer
-from merge_sumo.vuts.traci.server import BOOT
 
+SERVER: Final = "merge_sumo.vuts.traci.server:main"
+"""What runs in the process that serves a client."""
 DEFAULT_PORT: Final = 8813
 """Where TraCI clients connect when they are not told otherwise."""
 START_S: Final = 60.0
@@ -336,7 +337,7 @@ class Shadow:
                 "road": ShadowRoad.of(self._road).to_record(),
                 "vehicles": VEHICLES[: self._scenario.vehicles],
             }
-            child = SumoChild(BOOT, folder, settings)
+            child = SumoChild(SERVER, folder, settings)
             opened.callback(child.kill)
             self._opened = opened.pop_all()
         self._child, self._ready = child, False
