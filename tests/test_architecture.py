@@ -48,10 +48,23 @@ def module_of(file: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+IN_A_TEXT = re.compile(
+    r"(?:\bimport|\bfrom)\s+(merge_sumo(?:\.\w+)*)(?:\s+import\s+(\w+))?"
+    r"|^(merge_sumo(?:\.\w+)+)(?::\w+)?$"
+)
+"""An import in the text of a string, or a string that is the name of a module (and function)."""
+
+
 def imports(source: str, module: str = "merge_sumo.here", *, is_package: bool = False) -> set[str]:
-    """Return the dotted names that a source imports, by statement or by name, at any depth."""
+    """Return the dotted names that a source imports, at any depth.
+
+    By statement, by a call with a name, and by a string of this package: the text of a program, or
+    the name of a module.
+    """
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    prose = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -61,12 +74,62 @@ def imports(source: str, module: str = "merge_sumo.here", *, is_package: bool = 
                 above = package[: len(package) - node.level + 1]
                 base = ".".join([*above, base] if base else above)
             found |= {base} | {f"{base}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.Call) and called(node) in ("import_module", "__import__"):
+        elif isinstance(node, ast.Call) and called(node) in IMPORTERS:
             names = [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
             found |= {str(name) for name in names}
-        elif isinstance(node, ast.Constant) and OBJECT.fullmatch(str(node.value)):
-            found.add(str(node.value).partition(":")[0])
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in prose:
+            for base, name, alone in IN_A_TEXT.findall(node.value):
+                found |= {alone or base, f"{base}.{name}" if name else alone or base}
     return found
+
+
+IMPORTERS = ("import_module", "__import__")
+IMPORTED_BY_A_VARIABLE = {
+    "merge_sumo": "the room of a public name that is asked for",
+    "merge_sumo.reports.exports": "a package of the extra `export`",
+    "merge_sumo.system.workers": "what a worker loads first",
+    "merge_sumo.system.spawning": "the function that a new process of this package is to run",
+    "merge_sumo.vuts.python": "the module of a user's VUT",
+}
+"""Files that import what a variable names, and what that is."""
+
+
+def imports_a_variable(source: str) -> bool:
+    """Return whether a source imports a module whose name is no literal."""
+    calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    return any(
+        called(call) in IMPORTERS and not isinstance(call.args[0], ast.Constant) for call in calls
+    )
+
+
+LOADED_BY_WORKERS = {"merge_sumo.engine.simulator"}
+"""Named in `system/workers.py`, which is to be told it instead."""
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Return the files of the package that each imports, by their dotted names."""
+    modules = {module_of(file): file for file in FILES}
+    return {
+        module: {name for name in imports_of(file) if name in modules}
+        - {module, *(LOADED_BY_WORKERS if module == "merge_sumo.system.workers" else ())}
+        for module, file in modules.items()
+    }
+
+
+def circle_in(graph: dict[str, set[str]]) -> list[str]:
+    """Return files of which each imports the next and the last the first; [] where none do."""
+    done: set[str] = set()
+
+    def search(path: list[str]) -> list[str]:
+        for name in sorted(graph.get(path[-1], ())):
+            if name in path:
+                return path[path.index(name) :]
+            if name not in done and (circle := search([*path, name])):
+                return circle
+        done.add(path[-1])
+        return []
+
+    return next((circle for name in sorted(graph) if (circle := search([name]))), [])
 
 
 def called(node: ast.Call) -> str:
@@ -184,9 +247,17 @@ class TestImports:
                 continue
             allowed = {*LAYERS[: LAYERS.index(room) + 1], ""}
             ours = imports_any(imports_of(file), {"merge_sumo"})
-            if wrong := {name for name in ours if layer_of(name) not in allowed}:
+            wrong = {name for name in ours if layer_of(name) not in allowed}
+            if wrong - LOADED_BY_WORKERS:
                 above[module_of(file)] = wrong
         assert above == {}
+
+    def test_of_files_make_no_circle(self):
+        assert circle_in(import_graph()) == []
+
+    def test_of_what_a_variable_names_are_known(self):
+        files = {module_of(f) for f in FILES if imports_a_variable(f.read_text(encoding="utf-8"))}
+        assert files == set(IMPORTED_BY_A_VARIABLE)
 
     def test_are_known_for_every_folder_of_the_package(self):
         folders = {f.relative_to(PACKAGE).parts[0] for f in FILES if f.parent != PACKAGE}
@@ -268,6 +339,32 @@ class TestTheChecksThemselves:
 
     def test_see_what_a_registry_imports_by_name(self):
         assert imports_any(imports("R({'a': 'merge_sumo.sumo.world:World'})"), {"merge_sumo.sumo"})
+
+    @pytest.mark.parametrize(
+        "source",
+        [
+            "BOOT = 'import sys; from merge_sumo.sumo.live import main; main()'",
+            "BOOT = 'import merge_sumo.sumo.live as live'",
+            "SERVER = 'merge_sumo.sumo.live:main'",
+            "f(name='merge_sumo.sumo.live')",
+            'f"import json; from merge_sumo.sumo.live import {name}"',
+        ],
+    )
+    def test_see_an_import_that_is_written_in_a_string(self, source):
+        assert "merge_sumo.sumo.live" in imports(source)
+
+    def test_do_not_take_prose_for_an_import(self):
+        assert imports("'see merge_sumo.sumo.live for that'") == set()
+        assert imports("'made by merge_sumo'") == set()
+
+    def test_see_an_import_of_what_a_variable_names(self):
+        assert imports_a_variable("import_module(name)")
+        assert not imports_a_variable("import_module('libsumo')")
+
+    def test_see_a_circle(self):
+        graph = {"a": {"b"}, "b": {"c", "d"}, "c": set(), "d": {"b"}}
+        assert circle_in(graph) == ["b", "d"]
+        assert circle_in({"a": {"b"}, "b": {"c"}, "c": set()}) == []
 
     def test_do_not_mistake_a_name_for_its_beginning(self):
         assert not imports_any(imports("import sumolibrary, merge_sumo.sumo"), {"sumolib", "sumo"})

@@ -17,7 +17,6 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final, TypeVar
 
-import merge_sumo
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.child import Channel, channel_of
@@ -32,6 +31,7 @@ from merge_sumo.vuts.traci.session import CLOSE, SIMULATION_STEP, Session
 
 T = TypeVar("T")
 
+PACKAGE: Final = Path(__file__).resolve().parents[2]
 INSTALLED: Final = ("site-packages", "dist-packages")
 FAREWELL_STEPS: Final = 10
 """Steps on an empty road, with no vehicle to come, in which a client may end by itself."""
@@ -80,7 +80,7 @@ def _folders_to_read() -> list[Path]:
     paths = sysconfig.get_paths()
     modules = {Path(paths[name]) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
     modules |= {Path(folder) for folder in sys.path if Path(folder).name in INSTALLED}
-    return [*modules, Path(sumo_program("sumo")).parents[1], Path(merge_sumo.__file__).parent]
+    return [*modules, Path(sumo_program("sumo")).parents[1], PACKAGE]
 
 
 def _limit() -> None:
