@@ -160,7 +160,7 @@ def compare(
     vut: AnyVut,
     level: int | str = "all",
     *,
-    samplers: Sequence[str] = tuple(SAMPLERS),
+    samplers: Sequence[str] | None = None,
     seeds: int = 10,
     cases: int = 400,
     batch: int | None = None,
@@ -176,7 +176,7 @@ def compare(
     Args:
         vut: as of `campaign`.
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all", over which coverage is summed.
-        samplers: their names.
+        samplers: their names; all by default.
         seeds: runs of each sampler.
         cases: cases of each run.
         batch: cases per batch; by default 20, and what it wants for `coverage`.
@@ -190,7 +190,9 @@ def compare(
     Raises `UserError` for values that make no comparison.
     """
     check_keywords("compare", setup, Setup)
-    names = list(dict.fromkeys(name.strip() for name in samplers))
+    names = list(
+        dict.fromkeys(name.strip() for name in (SAMPLERS if samplers is None else samplers))
+    )
     if not names:
         raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}")
     settings, count = settings_for(

@@ -59,7 +59,7 @@ def campaign(
     sampler: Annotated[
         str,
         typer.Option(
-            help="Who chooses: uniform, annealing, subset, gpr or coverage.",
+            help="What chooses the cases: {samplers}.",
             autocompletion=complete.samplers,
         ),
     ] = DEFAULT_SAMPLER,

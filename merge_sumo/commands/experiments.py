@@ -81,9 +81,13 @@ def compare(
     vut: VutOption,
     level: LevelOption = "all",
     samplers: Annotated[
-        str,
-        typer.Option(help="Names, separated by commas.", autocompletion=complete.samplers),
-    ] = "uniform,annealing,subset,gpr,coverage",
+        str | None,
+        typer.Option(
+            help="Names, separated by commas: {samplers}.",
+            show_default="all",
+            autocompletion=complete.samplers,
+        ),
+    ] = None,
     seeds: Annotated[int, typer.Option(help="Runs of each sampler.")] = 10,
     cases: Annotated[int, typer.Option(help="Cases of each run.")] = 400,
     batch: Annotated[
@@ -132,7 +136,9 @@ def compare(
     if figure is not None:
         figures.check_figure(figure)
     asked = settings_in(context, "seeds", "truth_cases", "dense", "workers", "dask")
-    found = api.compare(**asked, samplers=samplers.split(","), progress=not quiet)
+    found = api.compare(
+        **asked, samplers=None if samplers is None else samplers.split(","), progress=not quiet
+    )
     if figure is not None:
         title = f"{vut} v level {'/'.join(map(level_name, found.truths))}, {seeds} seeds"
         picture = figures.coverage_curves(

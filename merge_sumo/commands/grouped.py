@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final, TextIO, TypeVar
 
@@ -15,6 +15,7 @@ from typer.core import TyperOption
 from merge_sumo.commands.once import OnceCommand
 from merge_sumo.errors import Notice
 from merge_sumo.system.printable import printable
+from merge_sumo.system.suggestions import either
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
@@ -39,6 +40,16 @@ An option has one name and one group in all commands.
 """
 GROUP_OF: Final = {name: group for group, names in GROUPS.items() for name in names}
 
+
+def _samplers() -> Iterable[str]:
+    from merge_sumo.samplers.registry import SAMPLERS
+
+    return SAMPLERS
+
+
+NAMES: Final[Mapping[str, Callable[[], Iterable[str]]]] = {"{samplers}": _samplers}
+"""What stands for the names of a registry in a help text; they are looked up when it is shown."""
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -60,6 +71,15 @@ class GroupedCommand(OnceCommand):
                 parameter.rich_help_panel = GROUP_OF.get(parameter.name or "")
         # Arguments stay in front, in their order.
         self.params.sort(key=lambda p: order.get(getattr(p, "rich_help_panel", None) or "", -1))
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the options; `{samplers}` in a help text becomes the names of a registry."""
+        for parameter in self.params:
+            text = getattr(parameter, "help", None) or ""
+            for placeholder, names in NAMES.items():
+                if placeholder in text:
+                    parameter.help = text = text.replace(placeholder, either(names()))  # type: ignore[attr-defined]
+        return super().get_params(ctx)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; a `Notice` becomes a sentence on standard error, and so does Ctrl-C."""

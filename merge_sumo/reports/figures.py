@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from merge_sumo.errors import UserError
+from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies.benchmark import Comparison
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
@@ -29,15 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS: Final = {
-    "truth": "#000000",
-    "uniform": "#8a8a8a",
-    "annealing": "#E69F00",
-    "subset": "#009E73",
-    "gpr": "#0072B2",
-    "coverage": "#D55E00",
-}
-OTHER_COLOUR: Final = "#7B3294"
+TRUTH: Final = "truth"
+TRUTH_COLOUR: Final = "#000000"
 LEVEL_COLOURS: Final = {0: "#000000", 1: "#CC79A7", 2: "#56B4E9", OWN: "#009E73"}
 LEVEL_MARKERS: Final = {0: "o", 1: "s", 2: "^", OWN: "D"}
 SAFE_COLOUR: Final = "#c4c9cf"
@@ -130,7 +124,7 @@ def _drawing(width: float, height: float) -> Iterator[Figure]:
 
 def colour(name: str) -> str:
     """Return the colour of a sampler, or of the truth."""
-    return COLOURS.get(name, OTHER_COLOUR)
+    return TRUTH_COLOUR if name == TRUTH else SAMPLERS[name].colour
 
 
 def coverage_curves(

@@ -36,6 +36,9 @@ class AnnealingSampler(LevelwiseSampler):
     and the batch, so that it is the same whenever it is replayed.
     """
 
+    about = "looks for the lowest score by simulated annealing"
+    colour = "#E69F00"
+
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:

@@ -30,6 +30,10 @@ class Sampler(ABC):
     telling its journal to a fresh sampler.
     """
 
+    about: ClassVar[str] = ""
+    """What it does, in a line without a full stop: for help and documentation."""
+    colour: ClassVar[str] = "#7B3294"
+    """Of its curves in figures, #RRGGBB."""
     learns: ClassVar[bool] = True
     """Whether outcomes decide on what it proposes, and not only how many cases there were."""
     foresees: ClassVar[bool] = False

@@ -54,6 +54,8 @@ class CoverageSampler(Sampler):
     three, and level 2 would never be asked.
     """
 
+    about = "asks for the batch that promises the most new coverage"
+    colour = "#D55E00"
     foresees = True
 
     def ask(self, n: int) -> list[Case]:

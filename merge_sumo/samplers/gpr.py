@@ -61,6 +61,9 @@ class GprSampler(LevelwiseSampler):
     ===========================  =====  =====  ===========================  =====  =====
     """
 
+    about = "chooses by a Gaussian process on the score: the paper's Algorithm 1"
+    colour = "#0072B2"
+
     def allocate(self, n: int) -> dict[int, int]:
         """Return equal shares first, then shares by the softmax of the last failure shares."""
         outcomes = self.told()

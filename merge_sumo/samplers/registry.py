@@ -2,36 +2,44 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from merge_sumo.errors import UserError
-from merge_sumo.samplers.annealing import AnnealingSampler
-from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.coverage import CoverageSampler
-from merge_sumo.samplers.gpr import GprSampler
-from merge_sumo.samplers.prediction_skill import Predictor
-from merge_sumo.samplers.subset import SubsetSampler
-from merge_sumo.samplers.uniform import UniformSampler
-from merge_sumo.system.suggestions import meant
-from merge_sumo.values.case import Pool
+from merge_sumo.system.registry import Registry
 
-SAMPLERS: Final[dict[str, type[Sampler]]] = {
-    "uniform": UniformSampler,
-    "annealing": AnnealingSampler,
-    "subset": SubsetSampler,
-    "gpr": GprSampler,
-    "coverage": CoverageSampler,
-}
+if TYPE_CHECKING:
+    from merge_sumo.samplers.base import Sampler
+    from merge_sumo.samplers.prediction_skill import Predictor
+    from merge_sumo.values.case import Pool
+
+
+def _is_sampler(item: object) -> bool:
+    from merge_sumo.samplers.base import Sampler
+
+    return isinstance(item, type) and issubclass(item, Sampler)
+
+
+SAMPLERS: Final[Registry[type[Sampler]]] = Registry(
+    "merge_sumo.samplers",
+    "sampler",
+    {
+        "uniform": "merge_sumo.samplers.uniform:UniformSampler",
+        "annealing": "merge_sumo.samplers.annealing:AnnealingSampler",
+        "subset": "merge_sumo.samplers.subset:SubsetSampler",
+        "gpr": "merge_sumo.samplers.gpr:GprSampler",
+        "coverage": "merge_sumo.samplers.coverage:CoverageSampler",
+    },
+    accepts=_is_sampler,
+    contract="a subclass of merge_sumo.samplers.base.Sampler",
+)
 
 
 def make_sampler(name: str, pool: Pool, seed: int, games: Predictor | None = None) -> Sampler:
-    """Return the sampler of that name; `UserError` for a name nobody knows.
+    """Return the sampler of that name; `UserError` for an unknown name.
 
-    `games` plays cases out, for samplers that make something of that.
+    Args:
+        name: as in `SAMPLERS`.
+        pool: cases from which it chooses.
+        seed: same seed, same proposals.
+        games: plays cases out, for samplers that foresee.
     """
-    if name not in SAMPLERS:
-        raise UserError(
-            f"there is no sampler {name!r}: {meant(name, SAMPLERS)}choose one of "
-            f"{', '.join(SAMPLERS)}"
-        )
     return SAMPLERS[name](pool, seed, games)

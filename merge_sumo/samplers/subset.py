@@ -111,6 +111,9 @@ class SubsetSampler(LevelwiseSampler):
     distribution each is accepted exactly where it stays in the region.
     """
 
+    about = "draws from ever smaller regions of low scores by Markov chains"
+    colour = "#009E73"
+
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:

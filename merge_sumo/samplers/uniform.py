@@ -10,6 +10,8 @@ from merge_sumo.values.case import Case
 class UniformSampler(Sampler):
     """Draws every case uniformly from the pool, an equal number at each level."""
 
+    about = "draws every case uniformly from the pool"
+    colour = "#8a8a8a"
     learns = False
 
     def ask(self, n: int) -> list[Case]:

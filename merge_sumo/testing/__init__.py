@@ -1,5 +1,6 @@
-"""What tests of others call: assertions on a controller, for pytest or any other runner."""
+"""What tests of others use: assertions on a controller, and contracts of what extends the tool."""
 
 from merge_sumo.testing.assertions import assert_no_failures
+from merge_sumo.testing.contracts import SamplerContract
 
-__all__ = ["assert_no_failures"]
+__all__ = ["SamplerContract", "assert_no_failures"]

@@ -142,7 +142,7 @@ def test_allocation_shows_each_level_and_leaves_a_gap_where_it_had_no_case(tmp_p
 
 
 def test_every_sampler_has_a_colour_of_its_own():
-    colours = [figures.colour(name) for name in [*SAMPLERS, "truth", "another"]]
+    colours = [figures.colour(name) for name in [*SAMPLERS, "truth"]]
     assert len(set(colours)) == len(colours)
 
 
