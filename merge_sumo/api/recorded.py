@@ -13,14 +13,11 @@ from merge_sumo.campaigns.run import SETTINGS, Run
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.reports import exports
-from merge_sumo.reports.comparison_page import write_comparison
-from merge_sumo.reports.history_page import write_history
 from merge_sumo.reports.progress import Counter
-from merge_sumo.studies import comparison
-from merge_sumo.studies.changes import RunComparison
+from merge_sumo.reports.version_pages import comparison_page, history_page, write_page
+from merge_sumo.studies import versions
 from merge_sumo.studies.history import History, history_of
-from merge_sumo.studies.rerun import Rerun, settings_today
-from merge_sumo.studies.rerun import rerun as run_again
+from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
 from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.replay import Replay
 from merge_sumo.system.folders import check_new_file, check_own
@@ -84,7 +81,7 @@ def rerun(
         Counter(f"{today.vut} again", total, "cases", shown=progress) as counter,
     ):
         road = None if net is None else Path(net)
-        return run_again(before, today, wanted, net=road, workers=there, on_case=counter.ended)
+        return versions.rerun(before, today, wanted, net=road, workers=there, on_case=counter.ended)
 
 
 def _of_level(run: Run, indices: tuple[int, ...], level: int | str | None) -> tuple[int, ...]:
@@ -137,11 +134,11 @@ def compare_runs(
     def keep(of: str, index: int, trajectory: Trajectory) -> None:
         motions[of, index] = trajectory
 
-    compared = comparison.compare_runs(
-        first, second, rerun=rerun, net=road, given=given, trust=trust_vut, on_again=keep
+    compared = versions.compare_runs(
+        first, second, rerun=rerun, net=road, given=given, trust=trust_vut, on_motion=keep
     )
     if out is not None:
-        write_comparison(compared, first, second, motions, tolerance, Path(out))
+        write_page(comparison_page(compared, first, second, motions, tolerance), Path(out))
     return compared
 
 
@@ -164,7 +161,7 @@ def history(runs: Iterable[AnyRun], *, out: Path | str | None = None) -> History
         check_new_file(Path(out))
     found = history_of([opened(run).run for run in runs])
     if out is not None:
-        write_history(found, Path(out))
+        write_page(history_page(found), Path(out))
     return found
 
 

@@ -43,7 +43,7 @@ from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
     from merge_sumo.api.results import CaseRun
-    from merge_sumo.studies.rerun import Rerun
+    from merge_sumo.studies.versions import Rerun
 
 
 @app.command()

@@ -26,7 +26,7 @@ from merge_sumo.commands.shared import (
 from merge_sumo.system.printable import quoted
 
 if TYPE_CHECKING:
-    from merge_sumo.studies.changes import RunComparison
+    from merge_sumo.studies.versions import RunComparison
 
 
 class Format(StrEnum):

@@ -1,32 +1,44 @@
-"""Several versions of a VUT in one page: what was found of each, and what changed between them.
+"""The history of a VUT: several campaigns, oldest first, compared by regions of failures.
 
-All of it is read from the records of the campaigns: no code of a folder is run, and no case again.
-What changed between neighbours is therefore told by regions (`history_steps.py`). `compare_runs`
-runs failures again and knows more.
+All of it is read from the records of the campaigns: no code of a folder is run, and no case again;
+`versions.compare_runs` runs failures again and knows more.
+
+Failures that are linked at the radius of FMC are one region, and what the other version did in it
+is what its own cases there say, those within that radius of a failure of the region. A region of
+the earlier version in which the later one tested cases and none failed counts as fixed; one of the
+later version in which the earlier one tested cases and none failed counts as broken. The share of a
+region's volume that these cases cover says how much that is worth.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from enum import StrEnum
 from itertools import pairwise
-from typing import Any
+from typing import Any, Final
 
+import numpy as np
+from scipy.spatial import cKDTree
+
+from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.diagnosis import Kind, diagnose
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import severities_of
 from merge_sumo.analysis.verdict import Verdict, in_words, judge
-from merge_sumo.campaigns.run import SETTINGS, Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.studies.avoidance import read_avoidance
-from merge_sumo.studies.comparison import check_comparable
 from merge_sumo.studies.counterfactuals import Avoidance
-from merge_sumo.studies.history_steps import Became, Step, step_between
-from merge_sumo.values.case import to_unit
-from merge_sumo.values.fmc import fmc, regions
-from merge_sumo.values.scenario import ALL_LEVELS, level_name
+from merge_sumo.studies.versions import check_comparable, levels_of
+from merge_sumo.values.case import Case, FloatArray, to_unit
+from merge_sumo.values.fmc import fmc, radius_for, regions
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
+
+ROUNDING: Final = 1e-9
+"""Share of the radius by which two points may be further apart and still count as near."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +55,9 @@ class LevelOfVersion:
         timeouts: cases in which the VUT never reached the merge point.
         fmc: failure mode coverage in the level's unit cube; None where nothing was tested.
         regions: groups of failures that are linked at the radius of FMC; None as well.
-        kinds: failures by kind, of those under the paper's rule whose motion is there.
         avoidance_known: failures of which it is recorded who would have avoided them.
         avoided: those of them that a careful driver in the VUT's place would have avoided.
+        kinds: failures by kind, of those under the paper's rule whose motion is there.
     """
 
     cases: int
@@ -57,9 +69,9 @@ class LevelOfVersion:
     timeouts: int
     fmc: float | None
     regions: int | None
-    kinds: dict[Kind, int]
     avoidance_known: int
     avoided: int
+    kinds: dict[Kind, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +82,6 @@ class Version:
         folder: of the campaign.
         vut: name of the VUT.
         sampler: that chose the cases.
-        wanted: cases that the campaign was to run.
         verdict: on all of its cases.
         levels: by POV level.
     """
@@ -78,9 +89,85 @@ class Version:
     folder: str
     vut: str
     sampler: str
-    wanted: int | None
     verdict: Verdict
     levels: dict[int, LevelOfVersion]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        verdict = self.verdict
+        record = {"folder": self.folder, "vut": self.vut, "sampler": self.sampler}
+        counts = {"cases": verdict.cases, "failures": verdict.failures, **verdict.to_record()}
+        levels = {level_name(level): asdict(of_level) for level, of_level in self.levels.items()}
+        return {**record, **counts, "levels": levels}
+
+
+class RegionChange(StrEnum):
+    """What became of a region of failures from one version to the next."""
+
+    FIXED = "fixed"
+    BROKE = "broke"
+    STILL = "still failing"
+    NOT_SEEN_AFTER = "not looked at after"
+    NOT_SEEN_BEFORE = "not looked at before"
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A region of failures of one of two neighbours, and what the other one did in it.
+
+    Attributes:
+        of: number of the version that fails there, from 1.
+        became: what became of it.
+        failures: of that version, in the region.
+        worst: index of the worst of them in its campaign.
+        where: the box of these failures, in words.
+        fmc: their volume.
+        cases: cases in the region that the other version tested.
+        failed: those of them that failed.
+        looked_at: share of the volume that these cases cover.
+    """
+
+    of: int
+    became: RegionChange
+    failures: int
+    worst: int
+    where: str
+    fmc: float
+    cases: int
+    failed: int
+    looked_at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What changed from a version to the next at one POV level.
+
+    Attributes:
+        before: number of the earlier version, from 1.
+        after: number of the later one.
+        level: POV level.
+        regions: those of both versions: what broke comes first, then the largest.
+        same: cases that both versions tested, to the last bit.
+        same_fixed: those of them in which only the earlier version fails.
+        same_broke: those in which only the later one fails.
+    """
+
+    before: int
+    after: int
+    level: int
+    regions: tuple[Region, ...]
+    same: int
+    same_fixed: int
+    same_broke: int
+
+    def count(self, became: RegionChange) -> int:
+        """Return the number of regions of which that became."""
+        return sum(region.became is became for region in self.regions)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        counts = {became.value: self.count(became) for became in RegionChange}
+        return asdict(self) | {"level": level_name(self.level), "counts": counts}
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -108,43 +195,43 @@ class History(Result):
     @property
     def headline(self) -> str:
         """What became of FMC from the first to the last version, in a sentence."""
-        said = []
+        parts = []
         for level in self.levels:
             known = [
-                (number, found.fmc)
+                (number, of_level.fmc)
                 for number, version in enumerate(self.versions, start=1)
-                if (found := version.levels.get(level)) is not None and found.fmc is not None
+                if (of_level := version.levels.get(level)) and of_level.fmc is not None
             ]
             if len(known) > 1:
                 (first, before), (last, after) = known[0], known[-1]
-                said.append(
+                parts.append(
                     f"at POV level {level_name(level)} from {before:.4f} (version {first}) to "
                     f"{after:.4f} (version {last})"
                 )
-        if not said:
+        if not parts:
             return "No POV level was tested in two versions."
-        return f"FMC went {in_words(said)}."
+        return f"FMC went {in_words(parts)}."
 
     def lines(self) -> list[str]:
         """Return what the command `history` prints."""
-        said = [self.headline]
+        text = [self.headline]
         for number, version in enumerate(self.versions, start=1):
-            said.append(f"{number}: {version.folder} ({version.vut}): {version.verdict.counts}")
-            said += version.verdict.trouble_lines()
+            text.append(f"{number}: {version.folder} ({version.vut}): {version.verdict.counts}")
+            text += version.verdict.trouble_lines()
         for step in self.steps:
-            counts = [f"{n} {became}" for became in Became if (n := step.count(became))]
-            said.append(
+            counts = [f"{n} {became}" for became in RegionChange if (n := step.count(became))]
+            text.append(
                 f"from {step.before} to {step.after} at POV level {level_name(step.level)}: "
                 f"{'regions: ' + ', '.join(counts) if counts else 'no failures in either'}"
             )
-        return [*said, *self.notes]
+        return [*text, *self.notes]
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
         return {
             "criterion": self.criterion,
             "scenario": self.scenario,
-            "versions": [_version_record(version) for version in self.versions],
+            "versions": [version.to_record() for version in self.versions],
             "steps": [step.to_record() for step in self.steps],
             "notes": list(self.notes),
         }
@@ -153,67 +240,62 @@ class History(Result):
 def history_of(runs: Sequence[Run]) -> History:
     """Return the history of campaigns, the oldest first.
 
-    Raises `UserError` for fewer than two, and where they differ in the scenario, the initial speed
-    of the VUT, the criterion or, at a level, the POV: FMC of these is of different pools.
+    Raises:
+        UserError: for fewer than two, and where they differ in the scenario, the initial speed of
+            the VUT, the criterion or, at a level, the POV: FMC of these is of different pools.
     """
     if len(runs) < 2:
         raise UserError("a history needs two campaigns or more: name the older one first")
-    levels_of = [_levels(run) for run in runs]
+    levels_by_run = [
+        sorted({*levels_of(run), *(outcome.case.level for outcome in run.outcomes)}) for run in runs
+    ]
     for run in runs[1:]:
         check_comparable(runs[0], run, ())
-    levels = sorted(set().union(*levels_of))
+    levels = sorted(set().union(*levels_by_run))
     steps = []
     for level in levels:
-        having = [number for number, has in enumerate(levels_of) if level in has]
-        for before, after in pairwise(having):
+        numbers = [number for number, present in enumerate(levels_by_run) if level in present]
+        for before, after in pairwise(numbers):
             check_comparable(runs[before], runs[after], [level])
-            steps.append(step_between(runs, before, after, level))
+            steps.append(_step(runs, before, after, level))
     return History(
         criterion=runs[0].criterion.text,
         scenario=runs[0].scenario.name,
         levels=tuple(levels),
-        versions=tuple(_version(run, has) for run, has in zip(runs, levels_of, strict=True)),
+        versions=tuple(_version(*pair) for pair in zip(runs, levels_by_run, strict=True)),
         steps=tuple(steps),
-        notes=tuple(_notes(runs, levels_of)),
+        notes=tuple(_notes(runs, levels_by_run)),
     )
 
 
-def _levels(run: Run) -> list[int]:
-    levels = run.settings.get("levels")
-    if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
-        raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
-    return sorted({*levels, *(outcome.case.level for outcome in run.outcomes)})
-
-
-def _notes(runs: Sequence[Run], levels_of: Sequence[Sequence[int]]) -> list[str]:
+def _notes(runs: Sequence[Run], levels_by_run: Sequence[list[int]]) -> list[str]:
     """Return what limits the comparison, in sentences."""
-    said = []
+    notes = []
     if len({str([r.settings.get(k) for k in ("sampler", "cases")]) for r in runs}) > 1:
-        said.append(
+        notes.append(
             "The campaigns differ in sampler or number of cases: FMC, failures and regions are "
             "what each of them found, and a longer search finds more."
         )
     if len({str(run.settings.get("net_sha256")) for run in runs}) > 1:
-        said.append("The campaigns were not all run on the same net.")
-    if any(list(has) != list(levels_of[0]) for has in levels_of):
-        said.append(
+        notes.append("The campaigns were not all run on the same net.")
+    if any(levels != levels_by_run[0] for levels in levels_by_run):
+        notes.append(
             "Not every campaign has every POV level: at a level, a version is compared with the "
             "last one before it that has the level."
         )
     for number, run in enumerate(runs, start=1):
         wanted = run.settings.get("cases")
         if run.torn or (isinstance(wanted, int) and len(run.outcomes) < wanted):
-            said.append(f"Campaign {number} ended after {len(run.outcomes)} of {wanted} cases.")
-    return said
+            notes.append(f"Campaign {number} ended after {len(run.outcomes)} of {wanted} cases.")
+    return notes
 
 
 def _version(run: Run, levels: Sequence[int]) -> Version:
-    known, wanted = read_avoidance(run), run.settings.get("cases")
+    known = read_avoidance(run)
     return Version(
         folder=str(run.folder),
         vut=run.vut,
         sampler=str(run.settings.get("sampler")),
-        wanted=wanted if isinstance(wanted, int) else None,
         verdict=judge(run.outcomes),
         levels={level: _level(run, level, known) for level in levels},
     )
@@ -221,25 +303,24 @@ def _version(run: Run, levels: Sequence[int]) -> Version:
 
 def _level(run: Run, level: int, known: dict[int, Avoidance]) -> LevelOfVersion:
     outcomes = [outcome for outcome in run.outcomes if outcome.case.level == level]
-    found = judge(outcomes)
-    failed = [outcome for outcome in outcomes if outcome.failed]
+    verdict, failed = judge(outcomes), [outcome for outcome in outcomes if outcome.failed]
     points = to_unit((outcome.case for outcome in failed), level, run.scenario)
-    kinds = Counter(kind for outcome in failed if (kind := _kind(run, outcome)) is not None)
-    of_level = [known[outcome.index] for outcome in failed if outcome.index in known]
+    kinds = Counter(_kind(run, outcome) for outcome in failed)
+    avoidances = [known[outcome.index] for outcome in failed if outcome.index in known]
     tested = sum(outcome.is_tested for outcome in outcomes)
     return LevelOfVersion(
-        cases=found.cases,
+        cases=verdict.cases,
         tested=tested,
-        failures=found.failures,
-        contacts=found.contacts,
+        failures=verdict.failures,
+        contacts=verdict.contacts,
         severities=severities_of(outcomes),
-        errors=found.errors,
-        timeouts=found.timeouts,
+        errors=verdict.errors,
+        timeouts=verdict.timeouts,
         fmc=fmc(points) if tested else None,
         regions=int(regions(points).max(initial=-1)) + 1 if tested else None,
+        avoidance_known=len(avoidances),
+        avoided=sum(one.by_careful for one in avoidances),
         kinds={kind: kinds[kind] for kind in Kind if kinds[kind]},
-        avoidance_known=len(of_level),
-        avoided=sum(one.by_careful for one in of_level),
     )
 
 
@@ -251,15 +332,103 @@ def _kind(run: Run, outcome: Outcome) -> Kind | None:
         return None
 
 
-def _version_record(version: Version) -> dict[str, Any]:
-    levels = {
-        level_name(level): {
-            name: getattr(found, name) for name in LevelOfVersion.__slots__ if name != "kinds"
-        }
-        | {"kinds": {kind.value: count for kind, count in found.kinds.items()}}
-        for level, found in version.levels.items()
-    }
-    record = {"folder": version.folder, "vut": version.vut, "sampler": version.sampler}
-    verdict = version.verdict
-    counts = {"cases": verdict.cases, "failures": verdict.failures, **verdict.to_record()}
-    return {**record, **counts, "levels": levels}
+def _step(runs: Sequence[Run], before: int, after: int, level: int) -> Step:
+    """Return what changed at a level between two of some campaigns, given by their places."""
+    earlier, later = (_Tested(runs[place], level) for place in (before, after))
+    # Where both fail the region is given once, as one of the earlier version.
+    both = [
+        *_regions(before + 1, earlier, later, (RegionChange.FIXED, RegionChange.NOT_SEEN_AFTER)),
+        *(
+            region
+            for region in _regions(
+                after + 1, later, earlier, (RegionChange.BROKE, RegionChange.NOT_SEEN_BEFORE)
+            )
+            if not region.failed
+        ),
+    ]
+    order = (
+        *(RegionChange.BROKE, RegionChange.FIXED, RegionChange.STILL),
+        *(RegionChange.NOT_SEEN_BEFORE, RegionChange.NOT_SEEN_AFTER),
+    )
+    both.sort(key=lambda region: (order.index(region.became), -region.fmc, region.worst))
+    first, second = (
+        {tuple(point): o.failed for point, o in zip(one.points.tolist(), one.outcomes, strict=True)}
+        for one in (earlier, later)
+    )
+    same = [(first[point], second[point]) for point in first.keys() & second.keys()]
+    return Step(
+        before=before + 1,
+        after=after + 1,
+        level=level,
+        regions=tuple(both),
+        same=len(same),
+        same_fixed=sum(a and not b for a, b in same),
+        same_broke=sum(b and not a for a, b in same),
+    )
+
+
+class _Tested:
+    """The cases of a version at a level that have a verdict, and their points, (n, d)."""
+
+    def __init__(self, run: Run, level: int) -> None:
+        self.outcomes = [o for o in run.outcomes if o.case.level == level and o.is_tested]
+        self.failures = [outcome for outcome in self.outcomes if outcome.failed]
+        self.points, self.failing = (
+            to_unit((o.case for o in some), level, run.scenario)
+            for some in (self.outcomes, self.failures)
+        )
+        self._tree = cKDTree(self.points) if self.outcomes else None
+
+    def near(self, points: FloatArray, radius: float) -> list[int]:
+        """Return the places of cases no further than a radius from one of some points, (m, d)."""
+        if self._tree is None:
+            return []
+        return sorted(set().union(*self._tree.query_ball_point(points, radius * (1.0 + ROUNDING))))
+
+
+def _regions(
+    of: int, own: _Tested, other: _Tested, if_none_failed: tuple[RegionChange, RegionChange]
+) -> list[Region]:
+    """Return the regions of a version's failures, and what the other one's cases say of them.
+
+    Args:
+        of: number of the version.
+        own: its cases.
+        other: the other one's.
+        if_none_failed: what became of a region with and without cases of the other, none of which
+            fails.
+    """
+    radius, labels = radius_for(own.points.shape[1]), regions(own.failing)
+    result = []
+    for label in range(int(labels.max(initial=-1)) + 1):
+        points = own.failing[labels == label]
+        failures = [own.failures[place] for place in np.flatnonzero(labels == label)]
+        inside, around = (other.near(points, radius * r) for r in (1.0, 2.0))
+        failed = sum(other.outcomes[place].failed for place in inside)
+        volume, seen = fmc(points), other.points[around]
+        shared = volume + fmc(seen) - fmc(np.concatenate([points, seen]))
+        result.append(
+            Region(
+                of=of,
+                became=RegionChange.STILL if failed else if_none_failed[not inside],
+                failures=len(failures),
+                worst=min(failures, key=lambda o: (o.score, o.index)).index,
+                where=_box_in_words([o.case for o in failures]),
+                fmc=volume,
+                cases=len(inside),
+                failed=failed,
+                looked_at=min(max(shared / volume, 0.0), 1.0),
+            )
+        )
+    return result
+
+
+def _box_in_words(cases: Sequence[Case]) -> str:
+    """Return the smallest box around some cases in words."""
+    parts = []
+    for coordinate in coordinates(cases[0].scenario, (cases[0].level,)):
+        ordered = sorted(cases, key=lambda case: coordinate.of(case) or 0.0)
+        low, high = coordinate.text(ordered[0]), coordinate.text(ordered[-1])
+        span = low if low == high else f"{low} to {high}"
+        parts.append(f"{coordinate.name} {span} {coordinate.unit}")
+    return ", ".join(parts)

@@ -22,15 +22,16 @@ from merge_sumo.analysis.coordinates import WRITTEN
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.reports import comparison_page, report
+from merge_sumo.reports import report
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.campaign_progress import CampaignProgress
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.running_page import running_page
+from merge_sumo.reports.version_pages import comparison_page, write_page
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.studies import comparison
 from merge_sumo.studies.avoidance import write_avoidance
 from merge_sumo.studies.counterfactuals import Avoidance
+from merge_sumo.studies.versions import compare_runs
 from merge_sumo.values.scenario import POV
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
@@ -136,9 +137,9 @@ def test_pages_without_a_script_open_without_a_complaint_and_fit_the_window(
     browser, made, tmp_path, options
 ):
     other = write_run(tmp_path / "other", 20, vut=EVIL, error=EVIL)
-    compared = comparison.compare_runs(made, other, rerun=False)
+    compared = compare_runs(made, other, rerun=False)
     file = tmp_path / "compared.html"
-    comparison_page.write_comparison(compared, made, other, {}, 0.0, file)
+    write_page(comparison_page(compared, made, other, {}), file)
     progress = CampaignProgress(EVIL, 400, (0, 1, 2))
     for outcome in made.outcomes:
         progress.case_ended(outcome)

@@ -19,9 +19,8 @@ import merge_sumo as ms
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
-from merge_sumo.reports.history_page import _top, history_page
-from merge_sumo.studies.history import history_of
-from merge_sumo.studies.history_steps import Became
+from merge_sumo.reports.version_pages import axis_end, history_page
+from merge_sumo.studies.history import RegionChange, history_of
 from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome, measure
@@ -49,7 +48,7 @@ def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> R
     return Run(folder)
 
 
-def became(*runs: Run) -> list[list[Became]]:
+def became(*runs: Run) -> list[list[RegionChange]]:
     return [[region.became for region in step.regions] for step in history_of(runs).steps]
 
 
@@ -59,7 +58,12 @@ class TestARegion:
         b = write(tmp_path / "b", (0.5, 0.54, "passes"))
         (step,) = history_of([a, b]).steps
         (region,) = step.regions
-        assert (region.became, region.of, region.cases, region.failed) == (Became.FIXED, 1, 1, 0)
+        assert (region.became, region.of, region.cases, region.failed) == (
+            RegionChange.FIXED,
+            1,
+            1,
+            0,
+        )
         # Two discs of radius r with centres 0.8 r apart: the lens that both cover.
         lens = 2.0 * math.acos(0.4) - 0.8 * math.sqrt(1.0 - 0.4**2)
         assert region.fmc == pytest.approx(BALL)
@@ -68,22 +72,22 @@ class TestARegion:
     def test_broke_where_the_earlier_version_tested_cases_and_none_failed(self, tmp_path):
         a = write(tmp_path / "a", (0.5, 0.54, "passes"))
         b = write(tmp_path / "b", (0.5, 0.5, "fails"))
-        assert became(a, b) == [[Became.BROKE]]
+        assert became(a, b) == [[RegionChange.BROKE]]
 
     def test_still_fails_where_one_of_the_later_versions_cases_fails(self, tmp_path):
         a = write(tmp_path / "a", (0.5, 0.5, "fails"))
         b = write(tmp_path / "b", (0.5, 0.52, "passes"), (0.5, 0.47, "fails"))
         (step,) = history_of([a, b]).steps
         assert [(r.became, r.of, r.cases, r.failed) for r in step.regions] == [
-            (Became.STILL, 1, 2, 1)
+            (RegionChange.STILL, 1, 2, 1)
         ], "it is given once, as one of the earlier version"
 
     @pytest.mark.parametrize("other", [(0.5, 0.56, "passes"), (0.5, 0.5, "errs")])
     def test_is_nothing_known_of_without_a_verdict_inside(self, tmp_path, other):
         a = write(tmp_path / "a", (0.5, 0.5, "fails"))
         b = write(tmp_path / "b", other)
-        assert became(a, b) == [[Became.NOT_SEEN_AFTER]]
-        assert became(b, a) == [[Became.NOT_SEEN_BEFORE]]
+        assert became(a, b) == [[RegionChange.NOT_SEEN_AFTER]]
+        assert became(b, a) == [[RegionChange.NOT_SEEN_BEFORE]]
 
     def test_is_what_is_linked_and_what_broke_comes_first(self, tmp_path):
         a = write(
@@ -94,8 +98,8 @@ class TestARegion:
         b = write(tmp_path / "b", (0.2, 0.31, "passes"), (0.8, 0.8, "fails"))
         (step,) = history_of([a, b]).steps
         assert [(r.became, r.failures) for r in step.regions] == [
-            (Became.BROKE, 1),
-            (Became.FIXED, 3),
+            (RegionChange.BROKE, 1),
+            (RegionChange.FIXED, 3),
         ]
 
 
@@ -185,7 +189,7 @@ def test_the_page_runs_nothing_loads_nothing_and_shows_names_as_text(tmp_path):
     ("most", "top"), [(0.0, 1.0), (0.0915, 0.1), (0.11, 0.2), (36, 40), (45, 100), (2, 2)]
 )
 def test_an_axis_ends_at_a_number_whose_half_is_round(most, top):
-    assert _top([most]) == top
+    assert axis_end([most]) == top
 
 
 class TestTheCommand:
@@ -223,7 +227,7 @@ class TestFromPython:
         _, said, _ = command_line("history", a.folder, b.folder, "--out", other)
         assert said == f"{found}\npage: {other}\n"
         assert page.read_bytes() == other.read_bytes()
-        assert found.steps[0].count(Became.FIXED) == 1
+        assert found.steps[0].count(RegionChange.FIXED) == 1
         assert repr(found).startswith("<History: FMC went at POV level 0 from 0.0079 (version 1)")
         assert found._repr_html_() == f"<pre>{escape(str(found))}</pre>"
 

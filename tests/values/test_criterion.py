@@ -21,9 +21,8 @@ from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.comparison import compare_runs
-from merge_sumo.studies.rerun import rerun
 from merge_sumo.studies.truth import ground_truth
+from merge_sumo.studies.versions import compare_runs, rerun
 from merge_sumo.values import score
 from merge_sumo.values.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.values.case import Pool

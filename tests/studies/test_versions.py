@@ -1,9 +1,12 @@
-"""Two campaigns side by side: what got fixed, what broke, and how that is known."""
+"""Two versions of a VUT: what got fixed, what broke, and recorded cases again."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
+import shutil
+from pathlib import Path
 
 import pytest
 from lxml import html
@@ -14,9 +17,17 @@ from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.reports import comparison_page
-from merge_sumo.studies.changes import Change, LevelChange, RunComparison, Untested
-from merge_sumo.studies.comparison import compare_runs
+from merge_sumo.reports import version_pages
+from merge_sumo.reports.version_pages import OVER_TIME, comparison_page
+from merge_sumo.studies.versions import (
+    Change,
+    LevelChange,
+    RunComparison,
+    Untested,
+    compare_runs,
+    rerun,
+    settings_today,
+)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +108,7 @@ class TestTheSameVut:
 
 class TestRecordsOnly:
     def test_run_nothing_again(self, run, other_seed, monkeypatch):
-        monkeypatch.setattr("merge_sumo.studies.comparison.plan_of", None)
+        monkeypatch.setattr("merge_sumo.studies.versions.plan_of", None)
         compared = compare_runs(run, other_seed, rerun=False)
         found = compared.levels[0]
         assert found.changes[Change.NOT_RUN_AGAIN] == len(compared.cases)
@@ -236,9 +247,9 @@ class TestThePage:
                 ends.append(max(float(p.split(",")[0]) for line in points for p in line))
                 for line in points:
                     for x, y in (map(float, p.split(",")) for p in line):
-                        assert comparison_page.LEFT <= x <= comparison_page.RIGHT
-                        assert comparison_page.TOP <= y <= comparison_page.BOTTOM
-            assert max(ends) == comparison_page.RIGHT, "the longer one fills the axis"
+                        assert OVER_TIME.left <= x <= OVER_TIME.right
+                        assert OVER_TIME.top <= y <= OVER_TIME.bottom
+            assert max(ends) == OVER_TIME.right, "the longer one fills the axis"
             index = int(details.xpath("./summary/b/text()")[0].split()[1])
             rows = len(
                 details.xpath(".//div[@class='pair'][1]//polyline")[-1].get("points").split()
@@ -252,7 +263,7 @@ class TestThePage:
 
     def test_of_records_alone_draws_what_is_known(self, run, other_seed):
         compared = compare_runs(run, other_seed, rerun=False)
-        page = comparison_page.comparison_page(compared, run, other_seed, {})
+        page = comparison_page(compared, run, other_seed, {})
         root = html.fromstring(page)
         assert len(root.findall(".//details")) == len(compared.cases)
         assert len(root.findall(".//div[@class='pair']")) == len(compared.cases)
@@ -260,8 +271,8 @@ class TestThePage:
 
     def test_draws_so_many_and_counts_the_others(self, run, fixed, monkeypatch):
         compared = compare_runs(run, fixed, rerun=False)
-        monkeypatch.setattr(comparison_page, "SHOWN", 3)
-        page = comparison_page.comparison_page(compared, run, fixed, {})
+        monkeypatch.setattr(version_pages, "SHOWN", 3)
+        page = comparison_page(compared, run, fixed, {})
         assert len(html.fromstring(page).findall(".//details")) == 3
         assert f"{len(compared.cases) - 3} further cases" in page
 
@@ -272,3 +283,79 @@ class TestThePage:
         result = CliRunner().invoke(cli.app, arguments)
         assert isinstance(result.exception, UserError)
         assert file.read_text() == "mine"
+
+
+SEVERE = ("contact", "conflict")
+
+
+@pytest.fixture
+def folder(run, tmp_path) -> Path:
+    return Path(shutil.copytree(run.folder, tmp_path / "campaign"))
+
+
+class TestRerunOfTheSameVut:
+    def test_gives_every_verdict_and_score_again(self, run):
+        found = rerun(run, settings_today(run))
+        assert [o.measures for o in found.after] == [o.measures for o in run.outcomes]
+        assert found.changed == []
+        assert found.compared.worse(0.0) == []
+
+    def test_is_said_to_change_nothing(self, command_line, folder):
+        code, out, _ = command_line("rerun", folder, "3", "7")
+        assert code == 0
+        assert "no verdict changed" in out
+        assert "it is not worse" in out
+
+
+class TestRerunOfAChangedVut:
+    def test_that_stands_times_out_in_all_cases_and_is_worse(
+        self, command_line, folder, tmp_path, monkeypatch
+    ):
+        monkeypatch.chdir(tmp_path)
+        Path("still.py").write_text("def f(seen):\n    return -4.0\n")
+        first, second = (outcome.index for outcome in failures(Run(folder).outcomes)[:2])
+        code, out, _ = command_line("rerun", folder, first, second, "--vut", "still.py:f", "--json")
+        told = json.loads(out)
+        assert code == 1
+        assert {
+            (c["index"], c["severity_before"] in SEVERE, c["end_after"]) for c in told["changed"]
+        } == {
+            (first, True, "TIMEOUT"),
+            (second, True, "TIMEOUT"),
+        }
+        assert any("in no case" in why for why in told["why"])
+        assert any(
+            "B has an error or timeout in 2 of 2 cases, A in 0 of 2" in w for w in told["why"]
+        )
+
+    def test_that_is_better_says_what_it_fixed(self, command_line, folder):
+        fixed = [o.index for o in failures(Run(folder).outcomes)]
+        code, out, _ = command_line("rerun", folder, "--vut", "design2")
+        assert code == 0
+        assert all(
+            re.search(rf"case {index}: con\w+ -> (safe|harsh) \(fixed\)", out) for index in fixed
+        )
+        assert f"merge-sumo run --case {folder} " in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("60",), "has no case 60"),
+        (("--vut", "design9"), "design9"),
+        (("--tolerance", "-1"), "--tolerance"),
+    ],
+)
+def test_bad_use_of_rerun_is_refused(command_line, folder, arguments, part):
+    code, out, err = command_line("rerun", folder, *arguments)
+    assert (code, out) == (2, "")
+    assert part in err
+
+
+def test_rerun_on_another_net_is_refused(command_line, folder):
+    settings = json.loads((folder / "campaign.json").read_text())
+    settings.pop("sha256")
+    settings["net_sha256"] = "0"
+    (folder / "campaign.json").write_text(json.dumps(settings))
+    code, _, err = command_line("rerun", folder)
+    assert (code, "another net" in err) == (2, True)

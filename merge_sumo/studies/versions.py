@@ -1,0 +1,708 @@
+"""Two versions of a VUT compared case by case: what got fixed, what broke, and whether B is worse.
+
+Two campaigns have different cases, so `compare_runs` runs the failures, errors and timeouts of each
+with the VUT of the other: then both VUTs have been tried on the same cases, those in which at least
+one of them failed or gave no verdict. `rerun` runs the recorded cases of one campaign with a
+changed VUT. Both return a `RunComparison`; A is the version before, B the version after. Volumes
+are failure mode coverages (FMC) of what is known of both.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.analysis.result import Result
+from merge_sumo.analysis.verdict import counted, judge
+from merge_sumo.campaigns.campaign import workers_or_here
+from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.repeats import cause
+from merge_sumo.campaigns.run import SETTINGS, Run, failures
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
+from merge_sumo.engine.simulator import road_for, run_cases, runs_on
+from merge_sumo.engine.versions import versions
+from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import Case, to_unit
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import ALL_LEVELS, level_name
+from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.files import changed
+from merge_sumo.vuts.registry import built_in_vuts
+
+FIRST_LOOKS: Final = 10
+"""Cases that are printed as those to look at first."""
+MOST_CHANGED: Final = 40
+"""Changed verdicts that are printed; `Rerun.changed` has all."""
+CHECKED: Final = 32
+"""Cases of a campaign, the worst, that its VUT must reproduce before it runs others."""
+SAME_SCORE: Final = 1e-6
+"""Difference of two scores P that is rounding."""
+VOLUME_NOISE: Final = 2e-4
+"""Share of a volume in three dimensions that is rounding of the integral (see `fmc`)."""
+SHARE_ROUNDING: Final = 1e-9
+
+
+class Change(StrEnum):
+    """What became of a case from A to B; an error or a timeout is no verdict."""
+
+    FIXED = "fixed"
+    BROKE = "broke"
+    BOTH_FAIL = "both fail"
+    NO_VERDICT_OF_A = "no verdict of A"
+    NO_VERDICT_OF_B = "no verdict of B"
+    NO_VERDICT = "no verdict"
+    NOT_RUN_AGAIN = "not run again"
+
+
+MOST_TELLING: Final = (
+    Change.BROKE,
+    Change.NO_VERDICT_OF_B,
+    Change.NOT_RUN_AGAIN,
+    Change.NO_VERDICT,
+    Change.BOTH_FAIL,
+    Change.NO_VERDICT_OF_A,
+    Change.FIXED,
+)
+"""The order in which cases are listed."""
+
+
+def change_between(a: Outcome | None, b: Outcome | None) -> Change:
+    """Return what became of a case in which A or B failed or gave no verdict; None: not run."""
+    if a is None or b is None:
+        return Change.NOT_RUN_AGAIN
+    if not (a.is_tested or b.is_tested):
+        return Change.NO_VERDICT
+    if not a.is_tested:
+        return Change.NO_VERDICT_OF_A
+    if not b.is_tested:
+        return Change.NO_VERDICT_OF_B
+    if a.failed and b.failed:
+        return Change.BOTH_FAIL
+    return Change.BROKE if b.failed else Change.FIXED
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedCase:
+    """A case in which at least one of the two VUTs failed or gave no verdict.
+
+    Attributes:
+        run: "A" or "B", the campaign that has the case.
+        index: its index there.
+        case: the case.
+        score_a: P of A; None where an error ended it or A was not run.
+        score_b: P of B.
+        end_a: how it ended with A; None where A was not run.
+        end_b: how it ended with B.
+        severity_a: contact, conflict, harsh or safe with A; None where it has none.
+        severity_b: the same with B.
+        change: what became of it.
+    """
+
+    run: str
+    index: int
+    case: Case
+    score_a: float | None
+    score_b: float | None
+    end_a: End | None
+    end_b: End | None
+    severity_a: str | None
+    severity_b: str | None
+    change: Change
+
+    @classmethod
+    def of(cls, run: str, index: int, a: Outcome | None, b: Outcome | None) -> ComparedCase:
+        """Return the case of a run, "A" or "B"; an outcome is None where a VUT was not run."""
+        known = a or b
+        assert known is not None, "a run has the case"  # noqa: S101
+        (score_a, end_a, severity_a), (score_b, end_b, severity_b) = (
+            (None, None, None) if o is None else (o.score, o.measures.end, o.measures.severity)
+            for o in (a, b)
+        )
+        return cls(
+            *(run, index, known.case, score_a, score_b, end_a, end_b, severity_a, severity_b),
+            change_between(a, b),
+        )
+
+    def rank(self) -> tuple[int, float, str, int]:
+        """Return the sort key: what broke comes first, the worst of B first."""
+        # Of what was not run again, B's cases may have broken, A's may be fixed.
+        score = self.score_b if self.score_b is not None else 0.0
+        return MOST_TELLING.index(self.change), score, self.run, self.index
+
+
+@dataclass(frozen=True, slots=True)
+class Untested:
+    """Cases at a level in which a VUT did not reach the merge point.
+
+    Attributes:
+        cases: cases that were looked at: those of both campaigns where both VUTs were run again,
+            else those of its own.
+        errors: that ended in an error.
+        timeouts: in which it never reached the merge point.
+        nothing_tested: whether its own campaign has cases at this level, and none was tested.
+    """
+
+    cases: int
+    errors: int
+    timeouts: int
+    nothing_tested: bool = False
+
+    def share(self, number: int) -> float:
+        """Return a number of the cases as a share of them."""
+        return number / self.cases if self.cases else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LevelChange:
+    """What changed at a POV level; volumes in the level's unit cube.
+
+    Attributes:
+        untested_a: cases without a verdict of A.
+        untested_b: the same of B.
+        fmc_a: coverage of the cases in which A is known to fail.
+        fmc_b: the same of B.
+        fmc_fixed: volume that A's failures cover and B's do not; failures on which B gives no
+            verdict are not fixed.
+        fmc_broke: volume that B's failures cover and A's do not, in the same way.
+        changes: number of cases by what became of them.
+    """
+
+    untested_a: Untested
+    untested_b: Untested
+    fmc_a: float
+    fmc_b: float
+    fmc_fixed: float
+    fmc_broke: float
+    changes: dict[str, int]
+
+    def worse(self, level: int, tolerance: float) -> list[str]:
+        """Return in sentences why B is worse than A at this level."""
+        at, a, b = f"at POV level {level_name(level)}", self.untested_a, self.untested_b
+        reasons = []
+        if b.nothing_tested:
+            reasons.append(f"{at} B reached the merge point in no case of its campaign")
+        for what, number_a, number_b in (
+            ("error", a.errors, b.errors),
+            ("error or timeout", a.errors + a.timeouts, b.errors + b.timeouts),
+        ):
+            if b.share(number_b) - a.share(number_a) > tolerance + SHARE_ROUNDING:
+                reasons.append(
+                    f"{at} B has an {what} in {number_b} of {counted(b.cases, 'case')}, "
+                    f"A in {number_a} of {a.cases}"
+                )
+        if self.fmc_b - self.fmc_a > tolerance + VOLUME_NOISE * self.fmc_b:
+            reasons.append(f"{at} FMC is {self.fmc_b:.4f} with B, {self.fmc_a:.4f} with A")
+        return reasons
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class RunComparison(Result):
+    """What changed from A to B.
+
+    Attributes:
+        levels: by POV level.
+        cases: every case in which one failed or gave no verdict; what broke comes first, the
+            worst of B first.
+        evidence: how the verdicts of the other VUT came about, as a sentence.
+    """
+
+    levels: dict[int, LevelChange]
+    cases: list[ComparedCase]
+    evidence: str
+
+    def worse(self, tolerance: float) -> list[str]:
+        """Return in sentences why B is worse than A; empty where it is not.
+
+        At some level B reached the merge point in no case of its campaign, or one of these grew by
+        more than the tolerance: the share of cases with an error, the share of cases with an error
+        or a timeout, FMC.
+        """
+        return [
+            reason
+            for level, change in self.levels.items()
+            for reason in change.worse(level, tolerance)
+        ]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return a table of what changed, level by level, and how that is known."""
+        table = [
+            f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "
+            f"cases: {', '.join(Change)}"
+        ]
+        for level, of_level in self.levels.items():
+            changes = ", ".join(str(of_level.changes[change]) for change in Change)
+            table.append(
+                f"{level_name(level):<6} {of_level.fmc_a:8.4f} {of_level.fmc_b:8.4f} "
+                f"{of_level.fmc_fixed:8.4f} {of_level.fmc_broke:8.4f}   {changes}"
+            )
+        return [*table, f"evidence: {self.evidence}"]
+
+    def __repr__(self) -> str:
+        """Return FMC of both in a line."""
+        levels = (
+            f"level {level_name(level)}: FMC {change.fmc_a:.4f} -> {change.fmc_b:.4f}"
+            for level, change in self.levels.items()
+        )
+        return f"<RunComparison: {', '.join(levels)}>"
+
+    def look_first(self) -> list[ComparedCase]:
+        """Return the cases to look at first: those that broke, then those without a verdict."""
+        return [case for case in self.cases if case.change in MOST_TELLING[:3]][:FIRST_LOOKS]
+
+
+def _level_change(
+    cases: Sequence[ComparedCase],
+    own_a: Sequence[Outcome],
+    own_b: Sequence[Outcome],
+    level: int,
+    *,
+    same_cases: bool = False,
+    records_only: bool = False,
+) -> LevelChange:
+    """Return what changed at a level.
+
+    Args:
+        cases: the compared cases of the level.
+        own_a: all outcomes of the campaign of A at the level.
+        own_b: all outcomes of B.
+        level: POV level.
+        same_cases: whether the cases of B are those of A, run again.
+        records_only: whether no case was to run again.
+    """
+    fails_a = [c.case for c in cases if _fails(c.score_a)]
+    fails_b = [c.case for c in cases if _fails(c.score_b)]
+    # Where one fails and the other gives no verdict, or could not be run, nothing is known to be
+    # fixed and nothing to be broken. Records alone are compared as they are.
+    silent = {Change.NO_VERDICT_OF_A, Change.NO_VERDICT_OF_B}
+    silent |= set() if records_only else {Change.NOT_RUN_AGAIN}
+    unknown = [
+        c.case for c in cases if c.change in silent and (_fails(c.score_a) or _fails(c.score_b))
+    ]
+    # Both VUTs were tried on the same cases: the others of both campaigns raise no question.
+    shared = all(case.change is not Change.NOT_RUN_AGAIN for case in cases)
+    together = len(own_a) + (0 if same_cases else len(own_b))
+
+    def untested(run: str, own: Sequence[Outcome]) -> Untested:
+        tried = cases if shared else [c for c in cases if c.run == run]
+        results = [(c.end_a, c.score_a) if run == "A" else (c.end_b, c.score_b) for c in tried]
+        ends = Counter(end for end, score in results if not _fails(score))
+        return Untested(
+            cases=together if shared else len(own),
+            errors=ends[End.VUT_ERROR] + ends[End.SIM_ERROR],
+            timeouts=ends[End.TIMEOUT],
+            nothing_tested=bool(own) and not any(outcome.is_tested for outcome in own),
+        )
+
+    def volume(failing: Iterable[Case]) -> float:
+        return fmc(to_unit(failing, level))
+
+    fmc_a, fmc_b, either = volume(fails_a), volume(fails_b), volume(fails_a + fails_b)
+    return LevelChange(
+        untested_a=untested("A", own_a),
+        untested_b=untested("B", own_b),
+        fmc_a=fmc_a,
+        fmc_b=fmc_b,
+        fmc_fixed=max(either - volume(fails_b + unknown), 0.0),
+        fmc_broke=max(either - volume(fails_a + unknown), 0.0),
+        changes={change.value: sum(case.change is change for case in cases) for change in Change},
+    )
+
+
+def _fails(score: float | None) -> bool:
+    return score is not None and score < FAILURE_SCORE
+
+
+def _comparison(
+    cases: Iterable[ComparedCase],
+    own_a: Sequence[Outcome],
+    own_b: Sequence[Outcome],
+    levels: Iterable[int],
+    evidence: str,
+    **known: bool,
+) -> RunComparison:
+    """Return the comparison of cases at some levels; the keywords are those of `_level_change`."""
+    ranked = sorted(cases, key=ComparedCase.rank)
+    by_level = {
+        level: _level_change(
+            [case for case in ranked if case.case.level == level],
+            [outcome for outcome in own_a if outcome.case.level == level],
+            [outcome for outcome in own_b if outcome.case.level == level],
+            level,
+            **known,
+        )
+        for level in levels
+    }
+    return RunComparison(by_level, ranked, evidence)
+
+
+# Two campaigns: the telling cases of each, run again with the VUT of the other.
+
+
+OnMotion = Callable[[str, int, Trajectory], None]
+"""Told of a motion with the campaign of its case, "A" or "B", and the index of that case there."""
+
+
+def compare_runs(
+    a: Run,
+    b: Run,
+    *,
+    rerun: bool = True,
+    net: Corridor | None = None,
+    given: Mapping[str, object] | None = None,
+    trust: bool = False,
+    on_motion: OnMotion = lambda _run, _index, _trajectory: None,
+) -> RunComparison:
+    """Compare two campaigns level by level.
+
+    That a VUT is still the one of its campaign is checked first: it must give again the scores that
+    were recorded.
+
+    Args:
+        a: campaign of the VUT before.
+        b: campaign of the VUT after.
+        rerun: run the failures, errors and timeouts of each with the VUT of the other.
+        net: net for that; must be the one of the campaigns.
+        given: settings in the place of what the folders name: policies that are elsewhere.
+        trust: run the controllers that the folders name although they may be a stranger's.
+        on_motion: told what a VUT did in a case of the other's campaign.
+
+    Raises:
+        UserError: where the campaigns have no level in common or no case at one, differ in the
+            initial speed of the VUT or in the POV of a level, or were run on another net than the
+            one to run again on.
+    """
+    levels = sorted(set(levels_of(a)) & set(levels_of(b)))
+    if not levels:
+        raise UserError(f"{a.folder} and {b.folder} have no POV level in common")
+    check_comparable(a, b, levels)
+    own_a, own_b = ([o for o in run.outcomes if o.case.level in levels] for run in (a, b))
+    for run, own in ((a, own_a), (b, own_b)):
+        if not own:
+            raise UserError(f"{run.folder} has no case at a POV level of both: it shows nothing")
+    telling_a, telling_b = (
+        [*failures(own), *(o for o in own if not o.is_tested)] for own in (own_a, own_b)
+    )
+    again_a = again_b = _RunAgain("was not run again")
+    if rerun:
+        road = net or road_for(a.scenario)
+        for run in (a, b):
+            if run.settings.get("net_sha256") != road.sha256:
+                raise UserError(
+                    f"{run.folder} was run on another net than {road.path}: give that with --net, "
+                    "or compare the records with --no-rerun"
+                )
+        again_b = _run_again(b, telling_a, road, given, partial(on_motion, "A"), trust=trust)
+        again_a = _run_again(a, telling_b, road, given, partial(on_motion, "B"), trust=trust)
+    cases = [
+        *(ComparedCase.of("A", o.index, o, again_b.outcomes.get(o.index)) for o in telling_a),
+        *(ComparedCase.of("B", o.index, again_a.outcomes.get(o.index), o) for o in telling_b),
+    ]
+    evidence = (
+        f"with {_in_words(own_a)} of A, B {again_b.how}; "
+        f"with {_in_words(own_b)} of B, A {again_a.how}"
+    )
+    return _comparison(cases, own_a, own_b, levels, evidence, records_only=not rerun)
+
+
+def levels_of(run: Run) -> list[int]:
+    """Return the POV levels that the settings of a campaign name; `UserError` for none."""
+    levels = run.settings.get("levels")
+    if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
+        raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
+    return levels
+
+
+def check_comparable(a: Run, b: Run, levels: Iterable[int]) -> None:
+    """Raise `UserError` where campaigns asked different things, or met other POVs at a level."""
+    if a.scenario != b.scenario:
+        raise UserError(
+            f"{a.folder} is of the scenario {a.scenario.name} and {b.folder} of another or a "
+            f"changed one, {b.scenario.name}: compare campaigns of one scenario"
+        )
+    speeds = [run.settings.get("v_vut0_mps") for run in (a, b)]
+    if speeds[0] != speeds[1]:
+        raise UserError(
+            f"the VUT starts at {speeds[0]} m/s in {a.folder} and at {speeds[1]} m/s in "
+            f"{b.folder}: compare campaigns with the same --v-vut0"
+        )
+    if a.criterion != b.criterion:
+        raise UserError(
+            f"a case of {a.folder} fails when {a.criterion.text}, and one of {b.folder} when "
+            f"{b.criterion.text}: compare campaigns with the same --fail-when"
+        )
+    for level in levels:
+        if not same_pov(a.settings, b.settings, level):
+            raise UserError(
+                f"the POV of level {level_name(level)} is another in {a.folder} than in "
+                f"{b.folder}: compare campaigns with the same --policies and --pov"
+            )
+
+
+def _in_words(own: Iterable[Outcome]) -> str:
+    """Return in words which cases of a campaign are run again."""
+    verdict = judge(own)
+    text = f"the {counted(verdict.failures, 'failure')}"
+    if verdict.errors or verdict.timeouts:
+        text += f", {counted(verdict.errors, 'error')} and {counted(verdict.timeouts, 'timeout')}"
+    return text
+
+
+@dataclass(frozen=True, slots=True)
+class _RunAgain:
+    """How a VUT was run in the other one's telling cases, and the outcomes by index."""
+
+    how: str
+    outcomes: dict[int, Outcome] = field(default_factory=dict)
+
+
+def _run_again(
+    run: Run,
+    telling: Sequence[Outcome],
+    net: Corridor,
+    given: Mapping[str, object] | None,
+    on_motion: Callable[[int, Trajectory], None],
+    *,
+    trust: bool,
+) -> _RunAgain:
+    """Run a campaign's VUT in the other's telling cases, if it is still the same VUT."""
+    if not telling:
+        return _RunAgain("had nothing to run")
+    scored = [o for o in run.outcomes if o.score is not None]
+    checked = sorted(scored, key=lambda o: (o.score, o.index))[:CHECKED]
+    cases = [o.case for o in (*checked, *telling)]
+    settings = settings_of(run.folder, run.settings, given, trust=trust)
+    results = run_cases(plan_of(settings, net, cases=len(cases)), cases)
+    for before, now in zip(checked, results, strict=False):
+        if before.score is None or now.score is None or abs(before.score - now.score) > SAME_SCORE:
+            return _RunAgain(
+                "could not be run: its VUT or its POV does not do again what case "
+                f"{before.index} records"
+            )
+    again = _RunAgain("was run again")
+    for other, now in zip(telling, results[len(checked) :], strict=True):
+        on_motion(other.index, now.trajectory)
+        again.outcomes[other.index] = Outcome(
+            other.index, 0, other.case, now.measures, margin=now.margin
+        )
+    return again
+
+
+# One campaign: its recorded cases with a changed VUT.
+
+
+@dataclass(frozen=True, slots=True)
+class ChangedVerdict:
+    """A case whose verdict is another than the recorded one."""
+
+    before: Outcome
+    after: Outcome
+
+    @property
+    def change(self) -> str:
+        """What that means: fixed, broke, or between failing and giving no verdict."""
+        return change_between(self.before, self.after)
+
+    @property
+    def became(self) -> str:
+        """What the case was and is; where the words are one, which of them is a failure."""
+        words = [outcome.measures.became for outcome in (self.before, self.after)]
+        if words[0] == words[1]:
+            words = [
+                f"{words[0]}, {'a failure' if outcome.failed else 'no failure'}"
+                for outcome in (self.before, self.after)
+            ]
+        return " -> ".join(words)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        before, after = self.before.measures, self.after.measures
+        return {
+            "index": self.before.index,
+            "level": self.before.case.level,
+            "change": self.change,
+            **{"end_before": before.end, "end_after": after.end},
+            **{"severity_before": before.severity, "severity_after": after.severity},
+            **{"score_before": self.before.score, "score_after": self.after.score},
+        }
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Rerun(Result):
+    """Recorded cases and what the VUT of today makes of them.
+
+    Attributes:
+        vut: name of that VUT.
+        before: the recorded outcomes.
+        after: those of today, in the same order, with the same indices.
+        compared: what changed, as in `compare_runs`: A is what was recorded, B is today's.
+        unrepeated: indices of the cases that did not go as before although the VUT is the same, by
+            its name, its command and its files; empty where it is another one.
+    """
+
+    vut: str
+    before: list[Outcome]
+    after: list[Outcome]
+    compared: RunComparison
+    unrepeated: tuple[int, ...] = ()
+
+    @property
+    def changed(self) -> list[ChangedVerdict]:
+        """The cases whose verdict changed, in the order of the campaign."""
+        return [
+            ChangedVerdict(a, b)
+            for a, b in zip(self.before, self.after, strict=True)
+            if (a.measures.end, a.failed) != (b.measures.end, b.failed)
+        ]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {
+            "vut": self.vut,
+            "cases": len(self.before),
+            "changed": [one.to_record() for one in self.changed],
+            "levels": self.compared.to_record()["levels"],
+            "unrepeated": self.unrepeated,
+        }
+
+    def lines(self) -> list[str]:
+        """Return both verdicts, and which cases changed theirs."""
+        now, changed = judge(self.after), self.changed
+        text = [f"recorded:  {judge(self.before).counts}", f"now:       {now.counts} ({self.vut})"]
+        text += now.trouble_lines()
+        if self.unrepeated:
+            text.append(
+                f"{len(self.unrepeated)} of {counted(len(self.after), 'case')} went differently, "
+                f"and no file of the VUT has changed (the first is case {self.unrepeated[0]}). "
+                f"{cause()}."
+            )
+        if not changed:
+            return [*text, "no verdict changed"]
+        text.append(
+            f"{len(changed)} verdicts changed:" if len(changed) > 1 else "one verdict changed:"
+        )
+        for one in changed[:MOST_CHANGED]:
+            change = one.change.replace("of A", "before").replace("of B", "now")
+            text.append(f"  case {one.before.index}: {one.became} ({change})")
+        if len(changed) > MOST_CHANGED:
+            text.append(f"  and {len(changed) - MOST_CHANGED} others")
+        return text
+
+
+def settings_today(
+    run: Run, given: Mapping[str, object] | None = None, *, trust: bool = False
+) -> CampaignSettings:
+    """Return the settings of a campaign with what is given in the place of what it recorded.
+
+    A VUT that is not given is that of the campaign, as its files are today. The controller that a
+    folder names runs only where the folder was made here, or with `trust`.
+    """
+    wanted = dict(given or {})
+    if "vut" in wanted:
+        wanted.setdefault("vut_command", None)  # the recorded command is of the recorded VUT
+    return settings_of(run.folder, run.settings, wanted, trust=trust)
+
+
+def rerun(
+    run: Run,
+    settings: CampaignSettings,
+    indices: Sequence[int] = (),
+    *,
+    net: Path | None = None,
+    workers: Workers | None = None,
+    on_case: Callable[[int], None] = lambda _: None,
+) -> Rerun:
+    """Run cases of a campaign again.
+
+    Args:
+        run: the campaign.
+        settings: how: `settings_today`.
+        indices: its cases; all of them when left out.
+        net: net for that; must be the one of the campaign.
+        workers: where the cases run, by default in this process.
+        on_case: told how many cases have just ended.
+
+    Raises:
+        UserError: for an index without a case, and where net or POV are not those of the campaign:
+            then not only the VUT would have changed.
+    """
+    before = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
+    if not before:
+        raise UserError(f"{run.folder} has no case yet")
+    road = road_for(settings.scenario, net)
+    if run.settings.get("net_sha256", road.sha256) != road.sha256:
+        raise UserError(
+            f"{run.folder} was run on another net than {road.path}: give that with --net"
+        )
+    levels = sorted({outcome.case.level for outcome in before})
+    today = record_of(settings, road)
+    for level in levels:
+        if not same_pov(run.settings, today, level):
+            raise UserError(
+                f"{run.folder} was run against another POV of level {level_name(level)} than "
+                "today's: give its --policies"
+            )
+    # In another order than the campaign's, which a VUT that remembers would repeat.
+    order, by_index = before[::-1], dict[int, Outcome]()
+    with workers_or_here(workers) as processes:
+        run_all = runs_on(processes, plan_of(settings, road, cases=len(before)))
+        for place, now in run_all([outcome.case for outcome in order]):
+            old = order[place]
+            by_index[old.index] = Outcome(
+                old.index, old.batch, old.case, now.measures, margin=now.margin
+            )
+            on_case(1)
+    after = [by_index[outcome.index] for outcome in before]
+    cases = [
+        ComparedCase.of("A", a.index, a, b)
+        for a, b in zip(before, after, strict=True)
+        if any(o.failed or not o.is_tested for o in (a, b))
+    ]
+    evidence = f"{counted(len(before), 'case')} ran again"
+    compared = _comparison(cases, before, after, levels, evidence, same_cases=True)
+    unrepeated = _unrepeated(before, after) if _same_vut(run, settings) else ()
+    return Rerun(settings.vut, before, after, compared, unrepeated)
+
+
+def _same_vut(run: Run, settings: CampaignSettings) -> bool:
+    """Return whether a VUT that is not of the package is the one that was recorded."""
+    recorded, files = run.settings, run.settings.get("vut_files")
+    return (
+        settings.vut not in built_in_vuts()
+        and (settings.vut, settings.vut_command)
+        == (recorded.get("vut"), recorded.get("vut_command"))
+        and recorded.get("versions") == versions()
+        and isinstance(files, dict)
+        and not changed(files)
+    )
+
+
+def _unrepeated(before: Sequence[Outcome], after: Sequence[Outcome]) -> tuple[int, ...]:
+    """Return the indices of the cases that did not go as before, except those with an error."""
+
+    def motion(outcome: Outcome) -> tuple[object, ...]:
+        measures = outcome.measures
+        return (
+            measures.end,
+            measures.t_end_s,
+            measures.dx_m,
+            measures.dv_mps,
+            measures.clipped_steps,
+        )
+
+    return tuple(
+        a.index
+        for a, b in zip(before, after, strict=True)
+        if not (a.measures.end.is_error or b.measures.end.is_error) and motion(a) != motion(b)
+    )
