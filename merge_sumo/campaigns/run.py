@@ -26,12 +26,13 @@ from numpy.typing import NDArray
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.printable import printable
+from merge_sumo.system.records import decode
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.signals import Signals, from_record
+from merge_sumo.values.signals import SignalRuns, Signals, from_runs
 from merge_sumo.values.trajectory import Trajectory
 
 SETTINGS: Final = "campaign.json"
@@ -46,10 +47,6 @@ RAN_AGAIN: Final = "ran_again"
 """Key of `campaign.json`: how many cases ran again because a process had died or was stopped."""
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json`: the hash of all other keys with their values."""
-UNREADABLE_RECORD: Final = (
-    *(ValueError, TypeError, KeyError, AttributeError, RecursionError, UserError),
-)
-"""What is raised when a line is not the record of an outcome."""
 
 
 class Run:
@@ -171,7 +168,7 @@ class Run:
                 motion = _motion_by_case(self.scenario.vehicles, **arrays)
                 self._signals |= {} if text is None else _signals_by_case(text, motion)
                 self._batches[batch] = motion
-            except UNREADABLE_NPZ as error:
+            except (*UNREADABLE_NPZ, UserError) as error:
                 raise UserError(f"cannot read the trajectories in {path}: {error}") from error
         return self._batches[batch]
 
@@ -180,13 +177,11 @@ def read_settings(folder: Path) -> dict[str, Any]:
     """Return what `campaign.json` says; `UserError` when it is no campaign's."""
     path = folder / SETTINGS
     try:
-        settings = _decode(regular(path).read_text(encoding="utf-8"))
+        settings: dict[str, Any] = decode(regular(path).read_bytes(), dict[str, Any])
     except OSError as error:
         raise _no_campaign(folder, error) from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not readable JSON: {error}") from error
-    if not isinstance(settings, dict):
-        raise UserError(f"{path} is not a JSON object")
+    except UserError as error:
+        raise UserError(f"{path} is no campaign's: {error}") from error
     written = settings.pop(CHECKSUM, None)
     if written is not None and written != settings_sha256(settings):
         raise UserError(
@@ -241,13 +236,12 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[li
                 raise UserError(f"line {number} of {name} does not end as it was written")
             break
         try:
-            outcome = Outcome.from_record(_decode(line.decode()), scenario)
+            outcome = Outcome.from_json(line, scenario)
             if outcome.index != number - 1:
-                raise ValueError(f"index is {outcome.index}")
-        except UNREADABLE_RECORD as error:
+                raise UserError(f"index is {outcome.index}")
+        except UserError as error:
             raise UserError(
-                f"line {number} of {name} is not the outcome of case {number - 1}: "
-                f"{type(error).__name__} {error}"
+                f"line {number} of {name} is not the outcome of case {number - 1}: {error}"
             ) from error
         outcomes.append(outcome)
     return outcomes, torn
@@ -300,25 +294,10 @@ def _no_campaign(folder: Path, error: OSError) -> UserError:
 def _is_whole(line: bytes) -> bool:
     """Return whether bytes are a line: of one that was being written, no part is."""
     try:
-        _decode(line.decode())
-    except (ValueError, RecursionError):
+        decode(line)
+    except UserError:
         return False
-    return bool(line)
-
-
-def _no_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no JSON")
-
-
-_decoder: Final = json.JSONDecoder(parse_constant=_no_constant)
-
-
-def _decode(text: str) -> Any:
-    """Return what JSON says; ValueError or RecursionError for what is none, or no text."""
-    value = _decoder.decode(text)
-    if "\\u" in text:
-        json.dumps(value, ensure_ascii=False).encode()  # half a character cannot be written
-    return value
+    return True
 
 
 def _motion_by_case(
@@ -342,11 +321,8 @@ def _signals_by_case(
     """Return the signals of each case; ValueError or TypeError where they do not fit the motion."""
     if text.dtype != np.uint8 or text.ndim != 1:
         raise ValueError(f"the signals are {text.dtype} of shape {text.shape}")
-    try:
-        record = _decode(text.tobytes().decode())
-    except RecursionError as error:
-        raise ValueError("the signals are no JSON") from error
-    return {int(index): from_record(of, len(motion[int(index)])) for index, of in record.items()}
+    runs = decode(text.tobytes(), dict[str, SignalRuns])
+    return {int(index): from_runs(of, len(motion[int(index)])) for index, of in runs.items()}
 
 
 def _check_lines(folder: Path, text: bytes, outcomes: list[Outcome]) -> None:

@@ -11,20 +11,20 @@ from merge_sumo.values.severity import severity_of
 from merge_sumo.values.trajectory import End
 
 
-def take_from_0_1(values: dict[str, Any], scenario: Scenario) -> None:
+def upgrade_from_0_1(values: dict[str, Any], scenario: Scenario) -> None:
     """Give a record of release 0.1 the fields of today, in place.
 
     That release called |dx| < 6 m a collision and recorded nothing of bodies. Their state at M
     follows from dx and dv of the nearest car; what bodies did before M is not known.
     """
-    if values["end"] == "COLLISION":
+    if values.get("end") == "COLLISION":
         values["end"] = End.MERGED.value
     values.pop("after_merge", None)
     values |= dict.fromkeys(
         ("severity", "bumper_gap_m", "clearance_m", "before_clearance_m", "brake_after_mps2")
     )
     values["impact_speed_mps"] = None
-    dx, dv, score = values["dx_m"], values["dv_mps"], values["score"]
+    dx, dv, score = (values.get(name) for name in ("dx_m", "dv_mps", "score"))
     if not (type(dx) is float and type(dv) is float and type(score) is float):
         return
     ahead = dx >= 0.0

@@ -11,14 +11,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from functools import cache
+from typing import Any, Final, Literal, get_type_hints
 
 import numpy as np
 
+from merge_sumo.errors import UserError
 from merge_sumo.system.pickling import quickly_pickled
+from merge_sumo.system.records import convert, decode, record_type, to_plain
 from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
-from merge_sumo.values.former import take_from_0_1
+from merge_sumo.values.former import upgrade_from_0_1
 from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
@@ -98,7 +101,7 @@ class Measures:
     ttc_s: float | None
     pet_s: float | None
     t_end_s: float
-    severity: str | None
+    severity: Severity | None
     bumper_gap_m: float | None
     clearance_m: float | None
     before_clearance_m: float | None
@@ -107,7 +110,7 @@ class Measures:
     vut_max_brake_mps2: float
     pov_max_brake_mps2: float
     impact_speed_mps: float | None
-    merged_first: str | None
+    merged_first: Literal["VUT", "POV"] | None
     last_avoidable_s: float | None
     avoidable: bool | None
     clipped_steps: int
@@ -179,69 +182,49 @@ class Outcome:
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
-        case = self.case
-        measures = {name: getattr(self.measures, name) for name in Measures.__slots__}
-        names: tuple[str, ...] = RECORDED
-        if case.scenario.vehicles > 2:
-            names += RECORDED_IN_TRAFFIC
-        else:
-            del measures["nearest"]
-        if not case.scenario.follow_up_s:
-            for name in FOLLOWED_UP:
-                del measures[name]
-        place = {"index": self.index, "batch": self.batch}
-        record = place | {name: getattr(case, name) for name in names} | measures
+        case_names, measure_names, _ = record_fields(self.case.scenario)
+        record: dict[str, Any] = {"index": self.index, "batch": self.batch}
+        record |= {name: getattr(self.case, name) for name in case_names}
+        record |= {name: getattr(self.measures, name) for name in measure_names}
         if self.margin is not None:
             record["margin"] = self.margin
-        return (
-            record
-            if self.prediction is None
-            else record | {"foretold": self.prediction.to_record()}
-        )
+        if self.prediction is not None:
+            record["foretold"] = to_plain(self.prediction)
+        return record
 
     @classmethod
-    def from_record(cls, record: dict[str, Any], scenario: Scenario = US23) -> Outcome:
-        """Return the outcome of a record; KeyError, TypeError or ValueError where it is not one."""
-        values = dict(record)
-        index, batch = values.pop("index"), values.pop("batch")
-        if type(index) is not int or type(batch) is not int:
-            raise TypeError("index and batch must be whole numbers")
-        margin = values.pop("margin", None)
-        if margin is not None and not (type(margin) is float and math.isfinite(margin)):
-            raise ValueError(f"margin is {margin!r}")
-        in_traffic = scenario.vehicles > 2
-        names = (*RECORDED, *RECORDED_IN_TRAFFIC) if in_traffic else RECORDED
-        case = Case(**{name: values.pop(name) for name in names}, scenario=scenario)
-        prediction = values.pop("foretold", None)
-        if "severity" not in values:
-            take_from_0_1(values, scenario)
-        values["end"] = End(values["end"])
-        if not in_traffic:
-            values["nearest"] = VEHICLES[POV]
-        if values["nearest"] not in VEHICLES:
-            raise ValueError(f"nearest is {values['nearest']!r}")
-        if values["severity"] not in (None, *Severity):
-            raise ValueError(f"severity is {values['severity']!r}")
-        if not scenario.follow_up_s:
-            values |= dict.fromkeys(FOLLOWED_UP)
-        for name, types in _TYPES.items():
-            if type(value := values[name]) not in types:
-                raise TypeError(f"{name} is {value!r}")
-            if type(value) is float and not math.isfinite(value):
-                raise ValueError(f"{name} is {value!r}")
-        said = None if prediction is None else Prediction.from_record(prediction)
-        return cls(index, batch, case, Measures(**values), said, margin)
+    def from_json(cls, line: bytes | str, scenario: Scenario = US23) -> Outcome:
+        """Return the outcome of a line of `outcomes.jsonl`; `UserError` where it is none."""
+        case_names, measure_names, flat = record_fields(scenario)
+        record = decode(line)
+        if isinstance(record, dict) and "severity" not in record:
+            upgrade_from_0_1(record, scenario)
+        known = convert(record, flat)
+        case = Case(**{name: getattr(known, name) for name in case_names}, scenario=scenario)
+        measures = Measures(**{name: getattr(known, name) for name in measure_names})
+        if measures.nearest not in VEHICLES:
+            raise UserError(f"nearest is {measures.nearest!r}: it must be one of {VEHICLES}")
+        return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
 
 
 FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
 """Measures of the follow-up."""
-_JSON_TYPES: Final = {"None": type(None), "float": float, "str": str, "bool": bool, "int": int}
-_TYPES: Final = {
-    name: frozenset(_JSON_TYPES[part] for part in annotation.split(" | "))
-    for name, annotation in Measures.__annotations__.items()
-    if name != "end"
-}
-"""What the fields of `Measures` may hold when they are read from JSON."""
+
+
+def record_fields(scenario: Scenario) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
+    """Return the fields of a case and of measures that a record has, and the type of the record."""
+    return _record_fields(scenario.vehicles > 2, scenario.follow_up_s > 0.0)
+
+
+@cache
+def _record_fields(traffic: bool, followed: bool) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
+    case_names = (*RECORDED, *RECORDED_IN_TRAFFIC) if traffic else RECORDED
+    left_out = {*(() if traffic else ("nearest",)), *(() if followed else FOLLOWED_UP)}
+    measure_names = tuple(name for name in Measures.__slots__ if name not in left_out)
+    types = {"index": int, "batch": int, **get_type_hints(Case), **get_type_hints(Measures)}
+    required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
+    optional = [("margin", float | None, None), ("foretold", Prediction | None, None)]
+    return case_names, measure_names, record_type("outcome", [*required, *optional])
 
 
 def score_of(margin: float) -> float:
@@ -300,7 +283,7 @@ def _measure(trajectory: Trajectory, before_m: float, *, way_out: bool) -> Measu
     followed: tuple[float | None, ...] = followed_up(trajectory) or (None, None, None)
     return Measures(
         end=end,
-        severity=None if severity is None else severity.value,
+        severity=severity,
         score=None if trajectory.error is not None else _score(trajectory, dx, ttc, close=close),
         dx_m=dx,
         bumper_gap_m=min((gap for gap, _ in neighbours(trajectory)), default=None),

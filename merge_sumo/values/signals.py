@@ -7,13 +7,15 @@ and words are a stranger's: they are bounded, and printable.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from itertools import groupby, islice
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
+from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
+from merge_sumo.system.records import Meta
 
 Left = dict[str, float | str]
 """What is left at one step, by name."""
@@ -84,27 +86,28 @@ def to_record(signals: Signals) -> dict[str, list[list[Any]]]:
     }
 
 
-def from_record(record: object, rows: int) -> Signals:
-    """Return the signals of a case of so many rows; ValueError or TypeError for what is none."""
-    if not isinstance(record, dict) or not 0 < len(record) <= MOST_NAMES:
-        raise ValueError("it has no signals, or too many")
-    return {_checked_name(name): _expanded(runs, rows) for name, runs in record.items()}
+SignalRuns = Annotated[
+    dict[str, tuple[tuple[Annotated[int, Meta(ge=1)], float | str | None], ...]],
+    Meta(min_length=1, max_length=MOST_NAMES),
+]
+"""What `to_record` returns, as JSON has it."""
 
 
-def _checked_name(name: str) -> str:
-    if _word(name) != name:
-        raise ValueError("a name is not as it is written")
-    return name
+def from_runs(runs: SignalRuns, rows: int) -> Signals:
+    """Return the signals of a case of so many rows; `UserError` where they are not as written."""
+    return {name: _expanded(name, values, rows) for name, values in runs.items()}
 
 
-def _expanded(runs: Sequence[Any], rows: int) -> tuple[float | str | None, ...]:
+def _expanded(
+    name: str, runs: Iterable[tuple[int, float | str | None]], rows: int
+) -> tuple[float | str | None, ...]:
     values: list[float | str | None] = []
     for count, value in runs:
-        if type(count) is not int or not 0 < count <= rows - len(values):
-            raise ValueError("it has other rows than the motion")
-        if value is not None and (isinstance(value, bool) or _value(value) != value):
-            raise ValueError("a value is not as it is written")
+        if count > rows - len(values):
+            raise UserError("a signal has other rows than the motion")
+        if _word(name) != name or (value is not None and _value(value) != value):
+            raise UserError("a signal is not as it was written")
         values += [value] * count
     if len(values) != rows:
-        raise ValueError("it has other rows than the motion")
+        raise UserError("a signal has other rows than the motion")
     return tuple(values)
