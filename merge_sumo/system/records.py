@@ -15,8 +15,17 @@ from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get_origin
-from typing import get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 import numpy as np
@@ -84,12 +93,13 @@ def convert(record: object, kind: type[T]) -> T:
         raise UserError("it is nested too deeply") from error
 
 
-def check_fields(value: object) -> None:
+def check_fields(value: Any) -> None:
     """Check and convert the fields of a dataclass in place: 18 to 18.0, a list to a tuple.
 
     Numbers of numpy are as good as those of Python. Raises `UserError` for another type.
     """
-    for name, hint in _hints(type(value)).items():
+    kind: Any = type(value)
+    for name, hint in _hints(kind).items():
         known = getattr(value, name)
         plain = known.item() if isinstance(known, np.generic) else known
         try:

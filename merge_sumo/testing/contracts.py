@@ -11,6 +11,7 @@ A contract needs no pytest to be imported, and no SUMO unless it says so.
 
 from __future__ import annotations
 
+import json
 import math
 from functools import lru_cache
 from typing import Any, Final
@@ -187,8 +188,8 @@ class SamplerContract:
             expected = [outcome.case for outcome in outcomes if outcome.batch == batches]
             assert resumed.ask(9) == expected
         resumed = self.fresh()
-        records = [outcome.to_record() for outcome in outcomes]
-        resumed.tell([Outcome.from_record(record, self.pool.scenario) for record in records])
+        lines = [json.dumps(outcome.to_record()) for outcome in outcomes]
+        resumed.tell([Outcome.from_json(line, self.pool.scenario) for line in lines])
         assert resumed.ask(9) == proposed
 
     def test_proposes_other_cases_for_another_seed(self) -> None:

@@ -264,7 +264,8 @@ def _measure(trajectory: Trajectory, before_m: float, *, way_out: bool) -> Measu
     pair = trajectory.facing(nearest)
     (x_pov, v_pov, _), (x_vut, v_vut, _) = pair.motion[-1].tolist()
     end, close = trajectory.end, is_close(trajectory)
-    dx = dv = ttc = pet = drac = first = avoidable = last_avoidable = None
+    dx = dv = ttc = pet = drac = avoidable = last_avoidable = None
+    first: Literal["VUT", "POV"] | None = None
     if end.is_tested:
         dx, dv = x_pov - x_vut, v_pov - v_vut
         ttc = time_to_collision(dx, dv)

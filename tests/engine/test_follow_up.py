@@ -60,7 +60,7 @@ class TestMeasures:
         outcome = Criterion("contact").outcome(0, 0, followed((-10.0, 20.0, 0.0, 25.0)))
         record = json.loads(json.dumps(outcome.to_record()))
         assert list(record)[-4:] == [*FOLLOWED_UP, "margin"]
-        assert Outcome.from_record(record, FOLLOWED) == outcome
+        assert Outcome.from_json(json.dumps(record), FOLLOWED) == outcome
         assert not set(FOLLOWED_UP) & set(Outcome(0, 0, CASE, measure(ending(9.0))).to_record())
 
     def test_that_nobody_takes_are_refused(self):

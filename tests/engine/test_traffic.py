@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from typing import Any
@@ -331,7 +332,7 @@ class TestTheVerdict:
         record = outcome.to_record()
         assert record["nearest"] == "behind"
         assert record["headway_ahead_s"] == trajectory.case.headway_ahead_s
-        assert Outcome.from_record(record, TRAFFIC) == outcome
+        assert Outcome.from_json(json.dumps(record), TRAFFIC) == outcome
 
     def test_knows_no_way_out_through_a_car(self):
         # Braking avoids the POV, but not the car behind it.

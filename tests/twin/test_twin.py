@@ -27,6 +27,7 @@ from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.studies.prediction_quality import Expected, off_m, prediction_in_words, surprises
 from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.records import decode, to_plain
 from merge_sumo.twin.observation import NOW, Observation
 from merge_sumo.twin.rollout import TwinRollout
 from merge_sumo.twin.twin import Twin
@@ -263,7 +264,7 @@ class TestPrediction:
     def test_is_read_as_it_was_written(self):
         one = Prediction.of(np.array([[1.23456, math.nan]]), 0.5, 0.25, 0.4)
         assert one.dx_m == ((1.2346, None),)
-        assert Prediction.from_record(json.loads(json.dumps(one.to_record()))) == one
+        assert decode(json.dumps(to_plain(one)), Prediction) == one
         assert one.median_dx_m is None
 
     @pytest.mark.parametrize(
@@ -279,8 +280,8 @@ class TestPrediction:
     )
     def test_is_no_other_table(self, changed):
         record = {"dx_m": [[1.0]], "p_twin": 0.5, "p_surrogate": 0.5, "p_fail": 0.5}
-        with pytest.raises((TypeError, ValueError, KeyError)):
-            Prediction.from_record(record | changed)
+        with pytest.raises(UserError):
+            decode(json.dumps(record | changed), Prediction)
 
 
 class TestACampaign:

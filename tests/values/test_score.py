@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -169,4 +170,4 @@ class TestMeasures:
 def test_outcomes_round_trip_through_their_record():
     for trajectory in (ending(3.0), ending(30.0), eq4(-250.0, 30.0, 0.0, -182.0, 0.0, 0.0)):
         outcome = Outcome(7, 2, CASE, measure(trajectory))
-        assert Outcome.from_record(outcome.to_record()) == outcome
+        assert Outcome.from_json(json.dumps(outcome.to_record())) == outcome

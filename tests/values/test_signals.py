@@ -18,14 +18,16 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.system.arrays import read_arrays
+from merge_sumo.system.records import decode
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.signals import (
     CHARACTERS,
     MOST_NAMES,
     Left,
+    SignalRuns,
     Signals,
     as_signals,
-    from_record,
+    from_runs,
     series,
     to_record,
 )
@@ -195,8 +197,8 @@ def test_numbers_of_numpy_are_numbers():
     ],
 )
 def test_a_file_of_a_stranger_is_refused(record):
-    with pytest.raises((ValueError, TypeError)):
-        from_record(record, 5)
+    with pytest.raises(UserError):
+        from_runs(decode(json.dumps(record), SignalRuns), 5)
 
 
 def test_a_file_that_was_changed_is_named(campaign):
@@ -213,7 +215,7 @@ def test_a_file_that_was_changed_is_named(campaign):
 
 def test_what_is_kept_is_read_as_it_was():
     signals: Signals = {"mode": ("go", "go", None), "gap_m": (1.5, -2.0, None)}
-    assert from_record(json.loads(json.dumps(to_record(signals))), 3) == signals
+    assert from_runs(decode(json.dumps(to_record(signals)), SignalRuns), 3) == signals
 
 
 @pytest.mark.parametrize(
