@@ -84,7 +84,7 @@ def search(
     pool = Pool(levels=(level,))
     games = None if name == WITHOUT else Twin(pool, plan.povs, seed)
     sampler = make_sampler("coverage" if name == WITHOUT else name, pool, seed, games)
-    batch = None if sampler.games else BATCH
+    batch = None if sampler.predictor else BATCH
     seconds = 0.0
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:

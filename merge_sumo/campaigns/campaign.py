@@ -72,12 +72,12 @@ def conduct(
     Without a `batch`, the sampler says how many cases it wants. It ends after `cases`, or earlier
     where `stop` says so of the outcomes so far. A campaign goes on after `history`, whole batches
     of its own outcomes: the sampler is told them, and as it is pure in what it was told, it
-    proposes what it would have proposed then. One that foresees is told the `motions`,
+    proposes what it would have proposed then. One that uses_predictions is told the `motions`,
     (T + 1, A, 3), of the history by index, too.
     """
     sampler.tell(history, motions)
     number, first = (history[-1].batch + 1 if history else 0), len(history)
-    while first < cases and not (stop is not None and stop(sampler.told())):
+    while first < cases and not (stop is not None and stop(sampler.observed())):
         ran: list[tuple[Outcome, Trajectory]] = []
         for place, done in run(sampler.ask(min(batch or sampler.batch_size(), cases - first))):
             case, prediction = done.trajectory.case, sampler.prediction(place)
@@ -259,7 +259,7 @@ def _go_on(
     history = [] if before is None else before.outcomes
     ended: list[Outcome] = []
     motions = None
-    if before is not None and sampler.foresees:
+    if before is not None and sampler.uses_predictions:
         motions = {o.index: before.trajectory(o.index).motion for o in history}
     scout = make_sampler(settings.sampler, settings.pool, settings.seed)
     proposed = proposals(scout, history, settings.cases, settings.batch)

@@ -124,8 +124,8 @@ class CampaignSettings:
 
     def _check_sampler(self) -> None:
         sampler = make_sampler(self.sampler, self.pool, self.seed)
-        if self.learn_from and not sampler.foresees:
-            able = [name for name, kind in SAMPLERS.items() if kind.foresees]
+        if self.learn_from and not sampler.uses_predictions:
+            able = [name for name, kind in SAMPLERS.items() if kind.uses_predictions]
             raise UserError(
                 f"--learn-from needs a sampler that plays cases out: choose --sampler "
                 f"{' or '.join(able)}"

@@ -72,7 +72,7 @@ class Plan(NamedTuple):
 
 
 class RampDriver(Level0Vut):
-    """Takes the level-0 profile, and gives way when a model foresees a conflict at M.
+    """Takes the level-0 profile, and gives way when a model predicts a conflict at M.
 
     Attributes:
         model: the model.

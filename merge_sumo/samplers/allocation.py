@@ -8,26 +8,28 @@ from collections.abc import Mapping
 from merge_sumo.values.score import Outcome
 
 
-def even_shares(told: Mapping[int, int], n: int) -> dict[int, int]:
-    """Share `n` cases out evenly; the odd ones go to the levels with the fewest cases `told`."""
-    return whole_shares(dict.fromkeys(told, 1.0), told, n)
+def even_shares(proposed: Mapping[int, int], n: int) -> dict[int, int]:
+    """Share `n` cases out evenly; remainders go to the levels with the fewest cases `proposed`."""
+    return whole_shares(dict.fromkeys(proposed, 1.0), proposed, n)
 
 
 def softmax_shares(
-    failure_share: Mapping[int, float], told: Mapping[int, int], n: int, xi: float
+    failure_share: Mapping[int, float], proposed: Mapping[int, int], n: int, xi: float
 ) -> dict[int, int]:
     """Share `n` cases out in proportion to exp(xi U_k), U_k the failure share of level k."""
     weights = {level: math.exp(xi * u) for level, u in failure_share.items()}
-    return whole_shares(weights, told, n)
+    return whole_shares(weights, proposed, n)
 
 
-def whole_shares(weights: Mapping[int, float], told: Mapping[int, int], n: int) -> dict[int, int]:
+def whole_shares(
+    weights: Mapping[int, float], proposed: Mapping[int, int], n: int
+) -> dict[int, int]:
     """Share `n` out in proportion to positive weights, in whole numbers that add up to `n`.
 
-    No level starves: each gets one case first, those with the fewest cases `told` before the
-    others where `n` does not suffice. The rest follows the largest remainders.
+    Each level gets one case first; if `n` does not suffice, the levels with the fewest cases
+    `proposed` come first. The rest follows the largest remainders.
     """
-    by_need = sorted(weights, key=lambda level: (told[level], level))
+    by_need = sorted(weights, key=lambda level: (proposed[level], level))
     shares = {level: 1 if rank < n else 0 for rank, level in enumerate(by_need)}
     total = sum(weights.values())
     quota = {level: n * weight / total for level, weight in weights.items()}

@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from merge_sumo.samplers.prediction_skill import Predictor
 
 DEFAULT_BATCH: Final = 40
-"""Cases of a batch where a sampler has no wish of its own."""
+"""Cases of a batch of a sampler without a preferred size."""
 
 
 class Sampler(ABC):
-    """Proposes cases; knows nothing of SUMO and never runs anything.
+    """Proposes cases; knows nothing of SUMO and runs nothing.
 
-    `ask` is a pure function of the settings and of what was told: asking twice gives the same
-    cases, and the order of telling and telling twice do not matter. So a campaign is resumed by
-    telling its journal to a fresh sampler.
+    `ask` is a pure function of the settings and of the outcomes told so far: two calls return the
+    same cases, and neither the order of `tell` nor a repeated `tell` matters. A campaign resumes by
+    telling its journal to a new sampler.
     """
 
     about: ClassVar[str] = ""
@@ -35,18 +35,18 @@ class Sampler(ABC):
     colour: ClassVar[str] = "#7B3294"
     """Of its curves in figures, #RRGGBB."""
     learns: ClassVar[bool] = True
-    """Whether outcomes decide on what it proposes, and not only how many cases there were."""
-    foresees: ClassVar[bool] = False
-    """Whether it makes something of games that are played out before cases run."""
+    """Whether proposals depend on the outcomes, and not only on their number."""
+    uses_predictions: ClassVar[bool] = False
+    """Whether proposals depend on predictions of a twin of the VUT."""
 
-    def __init__(self, pool: Pool, seed: int, games: Predictor | None = None) -> None:
+    def __init__(self, pool: Pool, seed: int, predictor: Predictor | None = None) -> None:
         """Propose cases from `pool`; `seed` makes the proposals reproducible.
 
-        `games` plays cases out, for samplers that make something of that.
+        `predictor` simulates cases before they run, for samplers with `uses_predictions`.
         """
         self.pool = pool
         self.seed = seed
-        self.games = games if self.foresees else None
+        self.predictor = predictor if self.uses_predictions else None
         self._outcomes: dict[int, Outcome] = {}
         self._proposed: Counter[int] = Counter()
 
@@ -55,11 +55,11 @@ class Sampler(ABC):
         """Return the next `n` cases."""
 
     def prediction(self, place: int) -> Prediction | None:
-        """Return what was predicted of a case that was asked for last, by its place there."""
+        """Return the prediction of a case of the last batch, by its place in the batch."""
         return None
 
     def batch_size(self) -> int:
-        """Return how many cases to ask for next, where nobody says."""
+        """Return the preferred number of cases of the next batch."""
         return DEFAULT_BATCH
 
     def tell(
@@ -67,19 +67,19 @@ class Sampler(ABC):
     ) -> None:
         """Take outcomes; those without a verdict (VUT_ERROR, SIM_ERROR) only count as proposed.
 
-        `motions`, (T + 1, A, 3) by the index of an outcome, are for who plays games.
+        `motions`, (T + 1, A, 3) by the index of an outcome, are for the predictor.
         """
         for outcome in outcomes:
             self._proposed[outcome.case.level] += outcome.index not in self._outcomes
             self._outcomes[outcome.index] = outcome
-        if self.games is not None and motions is not None:
-            self.games.tell(outcomes, motions)
+        if self.predictor is not None and motions is not None:
+            self.predictor.tell(outcomes, motions)
 
     def skip(self, cases: Iterable[Case]) -> None:
-        """Count cases as proposed of which nothing will be told."""
+        """Count cases as proposed whose outcomes will not be told."""
         self._proposed.update(case.level for case in cases)
 
-    def told(self, level: int | None = None) -> list[Outcome]:
+    def observed(self, level: int | None = None) -> list[Outcome]:
         """Return the outcomes with a verdict, of one level or of all, in order of their index."""
         return [
             outcome
@@ -88,12 +88,12 @@ class Sampler(ABC):
         ]
 
     def proposed(self, level: int | None = None) -> int:
-        """Return how many cases were told, with a verdict or without, of one level or of all."""
+        """Return the number of cases told, with or without a verdict, of one level or of all."""
         return self._proposed.total() if level is None else self._proposed[level]
 
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays."""
-        outcomes = self.told(level)
+        outcomes = self.observed(level)
         return LevelHistory(
             points=to_unit((o.case for o in outcomes), level, self.pool.scenario),
             score=np.array([o.score for o in outcomes], dtype=np.float64),

@@ -1,4 +1,4 @@
-"""What `coverage` believes: P(fail) of a case, from the cases so far.
+"""The surrogate of `coverage`: P(fail) of a case, from the outcomes so far.
 
 Failing means that the signed gap dx at M is within 6 m, so failures lie where the gap changes its
 sign: where another car goes first. There the gap often jumps, and no test between the two sides
@@ -36,13 +36,13 @@ from merge_sumo.values.scenario import DX_CRASH_M
 from merge_sumo.values.score import FAILURE_SCORE
 
 NO_GAP_M: Final = 200.0
-"""Gap of a VUT that never arrives: the POV goes first, as far ahead as one can be."""
+"""Gap of a VUT that never arrives: the POV goes first, at the largest possible distance."""
 MAX_LEARNED: Final = 1000
-"""Cases that a process learns from; what bounds the time per batch in a long campaign."""
+"""Cases that a process learns from; bounds the time per batch in a long campaign."""
 BRANCH_FROM: Final = 20
-"""Cases on either side that it takes to learn the gap of each side by itself."""
+"""Fewest cases of either merging order to learn the gap of each order by itself."""
 NEAR: Final = 0.005
-"""Distances below this are not told apart."""
+"""Distances below this count as this."""
 CALIBRATION: Final = (np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, 1.0, 0.3, 0.3]))
 """Mean and standard deviation, before anything is known, of the weights by which the log odds, 1,
 and the log distances to the nearest failure and to the curve add up to calibrated log odds."""
@@ -51,13 +51,13 @@ WIDTHS: Final = np.geomspace(0.001, 0.5, 25)
 LOG_PRIOR_WIDTH: Final = (np.log(0.02), 1.5)
 """Widths w that are tried, and mean and standard deviation of log w before anything is known."""
 SURE: Final = 1e-3
-"""Probabilities nearer to 0 or 1 than this are not told apart, nor are weights of evidence."""
+"""Probabilities are clipped this far from 0 and 1; also the smallest Newton step."""
 PREDICTED: Final = 100
-"""Cases, the last ones, that a belief without them predicts, to see how far it can be trusted."""
+"""Last cases that a surrogate without them predicts, to calibrate it."""
 FAR: Final = 2.0
-"""Radii of the FMC from the nearest failure from which a case is far from all of them."""
+"""Distance from the nearest failure, in radii of the FMC, from which a case counts as far."""
 JUDGED_FROM: Final = 3
-"""Failures, and safe cases, that it takes to tell somebody else P(fail)."""
+"""Fewest failures, and fewest safe cases, for a published P(fail)."""
 
 
 class Belief:
@@ -85,57 +85,57 @@ class Belief:
         positive = int((values >= 0.0).sum())
         if has_gaps(history) and min(positive, len(values) - positive) >= BRANCH_FROM:
             self._branches = Branches(learned.points, values, self._smooth)
-        self._judge(learned)
+        self._weigh(learned)
 
     def of(self, cases: FloatArray) -> FloatArray:
         """Return P(fail) of cases, (m, d)."""
         dims = self.history.dims
         distances = [nearest(cases, self.history.points[group]) for group in self.groups]
         chances = [
-            expit(_evidence(_lowered(said, distances, width), distances, dims) @ calibration)
-            for said, (width, calibration) in zip(self._said(cases), self._judged, strict=True)
+            expit(_evidence(_lowered(chance, distances, width), distances, dims) @ calibration)
+            for chance, (width, calibration) in zip(self._chances(cases), self._fitted, strict=True)
         ]
         return np.asarray(np.average(chances, axis=0, weights=self._weights), dtype=np.float64)
 
-    def _said(self, cases: FloatArray) -> list[FloatArray]:
-        """Return what each expert says of cases, (m, d); the smooth process is asked once."""
+    def _chances(self, cases: FloatArray) -> list[FloatArray]:
+        """Return P(fail) of cases, (m, d), by each expert; the smooth process is evaluated once."""
         smooth = self._smooth.process.at(cases)
-        found = [self._smooth.probability(*smooth), self._rough.at(cases)]
-        return found if self._branches is None else [*found, self._branches.at(cases, smooth)]
+        chances = [self._smooth.probability(*smooth), self._rough.at(cases)]
+        return chances if self._branches is None else [*chances, self._branches.at(cases, smooth)]
 
-    def _judge(self, learned: LevelHistory) -> None:
+    def _weigh(self, learned: LevelHistory) -> None:
         """Weigh the experts, and learn width and calibration, by how each predicted each case."""
         distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
         log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
-        self._judged: list[tuple[float, FloatArray]] = []
+        self._fitted: list[tuple[float, FloatArray]] = []
         best = []
         experts: list[Margin | Branches] = [self._smooth, self._rough]
         experts += [] if self._branches is None else [self._branches]
         for expert in experts:
             chance = expert.left_out()
-            found = []
+            fits = []
             for width, prior in zip(WIDTHS.tolist(), log_prior.tolist(), strict=True):
                 evidence = _evidence(_lowered(chance, distances, width), distances, learned.dims)
                 calibration, posterior = _calibrated(evidence, learned.failed)
-                found.append((posterior + prior, width, calibration))
-            posterior, width, calibration = max(found, key=lambda one: one[0])
-            self._judged.append((width, calibration))
+                fits.append((posterior + prior, width, calibration))
+            posterior, width, calibration = max(fits, key=lambda fit: fit[0])
+            self._fitted.append((width, calibration))
             best.append(posterior)
         self._weights = np.exp(np.array(best) - max(best))
 
 
 class Calibration:
-    """How far P(fail) is to be trusted, near failures and far from them.
+    """Correction of the bias of P(fail) among picked cases.
 
-    Cases are picked where P(fail) is large, so among them it is too large more often than not.
-    What came of the last picks tells by how much.
+    Picks have a large P(fail), so P(fail) is biased upwards among them. The outcomes of the last
+    picks give the bias.
 
     Attributes:
-        factors: what it is multiplied by, near failures and far from them, (2,).
+        factors: factors of P(fail), near failures and far from them, (2,).
     """
 
     def __init__(self, history: LevelHistory) -> None:
-        """Compare what became of the last cases with what those before them let one expect."""
+        """Compare the last outcomes with the expectation from those before them."""
         self._failing = history.points[history.failed]
         self.factors = np.ones(2)
         first = len(history.points) - PREDICTED
@@ -148,15 +148,15 @@ class Calibration:
         self.factors = np.minimum((failed + 1.0) / (predicted + 1.0), 1.0)
 
     def of(self, belief: Belief, cases: FloatArray) -> FloatArray:
-        """Return P(fail) of cases, (m, d), by a belief and what it has been worth."""
-        trusted: FloatArray = belief.of(cases) * self.factors[_far(cases, self._failing)]
-        return trusted
+        """Return the corrected P(fail) of cases, (m, d), as (m,)."""
+        corrected: FloatArray = belief.of(cases) * self.factors[_far(cases, self._failing)]
+        return corrected
 
 
 def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | None:
     """Return a function that gives P(fail), (n,), at points, (n, d), of the unit cube.
 
-    None while too few cases failed, or too few did not, to judge it by.
+    None with too few failures or too few safe cases.
     """
     if min(history.failed.sum(), (~history.failed).sum()) < JUDGED_FROM:
         return None

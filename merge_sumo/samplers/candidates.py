@@ -1,4 +1,4 @@
-"""Places that are worth a look: near others, between others, on the faces of the pool."""
+"""Candidate cases: uniform, near failures, between safe cases, on the faces of the unit cube."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ LOCAL_QUERIES: Final = 600
 BETWEEN_QUERIES: Final = 600
 LINES: Final = 40
 LINE_STEPS: Final = 120
-"""Candidates of a surrogate: anywhere, within LOCAL_REACH of a failure, between safe cases on
-either side, and on lines across the cube along the slope of the margin."""
+"""Candidates of the surrogate: uniform, within LOCAL_REACH of a failure, between safe cases of the
+two merging orders, and on lines across the cube along the slope of the margin."""
 LOCAL_REACH: Final = 2.0
-"""How far from a failure others are looked for,"""
+"""Reach of candidates around a failure, in radii of the FMC."""
 REFINED_REACH: Final = 0.6
-"""and how far from the best candidates better ones are; reaches are in radii of the FMC."""
+"""Reach of candidates around the best candidates, in radii of the FMC."""
 
 
 def of_belief(
     history: LevelHistory, belief: Belief, rng: np.random.Generator, n: int
 ) -> FloatArray:
-    """Return more than `n` candidates, (m, d), for who knows a belief alone."""
+    """Return more than `n` candidates, (m, d), of the surrogate alone."""
     worst = history.points[np.argsort(history.score, kind="stable")[:20]]
     failing = history.points[history.failed]
     local_reach = LOCAL_REACH * radius_for(history.dims)
@@ -48,7 +48,7 @@ def of_belief(
 
 
 def around(points: FloatArray, n: int, reach: float, rng: np.random.Generator) -> FloatArray:
-    """Return `n` places of the unit cube, (n, d), within reach of some of the points."""
+    """Return `n` points of the unit cube, (n, d), within `reach` of some of the points."""
     centres = points[rng.integers(len(points), size=n)]
     direction = rng.standard_normal(centres.shape)
     direction /= np.linalg.norm(direction, axis=1)[:, None]
@@ -56,8 +56,9 @@ def around(points: FloatArray, n: int, reach: float, rng: np.random.Generator) -
 
 
 def between(belief: Belief, n: int, rng: np.random.Generator) -> FloatArray:
-    """Return `n` places, (n, d), or none, between safe cases on either side, most in narrow
-    brackets.
+    """Return `n` points, (n, d), between safe cases of the two orders, most in narrow brackets.
+
+    Empty, (0, d), without safe cases of both orders.
     """
     points = belief.history.points
     _, before, behind = (points[group] for group in belief.groups)
@@ -74,20 +75,20 @@ def between(belief: Belief, n: int, rng: np.random.Generator) -> FloatArray:
 
 
 def spread_out(n: int, dims: int, rng: np.random.Generator) -> FloatArray:
-    """Return `n` points, (n, d), of a scrambled Halton sequence: no two of them close by chance."""
+    """Return `n` points, (n, d), of a scrambled Halton sequence."""
     from scipy.stats.qmc import Halton
 
     return np.asarray(Halton(dims, seed=rng).random(n), dtype=np.float64)
 
 
 def anywhere(n: int, dims: int, on_faces: float, rng: np.random.Generator) -> FloatArray:
-    """Return `n` places of the unit cube, (n, d), a share of them on its faces and edges."""
+    """Return `n` points of the unit cube, (n, d), a share of them on its faces and edges."""
     points = rng.random((n, dims))
-    put = rng.random(points.shape) < on_faces / dims
-    return np.where(put, rng.integers(0, 2, points.shape), points)
+    on_face = rng.random(points.shape) < on_faces / dims
+    return np.where(on_face, rng.integers(0, 2, points.shape), points)
 
 
 def _pairs(points: FloatArray, others: FloatArray, near: list[int]) -> NDArray[np.int64]:
-    """Return pairs (place, place of one of its nearest others), (m, 2)."""
+    """Return pairs (index, index of one of its nearest neighbours), (m, 2)."""
     _, place = cKDTree(others).query(points, k=near)
     return np.column_stack([np.repeat(np.arange(len(points)), len(near)), place.ravel()])

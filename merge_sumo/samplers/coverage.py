@@ -1,7 +1,7 @@
-"""Ours: ask for what users want, the batch that maximises the expected new coverage.
+"""The default sampler: each batch maximises the expected new failure mode coverage.
 
 A case is worth P(fail) (`belief.py`) times the share of its ball (radius rho of the FMC) that is
-not covered yet. Candidates are places anywhere, near failures, and where another car goes first;
+not covered yet. Candidates are uniform, near failures, and near where the merging order changes;
 the batch is picked from them greedily.
 """
 
@@ -21,7 +21,7 @@ from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import PredictionSkill
-from merge_sumo.samplers.twin_guided import FEWEST, informed_batch
+from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.prediction import Prediction
@@ -30,33 +30,33 @@ from merge_sumo.values.scenario import DX_CRASH_M
 FIRST_BATCH: Final = 10
 YOUNG: Final = 60
 YOUNG_BATCH: Final = 5
-"""Cases of the first batch; and of a level up to which it is young, and its share of a batch by
-then: what few cases teach changes where the next ones should be."""
+"""Cases of the first batch; cases of a level up to which its batches are small, and their size: the
+first outcomes change the next proposals most."""
 BATCHES: Final = ((100, 10, 5), (400, 20, 10), (math.inf, 40, 20))
-"""Cases up to which later batches have a size, and at least how many of a batch are a level's."""
+"""Later batches: cases up to which a size holds, the size, and the least number per level."""
 REPLAYED: Final = 40
-"""Cases, the last ones of a level, by which who plays games is judged."""
+"""Last cases of a level on which the predictor is evaluated."""
 REFINED_QUERIES: Final = 600
 BEST: Final = 150
-"""Candidates around the best of the others, and from how many of these."""
+"""Candidates around the best ones, and the number of these."""
 SHORTLIST: Final = 2000
-"""Candidates from which the batch is picked."""
+"""Candidates among which the batch is picked."""
 NEAREST: Final = 3
-"""Failures that it takes to aim at failures alone, and else how many cases stand in for them."""
+"""Fewest failures to aim at failures alone; otherwise as many nearest cases stand in for them."""
 PATIENCE: Final = 40
-"""Cases that are run before anything stands in for failures."""
+"""Cases before near misses stand in for failures."""
 
 
 class CoverageSampler(Sampler):
-    """Maximises the expected new coverage, over the levels too.
+    """Maximises the expected new coverage over all levels.
 
-    Gains are in balls, not in volumes: a volume of two dimensions does not compare with one of
-    three, and level 2 would never be asked.
+    Gains are in balls, not in volumes: volumes of two and of three dimensions do not compare, and
+    level 2 would get no case.
     """
 
     about = "asks for the batch that promises the most new coverage"
     colour = "#D55E00"
-    foresees = True
+    uses_predictions = True
 
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
@@ -74,11 +74,11 @@ class CoverageSampler(Sampler):
         ]
 
     def prediction(self, place: int) -> Prediction | None:
-        """Return what was predicted of a case of the last batch, by its place in it."""
+        """Return the prediction of a case of the last batch, by its place in the batch."""
         return self._predictions[place]
 
     def batch_size(self) -> int:
-        """Return how many cases to ask for next: few while what they teach changes much."""
+        """Return the size of the next batch: small while each outcome changes the model most."""
         proposed, levels = self.proposed(), len(self.pool.levels)
         if not proposed:
             return max(FIRST_BATCH, YOUNG_BATCH * levels)
@@ -94,7 +94,7 @@ class CoverageSampler(Sampler):
     def expected_gain(self, n: int) -> float:
         """Return the expected new coverage of the next `n` cases as a share of that so far.
 
-        Infinite while no failure is known: then nobody can say that the search is over.
+        Infinite without a failure: the search cannot have converged.
         """
         proposals = self._proposals(n)
         shares = self._shares(proposals, n)
@@ -102,13 +102,13 @@ class CoverageSampler(Sampler):
         covered = 0.0
         for level in self.pool.levels:
             history = self.history(level)
-            ground = CoverageGrid(history.dims)
-            ground.cover(ground.balls(history.points[history.failed]), 1.0)
-            covered += ground.covered_balls()
+            grid = CoverageGrid(history.dims)
+            grid.cover(grid.balls(history.points[history.failed]), 1.0)
+            covered += grid.covered_balls()
         return gain / covered if covered > 0.0 else np.inf
 
     def _proposals(self, n: int) -> dict[int, Proposal]:
-        """Return the batch that each level would get on its own."""
+        """Return the batch of each level on its own."""
         return {level: self._propose(level, n) for level in self.pool.levels}
 
     def _propose(self, level: int, n: int) -> Proposal:
@@ -118,39 +118,39 @@ class CoverageSampler(Sampler):
         few = len(history.points) < FEWEST
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
-            if self.games is None or not self.games.can_play(level):
+            if self.predictor is None or not self.predictor.can_predict(level):
                 if few:
                     chance = np.ones(n)
                     spread = spread_out(n, history.dims, rng)
                     return Proposal(spread, chance, chance, (None,) * n)
                 return _Search(history, rng, n).batch(n)
-            play = partial(self.games.play, level)
-            record = self._record(level, history)
-            if record.is_worthless and not few:
-                return record.noted(_Search(history, rng, n).batch(n), play)
-            return informed_batch(history, n, rng, play, record)
+            predict = partial(self.predictor.predict, level)
+            skill = self._skill(level, history)
+            if skill.is_worthless and not few:
+                return skill.annotated(_Search(history, rng, n).batch(n), predict)
+            return twin_guided_batch(history, n, rng, predict, skill)
 
-    def _record(self, level: int, history: LevelHistory) -> PredictionSkill:
-        """Return what the games have been worth, by what all levels have seen."""
-        last = self.told(level)[-REPLAYED:]
+    def _skill(self, level: int, history: LevelHistory) -> PredictionSkill:
+        """Return the skill of the predictions so far, of all levels."""
+        last = self.observed(level)[-REPLAYED:]
         replayed: dict[int, FloatArray] = {}
-        if last and self.games is not None:
+        if last and self.predictor is not None:
             indices = [outcome.index for outcome in last]
-            gaps_m = self.games.replay(level, indices, history.points[-REPLAYED:])
+            gaps_m = self.predictor.predict_held_out(level, indices, history.points[-REPLAYED:])
             replayed = dict(zip(indices, gaps_m.T, strict=True))
-        told = self.told()
-        # What stands for a gap under another criterion has the limit of the paper's scenario.
-        stands_in = any(outcome.margin is not None for outcome in told)
+        outcomes = self.observed()
+        # The stand-in for a gap under another criterion has the limit of the paper's scenario.
+        stands_in = any(outcome.margin is not None for outcome in outcomes)
         limit_m = DX_CRASH_M if stands_in else self.pool.scenario.dx_crash_m
-        return PredictionSkill(told, level, limit_m, replayed)
+        return PredictionSkill(outcomes, level, limit_m, replayed)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: half of them evenly, the rest by the next gain.
 
-        A level whose failures are rare promises next to nothing until one of them is found.
+        A level with rare failures has hardly any expected gain before its first failure.
         """
         proposed = {level: self.proposed(level) for level in self.pool.levels}
-        if min(len(self.told(level)) for level in self.pool.levels) < 2:
+        if min(len(self.observed(level)) for level in self.pool.levels) < 2:
             return even_shares(proposed, n)
         shares = even_shares(proposed, max(min(n, len(proposed)), n // 2))
         for _ in range(n - sum(shares.values())):
@@ -164,35 +164,35 @@ class _Search:
 
     def __init__(self, history: LevelHistory, rng: np.random.Generator, n: int) -> None:
         failing = history.points[history.failed]
-        self._ground = CoverageGrid(history.dims)
-        self._ground.cover(self._ground.balls(failing), 1.0)
-        limit, trust = _limit(history), Calibration(history)
+        self._grid = CoverageGrid(history.dims)
+        self._grid.cover(self._grid.balls(failing), 1.0)
+        limit, calibration = _limit(history), Calibration(history)
         belief = Belief(history, limit)
         candidates = of_belief(history, belief, rng, n)
-        probability, balls = trust.of(belief, candidates), self._ground.balls(candidates)
-        worth = probability * self._ground.new(balls)
+        probability, balls = calibration.of(belief, candidates), self._grid.balls(candidates)
+        worth = probability * self._grid.new(balls)
         best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
         refined = around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
         candidates = np.concatenate([candidates, refined])
-        probability = np.concatenate([probability, trust.of(belief, refined)])
-        balls = np.concatenate([balls, self._ground.balls(refined)])
-        worth = probability * (self._ground.new(balls) + EVEN_IF_COVERED)
+        probability = np.concatenate([probability, calibration.of(belief, refined)])
+        balls = np.concatenate([balls, self._grid.balls(refined)])
+        worth = probability * (self._grid.new(balls) + EVEN_IF_COVERED)
         kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
         self._candidates, self._aim = candidates[kept], probability[kept]
         self._probability = (
-            self._aim if limit is None else trust.of(Belief(history), self._candidates)
+            self._aim if limit is None else calibration.of(Belief(history), self._candidates)
         )
 
     def batch(self, n: int) -> Proposal:
         """Return the greedy batch of `n` cases."""
-        picks, gain = greedy(self._ground, self._candidates, self._aim, self._probability, n)
+        picks, gain = greedy(self._grid, self._candidates, self._aim, self._probability, n)
         return Proposal(self._candidates[picks], gain, self._probability[picks], (None,) * n)
 
 
 def _limit(history: LevelHistory) -> float | None:
-    """Return the gap, in m, or the score that is aimed at; None for that of a failure.
+    """Return the gap in m, or the score, that the search aims at; None for that of a failure.
 
-    Where failures are rare, the cases that came nearest show the way, as in subset simulation.
+    With few failures, the nearest misses guide the search, as in subset simulation.
     """
     if history.failed.sum() >= NEAREST or len(history.score) < PATIENCE:
         return None

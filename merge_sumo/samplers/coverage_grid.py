@@ -1,8 +1,8 @@
-"""What is covered already: the balls of the FMC as places, for samplers that must be quick.
+"""Discrete coverage of the unit cube by the balls of the FMC, for samplers that must be fast.
 
-A ball is the places in it. In two and three dimensions these are the nodes of a grid. In more, a
-grid that is fine beside a ball has too many nodes; there they are the points of a sequence that
-fills space evenly, and a ball is the nearest so many of them to its middle.
+A ball is a set of nodes. In two and three dimensions the nodes form a regular grid. In more
+dimensions a grid finer than a ball has too many nodes; the nodes are then points of a Halton
+sequence, and a ball is a fixed number of nodes nearest to its centre.
 """
 
 from __future__ import annotations
@@ -20,39 +20,39 @@ from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import RADIUS, fmc, radius_for
 
 CELL: Final = {2: 0.01, 3: 0.0125}
-"""Spacing of the grid, per dimension, on which coverage is counted,"""
+"""Spacing of the grid, by the number of dimensions."""
 FINE_CELL: Final = {**CELL, 2: 0.0025}
-"""and where slivers count, which are what a case adds late in a search: in two dimensions a grid
-that shows them is cheap."""
+"""Spacing that resolves slivers, which are the gain of a case late in a search; in two dimensions
+such a grid is cheap."""
 PLACES_PER_BALL: Final = 64
-"""Places in a ball where there is no grid."""
+"""Nodes in a ball without a grid."""
 MARGIN: Final = 1.1
-"""Radii by which the places reach beyond the unit cube."""
+"""Margin of nodes around the unit cube, in radii."""
 
 IntArray = NDArray[np.int64]
 
 
 class CoverageGrid:
-    """The unit cube with a margin, as places with the chance not to be covered.
+    """The unit cube with a margin, as nodes with the probability of each not to be covered.
 
     Attributes:
-        overlap: balls of points that are farther apart have no place in common.
+        overlap: distance from which two balls share no node.
     """
 
     def __init__(self, dims: int, *, fine: bool = True) -> None:
-        """Prepare an uncovered ground of `dims` dimensions."""
+        """Prepare an uncovered grid of `dims` dimensions."""
         self._places = _places(dims, (FINE_CELL if fine else CELL).get(dims))
         self.overlap: Final = self._places.overlap
         self._open = np.ones(self._places.count, dtype=np.float32)
 
     def copy(self) -> Self:
-        """Return a ground that is covered as this one is."""
+        """Return a grid that is covered as this one is."""
         other = copy(self)
         other._open = self._open.copy()
         return other
 
     def balls(self, points: FloatArray) -> IntArray:
-        """Return the places in the ball around each point, (n, places)."""
+        """Return the nodes of the ball around each point, (n, nodes)."""
         return self._places.balls(points)
 
     def new(self, balls: IntArray) -> FloatArray:
@@ -69,12 +69,12 @@ class CoverageGrid:
 
 
 class _Places(Protocol):
-    """Places in space, the same for every ground of that many dimensions.
+    """Nodes, the same for every grid with as many dimensions.
 
     Attributes:
-        count: their number.
-        per_ball: how many of them are in a ball.
-        overlap: balls of points that are farther apart have no place in common.
+        count: number of nodes.
+        per_ball: nodes in a ball.
+        overlap: distance from which two balls share no node.
     """
 
     count: int

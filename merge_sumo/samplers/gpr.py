@@ -66,7 +66,7 @@ class GprSampler(LevelwiseSampler):
 
     def allocate(self, n: int) -> dict[int, int]:
         """Return equal shares first, then shares by the softmax of the last failure shares."""
-        outcomes = self.told()
+        outcomes = self.observed()
         proposed = {level: self.proposed(level) for level in self.pool.levels}
         shares = {level: last_failure_share(outcomes, level) for level in self.pool.levels}
         return softmax_shares(shares, proposed, n, XI)
@@ -103,19 +103,19 @@ class _Posterior:
         self._badness = badness + 1e-6
         self._variance = self._kernel.diag(queries) - np.square(self._explained).sum(axis=0)
         self._taken = np.zeros(len(queries), dtype=bool)
-        self._ground = CoverageGrid(queries.shape[1], fine=False)
-        self._ground.cover(self._ground.balls(failures), 1.0)
-        self._balls = self._ground.balls(queries)
+        self._grid = CoverageGrid(queries.shape[1], fine=False)
+        self._grid.cover(self._grid.balls(failures), 1.0)
+        self._balls = self._grid.balls(queries)
 
     def pick(self, z_badness: float, z_variance: float) -> int:
         """Take the query that maximises badness^z variance^z new, and condition on it."""
         variance = np.maximum(self._variance, 1e-12)
         quality = z_badness * np.log(self._badness) + z_variance * np.log(variance)
-        quality += np.log(self._ground.new(self._balls) + FLOOR)
+        quality += np.log(self._grid.new(self._balls) + FLOOR)
         quality[self._taken] = -np.inf
         best = int(np.argmax(quality))
         self._taken[best] = True
-        self._ground.cover(self._balls[best], 1.0)
+        self._grid.cover(self._balls[best], 1.0)
         covariance = self._kernel(self._queries[[best]], self._queries)[0]
         covariance -= self._explained[:, best] @ self._explained
         step = covariance / np.sqrt(variance[best] + NOISE)

@@ -12,14 +12,14 @@ from merge_sumo.values.case import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class LevelHistory:
-    """What is known of one POV level: N outcomes with a verdict, in the order of their index.
+    """The outcomes of one POV level: N cases with a verdict, in the order of their index.
 
     Attributes:
         points: cases in the unit cube, (N, d).
-        score: P, or what stands for it under another criterion than the paper's, (N,).
+        score: P, or its stand-in under another criterion than the paper's, (N,).
         failed: score < lambda, (N,).
-        dx_m: signed gap at M, (N,), or what stands for it under another criterion: a case fails
-            where it is within 6 m; NaN where the VUT never arrived or gives no trajectory.
+        dx_m: signed gap at M, (N,), or its stand-in under another criterion: a case fails
+            within 6 m; NaN where the VUT never arrived or there is no trajectory.
         batch: batch of the campaign in which the case ran, (N,).
     """
 

@@ -1,4 +1,4 @@
-"""What is made of games that were played out before their cases run: P(fail), by the record.
+"""P(fail) from the predictions of a twin, weighted by the skill of its predictions so far.
 
 A *predictor*, which knows the POVs and has observed the VUT, plays cases out and predicts the gap
 at M. It has experts of several kinds, and of each several members who know
@@ -49,29 +49,31 @@ EDGE: Final = float(np.arcsinh(1.0))
 """The limit of a failure on the scale of `compressed`."""
 
 
-Play = Callable[..., FloatArray]
-"""Plays cases of one level: see `Predictor.play`."""
+PredictGaps = Callable[..., FloatArray]
+"""Predicts the gaps of cases of one level: see `Predictor.predict`."""
 
 
 class Predictor(Protocol):
-    """Plays cases out; a pure function of what it was told."""
+    """Predicts the gaps of cases; a pure function of the outcomes told so far."""
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
         """Take outcomes, and their motions, (T + 1, A, 3), by index."""
 
-    def can_play(self, level: int) -> bool:
-        """Return whether it knows enough to play cases of a level."""
+    def can_predict(self, level: int) -> bool:
+        """Return whether the outcomes so far suffice to predict cases of a level."""
 
-    def play(self, level: int, points: FloatArray, screening: int | None = None) -> FloatArray:
+    def predict(self, level: int, points: FloatArray, screening: int | None = None) -> FloatArray:
         """Return the gaps at M in m of cases, (n, d), of the unit cube, as (E, G, n).
 
-        NaN where the VUT never arrives. With `screening`, one member of that expert alone plays.
+        NaN where the VUT never arrives. `screening` is the one expert of which one member predicts.
         """
 
-    def replay(self, level: int, indices: Sequence[int], points: FloatArray) -> FloatArray:
-        """Return the gaps at M in m, (E, n), of cases that it was told, by their indices.
+    def predict_held_out(
+        self, level: int, indices: Sequence[int], points: FloatArray
+    ) -> FloatArray:
+        """Return the gaps at M in m, (E, n), of cases told before, by their indices.
 
-        Of each expert that member plays a case which has not learned from it.
+        Each case is predicted by a member of each expert that has not learned from the case.
         """
 
 
@@ -81,14 +83,14 @@ def compressed(gap_m: FloatArray, limit_m: float) -> FloatArray:
 
 
 class PredictionSkill:
-    """How well gaps and failures were predicted, and what that makes of the next ones.
+    """The skill of the predictions so far, and P(fail) of the next ones that follows from it.
 
     Attributes:
-        experts: weight of each expert, (E,); (1,) for all of them before there is a record.
-        twin: weight of the games against the surrogate where members disagree, and where they
+        experts: weight of each expert, (E,); (1,) for all of them without predictions so far.
+        twin: weight of the twin against the surrogate where members disagree, and where they
             agree on the verdict, (2,).
-        trust: what gains are multiplied by. Cases are picked where P(fail) is large, so among them
-            it is too large more often than not; what came of the last picks tells by how much.
+        trust: factor of the gains. Picks have a large P(fail), so P(fail) is biased upwards among
+            them; the outcomes of the last picks give the bias.
     """
 
     def __init__(
@@ -98,9 +100,9 @@ class PredictionSkill:
         limit_m: float,
         replayed: Mapping[int, FloatArray] | None = None,
     ) -> None:
-        """Judge by outcomes in the order of their index; a failure is a gap below the limit.
+        """Learn from outcomes in the order of their index; a failure is a gap below the limit.
 
-        `replayed` are gaps, (E,), by the index of a case, of who had not learned from it.
+        `replayed` are gaps, (E,), by the index of a case, of members that did not learn from it.
         """
         known = [(o, o.prediction) for o in outcomes if o.prediction is not None]
         self._limit_m = limit_m
@@ -116,20 +118,20 @@ class PredictionSkill:
 
     @property
     def is_worthless(self) -> bool:
-        """Whether the record says that nothing can be predicted of this VUT."""
+        """Whether the predictions so far show no skill for this VUT."""
         return self._cases >= JUDGED_FROM and bool((self.twin < WORTHLESS).all())
 
     @property
     def is_doubted(self) -> bool:
-        """Whether, after many cases, nothing is made of the games where members disagree.
+        """Whether, after many cases, the twin has no weight where its members disagree.
 
-        Then the surrogate decides, which is to be trusted as far as it has earned, and a case that
-        the games would learn most from is one that the search would have used better.
+        The surrogate then decides, with its own calibration, and no case of a batch is spent on
+        information for the twin.
         """
         return self._cases >= TRUSTED_FROM and bool(self.twin[0] < WORTHLESS)
 
     def expert(self, rng: np.random.Generator) -> int:
-        """Return one of the experts by chance, the better ones more often."""
+        """Return an expert drawn by weight."""
         return int(rng.choice(len(self.experts), p=self.experts))
 
     def chance(self, gaps_m: FloatArray, expert: int | None = None) -> FloatArray:
@@ -146,22 +148,22 @@ class PredictionSkill:
         return np.asarray(np.average(by_expert, axis=0, weights=weights), dtype=np.float64)
 
     def mixed(self, gaps_m: FloatArray, p_twin: FloatArray, p_surrogate: FloatArray) -> FloatArray:
-        """Return P(fail), (n,), by the games and the surrogate together."""
+        """Return P(fail), (n,), of twin and surrogate together."""
         weight = self.twin[self._agreed(gaps_m).astype(np.int64)]
         mixed: FloatArray = weight * p_twin + (1.0 - weight) * p_surrogate
         return mixed
 
-    def doubt(self, gaps_m: FloatArray) -> FloatArray:
-        """Return how much is to be learned from cases, (n,), by gaps, (E, G, n).
+    def disagreement(self, gaps_m: FloatArray) -> FloatArray:
+        """Return the information in cases, (n,), by gaps, (E, G, n).
 
-        Members disagree there, on a gap that may be near.
+        Large where members disagree on a gap that may be small.
         """
         said = compressed(gaps_m, self._limit_m).reshape(-1, gaps_m.shape[-1])
         return np.asarray(said.std(axis=0) * np.exp(-0.25 * np.square(np.median(said, axis=0))))
 
-    def noted(self, proposal: Proposal, play: Play) -> Proposal:
+    def annotated(self, proposal: Proposal, predict: PredictGaps) -> Proposal:
         """Return a proposal of the surrogate's with what games say of it: that may change."""
-        gaps_m = play(proposal.points)
+        gaps_m = predict(proposal.points)
         said = tuple(
             Prediction.of(gaps_m[..., i], float(p), float(chance), float(chance))
             for i, (p, chance) in enumerate(

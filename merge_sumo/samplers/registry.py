@@ -1,4 +1,4 @@
-"""The samplers by the name that a person writes after `--sampler`."""
+"""The samplers by their names on the command line."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SAMPLERS: Final[Registry[type[Sampler]]] = Registry(
 )
 
 
-def make_sampler(name: str, pool: Pool, seed: int, games: Predictor | None = None) -> Sampler:
+def make_sampler(name: str, pool: Pool, seed: int, predictor: Predictor | None = None) -> Sampler:
     """Return the sampler of that name; `UserError` for an unknown name.
 
     Args:
         name: as in `SAMPLERS`.
         pool: cases from which it chooses.
         seed: same seed, same proposals.
-        games: plays cases out, for samplers that foresee.
+        predictor: for samplers that use predictions.
     """
-    return SAMPLERS[name](pool, seed, games)
+    return SAMPLERS[name](pool, seed, predictor)

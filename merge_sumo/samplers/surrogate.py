@@ -1,4 +1,4 @@
-"""The Gaussian processes of `coverage`: what a margin that is learned says of failing.
+"""The Gaussian processes of `coverage`: P(fail) from a learned margin.
 
 The kernel is var * prod_j k_j(|z_j - z'_j| / l_j) in coordinates z = Q^T x. The rotation Q turns
 the first axis along the mean slope of the margin: who goes first changes across a slanted curve,
@@ -22,7 +22,7 @@ from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import FloatArray
 
 LEARN_FROM: Final = 150
-"""Cases from which the parameters of the kernel are learned at most, and SPACING apart."""
+"""Most cases for the parameters of the kernel, SPACING apart."""
 SPACING: Final = 0.02
 """Cases that close on both sides of a jump would make the whole field look rough."""
 NOISE: Final = 1e-3
@@ -38,11 +38,11 @@ CLIPPED: Final = 2.0
 """Margins are clipped at this for the slope, which is sought near the failures."""
 ITERATIONS: Final = 25
 BLOCK: Final = 128
-"""Queries whose covariances are worked out at a time: so many fit into the cache of a core."""
+"""Queries per block of covariances: so many fit into the cache of a core."""
 
 
 class Process:
-    """A Gaussian process on values; mean and variance at places that it has seen or not."""
+    """A Gaussian process on values, with leave-one-out predictions."""
 
     def __init__(
         self,
@@ -89,8 +89,8 @@ class Process:
         covariance: FloatArray = np.empty((len(self._points), len(others)))
         for first in range(0, len(others), BLOCK):
             block = slice(first, first + BLOCK)
-            found, _ = _correlation(self._points, others[block], self._lengths, self._rough)
-            covariance[:, block] = self._variance * found
+            correlation, _ = _correlation(self._points, others[block], self._lengths, self._rough)
+            covariance[:, block] = self._variance * correlation
         if self._trend:
             covariance += self._trend * (1.0 + self._points @ others.T)
         return covariance
@@ -235,7 +235,7 @@ def _learn_kernel(
 ) -> tuple[float, FloatArray]:
     """Return variance and lengths, (d,), of the largest posterior density.
 
-    `plane` is the covariance, (n, n), that is there besides.
+    `plane` is the covariance, (n, n), of the prior plane.
     """
     n, dims = points.shape
     fixed = plane + NOISE * np.eye(n)
@@ -256,7 +256,7 @@ def _learn_kernel(
         value = 0.5 * (values @ alpha + off @ off) + np.log(np.diag(factor)).sum()
         return float(value), 0.5 * np.array(slopes) + off / priors[:, 1]
 
-    found = minimize(
+    optimum = minimize(
         loss,
         priors[:, 0],
         jac=True,
@@ -264,5 +264,5 @@ def _learn_kernel(
         bounds=bounds,
         options={"maxiter": ITERATIONS},
     )
-    parameters = np.exp(found.x)
+    parameters = np.exp(optimum.x)
     return float(parameters[0]), np.asarray(parameters[1:], dtype=np.float64)

@@ -78,7 +78,7 @@ def _search(
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
     search = Search([], [], 0.0)
-    batch = batch or (None if sampler.foresees else COMPARED_BATCH)
+    batch = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
     for ran in conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), cases, batch):
         search.outcomes.extend(outcome for outcome, _ in ran)
         search.fmc.append(sum(fmc(search.failures(level)) for level in levels))

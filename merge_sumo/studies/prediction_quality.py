@@ -112,12 +112,12 @@ class Expected:
         """
         from threadpoolctl import threadpool_limits
 
-        if not self._twin.can_play(level):
+        if not self._twin.can_predict(level):
             return None
         with threadpool_limits(1):
             gaps_m = np.concatenate(
                 [
-                    self._twin.play(level, part)
+                    self._twin.predict(level, part)
                     for part in np.array_split(points, len(points) // MOST_CASES + 1)
                 ],
                 axis=-1,

@@ -139,7 +139,7 @@ class SamplerContract:
         shuffled = [outcomes[i] for i in order]
         sampler, before = self.fresh(), list(shuffled)
         sampler.tell(shuffled)
-        assert sampler.told() == outcomes, "rounding follows the order of the history"
+        assert sampler.observed() == outcomes, "rounding follows the order of the history"
         assert sampler.ask(9) == proposed
         assert shuffled == before
 

@@ -44,7 +44,7 @@ class TwinRollout:
             for level in set(povs.levels) & set(POLICIES)
         }
 
-    def can_play(self, level: int) -> bool:
+    def can_predict(self, level: int) -> bool:
         """Return whether the POV of a level is known, and not a program of a person's own.
 
         A game ends at M, so none can be played where what happens behind it counts.
@@ -112,16 +112,16 @@ class TwinRollout:
         cars = [row for row in range(len(x_m)) if row != VUT]
         a_mps2 = np.zeros_like(x_m)
         held = np.zeros((len(cars), len(rows)))
-        watcher = Observation(scenario, len(rows))
+        observation = Observation(scenario, len(rows))
         taken_m, decel = scenario.pov_length_m + scenario.min_gap_m, -scenario.a_min_mps2
         for step in range(scenario.max_steps):
-            inputs = watcher.see(x_m, v_mps, a_mps2[VUT])
+            inputs = observation.see(x_m, v_mps, a_mps2[VUT])
             if level and step % DECISION_STEPS == 0:
                 held = self._decide(x_m[cars], v_mps[cars], x_m[VUT], v_mps[VUT], svo_rad, level)
             a_mps2[cars] = held
             if len(cars) > 1:
                 keep_safe(a_mps2, x_m, v_mps, taken_m, decel, scenario.tau_s)
-            a_mps2[VUT] = answer(inputs, watcher.now, rows)
+            a_mps2[VUT] = answer(inputs, observation.now, rows)
             a_mps2 = np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2)
             v_next = np.maximum(v_mps + a_mps2 * DT_S, 0.0)
             x_before_m, x_m = x_m, x_m + v_mps * DT_S
@@ -144,7 +144,7 @@ class TwinRollout:
                     rows, svo_rad = rows[going], svo_rad[going]
                     x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
                     held = held[:, going]
-                    watcher.keep(going)
+                    observation.keep(going)
         if played is not None:
             played.append(np.stack((x_m, v_mps, np.zeros_like(x_m)), axis=1))
         return gap_m

@@ -50,10 +50,10 @@ class Twin:
         `others` are motions, (T + 1, A, 3), of campaigns that are learned from.
         """
         self._pool, self._seed = pool, seed
-        self._games = TwinRollout(pool, povs, criterion, lines)
+        self._rollout = TwinRollout(pool, povs, criterion, lines)
         self._batch: dict[int, int] = {}
         self._steps: dict[int, Steps] = {}
-        self._others = self._watched(others, own=False)
+        self._others = self._observed_steps(others, own=False)
         self._experts = (*EXPERTS, *TAUGHT) if self._others else EXPERTS
         self._members: dict[tuple[int, int], tuple[tuple[int, ...], Any]] = {}
         """By expert and group: from which cases it has learned, and what."""
@@ -61,17 +61,17 @@ class Twin:
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
         """Take outcomes and their motions by index; an episode that went wrong teaches nothing."""
         new = [o for o in outcomes if not o.measures.end.is_error and o.index not in self._batch]
-        watched = self._watched([motions[o.index] for o in new])
+        watched = self._observed_steps([motions[o.index] for o in new])
         for outcome, steps in zip(new, watched, strict=True):
             self._batch[outcome.index] = outcome.batch
             self._steps[outcome.index] = steps
 
-    def can_play(self, level: int) -> bool:
+    def can_predict(self, level: int) -> bool:
         """Return whether it has seen enough, and the POV is no program of a person's own."""
         known = len(self._steps) >= FEWEST or bool(self._others)
-        return known and self._games.can_play(level)
+        return known and self._rollout.can_predict(level)
 
-    def play(self, level: int, points: FloatArray, screening: int | None = None) -> FloatArray:
+    def predict(self, level: int, points: FloatArray, screening: int | None = None) -> FloatArray:
         """Return gaps at M, (E, G, n), of cases, (n, d), of the unit cube; see `Predictor`."""
         experts = self._speakers()
         if screening is None:
@@ -108,10 +108,12 @@ class Twin:
                 first = last
             return answers
 
-        gaps_m = self._games.play(points[np.concatenate(places)], level, answer)
+        gaps_m = self._rollout.play(points[np.concatenate(places)], level, answer)
         return np.split(gaps_m, cuts[1:-1])
 
-    def replay(self, level: int, indices: Sequence[int], points: FloatArray) -> FloatArray:
+    def predict_held_out(
+        self, level: int, indices: Sequence[int], points: FloatArray
+    ) -> FloatArray:
         """Return gaps at M, (E, n), by members that have not learned from these cases."""
         group = np.array(indices) % GROUPS
         members = [(e, g) for e in self._speakers() for g in range(GROUPS)]
@@ -149,7 +151,7 @@ class Twin:
             some = [some[place] for place in spread.tolist()] + some[-half:]
         return tuple(index for index in some if index % GROUPS != group or len(some) < GROUPS)
 
-    def _watched(self, motions: Sequence[FloatArray], *, own: bool = True) -> list[Steps]:
+    def _observed_steps(self, motions: Sequence[FloatArray], *, own: bool = True) -> list[Steps]:
         """Return what the VUT saw and did in motions, (T + 1, A, 3) each."""
         if not motions:
             return []
@@ -158,17 +160,17 @@ class Twin:
         for place, motion in enumerate(motions):
             together[: len(motion), ..., place] = motion
             together[len(motion) :, ..., place] = motion[-1, ..., :]
-        watcher = Observation(self._pool.scenario, len(motions))
+        observation = Observation(self._pool.scenario, len(motions))
         last = np.zeros(len(motions))
         seen = []
         for x_v_a in together[:-1]:
-            seen.append(watcher.see(x_v_a[:, 0], x_v_a[:, 1], last).copy())
+            seen.append(observation.see(x_v_a[:, 0], x_v_a[:, 1], last).copy())
             last = x_v_a[VUT, 2]
         inputs = np.array(seen)
         return [
             Steps(
                 np.ascontiguousarray(inputs[: len(motion) - 1, place]),
-                watcher.now,
+                observation.now,
                 motion[:-1, VUT, 2],
                 own,
             )

@@ -28,7 +28,7 @@ class Oracle(UniformSampler):
 
     def expected_gain(self, n: int) -> float:
         Oracle.asked += 1
-        batches = {outcome.batch for outcome in self.told()}
+        batches = {outcome.batch for outcome in self.observed()}
         return self.says[len(batches) - 1]
 
 

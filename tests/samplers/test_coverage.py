@@ -68,32 +68,32 @@ class TestTheGround:
     def test_counts_what_fmc_measures(self, dims):
         reach = 2.0 * radius_for(dims)
         points = np.random.default_rng(dims).uniform(0.5 - reach, 0.5 + reach, (30, dims))
-        ground = CoverageGrid(dims)
-        ground.cover(ground.balls(points), 1.0)
+        grid = CoverageGrid(dims)
+        grid.cover(grid.balls(points), 1.0)
         one = np.array([[0.5] * dims])
-        assert ground.covered_balls() == pytest.approx(fmc(points) / fmc(one), rel=0.05)
+        assert grid.covered_balls() == pytest.approx(fmc(points) / fmc(one), rel=0.05)
 
     @pytest.mark.parametrize("dims", range(2, 7))
     def test_holds_the_balls_at_the_corners_of_the_cube(self, dims):
         corners = np.array([[0.0] * dims, [1.0] * dims])
-        ground = CoverageGrid(dims)
-        ground.cover(ground.balls(corners), 1.0)
-        assert ground.covered_balls() == pytest.approx(2.0)
+        grid = CoverageGrid(dims)
+        grid.cover(grid.balls(corners), 1.0)
+        assert grid.covered_balls() == pytest.approx(2.0)
 
     @pytest.mark.parametrize("dims", [2, 5])
     def test_a_pick_that_fails_with_a_chance_of_60_percent_leaves_40_percent_uncovered(self, dims):
-        ground = CoverageGrid(dims)
-        here = ground.balls(np.full((1, dims), 0.4))
-        ground.cover(here[0], 0.6)
-        assert ground.new(here) == pytest.approx([0.4], rel=1e-6)
+        grid = CoverageGrid(dims)
+        here = grid.balls(np.full((1, dims), 0.4))
+        grid.cover(here[0], 0.6)
+        assert grid.new(here) == pytest.approx([0.4], rel=1e-6)
 
     @pytest.mark.parametrize("dims", [2, 4])
     def test_a_ball_two_radii_away_is_all_new(self, dims):
-        ground = CoverageGrid(dims)
+        grid = CoverageGrid(dims)
         here = np.full((1, dims), 0.3)
-        ground.cover(ground.balls(here), 1.0)
+        grid.cover(grid.balls(here), 1.0)
         beside = here + (2.0 * radius_for(dims) + 0.02) * np.eye(dims)[0]
-        assert ground.new(ground.balls(beside)) == pytest.approx([1.0])
+        assert grid.new(grid.balls(beside)) == pytest.approx([1.0])
 
     @pytest.mark.parametrize("dims", [4, 5, 6])
     def test_has_balls_of_the_radius_where_they_are_no_grid(self, dims):
@@ -108,13 +108,13 @@ class TestTheGround:
         rng = np.random.default_rng(dims)
         points, chance = 0.3 * rng.random((100, dims)), rng.random(100)
         picks, gains = greedy(CoverageGrid(dims), points, chance, chance, 20)
-        ground, free = CoverageGrid(dims), np.ones(100)
-        balls = ground.balls(points)
+        grid, free = CoverageGrid(dims), np.ones(100)
+        balls = grid.balls(points)
         for pick, gain in zip(picks, gains, strict=True):
-            new = ground.new(balls)
+            new = grid.new(balls)
             assert pick == np.argmax(free * chance * (new + EVEN_IF_COVERED))
             assert gain == chance[pick] * new[pick]
-            ground.cover(balls[pick], max(PICKED, chance[pick]))
+            grid.cover(balls[pick], max(PICKED, chance[pick]))
             free[pick] = 0.0
 
     def test_is_new_each_time(self):

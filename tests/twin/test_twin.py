@@ -116,17 +116,17 @@ class TestGames:
         assert (np.abs(found) < 6.0).any()
 
     def test_cannot_be_played_against_a_program(self):
-        assert not TwinRollout(Pool(levels=(0,)), Povs()).can_play(3)
+        assert not TwinRollout(Pool(levels=(0,)), Povs()).can_predict(3)
 
 
 class TestWatching:
     def test_sees_the_state_and_what_was_before(self):
-        watcher = Observation(US23, 1)
+        observation = Observation(US23, 1)
         for step in range(5):
             x = np.array([[-200.0 + step], [-100.0 + 2.0 * step]])
             v = np.array([[30.0], [20.0]])
-            seen = watcher.see(x, v, np.array([0.0 if step < 4 else -2.0]))[0].copy()
-        assert watcher.now == NOW
+            seen = observation.see(x, v, np.array([0.0 if step < 4 else -2.0]))[0].copy()
+        assert observation.now == NOW
         assert seen[:7].tolist() == [-2.0, -104.0, 10.0, -196.0, 30.0, -92.0, 20.0]
         # The time, steps since the jump, the lowest and the highest acceleration so far.
         assert seen[NOW : NOW + 4].tolist() == [4.0, 0.0, -2.0, 0.0]
@@ -150,7 +150,7 @@ class TestTwin:
         twin = Twin(Pool(levels=(0,)), Povs(), 0)
         twin.tell(outcomes[:40], motions)
         points = np.random.default_rng(3).random((60, 2))[40:]
-        found = twin.play(0, points)
+        found = twin.predict(0, points)
         assert found.shape == (2, 4, 20)
         off = np.abs(np.median(found, axis=(0, 1)) - gaps_of(outcomes[40:]))
         assert np.median(off) < 1.0
@@ -161,9 +161,9 @@ class TestTwin:
         at_once, in_parts = (Twin(Pool(levels=(0,)), Povs(), 5) for _ in range(2))
         at_once.tell(outcomes, motions)
         in_parts.tell(outcomes[30:], motions)
-        in_parts.play(0, points)
+        in_parts.predict(0, points)
         in_parts.tell(outcomes[:40], motions)
-        assert (at_once.play(0, points) == in_parts.play(0, points)).all()
+        assert (at_once.predict(0, points) == in_parts.predict(0, points)).all()
 
     def test_replays_a_case_by_who_has_not_learned_from_it(self, seen):
         outcomes, motions = seen
@@ -173,7 +173,10 @@ class TestTwin:
         plain, taught = (Twin(Pool(levels=(0,)), Povs(), 0) for _ in range(2))
         plain.tell(outcomes[:40], motions)
         taught.tell(outcomes[:40], odd)
-        same = [plain.replay(0, [8], points[8:9]), taught.replay(0, [8], points[8:9])]
+        same = [
+            plain.predict_held_out(0, [8], points[8:9]),
+            taught.predict_held_out(0, [8], points[8:9]),
+        ]
         assert same[0].tolist() == same[1].tolist()
 
     @pytest.mark.parametrize("size", some([60, 20, 7], 7))
@@ -182,7 +185,7 @@ class TestTwin:
         twin = Twin(Pool(levels=(0,)), Povs(), 0)
         many = [replace(o, index=k, batch=k // size) for k, o in enumerate(outcomes * 3)]
         twin.tell(many, {o.index: motions[o.index % len(outcomes)] for o in many})
-        assert twin.play(0, np.full((1, 2), 0.5)).shape == (2, 4, 1)
+        assert twin.predict(0, np.full((1, 2), 0.5)).shape == (2, 4, 1)
 
     def test_needs_some_cases_and_learns_nothing_from_errors(self, seen):
         outcomes, motions = seen
@@ -194,14 +197,14 @@ class TestTwin:
             ],
             motions,
         )
-        assert not twin.can_play(0)
+        assert not twin.can_predict(0)
 
     def test_lets_others_speak_for_a_vut_that_it_has_not_seen(self, seen):
         outcomes, motions = seen
         twin = Twin(Pool(levels=(0,)), Povs(), 0, list(motions.values()))
-        assert twin.can_play(0)
+        assert twin.can_predict(0)
         off = np.abs(
-            np.median(twin.play(0, np.random.default_rng(3).random((60, 2))), axis=(0, 1))
+            np.median(twin.predict(0, np.random.default_rng(3).random((60, 2))), axis=(0, 1))
             - gaps_of(outcomes)
         )
         assert np.median(off) < 1.0
@@ -255,7 +258,7 @@ class TestTheRecord:
     def test_doubts_where_members_disagree_on_a_near_gap(self):
         gaps = np.zeros((2, 4, 3))
         gaps[0, :, 1], gaps[:, :, 2] = 20.0, 100.0
-        doubt = PredictionSkill([], 0, 6.0).doubt(gaps)
+        doubt = PredictionSkill([], 0, 6.0).disagreement(gaps)
         assert doubt.argmax() == 1
         assert doubt[0] == doubt[2] == 0.0
 
