@@ -17,22 +17,22 @@ HEAD = """# What a TraCI controller can do
 
 Made by `python tools/traci_page.py` from SUMO's own client: do not edit.
 
-Questions are answered by SUMO, about the net as it is in its file and the vehicles `pov` and \
-`vut` (in traffic also `ahead` and `behind`), by a shadow SUMO that has the same vehicles in the \
-same state. It runs as a library in a process of its own and opens no port. What it cannot know, \
-merge-sumo answers: where a vehicle was put after the step, and who came and went while several \
-steps were made. A question about an object that there is not is refused as by SUMO. \
-Subscriptions and context subscriptions take all of it, too, but no filters of contexts.
+A shadow SUMO answers questions. It has the original net and the vehicles `pov` and `vut` (in \
+traffic also `ahead` and `behind`) in their present state, and runs as a library in a process of \
+its own, without a port. merge-sumo itself answers what this SUMO cannot know: the position of a \
+vehicle after the step, and the vehicles that departed and arrived during several steps. A \
+question about an unknown object is refused as by SUMO. Subscriptions and context subscriptions \
+are available for all questions, without filters of contexts.
 
-Commands on `vut` and its type are carried out by the same SUMO, and the speed that its step gives \
-the VUT is what the controller commanded; the rollout then moves the VUT by eq. (4), within the \
-scenario's limits. `vut` departs in speed mode 38 with its speed set, so a controller that \
-commands nothing keeps its speed: limits of acceleration act, SUMO's checks of safe speed, right \
-of way and red lights do not. Speed mode 31, `setSpeed(-1)`, `setTau`, `openGap` and `setStop` \
-mean what they mean in SUMO, whose car-following model then drives the VUT (without chance: \
-`sigma` is 0, unless `setImperfection` sets another). The rest is accepted because it can change \
-nothing here (which is noted once in `controller.log`), or it is refused by name and with a \
-reason, as an error of that command: the connection stays.
+The same SUMO carries out commands on `vut` and its type; the speed that its step gives the VUT is \
+the command of the controller, and the campaign then moves the VUT by eq. (4), within the \
+scenario's limits. `vut` departs in speed mode 38 with its speed set, so a controller without \
+commands keeps its speed: limits of acceleration act, SUMO's checks of safe speed, right of way \
+and red lights do not. Speed mode 31, `setSpeed(-1)`, `setTau`, `openGap` and `setStop` have their \
+meaning in SUMO, whose car-following model then drives the VUT (deterministically: `sigma` is 0, \
+unless `setImperfection` changes it). Other commands are accepted without effect (with one note in \
+`controller.log`), or refused with a reason, as an error of that command; the connection stays \
+open. [Why SUMO decides](../decisions/traci-server.md).
 """
 
 
