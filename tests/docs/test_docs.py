@@ -32,3 +32,35 @@ def test_the_site_has_what_lies_outside_of_docs_one_folder_nearer():
     assert on_page_markdown("[a](../docs/faq.md)", shown) == "[a](../faq.md)"
     root = SimpleNamespace(file=SimpleNamespace(src_uri="SECURITY.md"))
     assert on_page_markdown("[a](docs/faq.md)", root) == "[a](faq.md)"
+
+
+class TestTheArchitecture:
+    PAGE = (ROOT / "docs/explanations/architecture.md").read_text(encoding="utf-8")
+
+    def test_lists_the_rooms_in_the_order_of_imports(self):
+        rooms = re.findall(r"^\| `(\w+)/`", self.PAGE, re.MULTILINE)
+        layers = (ROOT / "tests/test_architecture.py").read_text(encoding="utf-8")
+        (listed,) = re.findall(r"^LAYERS = \((.*?)^\)$", layers, re.MULTILINE | re.DOTALL)
+        assert rooms == re.findall(r'"(\w+)"', listed)
+
+    def test_names_at_most_eight_files_from_a_sampler_to_an_outcome(self):
+        way = self.PAGE.partition("## The way of a case")[2].partition("\n## ")[0]
+        files = set(re.findall(r"`(\w+/[\w/]+\.py)`", way))
+        assert 1 < len(files) <= 8
+        assert all((ROOT / "merge_sumo" / file).is_file() for file in files)
+
+
+NAMED_FILE = re.compile(r"`((?:merge_sumo|tests|tools)/[\w/.-]+\.\w+)")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_files_that_a_page_names_exist(page: Path):
+    names = NAMED_FILE.findall(page.read_text(encoding="utf-8"))
+    assert [name for name in names if not (ROOT / name).exists()] == []
+
+
+def test_attacks_name_tests_that_exist():
+    rows = (ROOT / "tests/README.md").read_text(encoding="utf-8")
+    names = set(re.findall(r"\btests/[\w/]+\.py\b", rows))
+    assert names
+    assert [name for name in sorted(names) if not (ROOT / name).is_file()] == []
