@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import counted
-from merge_sumo.studies.benchmark import Comparison, Quartiles
+from merge_sumo.studies.benchmark import Quartiles, SamplerSummary
 from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.interval import Estimate
 from merge_sumo.studies.truth import DENSE_CASES, REAL_REGION, Truth
@@ -108,7 +108,7 @@ class Benchmark(Result):
     """Samplers beside each other, and beside the ground truth, over several seeds.
 
     Attributes:
-        samplers: `Comparison` by name: medians and quartiles over the seeds.
+        samplers: `SamplerSummary` by name: medians and quartiles over the seeds.
         truths: the truth by level.
         dense: the dense truth by level, where one is known.
         limit_fmc: coverage of all that truth and searches found, or of the dense truths.
@@ -116,7 +116,7 @@ class Benchmark(Result):
         cases: cases of each search.
     """
 
-    samplers: dict[str, Comparison]
+    samplers: dict[str, SamplerSummary]
     truths: dict[int, Truth]
     dense: dict[int, Truth]
     limit_fmc: float
@@ -159,7 +159,7 @@ def limit_of(dense: Collection[int], levels: Sequence[int]) -> str:
     return f"of {DENSE_CASES:,} uniform cases{where}, or of all that was found, where that is more"
 
 
-def _table(compared: Mapping[str, Comparison]) -> list[str]:
+def _table(compared: Mapping[str, SamplerSummary]) -> list[str]:
     """Return a line per sampler: medians, with the quartiles in brackets."""
     from rich.console import Console
     from rich.table import Table

@@ -172,32 +172,35 @@ def reproduce(
 ) -> None:
     """Reproduce the paper: Table II and every figure of its results, beside the paper's numbers.
 
-    Writes table2.md, table2.json, the figures as PNG, and index.html that shows it all.
+    Writes reproduction.md, reproduction.json, the figures as PNG, and index.html that shows it all.
 
     Example:  merge-sumo reproduce --seeds 10 --out reproduction
     """
     from merge_sumo.campaigns.settings import povs_of
-    from merge_sumo.reports import reproduction as paper
+    from merge_sumo.reports import figures
     from merge_sumo.reports.progress import Bars, rate_text
-    from merge_sumo.studies import table2
+    from merge_sumo.reports.reproduction_page import write_reproduction_page
+    from merge_sumo.studies import reproduction
     from merge_sumo.system.workers import open_workers
 
     if seeds is None:
         seeds = 2 if quick else 10
-    scale = table2.quick(seeds) if quick else table2.Scale(seeds=seeds)
+    scale = reproduction.quick(seeds) if quick else reproduction.Scale(seeds=seeds)
     if dense is not None:
         scale = replace(scale, dense=dense)
     povs = povs_of(policies, US23)
     folder = out or dated("reproduce")
+    figures.require_matplotlib()
     with open_workers(workers, dask) as there, Bars(shown=not quiet) as bars:
 
         def ran(title: str, done: int, total: int, unit: str) -> None:
             bars.show(title, done, total, rate_text(done, bars.elapsed_s(title), unit))
 
-        index = paper.reproduce(folder, scale, povs=povs, workers=there, on_run=ran)
+        reproduction.reproduce(folder, scale, povs=povs, workers=there, on_run=ran)
+    index = write_reproduction_page(folder)
     if as_json:
-        typer.echo((folder / paper.TABLE_JSON).read_text(encoding="utf-8").strip())
+        typer.echo((folder / reproduction.TABLE_JSON).read_text(encoding="utf-8").strip())
         say(f"all of it: {index}")
         return
-    typer.echo((folder / paper.TABLE_MARKDOWN).read_text(encoding="utf-8"), nl=False)
+    typer.echo((folder / reproduction.TABLE_MARKDOWN).read_text(encoding="utf-8"), nl=False)
     show(f"all of it: {index}")

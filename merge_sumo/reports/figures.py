@@ -11,7 +11,6 @@ import importlib
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,7 +18,8 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies.benchmark import Comparison
+from merge_sumo.studies.benchmark import SamplerSummary
+from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
 from merge_sumo.values.fmc import RADIUS
@@ -56,15 +56,6 @@ STYLE: Final[Any] = {
     "svg.fonttype": "path",
     "mathtext.default": "regular",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Panel:
-    """Cases at one level in the unit cube, (n, d), which of them failed, (n,), and their FMC."""
-
-    points: FloatArray
-    failed: Any
-    fmc: float
 
 
 def check_figure(path: Path) -> None:
@@ -129,7 +120,7 @@ def colour(name: str) -> str:
 
 def coverage_curves(
     title: str,
-    compared: Mapping[str, Comparison],
+    compared: Mapping[str, SamplerSummary],
     truth_fmc: float,
     oracle: Mapping[int, float],
     limit_fmc: float,
@@ -283,20 +274,9 @@ def _box(axes: Any, panel: Panel, level: int, ink: str) -> None:
     axes.tick_params(labelsize=7, pad=0)
 
 
-@dataclass(frozen=True, slots=True)
-class Surface:
-    """A surrogate after a number of batches.
-
-    Attributes:
-        predicted: P on a regular grid, (n, n), rows along v_POV0, columns along x_POV0.
-        learned: the cases that it has learned from.
-    """
-
-    predicted: FloatArray
-    learned: Panel
-
-
-def surfaces(title: str, by_batch: Mapping[int, Surface], level: int, truth: FloatArray) -> Figure:
+def predicted_scores(
+    title: str, by_batch: Mapping[int, PredictedScores], level: int, truth: FloatArray
+) -> Figure:
     """Draw the surrogate's score P after some batches, with the failures of the truth, (m, 2)."""
     x, v = dimensions(level)
     steps = np.linspace(2.0 * FAILURE_SCORE, 0.0, 21)
@@ -307,24 +287,24 @@ def surfaces(title: str, by_batch: Mapping[int, Surface], level: int, truth: Flo
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for unused in grid.flat[len(by_batch) :]:
             unused.set_visible(False)
-        for axes, (batch, surface) in zip(grid.flat, by_batch.items(), strict=False):
-            n = len(surface.predicted)
+        for axes, (batch, predicted) in zip(grid.flat, by_batch.items(), strict=False):
+            n = len(predicted.score)
             across, up = np.linspace(x.low, x.high, n), np.linspace(v.low, v.high, n)
             filled = axes.contourf(
                 across,
                 up,
-                np.minimum(surface.predicted, 0.0),
+                np.minimum(predicted.score, 0.0),
                 steps,
                 cmap="cividis",
                 extend="min",
             )
             line: Any = {"colors": "white", "linewidths": 1.6, "linestyles": "solid"}
-            if surface.predicted.min() < FAILURE_SCORE < surface.predicted.max():
-                axes.contour(across, up, surface.predicted, [FAILURE_SCORE], **line)
+            if predicted.score.min() < FAILURE_SCORE < predicted.score.max():
+                axes.contour(across, up, predicted.score, [FAILURE_SCORE], **line)
             axes.scatter(
                 failures[:, 0], failures[:, 1], s=2, color="#D55E00", linewidths=0, alpha=0.5
             )
-            run = _physical(surface.learned.points, level)
+            run = _physical(predicted.learned.points, level)
             axes.scatter(
                 run[:, 0], run[:, 1], s=9, color="white", edgecolors="black", linewidths=0.5
             )
@@ -336,20 +316,7 @@ def surfaces(title: str, by_batch: Mapping[int, Surface], level: int, truth: Flo
     return figure
 
 
-@dataclass(frozen=True, slots=True)
-class Levels:
-    """How a sampler went on over batches at each level, one row per seed, (seeds, batches).
-
-    Attributes:
-        cases: cases at the level in each batch.
-        score: mean score P of them; NaN where there was none.
-    """
-
-    cases: Mapping[int, FloatArray]
-    score: Mapping[int, FloatArray]
-
-
-def allocation(title: str, by_sampler: Mapping[str, Levels]) -> Figure:
+def allocation(title: str, by_sampler: Mapping[str, LevelBatches]) -> Figure:
     """Draw cases per level and mean score per level over the batches: median and quartile band."""
     with _drawing(4.6 * len(by_sampler), 6.4) as figure:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold")

@@ -113,7 +113,7 @@ Quartiles = tuple[float | None, float | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class SamplerSummary:
     """One sampler over all seeds, as medians and as quartiles (25 % and 75 %).
 
     Coverage is summed over the levels. `cases_to_50_percent` and `cases_to_90_percent` are cases
@@ -199,7 +199,7 @@ def limit_fmc(
 
 def compare(
     searches: Sequence[Search], truths: Mapping[int, Truth], limit: float | None = None
-) -> Comparison:
+) -> SamplerSummary:
     """Compare what one sampler found, one search a seed, with the truth at each level.
 
     `limit` is the coverage of all that is known to fail (`limit_fmc`).
@@ -218,7 +218,7 @@ def compare(
     after = _cases_by_batch(searches[0])
     half, most = (_cases_to(part * truth_fmc, curves, after) for part in (0.5, 0.9))
     by_batch = [np.quantile(curves, part, axis=0).tolist() for part in (0.25, 0.75)]
-    return Comparison(
+    return SamplerSummary(
         fmc_median=float(np.median(curves[:, -1])),
         fmc_quartiles=_quartiles(curves[:, -1]),
         fmc_over_truth_median=_quantile(share, 0.5),

@@ -24,9 +24,8 @@ from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
-from merge_sumo.reports import reproduction as reproduce
 from merge_sumo.reports.report import REPORT, write_report
-from merge_sumo.studies import probability
+from merge_sumo.studies import probability, reproduction
 from merge_sumo.system import folders
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.training import helix
@@ -148,7 +147,7 @@ def no_cases(monkeypatch) -> None:
 
     stop = Stop()
     monkeypatch.setattr(conductor, "runs_on", lambda *_: stop)
-    monkeypatch.setattr(reproduce._Work, "column", stop)
+    monkeypatch.setattr(reproduction._Work, "column", stop)
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ import shutil
 
 import pytest
 
-from merge_sumo.reports.reproduction import TABLE_JSON
-from merge_sumo.studies.table2 import TABLE_II, Scale
+from merge_sumo.studies.reproduction import TABLE_II, TABLE_JSON, Scale
 
 
 @pytest.fixture
@@ -92,8 +91,8 @@ class TestReproduce:
     @pytest.fixture
     def tiny(self, monkeypatch):
         scale = Scale(seeds=1, truth_cases=(100, 100, 100), batches=1, batch=6)
-        monkeypatch.setattr("merge_sumo.studies.table2.quick", lambda seeds: scale)
-        monkeypatch.setattr("merge_sumo.reports.reproduction.TABLE_II", TABLE_II[:1])
+        monkeypatch.setattr("merge_sumo.studies.reproduction.quick", lambda seeds: scale)
+        monkeypatch.setattr("merge_sumo.studies.reproduction.TABLE_II", TABLE_II[:1])
 
     def test_prints_the_table_and_where_the_rest_is(self, call, tiny, tmp_path):
         code, out, err = call("reproduce", "--quick", "--workers", 1, "--out", "here")

@@ -13,14 +13,14 @@ from PIL import Image
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
-from merge_sumo.reports.figures import Levels, Panel, Surface
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies.benchmark import Comparison, LevelShare
+from merge_sumo.studies.benchmark import LevelShare, SamplerSummary
+from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
 from merge_sumo.values.fmc import RADIUS
 
 
-def compared(end: float) -> Comparison:
-    return Comparison(
+def compared(end: float) -> SamplerSummary:
+    return SamplerSummary(
         fmc_median=end,
         fmc_quartiles=(end, end),
         fmc_over_truth_median=None,
@@ -114,8 +114,8 @@ class TestTheMaps:
 
 def test_surfaces_show_a_panel_per_batch_on_one_scale(tmp_path):
     predicted = np.linspace(-900.0, 50.0, 25).reshape(5, 5)
-    shown = {batch: Surface(predicted, panel(20, 2)) for batch in (1, 4)}
-    figure = figures.surfaces("t", shown, 1, np.array([[0.2, 0.2]]))
+    shown = {batch: PredictedScores(predicted, panel(20, 2)) for batch in (1, 4)}
+    figure = figures.predicted_scores("t", shown, 1, np.array([[0.2, 0.2]]))
     assert [axes.get_title("left") for axes in figure.axes[:2]] == [
         "after batch 1: 20 cases",
         "after batch 4: 20 cases",
@@ -125,8 +125,8 @@ def test_surfaces_show_a_panel_per_batch_on_one_scale(tmp_path):
 
 @pytest.mark.parametrize("batches", [(1,), (1, 4, 13)])
 def test_surfaces_of_any_number_of_batches_are_drawn(batches):
-    flat = Surface(np.full((5, 5), -10.0), panel(20, 2))
-    figure = figures.surfaces("t", dict.fromkeys(batches, flat), 1, np.zeros((0, 2)))
+    flat = PredictedScores(np.full((5, 5), -10.0), panel(20, 2))
+    figure = figures.predicted_scores("t", dict.fromkeys(batches, flat), 1, np.zeros((0, 2)))
     assert sum(axes.get_visible() for axes in figure.axes) == len(batches) + 1
 
 
@@ -134,7 +134,7 @@ def test_allocation_shows_each_level_and_leaves_a_gap_where_it_had_no_case(tmp_p
     cases = {level: np.full((3, 4), 10.0) for level in (0, 1, 2)}
     score = {level: np.full((3, 4), -50.0) for level in (0, 1, 2)}
     score[0][:, 1] = np.nan
-    figure = figures.allocation("t", {"gpr": Levels(cases, score)})
+    figure = figures.allocation("t", {"gpr": LevelBatches(cases, score)})
     above, below = figure.axes
     assert [line.get_label() for line in above.lines] == ["0", "1", "2"]
     assert np.isnan(below.lines[0].get_ydata()).tolist() == [False, True, False, False]

@@ -10,8 +10,17 @@ from typing import Any
 import pytest
 
 from merge_sumo.errors import UserError
-from merge_sumo.reports.reproduction import reproduce
-from merge_sumo.studies.table2 import SAMPLERS, TABLE_II, Result, Scale, quick, table_markdown
+from merge_sumo.reports.reproduction_page import write_reproduction_page
+from merge_sumo.studies.reproduction import (
+    SAMPLERS,
+    TABLE_II,
+    ColumnResult,
+    Scale,
+    quick,
+    read_reproduction,
+    reproduce,
+    table_markdown,
+)
 from merge_sumo.system.workers import open_workers
 
 FIGURES = {
@@ -34,15 +43,15 @@ def tiny(tmp_path_factory):
     said = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MERGE_SUMO_CACHE", str(folder.parent / "cache"))
-        index = reproduce(folder, TINY, on_run=lambda *what: said.append(what))
-    return index, said
+        reproduce(folder, TINY, on_run=lambda *what: said.append(what))
+    return write_reproduction_page(folder), said
 
 
 class TestATinyReproduction:
     def test_writes_the_table_every_figure_and_a_page_that_shows_them(self, tiny):
         index, _ = tiny
         names = {path.name for path in index.parent.iterdir()}
-        assert names == FIGURES | {"table2.md", "table2.json", "index.html"}
+        assert names == FIGURES | {"reproduction.json", "table2.md", "table2.json", "index.html"}
         page = index.read_text()
         assert all(f'src="{name}"' in page for name in FIGURES)
         assert "http" not in page
@@ -77,7 +86,7 @@ class TestATinyReproduction:
             cases_by_batch=[20],
             fmc_by_batch_median=[0.09],
         )
-        of_one = Result(TABLE_II[0], 0.08, 7, 1, None, 0.1, dict.fromkeys(SAMPLERS, found))
+        of_one = ColumnResult(TABLE_II[0], 0.08, 7, 1, None, 0.1, dict.fromkeys(SAMPLERS, found))
         of_two = replace(of_one, dense_fmc=0.095)
         markdown = table_markdown({"one": of_one, "two": of_two})
         assert "| dense truth | - (-) | 0.0950 (-) |" in markdown
@@ -90,6 +99,22 @@ class TestATinyReproduction:
         assert last["design1 v level 0"] == (5, 5)
         assert last["design2 v level 0/1/2"] == (2, 2)
         assert last["truth of level-2 POV, design2"] == (300, 300)
+
+    def test_is_drawn_again_from_its_file_alone(self, tiny, tmp_path):
+        index, _ = tiny
+        (tmp_path / "reproduction.json").write_bytes(
+            (index.parent / "reproduction.json").read_bytes()
+        )
+        again = write_reproduction_page(tmp_path)
+        assert again.read_bytes() == index.read_bytes()
+        for name in FIGURES:
+            assert (tmp_path / name).read_bytes() == (index.parent / name).read_bytes()
+
+    @pytest.mark.parametrize("content", ["", "[]", '{"scale": {}}', "[" * 100_000])
+    def test_of_a_file_that_is_none_is_refused(self, tmp_path, content):
+        (tmp_path / "reproduction.json").write_text(content)
+        with pytest.raises(UserError, match="is not as it was written"):
+            read_reproduction(tmp_path)
 
     def test_refuses_a_folder_that_exists(self, tiny):
         index, _ = tiny
@@ -119,5 +144,6 @@ def test_a_quick_reproduction_is_the_same_twice(tmp_path, monkeypatch):
     for name, count in (("a", 2), ("b", 1)):
         with open_workers(count) as workers:
             reproduce(tmp_path / name, quick(2), workers=workers)
+        write_reproduction_page(tmp_path / name)
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name

@@ -1,0 +1,526 @@
+"""The paper's results in one go: what Table II and the figures show, our numbers and the paper's.
+
+Every number is the median over seeds; a picture of single cases shows the seed whose coverage is
+the median. Same seeds and same versions give the same files:
+
+reproduction.json       all that the page and its figures are drawn from, after each column
+table2.json, table2.md  Table II, for a program and to read
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from itertools import chain
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.settings import check_level
+from merge_sumo.engine.povs import Povs
+from merge_sumo.engine.simulator import SimulationPlan
+from merge_sumo.engine.versions import versions
+from merge_sumo.errors import UserError
+from merge_sumo.samplers.gpr import predicted_score
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.studies.benchmark import (
+    LevelShare,
+    SamplerSummary,
+    Search,
+    compare,
+    limit_fmc,
+    oracle,
+    search,
+)
+from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth
+from merge_sumo.system.arrays import regular
+from merge_sumo.system.folders import make_folder, replace_own, write_new
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import FloatArray, Pool, to_unit
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import LEVELS, US23
+from merge_sumo.values.score import FAILURE_SCORE, Outcome
+
+REPRODUCTION: Final = "reproduction.json"
+TABLE_JSON: Final = "table2.json"
+TABLE_MARKDOWN: Final = "table2.md"
+SAMPLERS: Final = ("uniform", "annealing", "subset", "gpr", "coverage")
+ADAPTIVE: Final = ("gpr", "coverage")
+"""The paper's sampler and ours: whose shares of the truth and of the levels are shown."""
+SURFACE_BATCHES: Final = (1, 4, 13, 20)
+"""Batches after which the paper shows its surrogate."""
+SURFACE_POINTS: Final = 81
+"""Points of a surrogate's grid, in each direction."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of Table II: a VUT against one POV level, and what the paper found.
+
+    Attributes:
+        paper: FMC of the truth and of each sampler that the paper has.
+    """
+
+    vut: str
+    level: int
+    paper: Mapping[str, float]
+
+    @property
+    def title(self) -> str:
+        """What stands above the column."""
+        return f"level-{self.level} POV, {self.vut}"
+
+
+TABLE_II: Final = (
+    Column(
+        "design1",
+        0,
+        {"truth": 0.1296, "uniform": 0.0223, "annealing": 0.0497, "subset": 0.0830, "gpr": 0.1012},
+    ),
+    Column(
+        "design2",
+        1,
+        {"truth": 0.0849, "uniform": 0.0144, "annealing": 0.0184, "subset": 0.0445, "gpr": 0.0585},
+    ),
+    Column(
+        "design2",
+        2,
+        {"truth": 0.0073, "uniform": 0.0, "annealing": 0.0006, "subset": 0.0019, "gpr": 0.0032},
+    ),
+)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Scale:
+    """How much is run. The default is the paper's; `UserError` for numbers that make none.
+
+    Attributes:
+        seeds: runs of each sampler.
+        truth_cases: uniform cases of the truth at each level.
+        batches: k, the batches of every run.
+        batch: n, the cases per batch at one level; twice as many run where all levels do.
+        dense: whether to run a dense truth, or to go without; None for one that is kept.
+    """
+
+    seeds: int = 10
+    truth_cases: tuple[int, int, int] = (TRUTH_CASES[0], TRUTH_CASES[1], TRUTH_CASES[2])
+    batches: int = 20
+    batch: int = 20
+    dense: bool | None = None
+
+    def __post_init__(self) -> None:
+        """Check the number of seeds."""
+        if self.seeds < 1:
+            raise UserError(f"--seeds is {self.seeds}: it must be 1 or more")
+
+
+def quick(seeds: int) -> Scale:
+    """Return a scale for a first look and for tests: it shows that all works, and no more."""
+    return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15, dense=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Cases at one level in the unit cube, (n, d), which of them failed, (n,), and their FMC."""
+
+    points: FloatArray
+    failed: NDArray[np.bool_]
+    fmc: float
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedScores:
+    """What a surrogate predicts after a number of batches.
+
+    Attributes:
+        score: P on a regular grid, (n, n), rows along v_POV0, columns along x_POV0.
+        learned: the cases that it has learned from.
+    """
+
+    score: FloatArray
+    learned: Panel
+
+
+@dataclass(frozen=True, slots=True)
+class LevelBatches:
+    """How a sampler went on over batches at each level, one row per seed, (seeds, batches).
+
+    Attributes:
+        cases: cases at the level in each batch.
+        score: mean score P of them; NaN where there was none.
+    """
+
+    cases: Mapping[int, FloatArray]
+    score: Mapping[int, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnResult:
+    """A column that has run: what the truth holds, and each sampler beside it.
+
+    Attributes:
+        column: the column.
+        truth_fmc: FMC of the truth.
+        truth_failures: failures of the truth.
+        truth_regions: its regions with a real share of them.
+        dense_fmc: FMC of a dense truth, if there is one.
+        limit_fmc: coverage of all that is known to fail.
+        compared: each sampler over all seeds.
+        oracle: FMC of the oracle after numbers of cases.
+        panels: cases of the truth, and of each sampler with the seed whose coverage is its median.
+        predicted: what the surrogate of `gpr` predicts after some batches; at level 1.
+    """
+
+    column: Column
+    truth_fmc: float
+    truth_failures: int
+    truth_regions: int
+    dense_fmc: float | None
+    limit_fmc: float
+    compared: dict[str, SamplerSummary]
+    oracle: dict[int, float] = field(default_factory=dict)
+    panels: dict[str, Panel] = field(default_factory=dict)
+    predicted: dict[int, PredictedScores] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction:
+    """What ran: the scale, the columns by title, all levels together by sampler, the versions."""
+
+    scale: Scale
+    columns: dict[str, ColumnResult]
+    levels: dict[str, LevelBatches]
+    versions: dict[str, str]
+
+
+OnRun = Callable[[str, int, int, str], None]
+"""Told what is going on: title, things done, things in all, and what a thing is."""
+
+
+def reproduce(
+    folder: Path,
+    scale: Scale,
+    *,
+    povs: Povs | None = None,
+    workers: Workers | None = None,
+    on_run: OnRun = lambda *_: None,
+) -> Reproduction:
+    """Run what Table II and the figures need, and write it into a new folder.
+
+    Args:
+        folder: new; `reproduction.json` is written after each column.
+        scale: how much is run.
+        povs: drivers of the POV, by default the shipped ones.
+        workers: where cases run, by default in this process.
+        on_run: told how far it is.
+
+    Raises:
+        UserError: when the folder exists or cannot be written, or where a level has no POV.
+    """
+    povs = povs or Povs()
+    for level in LEVELS:
+        check_level(level, povs)
+    make_folder(folder)
+    work = _Work(scale, povs, workers, on_run)
+    result = Reproduction(scale, {}, {}, versions())
+    for column in TABLE_II:
+        result.columns[column.title] = work.column(column)
+        _write(folder, result)
+    result.levels.update(work.all_levels())
+    _write(folder, result)
+    record = {**table_record(result), "policies_sha256": povs.sha256()}
+    write_new(folder / TABLE_JSON, (json.dumps(record, allow_nan=False) + "\n").encode())
+    write_new(folder / TABLE_MARKDOWN, table_markdown(result.columns).encode())
+    return result
+
+
+class _Work:
+    """Truths and searches of the columns, with one scale, POVs and workers."""
+
+    def __init__(self, scale: Scale, povs: Povs, workers: Workers | None, on_run: OnRun) -> None:
+        self.scale, self.povs, self.workers, self.on_run = scale, povs, workers, on_run
+
+    def plan(self, vut: str) -> SimulationPlan:
+        """Return the plan for a VUT of the paper on its road, by its criterion."""
+        return resolve(vut, scenario=US23, criterion=Criterion(), povs=self.povs)
+
+    def column(self, column: Column) -> ColumnResult:
+        """Run one column of the table."""
+        level, cases = column.level, self.scale.batches * self.scale.batch
+        truth = self.truth(column, self.scale.truth_cases[level])
+        if self.scale.dense is None:
+            dense = known_truth(self.plan(column.vut), level, DENSE_CASES)
+        else:
+            dense = self.truth(column, DENSE_CASES) if self.scale.dense else None
+        searches = self.search(column.vut, (level,), SAMPLERS)
+        truths, denses = {level: truth}, {} if dense is None else {level: dense}
+        limit = limit_fmc(chain.from_iterable(searches.values()), truths, denses)
+        shown = Panel(truth.points, truth.score < FAILURE_SCORE, fmc(truth.failures))
+        seeds = {name: _median_seed(of_name) for name, of_name in searches.items()}
+        panels = {
+            name: _panel(searches[name][seeds[name]].outcomes, level) for name in reversed(SAMPLERS)
+        }
+        gpr = searches["gpr"][seeds["gpr"]].outcomes
+        return ColumnResult(
+            column,
+            fmc(truth.failures),
+            len(truth.failures),
+            len(truth.real_regions()),
+            None if dense is None else fmc(dense.failures),
+            limit,
+            {name: compare(of_name, truths, limit) for name, of_name in searches.items()},
+            oracle(truths, cases, self.scale.batch),
+            {"truth": shown, **panels},
+            self.predicted(gpr, level, seeds["gpr"]) if level == 1 else {},
+        )
+
+    def truth(self, column: Column, cases: int) -> Truth:
+        """Return the truth of a column, from the cache where it is there."""
+        title = f"{'dense ' if cases == DENSE_CASES else ''}truth of {column.title}"
+        done = 0
+
+        def count(more: int) -> None:
+            nonlocal done
+            done += more
+            self.on_run(title, done, cases, "cases")
+
+        count(0)
+        truth = ground_truth(
+            self.plan(column.vut), column.level, cases, workers=self.workers, on_cases=count
+        )
+        self.on_run(title, cases, cases, "cases")
+        return truth
+
+    def search(
+        self,
+        vut: str,
+        levels: tuple[int, ...],
+        samplers: tuple[str, ...],
+        batch: int | None = None,
+    ) -> dict[str, list[Search]]:
+        """Let samplers search with all seeds, in batches of the paper's size if nobody says.
+
+        `coverage` has batches of its own then: they are a part of it.
+        """
+        title = f"{vut} v level {'/'.join(map(str, levels))}"
+        runs = len(samplers) * self.scale.seeds
+        counter = iter(range(1, runs + 1))
+        self.on_run(title, 0, runs, "runs")
+        return search(
+            self.plan(vut),
+            levels,
+            samplers,
+            seeds=self.scale.seeds,
+            cases=self.scale.batches * (batch or self.scale.batch),
+            batch=batch,
+            workers=self.workers,
+            on_search=lambda *_: self.on_run(title, next(counter), runs, "runs"),
+        )
+
+    def predicted(
+        self, outcomes: Sequence[Outcome], level: int, seed: int
+    ) -> dict[int, PredictedScores]:
+        """Return what the surrogate of `gpr` predicts after some batches of a search."""
+        axis = np.linspace(0.0, 1.0, SURFACE_POINTS)
+        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        result = {}
+        for batch in (b for b in SURFACE_BATCHES if b <= self.scale.batches):
+            known = [outcome for outcome in outcomes if outcome.batch < batch]
+            sampler = make_sampler("gpr", Pool(levels=(level,), scenario=US23), seed)
+            sampler.tell(known)
+            score = predicted_score(sampler.history(level), grid)
+            square = score.reshape(SURFACE_POINTS, SURFACE_POINTS)
+            result[batch] = PredictedScores(square, _panel(known, level))
+        return result
+
+    def all_levels(self) -> dict[str, LevelBatches]:
+        """Run all levels together and return how the samplers shared their batches out."""
+        searches = self.search("design2", LEVELS, ADAPTIVE, 2 * self.scale.batch)
+        return {name: _level_batches(of_name) for name, of_name in searches.items()}
+
+
+def _median_seed(searches: Sequence[Search]) -> int:
+    """Return the seed whose coverage is the median, the lower one of two."""
+    order = sorted(range(len(searches)), key=lambda seed: (searches[seed].fmc[-1], seed))
+    return order[(len(order) - 1) // 2]
+
+
+def _panel(outcomes: Sequence[Outcome], level: int) -> Panel:
+    points = to_unit((outcome.case for outcome in outcomes), level, US23)
+    failed = np.array([outcome.failed for outcome in outcomes])
+    return Panel(points, failed, fmc(points[failed]))
+
+
+def _level_batches(searches: Sequence[Search]) -> LevelBatches:
+    shape = len(LEVELS), len(searches), len(searches[0].fmc)
+    cases, judged, total = np.zeros((3, *shape))
+    for seed, one in enumerate(searches):
+        for outcome in one.outcomes:
+            place = LEVELS.index(outcome.case.level), seed, outcome.batch
+            cases[place] += 1
+            if outcome.measures.score is not None:
+                judged[place] += 1
+                total[place] += outcome.measures.score
+    score = np.divide(total, judged, out=np.full(shape, np.nan), where=judged > 0)
+    return LevelBatches(
+        dict(zip(LEVELS, cases, strict=True)), dict(zip(LEVELS, score, strict=True))
+    )
+
+
+# The file.
+
+
+def _write(folder: Path, result: Reproduction) -> None:
+    text = json.dumps(_plain(result), allow_nan=False) + "\n"
+    replace_own(folder / REPRODUCTION, text.encode())
+
+
+def _plain(value: Any) -> Any:
+    """Return dataclasses and arrays as JSON has them; a NaN in an array is null."""
+    if isinstance(value, np.ndarray):
+        rows = value.astype(object)
+        rows[value != value] = None  # noqa: PLR0124
+        return rows.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if hasattr(value, "__dataclass_fields__"):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    return value
+
+
+def read_reproduction(folder: Path) -> Reproduction:
+    """Return what `reproduce` left in a folder; `UserError` where it left nothing readable."""
+    path = folder / REPRODUCTION
+    try:
+        record = json.loads(regular(path).read_text(encoding="utf-8"))
+        return Reproduction(
+            Scale(**record["scale"]),
+            {title: _column_result(column) for title, column in record["columns"].items()},
+            {
+                name: LevelBatches(_by_number(one["cases"]), _by_number(one["score"]))
+                for name, one in record["levels"].items()
+            },
+            record["versions"],
+        )
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(f"{path} is not as it was written") from error
+
+
+def _by_number(rows: Mapping[str, Any]) -> dict[int, FloatArray]:
+    return {int(number): np.array(row, dtype=np.float64) for number, row in rows.items()}
+
+
+def _column_result(record: dict[str, Any]) -> ColumnResult:
+    return ColumnResult(
+        **record
+        | {
+            "column": Column(**record["column"]),
+            "compared": {
+                name: SamplerSummary(
+                    **one | {"levels": {int(k): LevelShare(**v) for k, v in one["levels"].items()}}
+                )
+                for name, one in record["compared"].items()
+            },
+            "oracle": {int(cases): value for cases, value in record["oracle"].items()},
+            "panels": {name: _read_panel(panel) for name, panel in record["panels"].items()},
+            "predicted": {
+                int(batch): PredictedScores(np.array(one["score"]), _read_panel(one["learned"]))
+                for batch, one in record["predicted"].items()
+            },
+        }
+    )
+
+
+def _read_panel(record: Mapping[str, Any]) -> Panel:
+    failed = np.array(record["failed"], dtype=np.bool_)
+    points = np.array(record["points"], dtype=np.float64).reshape(len(failed), -1)
+    return Panel(points, failed, record["fmc"])
+
+
+# Table II.
+
+
+def table_rows(
+    columns: Mapping[str, ColumnResult],
+) -> Iterator[tuple[str, list[tuple[float | None, float | None]]]]:
+    """Yield the rows of the table: a name, and (ours, the paper's) for each column."""
+    results = columns.values()
+    yield "truth", [(r.truth_fmc, r.column.paper["truth"]) for r in results]
+    if any(r.dense_fmc is not None for r in results):
+        yield "dense truth", [(r.dense_fmc, None) for r in results]
+    yield "limit", [(r.limit_fmc, None) for r in results]
+    for name in SAMPLERS:
+        yield name, [(r.compared[name].fmc_median, r.column.paper.get(name)) for r in results]
+
+
+def table_markdown(columns: Mapping[str, ColumnResult]) -> str:
+    """Return Table II as Markdown: our medians, with the paper's numbers in brackets."""
+    results = list(columns.values())
+    lines = ["| FMC: ours (the paper's) | " + " | ".join(columns) + " |"]
+    lines.append("|---|" + "---|" * len(columns))
+
+    def add(title: str, cells: Sequence[str]) -> None:
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+
+    for name, pairs in table_rows(columns):
+        add(name, [f"{_or_dash(ours, '.4f')} ({_or_dash(paper, '.4f')})" for ours, paper in pairs])
+    for name in ADAPTIVE:
+        cells = []
+        for result in results:
+            paper = result.column.paper
+            share = paper[name] / paper["truth"] if name in paper else None
+            ours = result.compared[name].fmc_over_truth_median
+            cells.append(f"{_or_dash(ours, '.2f')} ({_or_dash(share, '.2f')})")
+        add(f"{name} / truth", cells)
+    if any(result.dense_fmc for result in results):
+        for name in ADAPTIVE:
+            medians = [(r.compared[name].fmc_median, r.dense_fmc) for r in results]
+            cells = [_or_dash(ours / dense if dense else None, ".3f") for ours, dense in medians]
+            add(f"{name} / dense truth", cells)
+    for name in ADAPTIVE:
+        add(
+            f"{name} / limit",
+            [_or_dash(r.compared[name].fmc_over_limit_median, ".2f") for r in results],
+        )
+    for name in ADAPTIVE:
+        after = results[0].compared[name].cases_by_batch
+        # A quarter of all cases, or where a batch ended next.
+        cases = next(number for number in after if number >= after[-1] / 4)
+        early = [(r.compared[name].fmc_by_batch_median[after.index(cases)], r) for r in results]
+        shares = [median / r.truth_fmc if r.truth_fmc else None for median, r in early]
+        add(f"{name} / truth after {cases} cases", [_or_dash(share, ".2f") for share in shares])
+    return "\n".join(lines) + "\n"
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else f"{value:{form}}"
+
+
+def table_record(result: Reproduction) -> dict[str, Any]:
+    """Return Table II for a program; without seconds, so that it can be compared bit by bit."""
+    columns = []
+    for one in result.columns.values():
+        samplers = {name: asdict(summary) for name, summary in one.compared.items()}
+        for summary in samplers.values():
+            del summary["sampler_s_median"]
+        columns.append(
+            {
+                "vut": one.column.vut,
+                "level": one.column.level,
+                "truth_fmc": one.truth_fmc,
+                "truth_failures": one.truth_failures,
+                "truth_regions": one.truth_regions,
+                "limit_fmc": one.limit_fmc,
+                "dense_fmc": one.dense_fmc,
+                "paper_fmc": dict(one.column.paper),
+                "samplers": samplers,
+            }
+        )
+    return {"scale": asdict(result.scale), "versions": result.versions, "columns": columns}
