@@ -73,14 +73,16 @@ would add.
 
 def measures_page() -> str:
     """Return the measures of an episode as a table."""
+    from merge_sumo.values.measures import MEASURES
     from merge_sumo.values.score import Measures
 
-    about, attributes = inspect.cleandoc(Measures.__doc__ or "").split("Attributes:\n")
     rows = ""
-    for name, said in re.findall(r"^    (\w+): ((?:.*\n?)(?:     +.*\n?)*)", attributes, re.M):
-        told = " ".join(said.split()).replace("|", r"\|")
-        rows += f"| `{name}` | {told} |\n"
-    return f"# Measures\n\n{about.strip()}\n\n| name | what it is |\n|---|---|\n{rows}"
+    for name, measure in MEASURES.items():
+        about = f"{measure.about}.".replace("|", r"\|")
+        worse = f"{measure.worse}er values" if measure.worse else ""
+        rows += f"| `{name}` | {measure.unit} | {about} | {worse} |\n"
+    head = "| name | unit | what it is | worse |\n|---|---|---|---|\n"
+    return f"# Measures\n\n{inspect.cleandoc(Measures.__doc__ or '')}\n\n{head}{rows}"
 
 
 GENERATED: dict[str, Callable[[], str]] = {

@@ -12,6 +12,7 @@ from typing import Final
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.diagnosis import MEANING, diagnose
 from merge_sumo.analysis.verdict import message_of
+from merge_sumo.values.measures import MEASURES
 from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
@@ -22,25 +23,6 @@ PAST_M: Final = 0.08
 """Part of the strip that is behind M."""
 LETTERS: Final = ("P", "V", "a", "b")
 """Of the vehicles, in the order of their rows."""
-MEASURES: Final = (
-    ("score", "score P", ""),
-    ("dx_m", "front bumpers, x_POV - x_VUT", "m"),
-    ("bumper_gap_m", "bumper gap at M", "m"),
-    ("clearance_m", "smallest gap, driving on", "m"),
-    ("before_clearance_m", "smallest clearance before M", "m"),
-    ("dv_mps", "v_POV - v_VUT", "m/s"),
-    ("ttc_s", "time to collision", "s"),
-    ("pet_s", "post-encroachment time", "s"),
-    ("drac_mps2", "deceleration to keep 6 m apart", "m/s2"),
-    ("brake_after_mps2", "braking that M asks of the rear", "m/s2"),
-    ("impact_speed_mps", "impact speed", "m/s"),
-    ("vut_max_brake_mps2", "hardest braking of the VUT", "m/s2"),
-    ("pov_max_brake_mps2", "hardest braking of the POV", "m/s2"),
-    ("last_avoidable_s", "avoidable until", "s"),
-    ("after_gap_m", "smallest bumper gap behind M", "m"),
-    ("after_ttc_s", "time to collision behind M", "s"),
-    ("after_drac_mps2", "braking needed behind M", "m/s2"),
-)
 
 
 def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
@@ -92,10 +74,10 @@ def _margin(outcome: Outcome) -> Iterator[str]:
 def _measures(found: Measures, met: str) -> Iterator[str]:
     if met != "POV":
         yield f"  of the {met}, which is nearest to the VUT at the end:"
-    for name, text, unit in MEASURES:
-        value, what = getattr(found, name), text.replace("POV", met)
-        if value is not None:
-            yield f"  {what:<31} {value:10.2f} {unit}".rstrip()
+    for name, measure in MEASURES.items():
+        value, text = found.value(name), measure.label.replace("POV", met)
+        if value is not None and text:
+            yield f"  {text:<31} {value:10.2f} {measure.unit}".rstrip()
     if found.clipped_steps:
         yield f"  {'steps beyond its limits':<31} {found.clipped_steps:10d}"
 

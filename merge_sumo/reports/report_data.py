@@ -23,6 +23,7 @@ from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.studies.prediction_quality import off_m
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
+from merge_sumo.values.measures import MEASURES, Measure
 from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.signals import to_record
@@ -55,6 +56,9 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
         "ends": [end.value for end in End],
         "severities": [severity.value for severity in Severity],
         "kinds": [kind.value for kind in Kind],
+        "measures": [
+            {"name": m.name, "title": m.title, "digits": m.digits} for m in listed_measures()
+        ],
         "cases": _columns(facts, offsets),
         "boxes": _boxes(facts),
         "errors": {
@@ -71,6 +75,11 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
     }
 
 
+def listed_measures() -> list[Measure]:
+    """Return the measures that the table of all cases has a column for."""
+    return [measure for measure in MEASURES.values() if measure.column]
+
+
 def _boxes(facts: ReportModel) -> list[dict[str, Any]]:
     """Return level and cases of the regions in words, of the cases that are shown."""
     shown = {o.index for o in facts.shown}
@@ -82,6 +91,7 @@ def _boxes(facts: ReportModel) -> list[dict[str, Any]]:
 
 def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
     ends, kinds, severities = list(End), list(Kind), list(Severity)
+    listed = listed_measures()
     columns: dict[str, list[Any]] = {}
     for o in facts.shown:
         found = facts.diagnoses.get(o.index, UNKNOWN)
@@ -96,20 +106,9 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
             if o.measures.severity is None
             else severities.index(Severity(o.measures.severity)),
             "failed": int(o.failed),
+            **{m.name: _rounded(o.measures.value(m.name), 4) for m in listed},
             "score": _rounded(o.score, 1),
-            "dx": _rounded(o.measures.dx_m, 4),
-            "dv": _rounded(o.measures.dv_mps, 4),
-            "t_end": o.measures.t_end_s,
-            "ttc": _rounded(o.measures.ttc_s, 4),
-            "pet": _rounded(o.measures.pet_s, 4),
-            "vut_brake": _rounded(o.measures.vut_max_brake_mps2, 4),
-            "pov_brake": _rounded(o.measures.pov_max_brake_mps2, 4),
             "region": facts.regions.get(o.index),
-            "clearance": _rounded(o.measures.clearance_m, 4),
-            "before_clearance": _rounded(o.measures.before_clearance_m, 4),
-            "bumper_gap": _rounded(o.measures.bumper_gap_m, 4),
-            "brake_after": _rounded(o.measures.brake_after_mps2, 4),
-            "impact": _rounded(o.measures.impact_speed_mps, 4),
             **_avoidance(facts, o.index),
             "way_out": _rounded(o.measures.last_avoidable_s, 1),
             "vut_brakes": found.vut_brakes_s,

@@ -38,7 +38,7 @@ class Registry(Mapping[str, T], Generic[T]):
         self,
         group: str,
         noun: str,
-        ours: Mapping[str, str] | None = None,
+        ours: Mapping[str, str | T] | None = None,
         *,
         accepts: Callable[[object], bool] = lambda _: True,
         contract: str = "",
@@ -48,13 +48,16 @@ class Registry(Mapping[str, T], Generic[T]):
         Args:
             group: group of entry points, as `merge_sumo.samplers`.
             noun: what it holds, in the singular.
-            ours: objects of this package as `module:attribute`, by name.
+            ours: objects of this package by name, or `module:attribute` for an import when needed.
             accepts: whether a loaded object is of the kind.
             contract: what it must be, for the sentence where it is not, as "a subclass of Sampler".
         """
         self.group, self.noun = group, noun
         self._accepts, self._contract = accepts, contract
-        self._ours = {name: EntryPoint(name, at, group) for name, at in (ours or {}).items()}
+        self._ours = {
+            name: EntryPoint(name, item, group) if isinstance(item, str) else item
+            for name, item in (ours or {}).items()
+        }
         self._objects: dict[tuple[str, str], T] = {}
         self._registered: dict[str, T] = {}
 
@@ -82,7 +85,7 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         """Return the object of a name, which is imported if need be."""
-        bringers = dict(self._entries().get(name, {}))
+        bringers: dict[str, EntryPoint | T] = dict(self._entries().get(name, {}))
         if name in self._ours:
             bringers[OURS] = self._ours[name]
         if len(bringers) + (name in self._registered) > 1:
@@ -98,6 +101,8 @@ class Registry(Mapping[str, T], Generic[T]):
                 f"{', '.join(self)}"
             )
         ((package, entry),) = bringers.items()
+        if not isinstance(entry, EntryPoint):
+            return entry
         key = name, entry.value
         if key not in self._objects:
             self._objects[key] = self._loaded(entry, package)

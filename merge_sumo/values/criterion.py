@@ -9,7 +9,7 @@ a margin m is the score lambda (1 - m / (1 + |m|)), which is below lambda exactl
 from __future__ import annotations
 
 import math
-from collections.abc import Set
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -19,6 +19,7 @@ from merge_sumo.system.printable import printable
 from merge_sumo.system.suggestions import nearest
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
+from merge_sumo.values.measures import MEASURES, OURS
 from merge_sumo.values.ranges import Speeds
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
@@ -38,22 +39,7 @@ NAMED: Final = {
 SHORT: Final = 120
 """Characters of a condition in a headline."""
 
-NUMBERS: Final = (
-    *(
-        "ttc_s",
-        "clearance_m",
-        "before_clearance_m",
-        "bumper_gap_m",
-        "dx_m",
-        "dv_mps",
-        "drac_mps2",
-        "brake_after_mps2",
-        "pet_s",
-        "t_end_s",
-    ),
-    *("impact_speed_mps", "vut_max_brake_mps2", "pov_max_brake_mps2", "last_avoidable_s"),
-    *("clipped_steps", "score", *FOLLOWED_UP),
-)
+NUMBERS: Final = tuple(measure.name for measure in OURS if measure.missing is not None)
 TEXTS: Final = {
     "end": frozenset({End.MERGED.value, End.TIMEOUT.value}),
     "severity": frozenset(severity.value for severity in Severity),
@@ -63,16 +49,8 @@ TEXTS: Final = {
 """What may be said of measures that are texts. Errors have no verdict under any criterion."""
 OF_BODIES: Final = frozenset({"before_clearance_m"})
 """Measures that need the centre lines of the road."""
-VOCABULARY: Final[Vocabulary] = {**dict.fromkeys(NUMBERS), **TEXTS}
-NEVER: Final[dict[str, Value]] = {
-    **dict.fromkeys(("dx_m", "bumper_gap_m", "clearance_m", "before_clearance_m"), math.inf),
-    **dict.fromkeys(("ttc_s", "pet_s"), math.inf),
-    **dict.fromkeys(("last_avoidable_s", "after_gap_m", "after_ttc_s"), math.inf),
-    **dict.fromkeys(("dv_mps", "after_drac_mps2", "drac_mps2", "brake_after_mps2"), 0.0),
-    **dict.fromkeys(("impact_speed_mps", "score"), 0.0),
-    **dict.fromkeys(("merged_first", "severity"), ""),
-}
-"""What a measure without a value counts as: the two cars never meet."""
+NO_TEXT: Final = frozenset({"merged_first", "severity"})
+"""Texts that an episode may be without; they count as an empty one."""
 CLOSE: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
 """What it counts as where |dx| < 6 m: no braking would do, and there was no way out at any time."""
 
@@ -96,7 +74,7 @@ class Criterion:
         if name not in NAMED:
             if name.isidentifier() and (near := nearest(name, NAMED)):
                 raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
-            _, name = parse_condition(self.fail_when, VOCABULARY, "--fail-when", NAMED)
+            _, name = parse_condition(self.fail_when, vocabulary(), "--fail-when", NAMED)
         object.__setattr__(self, "fail_when", name)
         if self.require is not None:
             if name != PAPER:
@@ -192,7 +170,7 @@ class Criterion:
         """
         spoken = frozenset[str]() if self.require else _names(self.words)
         seen = lines if spoken & OF_BODIES else None
-        measures = measure(trajectory, seen, way_out="last_avoidable_s" in spoken)
+        measures = measure(trajectory, seen, way_out="last_avoidable_s" in spoken, further=spoken)
         return self._outcome(0, 0, trajectory, measures)
 
     def _outcome(
@@ -212,13 +190,18 @@ PAPER_CRITERION: Final = Criterion()
 @lru_cache
 def condition_of(text: str) -> Condition:
     """Return the condition that a criterion states, by its words."""
-    return parse_condition(text, VOCABULARY, "--fail-when", NAMED)[0]
+    return parse_condition(text, vocabulary(), "--fail-when", NAMED)[0]
+
+
+def vocabulary() -> Vocabulary:
+    """Return what a condition may speak of: None for a number, or all that a text may be."""
+    numbers = (name for name, one in MEASURES.items() if one.missing is not None)
+    return {**dict.fromkeys(numbers), **TEXTS}
 
 
 def _texts() -> dict[str, frozenset[str]]:
     """Return all that a text can be, also where an episode has none."""
-    missing = {name: frozenset({value}) for name, value in NEVER.items() if isinstance(value, str)}
-    return {name: texts | missing.get(name, frozenset()) for name, texts in TEXTS.items()}
+    return {name: texts | {""} if name in NO_TEXT else texts for name, texts in TEXTS.items()}
 
 
 @lru_cache
@@ -227,16 +210,17 @@ def _names(text: str) -> frozenset[str]:
     return names_of(condition_of(text))
 
 
-def values_of(measures: Measures, names: Set[str] = VOCABULARY.keys()) -> dict[str, Value]:
+def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[str, Value]:
     """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
-    missing = NEVER | (CLOSE if measures.is_close else {})
+    missing: dict[str, Value] = dict(CLOSE) if measures.is_close else {}
     if measures.end is End.MERGED:
-        missing = missing | {"brake_after_mps2": math.inf}
+        missing["brake_after_mps2"] = math.inf
     if measures.after_gap_m is not None and measures.after_gap_m <= 0.0:
-        missing = missing | {"after_drac_mps2": math.inf}
-    found: dict[str, Value] = {}
-    for name in names:
-        value = getattr(measures, name)
-        value = missing[name] if value is None else value
-        found[name] = value if isinstance(value, str) else float(value)
-    return found
+        missing["after_drac_mps2"] = math.inf
+    values: dict[str, Value] = {}
+    for name in vocabulary() if names is None else names:
+        value = measures.value(name)
+        if value is None:
+            value = missing.get(name, "" if name in NO_TEXT else MEASURES[name].missing)
+        values[name] = value if isinstance(value, str) else float(value or 0.0)
+    return values

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from merge_sumo.values.bodies import WIDTH_M
+from merge_sumo.values.measures import further_measures
 from merge_sumo.values.merge import REACTION_S
 from merge_sumo.values.scenario import DT_S, Scenario
 from merge_sumo.values.score import MU_CRASH, MU_SAFETY, MU_TASK
@@ -127,6 +128,7 @@ def measure_ranges(scenario: Scenario, speeds: Speeds) -> dict[str, Range]:
         "after_gap_m": Range(-length_m, inf),
         "after_ttc_s": NOT_NEGATIVE,
         "after_drac_mps2": NOT_NEGATIVE,
+        **dict.fromkeys(further_measures(), ANY),
     }
 
 

@@ -9,8 +9,8 @@ tens of metres towards that limit, jumps little there, and goes on falling beyon
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final, Literal, get_type_hints
 
@@ -22,6 +22,7 @@ from merge_sumo.system.records import convert, decode, record_type, to_plain
 from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
 from merge_sumo.values.former import upgrade_from_0_1
+from merge_sumo.values.measures import OURS, Further, further_measures, further_of
 from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
@@ -43,6 +44,10 @@ TTC_SHARE: Final = 1.0 / 9.0
 """Part of P_safety that a short time to collision can cost; the gap has the rest."""
 
 
+MEASURED: Final = frozenset(measure.name for measure in OURS)
+"""Measures that are fields of `Measures`."""
+
+
 @quickly_pickled
 @dataclass(frozen=True, slots=True)
 class Measures:
@@ -53,45 +58,7 @@ class Measures:
     is nearest to the VUT at the end: it takes the POV's place. What bodies do (severity, clearance,
     bumper gap, braking after M, impact speed) is that of all cars.
 
-    Attributes:
-        end: why the episode ended.
-        score: P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR).
-        dx_m: x_POV - x_VUT, of the front bumpers.
-        dv_mps: v_POV - v_VUT.
-        ttc_s: time to collision -dx/dv where dx dv < 0, else None (infinite).
-        pet_s: post-encroachment time: time between the two front bumpers at M (Allen et al.,
-            1978); where the POV has not arrived by t1, it is taken on at its speed at t1; None
-            when it stands.
-        t_end_s: time at which the episode ended.
-        severity: contact, conflict, harsh or safe (`severity.py`); None where the VUT never reached
-            M, and after an error.
-        bumper_gap_m: smallest gap at M between the front bumper of the car behind and the rear
-            bumper of the car ahead, negative where bodies overlap; None without a merge.
-        clearance_m: smallest gap between bumpers from M on, to the end of the follow-up, or without
-            one for 0.75 s at the speeds of M; 0 or less where bodies touch, None without a merge.
-        before_clearance_m: smallest distance of bodies before M, where the lanes run together; 0 or
-            less where they overlap, None where the VUT never came there.
-        drac_mps2: deceleration rate to avoid a crash that the follower needs at t1 (Cooper and
-            Ferguson, 1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None where |dx| < 6 m.
-        brake_after_mps2: deceleration that whoever is behind at M needs, after 0.75 s to react, not
-            to touch a car ahead that keeps its speed (`merge.py`); None where none is in time, and
-            without a merge.
-        vut_max_brake_mps2: hardest braking of the VUT, positive.
-        pov_max_brake_mps2: hardest braking of the POV, positive.
-        impact_speed_mps: relative speed at the first contact; None without one.
-        merged_first: "VUT" or "POV": whose front bumper is ahead at M.
-        last_avoidable_s: where |dx| < 6 m at M, the last time from which the VUT, at full
-            acceleration or full braking, would have kept 6 m against the recorded motion of the POV
-            and the other cars (taken on at constant speed); None when there was no such time, and
-            where |dx| >= 6 m.
-        avoidable: where |dx| < 6 m at M, whether there was such a time; else None.
-        clipped_steps: steps in which the VUT asked for more than its limits of acceleration.
-        error: what the VUT or the simulation did wrong, else None.
-        nearest: name of the car that the measures are of; recorded in traffic only.
-        after_gap_m: least gap between bumpers in the follow-up, 0 or less where bodies touch; this
-            and the next two are None without a merge, and recorded where there is a follow-up only.
-        after_ttc_s: lowest time to collision in it, between bumpers; None where no gap closes.
-        after_drac_mps2: hardest braking that it needs, dv^2 / (2 gap); None where bodies touch.
+    `measures.py` says what each is; `further` holds those that installed packages bring.
     """
 
     end: End
@@ -119,6 +86,11 @@ class Measures:
     after_gap_m: float | None = None
     after_ttc_s: float | None = None
     after_drac_mps2: float | None = None
+    further: Further = ()
+
+    def value(self, name: str) -> Any:
+        """Return the value of a measure, of this package or further; None where it has none."""
+        return getattr(self, name) if name in MEASURED else dict(self.further).get(name)
 
     @property
     def became(self) -> str:
@@ -186,6 +158,7 @@ class Outcome:
         record: dict[str, Any] = {"index": self.index, "batch": self.batch}
         record |= {name: getattr(self.case, name) for name in case_names}
         record |= {name: getattr(self.measures, name) for name in measure_names}
+        record |= dict(self.measures.further)
         if self.margin is not None:
             record["margin"] = self.margin
         if self.prediction is not None:
@@ -201,7 +174,10 @@ class Outcome:
             upgrade_from_0_1(record, scenario)
         known = convert(record, flat)
         case = Case(**{name: getattr(known, name) for name in case_names}, scenario=scenario)
-        measures = Measures(**{name: getattr(known, name) for name in measure_names})
+        measures = Measures(
+            **{name: getattr(known, name) for name in measure_names},
+            further=tuple((name, getattr(known, name)) for name in further_measures()),
+        )
         if measures.nearest not in VEHICLES:
             raise UserError(f"nearest is {measures.nearest!r}: it must be one of {VEHICLES}")
         return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
@@ -219,11 +195,12 @@ def record_fields(scenario: Scenario) -> tuple[tuple[str, ...], tuple[str, ...],
 @cache
 def _record_fields(traffic: bool, followed: bool) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
     case_names = (*RECORDED, *RECORDED_IN_TRAFFIC) if traffic else RECORDED
-    left_out = {*(() if traffic else ("nearest",)), *(() if followed else FOLLOWED_UP)}
+    left_out = {"further", *(() if traffic else ("nearest",)), *(() if followed else FOLLOWED_UP)}
     measure_names = tuple(name for name in Measures.__slots__ if name not in left_out)
     types = {"index": int, "batch": int, **get_type_hints(Case), **get_type_hints(Measures)}
     required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
-    optional = [("margin", float | None, None), ("foretold", Prediction | None, None)]
+    optional = [(name, float | None, None) for name in further_measures()]
+    optional += [("margin", float | None, None), ("foretold", Prediction | None, None)]
     return case_names, measure_names, record_type("outcome", [*required, *optional])
 
 
@@ -240,7 +217,11 @@ def is_close(trajectory: Trajectory) -> bool:
 
 
 def measure(
-    trajectory: Trajectory, lines: CentreLines | None = None, *, way_out: bool = True
+    trajectory: Trajectory,
+    lines: CentreLines | None = None,
+    *,
+    way_out: bool = True,
+    further: Collection[str] | None = None,
 ) -> Measures:
     """Return the verdict and the measures of an episode.
 
@@ -248,15 +229,30 @@ def measure(
         trajectory: what happened.
         lines: centre lines of the road; without them bodies are looked at from M on.
         way_out: whether the last way out is searched for, which takes most of the time.
+        further: names of the further measures that are taken; all by default.
     """
     before_m = math.inf if lines is None else closest_before_m([trajectory], lines)[0]
-    return _measure(trajectory, before_m, way_out=way_out)
+    measures = _measure(trajectory, before_m, way_out=way_out)
+    return _with_further(measures, trajectory, lines, further)
 
 
 def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[Measures]:
     """Return the verdict and the measures of episodes, which takes less time than one by one."""
     before = closest_before_m(trajectories, lines)
-    return [_measure(*pair, way_out=True) for pair in zip(trajectories, before, strict=True)]
+    return [
+        _with_further(_measure(trajectory, before_m, way_out=True), trajectory, lines)
+        for trajectory, before_m in zip(trajectories, before, strict=True)
+    ]
+
+
+def _with_further(
+    measures: Measures,
+    trajectory: Trajectory,
+    lines: CentreLines | None,
+    names: Collection[str] | None = None,
+) -> Measures:
+    further = further_of(trajectory, lines, names)
+    return replace(measures, further=further) if further else measures
 
 
 def _measure(trajectory: Trajectory, before_m: float, *, way_out: bool) -> Measures:

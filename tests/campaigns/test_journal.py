@@ -464,5 +464,5 @@ class TestARun:
 
 def test_every_measure_is_in_the_record():
     record = episode(0)[0].to_record()
-    elsewhere = {"nearest", *FOLLOWED_UP}  # in traffic, and where there is a follow-up
+    elsewhere = {"nearest", "further", *FOLLOWED_UP}  # in traffic, and where there is a follow-up
     assert {field.name for field in fields(Measures)} - elsewhere <= set(record)

@@ -26,7 +26,7 @@ from merge_sumo.studies.versions import compare_runs, rerun
 from merge_sumo.values import score
 from merge_sumo.values.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.values.case import Pool
-from merge_sumo.values.criterion import PAPER_CRITERION, VOCABULARY, Criterion
+from merge_sumo.values.criterion import PAPER_CRITERION, Criterion, vocabulary
 from merge_sumo.values.expression import MOST_CHARACTERS, MOST_MARGIN, parse_condition
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import FAILURE_SCORE, Outcome, measure, score_of
@@ -136,7 +136,7 @@ class TestRefused:
         ("text", "said"),
         [
             ("tcc_s < 1.5", "no measure 'tcc_s': did you mean ttc_s"),
-            ("zzzzzzzz < 1.5", "choose ttc_s, clearance_m"),
+            ("zzzzzzzz < 1.5", "choose score, dx_m"),
             ("papr", "did you mean paper?"),
             ('end == "TIMEOT"', "never 'TIMEOT': did you mean TIMEOUT? it is MERGED or TIMEOUT"),
             ('end == "VUT_ERROR"', "never 'VUT_ERROR'"),
@@ -196,7 +196,7 @@ class TestRefused:
 class TestMeasures:
     def test_every_name_has_a_value_in_every_episode(self):
         for end in (End.MERGED, End.TIMEOUT):
-            for name, choices in VOCABULARY.items():
+            for name, choices in vocabulary().items():
                 text = f"{name} < 1" if choices is None else f'{name} == "{min(choices)}"'
                 assert math.isfinite(of(text, ending(3.0, end=end)))
 
@@ -262,7 +262,7 @@ class TestRecords:
         after = np.array([[[20.0, 30.0, 0.0], [0.0, 26.0, 0.0]]])
         episode = replace(ending(20.0), case=followed, after=after)
         record = PAPER_CRITERION.outcome(0, 0, episode).to_record()
-        assert set(VOCABULARY) - {"nearest"} <= set(record)
+        assert set(vocabulary()) - {"nearest"} <= set(record)
 
     def test_of_release_0_1_are_read(self):
         record = PAPER_CRITERION.outcome(0, 0, ending(5.5, v_pov=20.0, v_vut=22.0)).to_record()

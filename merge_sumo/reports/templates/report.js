@@ -70,22 +70,22 @@ function conduct(i) { // what both did, by their speeds
   return `The VUT ${of(cases.vut_brakes[i], cases.vut_accelerates[i])}, the ${met} ${of(cases.pov_brakes[i], cases.pov_accelerates[i])}.`;
 }
 function words(i) {
-  const end = data.ends[cases.end[i]], parts = [], found = severity(i), at = `${fixed(cases.t_end[i], 1)} s`;
+  const end = data.ends[cases.end[i]], parts = [], found = severity(i), at = `${fixed(cases.t_end_s[i], 1)} s`;
   const met = NAMES[vehicles[cases.nearest[i]]];
   if (end === "MERGED") {
-    const first = cases.dx[i] < 0 ? "VUT" : met, kind = cases.kind[i] === null ? "" : ` (${data.kinds[cases.kind[i]]})`;
+    const first = cases.dx_m[i] < 0 ? "VUT" : met, kind = cases.kind[i] === null ? "" : ` (${data.kinds[cases.kind[i]]})`;
     if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}${kind}.`);
-    parts.push(`The VUT reaches M at ${at}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx[i]), 1)} m ahead.`);
-    if (found === "contact") parts.push(`Bodies touch at a relative speed of ${fixed(cases.impact[i], 1)} m/s.`);
-    else if (cases.brake_after[i] === null) parts.push("No braking of the car behind is in time.");
-    else if (cases.brake_after[i] < 0.1) parts.push("The car behind has to brake at less than 0.1 m/s² after M.");
-    else parts.push(`The car behind has to brake at ${fixed(cases.brake_after[i], 1)} m/s² after M.`);
+    parts.push(`The VUT reaches M at ${at}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx_m[i]), 1)} m ahead.`);
+    if (found === "contact") parts.push(`Bodies touch at a relative speed of ${fixed(cases.impact_speed_mps[i], 1)} m/s.`);
+    else if (cases.brake_after_mps2[i] === null) parts.push("No braking of the car behind is in time.");
+    else if (cases.brake_after_mps2[i] < 0.1) parts.push("The car behind has to brake at less than 0.1 m/s² after M.");
+    else parts.push(`The car behind has to brake at ${fixed(cases.brake_after_mps2[i], 1)} m/s² after M.`);
   } else if (end === "TIMEOUT") {
-    parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end[i], 0)} s.`);
+    parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end_s[i], 0)} s.`);
   } else {
     parts.push(`${end}: ${(data.errors[cases.index[i]] || "no reason given").replace(/\.?$/, ".")}`);
   }
-  if (cases.before_clearance[i] !== null && cases.before_clearance[i] < 0) parts.push("Bodies overlap before M, where the lanes run together.");
+  if (cases.before_clearance_m[i] !== null && cases.before_clearance_m[i] < 0) parts.push("Bodies overlap before M, where the lanes run together.");
   if (cases.margin && cases.margin[i] !== null) {
     parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
@@ -672,10 +672,8 @@ function allCases() { // gives what shows the cases that the filters let through
     { name: "kind", words: true, value: kindOf },
     { name: "region", value: (i) => cases.region[i], text: (value) => String(value + 1) },
     ...coordinates.map((c) => number(c.field, `${c.name}${c.unit === "rad" ? "" : ` ${c.unit}`}`, c.digits)),
-    number("score", "score", 0), ...(cases.margin ? [number("margin", "margin", 2)] : []),
-    number("dx", "Δx at M m", 1), number("dv", "dv m/s", 1), number("ttc", "TTC s", 1), number("pet", "PET s", 1),
-    number("vut_brake", "VUT brakes m/s\u00b2", 1), number("pov_brake", "POV brakes m/s\u00b2", 1), number("t_end", "time s", 1),
-    number("clearance", "clearance m", 1), number("before_clearance", "clearance before M m", 1), number("bumper_gap", "bumper gap at M m", 1), number("impact", "impact m/s", 1), number("brake_after", "braking asked after M m/s\u00b2", 1),
+    ...(cases.margin ? [number("margin", "margin", 2)] : []),
+    ...data.measures.map((measure) => number(measure.name, measure.title, measure.digits)),
   ];
   const all = cases.index.map((_, i) => i), PART = 100;
   let by = columns.find(({ name }) => name === "score"), way = 1, found = all, rows = 0;

@@ -1,0 +1,339 @@
+"""Measures of an episode: what each is, its unit, and how it is shown.
+
+Those of this package are measured together, by `score.py`, into the fields of `Measures`. A further
+one has a function of its own: it is recorded under its name after ours, conditions may name it, and
+the report, exports and documentation show it as any other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, Literal
+
+from merge_sumo.errors import UserError
+from merge_sumo.system.registry import Registry
+from merge_sumo.values.bodies import CentreLines
+from merge_sumo.values.trajectory import Trajectory
+
+Further = tuple[tuple[str, float | None], ...]
+"""Values of further measures by name."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measure:
+    """A measure of an episode.
+
+    Attributes:
+        name: in records and conditions, with the unit at its end.
+        about: what it is, in a sentence without its full stop.
+        unit: as a person reads it; empty for a number without one and for a text.
+        label: name in the listing of an episode; empty where that leaves it out.
+        column: name in the table of the report; empty where that leaves it out.
+        digits: decimals in tables.
+        missing: what a condition takes where an episode has no value: that of cars that never
+            meet; None for a measure that is no number.
+        worse: at which end of its values an episode is worse, if at one.
+        of: measures an episode on a road; None where it has no value, and for measures of this
+            package, which are fields of `Measures`.
+    """
+
+    name: str
+    about: str
+    unit: str = ""
+    label: str = ""
+    column: str = ""
+    digits: int = 1
+    missing: float | None = None
+    worse: Literal["low", "high"] | None = None
+    of: Callable[[Trajectory, CentreLines | None], float | None] | None = None
+
+    @property
+    def title(self) -> str:
+        """Name and unit, as the head of a column shows them."""
+        return f"{self.column} {self.unit}".replace("s2", "s²").rstrip()
+
+
+OURS: Final = (
+    Measure(
+        name="end",
+        about="why the episode ended",
+    ),
+    Measure(
+        name="severity",
+        about=(
+            "contact, conflict, harsh or safe (`severity.py`); None where the VUT never "
+            "reached M, and after an error"
+        ),
+    ),
+    Measure(
+        name="score",
+        about="P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)",
+        label="score P",
+        column="score",
+        digits=0,
+        missing=0.0,
+        worse="low",
+    ),
+    Measure(
+        name="dx_m",
+        about="x_POV - x_VUT, of the front bumpers",
+        label="front bumpers, x_POV - x_VUT",
+        column="Δx at M",
+        unit="m",
+        missing=math.inf,
+    ),
+    Measure(
+        name="bumper_gap_m",
+        about=(
+            "smallest gap at M between the front bumper of the car behind and the rear bumper "
+            "of the car ahead, negative where bodies overlap; None without a merge"
+        ),
+        label="bumper gap at M",
+        column="bumper gap at M",
+        unit="m",
+        missing=math.inf,
+        worse="low",
+    ),
+    Measure(
+        name="clearance_m",
+        about=(
+            "smallest gap between bumpers from M on, to the end of the follow-up, or without "
+            "one for 0.75 s at the speeds of M; 0 or less where bodies touch, None without a "
+            "merge"
+        ),
+        label="smallest gap, driving on",
+        column="clearance",
+        unit="m",
+        missing=math.inf,
+        worse="low",
+    ),
+    Measure(
+        name="before_clearance_m",
+        about=(
+            "smallest distance of bodies before M, where the lanes run together; 0 or less "
+            "where they overlap, None where the VUT never came there"
+        ),
+        label="smallest clearance before M",
+        column="clearance before M",
+        unit="m",
+        missing=math.inf,
+        worse="low",
+    ),
+    Measure(
+        name="dv_mps",
+        about="v_POV - v_VUT",
+        label="v_POV - v_VUT",
+        column="dv",
+        unit="m/s",
+        missing=0.0,
+    ),
+    Measure(
+        name="ttc_s",
+        about="time to collision -dx/dv where dx dv < 0, else None (infinite)",
+        label="time to collision",
+        column="TTC",
+        unit="s",
+        missing=math.inf,
+        worse="low",
+    ),
+    Measure(
+        name="pet_s",
+        about=(
+            "post-encroachment time: time between the two front bumpers at M (Allen et al., "
+            "1978); where the POV has not arrived by t1, it is taken on at its speed at t1; "
+            "None when it stands"
+        ),
+        label="post-encroachment time",
+        column="PET",
+        unit="s",
+        missing=math.inf,
+        worse="low",
+    ),
+    Measure(
+        name="t_end_s",
+        about="time at which the episode ended",
+        column="time",
+        unit="s",
+        missing=0.0,
+    ),
+    Measure(
+        name="drac_mps2",
+        about=(
+            "deceleration rate to avoid a crash that the follower needs at t1 (Cooper and "
+            "Ferguson, 1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None where |dx| < "
+            "6 m"
+        ),
+        label="deceleration to keep 6 m apart",
+        unit="m/s2",
+        missing=0.0,
+        worse="high",
+    ),
+    Measure(
+        name="brake_after_mps2",
+        about=(
+            "deceleration that whoever is behind at M needs, after 0.75 s to react, not to "
+            "touch a car ahead that keeps its speed (`merge.py`); None where none is in time, "
+            "and without a merge"
+        ),
+        label="braking that M asks of the rear",
+        column="braking asked after M",
+        unit="m/s2",
+        missing=0.0,
+        worse="high",
+    ),
+    Measure(
+        name="impact_speed_mps",
+        about="relative speed at the first contact; None without one",
+        label="impact speed",
+        column="impact",
+        unit="m/s",
+        missing=0.0,
+        worse="high",
+    ),
+    Measure(
+        name="vut_max_brake_mps2",
+        about="hardest braking of the VUT, positive",
+        label="hardest braking of the VUT",
+        column="VUT brakes",
+        unit="m/s2",
+        missing=0.0,
+        worse="high",
+    ),
+    Measure(
+        name="pov_max_brake_mps2",
+        about="hardest braking of the POV, positive",
+        label="hardest braking of the POV",
+        column="POV brakes",
+        unit="m/s2",
+        missing=0.0,
+        worse="high",
+    ),
+    Measure(
+        name="merged_first",
+        about='"VUT" or "POV": whose front bumper is ahead at M',
+    ),
+    Measure(
+        name="last_avoidable_s",
+        about=(
+            "where |dx| < 6 m at M, the last time from which the VUT, at full acceleration or "
+            "full braking, would have kept 6 m against the recorded motion of the POV and the "
+            "other cars (taken on at constant speed); None when there was no such time, and "
+            "where |dx| >= 6 m"
+        ),
+        label="avoidable until",
+        unit="s",
+        missing=math.inf,
+        worse="low",
+    ),
+    Measure(
+        name="avoidable",
+        about="where |dx| < 6 m at M, whether there was such a time; else None",
+    ),
+    Measure(
+        name="clipped_steps",
+        about="steps in which the VUT asked for more than its limits of acceleration",
+        digits=0,
+        missing=0.0,
+        worse="high",
+    ),
+    Measure(
+        name="error",
+        about="what the VUT or the simulation did wrong, else None",
+    ),
+    Measure(
+        name="nearest",
+        about="name of the car that the measures are of; recorded in traffic only",
+    ),
+    Measure(
+        name="after_gap_m",
+        about=(
+            "least gap between bumpers in the follow-up, 0 or less where bodies touch; this "
+            "and the next two are None without a merge, and recorded where there is a follow- "
+            "up only"
+        ),
+        label="smallest bumper gap behind M",
+        unit="m",
+        missing=math.inf,
+        worse="low",
+    ),
+    Measure(
+        name="after_ttc_s",
+        about="lowest time to collision in it, between bumpers; None where no gap closes",
+        label="time to collision behind M",
+        unit="s",
+        missing=math.inf,
+        worse="low",
+    ),
+    Measure(
+        name="after_drac_mps2",
+        about="hardest braking that it needs, dv^2 / (2 gap); None where bodies touch",
+        label="braking needed behind M",
+        unit="m/s2",
+        missing=0.0,
+        worse="high",
+    ),
+)
+"""The fields of `Measures`, in the order in which an episode is listed."""
+
+RESERVED: Final = frozenset({"index", "batch", "level", "margin", "foretold"})
+"""Names of a record that are no measures."""
+
+
+def _is_measure(item: object) -> bool:
+    return (
+        isinstance(item, Measure)
+        and (item in OURS or (item.of is not None and item.missing is not None))
+        and item.name.isidentifier()
+        and item.name not in RESERVED
+    )
+
+
+MEASURES: Final[Registry[Measure]] = Registry(
+    "merge_sumo.measures",
+    "measure",
+    {measure.name: measure for measure in OURS},
+    accepts=_is_measure,
+    contract="a merge_sumo.values.measures.Measure with a name, a function and a missing value",
+)
+
+
+@cache
+def further_measures() -> dict[str, Measure]:
+    """Return the measures that installed packages bring, by name; for a process they stay."""
+    ours = {measure.name for measure in OURS}
+    return {name: MEASURES[name] for name in MEASURES if name not in ours}
+
+
+def further_of(
+    trajectory: Trajectory, lines: CentreLines | None, names: Iterable[str] | None = None
+) -> Further:
+    """Return the values of further measures, all or those of some names.
+
+    Args:
+        trajectory: what happened; after an error no measure has a value.
+        lines: centre lines of the road, where they are known.
+        names: of measures; others than further ones are left out.
+
+    Raises:
+        UserError: where a measure fails, or gives no number.
+    """
+    chosen = further_measures()
+    if names is not None:
+        chosen = {name: chosen[name] for name in names if name in chosen}
+    return tuple((name, _value(one, trajectory, lines)) for name, one in chosen.items())
+
+
+def _value(measure: Measure, trajectory: Trajectory, lines: CentreLines | None) -> float | None:
+    if trajectory.end.is_error or measure.of is None:
+        return None
+    try:
+        value = measure.of(trajectory, lines)
+        number = None if value is None else float(value)
+    except Exception as error:
+        raise UserError(
+            f"the measure {measure.name!r} failed: {type(error).__name__}: {error}"
+        ) from error
+    return number if number is not None and math.isfinite(number) else None
