@@ -199,8 +199,8 @@ def _record_fields(traffic: bool, followed: bool) -> tuple[tuple[str, ...], tupl
     measure_names = tuple(name for name in Measures.__slots__ if name not in left_out)
     types = {"index": int, "batch": int, **get_type_hints(Case), **get_type_hints(Measures)}
     required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
-    optional = [(name, float | None, None) for name in further_measures()]
-    optional += [("margin", float | None, None), ("foretold", Prediction | None, None)]
+    further = [(name, float | None, None) for name in further_measures()]
+    optional = [*further, ("margin", float | None, None), ("foretold", Prediction | None, None)]
     return case_names, measure_names, record_type("outcome", [*required, *optional])
 
 
