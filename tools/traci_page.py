@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from merge_sumo.sumo.traci_names import Named, named
-from merge_sumo.vuts.traci.calls import NOT_ANSWERED, Kind, kind_of, reason_against
-from merge_sumo.vuts.traci.session import ASKS, OWN_ANSWERS
+from merge_sumo.vuts.traci.commands import Effect, effect_of, reason_against
+from merge_sumo.vuts.traci.questions import NOT_ANSWERED
+from merge_sumo.vuts.traci.session import OWN_ANSWERS, QUESTIONS
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
 HEAD = """# What a TraCI controller can do
@@ -43,8 +44,8 @@ def sections() -> Iterator[str]:
     for found in named().values():
         domains.setdefault(found.functions[0].partition(".")[0], []).append(found)
     for domain, mine in sorted(domains.items(), key=lambda item: (item[0] != "vehicle", item[0])):
-        asks = [f for f in mine if f.command in ASKS]
-        sets = [f for f in mine if f.command not in ASKS]
+        asks = [f for f in mine if f.command in QUESTIONS]
+        sets = [f for f in mine if f.command not in QUESTIONS]
         own = [f for f in asks if (f.command, f.variable) in OWN_ANSWERS]
         unanswered = [
             f for f in asks if domain == "gui" or not NOT_ANSWERED.isdisjoint(f.functions)
@@ -52,15 +53,15 @@ def sections() -> Iterator[str]:
         yield f"\n## {domain}\n"
         refused: dict[str, list[Named]] = {}
         for found in sets:
-            if kind_of(found.functions) is Kind.REFUSED:
+            if effect_of(found.functions) is Effect.REFUSED:
                 refused.setdefault(reason_against(found.functions), []).append(found)
         for what, those in (
             ("Answered here", own),
             ("Answered by SUMO", [f for f in asks if f not in own and f not in unanswered]),
             ("Not answered", unanswered),
             *(
-                (kind.value, [f for f in sets if kind_of(f.functions) is kind])
-                for kind in (Kind.CARRIED_OUT, Kind.NOTHING)
+                (effect.value, [f for f in sets if effect_of(f.functions) is effect])
+                for effect in (Effect.CARRIED_OUT, Effect.NOTHING)
             ),
             *((f"Refused ({reason})", those) for reason, those in refused.items()),
         ):

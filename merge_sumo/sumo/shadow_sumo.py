@@ -7,22 +7,23 @@ process of its own (`child.py`), so no port is open.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
+import msgspec
 from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.road import received
-from merge_sumo.road.corridor import Corridor, LanePath, LanePoint, Piece
+from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
 from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
 NET: Final = "road.net.xml"
 TYPES: Final = "types.add.xml"
+SETUP: Final = "setup.json"
 OPTIONS: Final = (
     *("--step-length", str(DT_S)),
     *("--collision.action", "none"),
@@ -52,58 +53,11 @@ State = tuple[float, float, float]
 """Position along the lanes in m, M = 0; speed in m/s; acceleration of the last step in m/s2."""
 
 
-@dataclass(frozen=True, slots=True)
-class ShadowRoad:
-    """Where vehicles may be: both paths, and how far the net goes behind M."""
+class _Setup(msgspec.Struct, frozen=True):
+    """What a shadow SUMO needs to know besides its net."""
 
-    mainline: LanePath
-    ramp: LanePath
-    drawn_after_m: float
-    drops: str
-    """"mainline" or "ramp" where its lane ends at M, else ""."""
-
-    @property
-    def dropped(self) -> LanePath | None:
-        """Return the path whose lane ends at M."""
-        return {"mainline": self.mainline, "ramp": self.ramp}.get(self.drops)
-
-    @property
-    def beside(self) -> Piece:
-        """Return the lane that goes on beside one that ends at M."""
-        other = self.ramp if self.drops == "mainline" else self.mainline
-        return next(piece for piece in reversed(other.pieces) if piece.start_m < 0.0)
-
-    def path(self, name: str) -> LanePath:
-        """Return the lanes that a vehicle drives on."""
-        return self.ramp if name == NAME_OF_VUT else self.mainline
-
-    def point(self, name: str, x_m: float) -> LanePoint:
-        """Return where a vehicle is."""
-        return self.path(name).point(x_m)
-
-    @classmethod
-    def of(cls, road: Corridor) -> Self:
-        """Return that of a corridor."""
-        drops = "ramp" if road.ramp_approach.yields else "mainline"
-        return cls(road.mainline, road.ramp, road.drawn_after_m, drops if road.lane_drop else "")
-
-    def to_record(self) -> dict[str, Any]:
-        """Return it as JSON has it."""
-        return asdict(self)
-
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """Return what `to_record` gave."""
-        mainline, ramp = (
-            LanePath(
-                tuple(
-                    Piece(**{**piece, "shape": tuple(map(tuple, piece["shape"]))})
-                    for piece in record[path]["pieces"]
-                )
-            )
-            for path in ("mainline", "ramp")
-        )
-        return cls(mainline, ramp, record["drawn_after_m"], record["drops"])
+    road: Corridor
+    names: tuple[str, ...]
 
 
 def write_files(folder: Path, road: Corridor, scenario: Scenario) -> None:
@@ -114,25 +68,38 @@ def write_files(folder: Path, road: Corridor, scenario: Scenario) -> None:
     )
     (folder / NET).write_bytes(received.cleaned(content, allowed.ROAD_NET, name))
     (folder / TYPES).write_bytes(_types(road, scenario))
+    setup = _Setup(road, VEHICLES[: scenario.vehicles])
+    (folder / SETUP).write_bytes(msgspec.json.encode(setup, enc_hook=str))
 
 
 class ShadowSumo:
-    """libsumo with the road of a scenario and its vehicles; one a process."""
+    """libsumo with the road of a scenario and its vehicles; one a process.
 
-    def __init__(self, folder: Path, road: ShadowRoad, names: Sequence[str]) -> None:
+    Attributes:
+        road: both paths.
+        at_m: positions of the vehicles on the road along their lanes, M = 0.
+    """
+
+    def __init__(self, folder: Path) -> None:
         """Take the folder of `write_files`; `load` starts it."""
         self._libsumo = load_libsumo()
-        self._road, self._names = road, names
+        setup = msgspec.json.decode(
+            (folder / SETUP).read_bytes(), type=_Setup, dec_hook=lambda kind, text: kind(text)
+        )
+        self.road, self._names = setup.road, setup.names
         files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
         self._options = [*files, *OPTIONS]
         self._started = False
         self.at_m: dict[str, float] = {}
-        """The vehicles on the road, and where they are along their lanes."""
 
     @property
     def time_s(self) -> float:
         """Simulation time."""
         return float(self._libsumo.simulation.getTime())
+
+    def path(self, name: str) -> LanePath:
+        """Return the lanes that a vehicle drives on."""
+        return self.road.ramp if name == NAME_OF_VUT else self.road.mainline
 
     def load(self) -> None:
         """Start with an empty road at time 0; `UserError` where SUMO cannot use the net."""
@@ -144,7 +111,7 @@ class ShadowSumo:
                 libsumo.start(["sumo", *self._options])
                 self._started = True
             for name in self._names:
-                libsumo.route.add(f"route.{name}", _edges(self._road.path(name)))
+                libsumo.route.add(f"route.{name}", _edges(self.path(name)))
         except libsumo.TraCIException as error:
             raise UserError(str(error)) from error
         self.at_m = {}
@@ -191,10 +158,6 @@ class ShadowSumo:
         self._libsumo.simulation.step()
         left = self._libsumo.vehicle.getIDList()
         self.at_m = {name: x_m for name, x_m in self.at_m.items() if name in left}
-        return self.wanted_mps()
-
-    def wanted_mps(self) -> float | None:
-        """Return the speed of the VUT."""
         if NAME_OF_VUT not in self.at_m:
             return None
         return float(self._libsumo.vehicle.getSpeed(NAME_OF_VUT))
@@ -207,11 +170,11 @@ class ShadowSumo:
         vehicle = self._libsumo.vehicle
         for name in list(self.at_m):
             x_m, v_mps, a_mps2 = states[name]
-            if x_m >= self._road.drawn_after_m:
+            if x_m >= self.road.drawn_after_m:
                 vehicle.remove(name)
                 del self.at_m[name]
                 continue
-            point = self._road.point(name, x_m)
+            point = self.path(name).point(x_m)
             vehicle.moveTo(name, point.lane, point.position_m)
             vehicle.setPreviousSpeed(name, v_mps, a_mps2)
             if name != NAME_OF_VUT:
@@ -226,20 +189,27 @@ class ShadowSumo:
 
     def point(self, name: str) -> LanePoint:
         """Return where a vehicle is; SUMO's own answer is that before it was put there."""
-        return self._road.point(name, self.at_m[name])
+        return self.path(name).point(self.at_m[name])
 
     def _change_lanes(self) -> None:
-        """Let who comes to the end of a lane that ends at M go on beside it: SUMO would stop."""
-        dropped, vehicle = self._road.dropped, self._libsumo.vehicle
+        """Move vehicles at the end of a lane that ends at M to the lane beside it.
+
+        SUMO would stop them there.
+        """
+        if not self.road.lane_drop:
+            return
+        ends, goes_on = self.road.mainline, self.road.ramp
+        if self.road.ramp_approach.yields:
+            ends, goes_on = goes_on, ends
+        beside = next(piece for piece in reversed(goes_on.pieces) if piece.start_m < 0.0)
         for name, x_m in self.at_m.items():
-            ends = x_m < 0.0 and dropped is not None and self._road.path(name) is dropped
-            if ends and x_m + (vehicle.getSpeed(name) + SPEED_MARGIN_MPS) * DT_S >= 0.0:
-                beside = self._road.beside
-                vehicle.moveTo(name, beside.lane, beside.length_m + x_m)
+            next_m = (self._libsumo.vehicle.getSpeed(name) + SPEED_MARGIN_MPS) * DT_S
+            if self.path(name) is ends and x_m < 0.0 <= x_m + next_m:
+                self._libsumo.vehicle.moveTo(name, beside.lane, beside.length_m + x_m)
 
     def _start(self, name: str, state: State) -> dict[str, str]:
         """Return where a vehicle departs; it can do so on the first edge of its route only."""
-        path = self._road.path(name)
+        path = self.path(name)
         point = path.point(state[0])
         edge, lane = _edge_of(point.lane), point.lane.rpartition("_")[2]
         # It is told its own speed behind the step; SUMO lets none depart faster than the limit.
@@ -265,10 +235,10 @@ def _edges(path: LanePath) -> list[str]:
 
 def _types(road: Corridor, scenario: Scenario) -> bytes:
     root = etree.Element("additional")
-    for who in VEHICLES[: scenario.vehicles]:
-        length_m = scenario.vut_length_m if who == NAME_OF_VUT else scenario.pov_length_m
+    for name in VEHICLES[: scenario.vehicles]:
+        length_m = scenario.vut_length_m if name == NAME_OF_VUT else scenario.pov_length_m
         values = {
-            "id": who,
+            "id": name,
             "length": repr(length_m),
             "width": repr(WIDTH_M),
             "height": repr(HEIGHT_M),

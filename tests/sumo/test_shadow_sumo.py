@@ -71,7 +71,8 @@ def test_who_drives_beyond_the_end_of_the_net_arrives_and_the_others_are_answere
 def test_who_leaves_a_lane_that_ends_at_m_goes_on_as_commanded(tmp_path):
     road = corridor_of("lane drop", tmp_path)
     sumo = shadow(tmp_path, US23, road)
-    assert sumo._road.drops == "ramp"
+    assert sumo.road.lane_drop
+    assert sumo.road.ramp_approach.yields
     sumo.enter({"pov": (-100.0, 10.0, 0.0), "vut": (-5.0, 10.0, 0.0)})
     x_m = -5.0
     for _ in range(12):

@@ -10,7 +10,7 @@ import traci_page
 from traci_pair import Pair, answer, questions, shown
 
 from merge_sumo.sumo.traci_names import name_of, named
-from merge_sumo.vuts.traci.session import ASKS
+from merge_sumo.vuts.traci.session import QUESTIONS
 
 SAME = 0.95
 
@@ -94,7 +94,7 @@ class TestSubscriptions:
 
         assert seen(pair.ours) == seen(pair.real)
         pair.ours.vehicle.unsubscribe("vut")
-        assert not [s for s in pair.session.subscriptions if s.of == (VEHICLES_OF, "vut", None)]
+        assert not [s for s in pair.session.subscriptions.all if s.of == (VEHICLES_OF, "vut", None)]
 
     def test_of_an_object_that_there_is_not_are_refused_as_by_sumo(self, pair):
         said = []
@@ -151,7 +151,7 @@ class TestCommands:
 
 
 def test_the_numbers_of_the_domains_are_those_of_the_client():
-    assert {d._cmdGetID for d in traci.domain.DOMAINS} == ASKS
+    assert {d._cmdGetID for d in traci.domain.DOMAINS} == QUESTIONS
     for d in traci.domain.DOMAINS:
         distances = (d._subscribeID - 0x30, d._contextID + 0x20)
         assert {*distances, d._cmdGetID if d._cmdSetID is None else d._cmdSetID - 0x20} == {

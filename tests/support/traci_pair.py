@@ -27,7 +27,6 @@ from merge_sumo.sumo.shadow_sumo import (
     NET,
     OPTIONS,
     TYPES,
-    ShadowRoad,
     ShadowSumo,
     _edges,
     write_files,
@@ -154,7 +153,7 @@ def shadow(folder: Path, scenario: Scenario = US23, road: Corridor | None = None
     """Return the shadow SUMO of this process, with an empty road at time 0."""
     road = road or road_of()
     write_files(folder, road, scenario)
-    sumo = ShadowSumo(folder, ShadowRoad.of(road), VEHICLES[: scenario.vehicles])
+    sumo = ShadowSumo(folder)
     sumo._started = bool(_shadows)
     sumo.load()
     _shadows[:] = [sumo]

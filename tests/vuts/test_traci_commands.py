@@ -13,8 +13,8 @@ from traci_pair import Drive
 
 from merge_sumo.sumo.traci_names import DUMMIES, named
 from merge_sumo.values.scenario import US23
-from merge_sumo.vuts.traci.calls import Kind, NotFiniteError, kind_of
-from merge_sumo.vuts.traci.session import ASKS
+from merge_sumo.vuts.traci.commands import Effect, NotFiniteError, effect_of
+from merge_sumo.vuts.traci.session import QUESTIONS
 
 V, T = "vehicle", "vehicletype"
 SCRIPTS: dict[str, list[tuple]] = {
@@ -319,8 +319,8 @@ def commanded(connection, function: str) -> str | None:
 
 def test_every_command_that_the_client_has_goes_to_sumo_or_changes_nothing_or_is_refused(drive):
     """No command but those on the VUT and its type reaches SUMO, and none moves the VUT away."""
-    kinds = {f: kind_of(n.functions) for n in named().values() for f in n.functions}
-    functions = [f for n in named().values() if n.command not in ASKS for f in n.functions]
+    effects = {f: effect_of(n.functions) for n in named().values() for f in n.functions}
+    functions = [f for n in named().values() if n.command not in QUESTIONS for f in n.functions]
     tried, called = 0, []
     for function in functions:
         drive.begin()
@@ -338,13 +338,13 @@ def test_every_command_that_the_client_has_goes_to_sumo_or_changes_nothing_or_is
         if said is None:
             continue
         tried += 1
-        if kinds[function] is Kind.REFUSED:
+        if effects[function] is Effect.REFUSED:
             assert said.startswith("merge-sumo does not carry out ")
             assert function in said
-        elif kinds[function] is Kind.NOTHING:
+        elif effects[function] is Effect.NOTHING:
             assert said == "", function
         assert drive.ours.vehicle.getLanePosition("vut") == pytest.approx(425.0 - 182.0)
     assert tried > 200
     assert {name.partition(".")[0] for name, _ in called} <= {"vehicle", "vehicletype"}
     assert {object_id for _, object_id in called} == {"vut"}
-    assert not any(kinds[name] is not Kind.CARRIED_OUT for name, _ in called)
+    assert not any(effects[name] is not Effect.CARRIED_OUT for name, _ in called)

@@ -26,8 +26,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.system import landlock
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.process import TOKEN_VARIABLE
-from merge_sumo.vuts.traci import peer as traci_peer
-from merge_sumo.vuts.traci.peer import TOKEN_KEY, descends, owner_of
+from merge_sumo.vuts.traci import door
+from merge_sumo.vuts.traci.door import TOKEN_KEY, descends, owner_of
 
 SUPPORT = Path(__file__).parents[1] / "support"
 RAW = SUPPORT / "raw_traci.py"
@@ -325,7 +325,7 @@ def test_the_sumo_that_a_controller_asks_has_no_port(tmp_path):
     assert {tuple(found) for found in seen} == {(), (f"0100007F:{port:04X}",)}
 
 
-@pytest.mark.skipif(not traci_peer.KNOWN_HERE, reason="needs /proc/net/tcp")
+@pytest.mark.skipif(not door.KNOWN_HERE, reason="needs /proc/net/tcp")
 class TestWhoseAConnectionIs:
     @pytest.mark.parametrize(
         ("family", "address"),

@@ -8,12 +8,21 @@ big-endian (https://sumo.dlr.de/docs/TraCI/Protocol.html). Bytes that are not th
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
+
+from merge_sumo.sumo.binding import SUMO_VERSION
 
 MAX_MESSAGE_BYTES: Final = 1 << 20
 """A controller of one vehicle never says more at a time; garbage read as a length mostly does."""
+API_VERSION: Final = 22
+"""Of the TraCI of SUMO 1.28."""
+
+GET_VERSION, SIMULATION_STEP, SET_ORDER, CLOSE = 0x00, 0x02, 0x03, 0x7F
+GET_VEHICLE, GET_SIMULATION, SET_VEHICLE, SET_SIMULATION = 0xA4, 0xAB, 0xC4, 0xCB
+"""Identifiers of commands."""
+PARAMETER: Final = 0x7E
+"""The variable of `getParameter` and `setParameter` in every domain."""
 
 POSITION_LON_LAT: Final = 0x00
 POSITION_2D: Final = 0x01
@@ -46,7 +55,9 @@ _FIXED: Final = {
     TYPE_DOUBLE: struct.Struct("!d"),
     TYPE_COLOR: struct.Struct("!BBBB"),
 }
-POSITIONS: Final = frozenset({POSITION_LON_LAT, POSITION_2D, POSITION_LON_LAT_ALT, POSITION_3D})
+POSITIONS: Final = frozenset(
+    {POSITION_LON_LAT, POSITION_2D, POSITION_LON_LAT_ALT, POSITION_3D, POSITION_ROADMAP}
+)
 _UBYTE, _INT, _DOUBLE = (_FIXED[t] for t in (TYPE_UBYTE, TYPE_INTEGER, TYPE_DOUBLE))
 _MAX_NESTING: Final = 4
 
@@ -55,9 +66,8 @@ class ProtocolError(Exception):
     """Bytes that are not TraCI; the text says what is wrong with them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
-    """A command of a message: its identifier and its payload."""
+class Command(NamedTuple):
+    """A command of a message."""
 
     identifier: int
     payload: bytes
@@ -105,45 +115,15 @@ class Reader:
             raise ProtocolError("a string is not UTF-8") from error
 
     def typed(self, nesting: int = 0) -> Any:
-        """Return the next value with a type before it; compounds and lists as tuples."""
-        return self._of_type(self.ubyte(), nesting)
+        """Return the next value with a type before it.
 
-    def arguments(self, nesting: int = 0) -> list[Any]:
-        """Return the values that are left, in order.
-
-        Those of compounds and positions stand one by one, lists and colours are one value each.
+        Lists and colours are tuples; compounds and positions are lists of what they are made of.
         """
-        found: list[Any] = []
-        while self.left:
-            kind = self.ubyte()
-            if kind == TYPE_COMPOUND:
-                if nesting >= _MAX_NESTING:
-                    raise ProtocolError("compounds are nested too deeply")
-                self._count(1)
-                nesting += 1
-            elif kind == POSITION_ROADMAP or kind in POSITIONS:
-                found += self._place(kind)
-            else:
-                found.append(self._of_type(kind, nesting))
-        return found
-
-    def place(self) -> tuple[int, list[Any]]:
-        """Return the type of the next value, a position, and what it is made of."""
         kind = self.ubyte()
-        return kind, self._place(kind)
-
-    def _place(self, kind: int) -> list[Any]:
-        if kind == POSITION_ROADMAP:
-            return [self.string(), self.double(), self.ubyte()]
-        if kind not in POSITIONS:
-            raise ProtocolError(f"a position was expected, not type 0x{kind:02x}")
-        return list(_FIXED[kind].unpack(self.raw(_FIXED[kind].size)))
-
-    def _of_type(self, kind: int, nesting: int) -> Any:
-        """Return the next value, whose type has been read."""
+        if kind in POSITIONS:
+            return self._position(kind)
         if kind in _FIXED:
-            form = _FIXED[kind]
-            values = form.unpack(self.raw(form.size))
+            values = _FIXED[kind].unpack(self.raw(_FIXED[kind].size))
             return values[0] if len(values) == 1 else values
         if kind == TYPE_STRING:
             return self.string()
@@ -154,15 +134,33 @@ class Reader:
         if kind == TYPE_COMPOUND:
             if nesting >= _MAX_NESTING:
                 raise ProtocolError("compounds are nested too deeply")
-            return tuple(self.typed(nesting + 1) for _ in range(self._count(1)))
+            return [self.typed(nesting + 1) for _ in range(self._count(1))]
         raise ProtocolError(f"there is no type 0x{kind:02x} that a controller could send")
 
-    def typed_double(self) -> float:
-        """Return the next value, which must be a double."""
-        value = self.typed()
-        if not isinstance(value, float):
-            raise ProtocolError(f"a double was expected, not {value!r:.40}")
-        return value
+    def typed_bytes(self) -> bytes:
+        """Return the bytes of the next value with its type."""
+        start = self._at
+        self.typed()
+        return self._data[start : self._at]
+
+    def arguments(self) -> list[Any]:
+        """Return the values that are left, in order; those of compounds and positions singly."""
+        values: list[Any] = []
+        while self.left:
+            values += _flat(self.typed())
+        return values
+
+    def place(self) -> tuple[int, list[Any]]:
+        """Return the type of the next value, a position, and what it is made of."""
+        kind = self.ubyte()
+        if kind not in POSITIONS:
+            raise ProtocolError(f"a position was expected, not type 0x{kind:02x}")
+        return kind, self._position(kind)
+
+    def _position(self, kind: int) -> list[Any]:
+        if kind == POSITION_ROADMAP:
+            return [self.string(), self.double(), self.ubyte()]
+        return list(_FIXED[kind].unpack(self.raw(_FIXED[kind].size)))
 
     def _count(self, smallest: int) -> int:
         """Return a number of items that can be there, each of at least `smallest` bytes."""
@@ -170,6 +168,12 @@ class Reader:
         if not 0 <= count * smallest <= self.left:
             raise ProtocolError(f"{count} items were announced where {self.left} bytes are left")
         return count
+
+
+def _flat(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        return [value]
+    return [inner for part in value for inner in _flat(part)]
 
 
 def message_length(head: bytes) -> int:
@@ -217,6 +221,12 @@ def command(content: bytes) -> bytes:
     return b"\x00" + _INT.pack(len(content) + 5) + content
 
 
+def raw_string(value: str) -> bytes:
+    """Return a string without its type."""
+    encoded = value.encode("utf-8")
+    return _INT.pack(len(encoded)) + encoded
+
+
 def raw_integer(value: int) -> bytes:
     """Return an integer without its type."""
     return _INT.pack(value)
@@ -227,79 +237,55 @@ def raw_double(value: float) -> bytes:
     return _DOUBLE.pack(value)
 
 
-def raw_string(value: str) -> bytes:
-    """Return a string without its type."""
-    encoded = value.encode("utf-8")
-    return _INT.pack(len(encoded)) + encoded
-
-
-def ubyte(value: int) -> bytes:
-    """Return a typed unsigned byte."""
-    return bytes((TYPE_UBYTE, value))
-
-
-def integer(value: int) -> bytes:
-    """Return a typed integer."""
-    return bytes((TYPE_INTEGER,)) + _INT.pack(value)
-
-
-def double(value: float) -> bytes:
-    """Return a typed double."""
-    return bytes((TYPE_DOUBLE,)) + _DOUBLE.pack(value)
-
-
-def string(value: str) -> bytes:
-    """Return a typed string."""
-    return bytes((TYPE_STRING,)) + raw_string(value)
-
-
-def strings(values: Sequence[str]) -> bytes:
-    """Return a typed list of strings."""
+def _strings(values: Sequence[str]) -> bytes:
     items = b"".join(map(raw_string, values))
     return bytes((TYPE_STRINGLIST,)) + _INT.pack(len(values)) + items
 
 
-def position(*coordinates: float) -> bytes:
-    """Return a typed position of two or three coordinates."""
-    kind = POSITION_2D if len(coordinates) == 2 else POSITION_3D
-    return bytes((kind,)) + _FIXED[kind].pack(*coordinates)
-
-
-def polygon(points: Sequence[tuple[float, float]]) -> bytes:
+def _polygon(points: Sequence[Sequence[float]]) -> bytes:
     """Return a typed list of points; a count above 255 stands behind a 0."""
-    items = b"".join(struct.pack("!dd", *point) for point in points)
     few = len(points) < 256
     count = bytes((len(points),)) if few else bytes((0,)) + _INT.pack(len(points))
+    items = b"".join(struct.pack("!dd", *point[:2]) for point in points)
     return bytes((TYPE_POLYGON,)) + count + items
 
 
-def byte(value: int) -> bytes:
-    """Return a typed signed byte."""
-    return bytes((TYPE_BYTE, value & 0xFF))
+def _road_position(place: tuple[str, float, int]) -> bytes:
+    edge, position_m, lane = place
+    return bytes((POSITION_ROADMAP,)) + raw_string(edge) + struct.pack("!dB", position_m, lane)
 
 
-def doubles(values: Sequence[float]) -> bytes:
-    """Return a typed list of doubles."""
-    items = struct.pack(f"!{len(values)}d", *values)
-    return bytes((TYPE_DOUBLELIST,)) + _INT.pack(len(values)) + items
+_PACK: Final[dict[str, Callable[[Any], bytes]]] = {
+    "i": lambda value: struct.pack("!Bi", TYPE_INTEGER, int(value)),
+    "d": lambda value: struct.pack("!Bd", TYPE_DOUBLE, value),
+    "s": lambda value: bytes((TYPE_STRING,)) + raw_string(str(value)),
+    "b": lambda value: bytes((TYPE_BYTE, (ord(value) if isinstance(value, str) else value) & 0xFF)),
+    "B": lambda value: bytes((TYPE_UBYTE, int(value))),
+    "l": _strings,
+    "f": lambda value: struct.pack(f"!Bi{len(value)}d", TYPE_DOUBLELIST, len(value), *value),
+    "o": lambda value: struct.pack("!B2d", POSITION_2D, *value),
+    "O": lambda value: struct.pack("!B3d", POSITION_3D, *value),
+    "c": lambda value: bytes((TYPE_COLOR, *value)),
+    "p": _polygon,
+    "r": _road_position,
+}
 
 
-def road_position(edge: str, position_m: float, lane: int) -> bytes:
-    """Return a typed position on a lane of an edge."""
-    place = raw_string(edge) + _DOUBLE.pack(position_m) + bytes((lane,))
-    return bytes((POSITION_ROADMAP,)) + place
+def pack(form: str, *values: Any) -> bytes:
+    """Return typed values, one for each letter of `form`; letters as in SUMO's own client.
+
+    Integer, double, string, signed and unsigned Byte, list of strings, list of floats, position in
+    the plane (o) and in space (O), colour, polygon, and place on a road.
+    """
+    return b"".join([_PACK[letter](value) for letter, value in zip(form, values, strict=True)])
 
 
-def colour(*channels: int) -> bytes:
-    """Return a typed colour of four channels."""
-    return bytes((TYPE_COLOR, *channels))
+def compound(count: int, content: bytes) -> bytes:
+    """Return `count` typed values as one."""
+    return bytes((TYPE_COMPOUND,)) + _INT.pack(count) + content
 
 
-def compound(*typed: bytes) -> bytes:
-    """Return typed values as one."""
-    return bytes((TYPE_COMPOUND,)) + _INT.pack(len(typed)) + b"".join(typed)
-
-
-def compound_list(items: Sequence[Sequence[bytes]]) -> bytes:
-    """Return items of typed values as one: their number, and the values of all."""
-    return compound(integer(len(items)), *(value for item in items for value in item))
+def version_answer() -> bytes:
+    """Return the answer to the question for the version, behind its status."""
+    text = raw_string(f"SUMO {SUMO_VERSION}, hosted by merge-sumo")
+    return command(bytes((GET_VERSION,)) + raw_integer(API_VERSION) + text)

@@ -20,14 +20,14 @@ from typing import Any, Final, TypeVar
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.child import Channel, channel_of
-from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, ShadowRoad, ShadowSumo, State
+from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, ShadowSumo, State
 from merge_sumo.sumo.traci_names import named
 from merge_sumo.system.landlock import lock_in
 from merge_sumo.vuts.process import GRACE_S
 from merge_sumo.vuts.traci import protocol as tp
-from merge_sumo.vuts.traci.calls import NotFiniteError
-from merge_sumo.vuts.traci.protocol import Command, ProtocolError, Reader
-from merge_sumo.vuts.traci.session import CLOSE, SIMULATION_STEP, Session
+from merge_sumo.vuts.traci.commands import NotFiniteError
+from merge_sumo.vuts.traci.protocol import CLOSE, SIMULATION_STEP, Command, ProtocolError, Reader
+from merge_sumo.vuts.traci.session import Session
 
 T = TypeVar("T")
 
@@ -59,20 +59,18 @@ class ClosedError(Exception):
 
 def main(settings: Mapping[str, Any]) -> None:
     """Serve clients, one after the other, until the channel ends."""
-    channel = channel_of(settings)
-    folder, road = Path(settings["folder"]), ShadowRoad.from_record(settings["road"])
+    channel, folder = channel_of(settings), Path(settings["folder"])
     _limit()
     try:
-        sumo = ShadowSumo(folder, road, settings["vehicles"])
+        sumo = ShadowSumo(folder)
         sumo.load()
     except UserError as error:
         channel.send({"refused": str(error)})
         return
-    named()
-    locked = lock_in([folder], _folders_to_read())
-    channel.send({"ready": True, "locked": locked})
+    named()  # what the client's commands are called is looked up before files are locked
+    channel.send({"locked": lock_in([folder], _folders_to_read())})
     with suppress(EOFError, OSError):
-        _Server(channel, sumo).serve()
+        _serve(channel, sumo)
 
 
 def _folders_to_read() -> list[Path]:
@@ -98,43 +96,32 @@ def _limit() -> None:
             resource.setrlimit(limit, (most, most))
 
 
-class _Server:
-    """What the parent asks for, and the client that is served."""
-
-    def __init__(self, channel: Channel, sumo: ShadowSumo) -> None:
-        self._channel, self._sumo = channel, sumo
-        self._client: Client | None = None
-
-    def serve(self) -> None:
-        """Answer what the parent asks until its end of the channel closes."""
-        while True:
-            message = self._channel.receive()
-            self._channel.send(self._answer(message))
-
-    def _answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        if message["do"] == "connect":
-            self._drop()
-            connection = self._channel.take()
-            self._sumo.load()
-            self._client = Client(connection, Session(self._sumo), message["deadline_s"])
-            return {}
-        if message["do"] == "drop" or self._client is None:
-            self._drop()
-            return {}
-        answer: dict[str, Any]
+def _serve(channel: Channel, sumo: ShadowSumo) -> None:
+    """Do what the parent asks for until its end of the channel closes."""
+    client: Client | None = None
+    while True:
+        message = channel.receive()
+        if message["do"] in ("connect", "drop") or client is None:
+            if client is not None:
+                client.close()
+                client = None
+            if message["do"] == "connect":
+                connection = channel.take()
+                sumo.load()
+                client = Client(connection, Session(sumo), message["deadline_s"])
+            channel.send({})
+            continue
+        answer: dict[str, Any] = {}
         try:
-            answer = _DO[message["do"]](self._client, message)
+            if message["do"] == "farewell":
+                client.farewell()
+            else:
+                answer = {"v_mps": client.show(message["states"], first=message["do"] == "enter")}
         except FaultError as fault:
             answer = {"fault": str(fault), "gone": fault.gone, "late": fault.late}
         except ClosedError:
             answer = {"closed": True}
-        notes = self._client.session.notes
-        return {**answer, "notes": notes}
-
-    def _drop(self) -> None:
-        if self._client is not None:
-            self._client.close()
-            self._client = None
+        channel.send({**answer, "notes": client.session.notes})
 
 
 class Client:
@@ -150,28 +137,33 @@ class Client:
         self._until_step_s: float | None = None
         """Time up to which the client asked to step, if it waits for a step; 0 for one step."""
 
-    def leave(self) -> None:
-        """End the episode that was, if there was one: its vehicles arrive."""
-        if self.session.driving:
-            # The step in which they arrive was made when the client asked for it.
-            self.session.clear()
-            self._answer_step()
-        if self._until_step_s is None:
-            self._serve()
-
     def show(self, states: Mapping[str, State], *, first: bool) -> float | None:
         """Show the next state, and serve the client until it makes its next step.
 
-        Returns the speed that SUMO gives the VUT in that step; None where it is beyond the net.
+        Args:
+            states: the vehicles of the episode.
+            first: whether an episode begins; the vehicles of the one before arrive then.
+
+        Returns:
+            The speed that SUMO gives the VUT in that step; None where it is beyond the net.
+
+        Raises:
+            FaultError: for what the client does wrong.
+            ClosedError: when it says goodbye before the vehicles depart.
         """
+        session = self.session
         if first:
-            self.session.enter(states)
+            if session.driving:
+                # The step in which they arrive was made when the client asked for it.
+                session.clear()
+                self._answer_step()
+            self._serve_until_step()
+            session.enter(states)
         else:
-            self.session.put(states)
+            session.put(states)
         self._answer_step()
-        if self._until_step_s is None:
-            self._serve()
-        return self.session.step()
+        self._serve_until_step()
+        return session.step()
 
     def farewell(self) -> None:
         """Show the last arrival, with no vehicle to come, and give the client time to close."""
@@ -186,7 +178,7 @@ class Client:
                 if self._until_step_s is not None:
                     self._until_step_s = 0.0  # the time that it asked for will not come
                 self._answer_step()
-                self._serve(GRACE_S)
+                self._serve_until_step(GRACE_S)
 
     def close(self) -> None:
         """Drop it."""
@@ -195,43 +187,50 @@ class Client:
     def _answer_step(self) -> None:
         """Answer the step that the client waits for, unless it asked to step on further."""
         until_s = self._until_step_s
-        if until_s is None or until_s > self.session.time_s + 1e-9:
+        if until_s is None or until_s > self.session.sumo.time_s + 1e-9:
             return
         self._until_step_s = None
         self._reply += tp.status(SIMULATION_STEP) + self.session.results()
         self._flush()
 
-    def _serve(self, patience_s: float = math.inf) -> None:
-        """Answer commands until the client makes a step."""
+    def _serve_until_step(self, patience_s: float = math.inf) -> None:
+        """Answer commands until the client waits for a step."""
         until = monotonic() + min(self._deadline_s, patience_s)
-        session = self.session
-        while True:
-            while self._commands:
-                command = self._commands.popleft()
-                if command.identifier == SIMULATION_STEP:
-                    target = self._checked(lambda c: Reader(c.payload).double(), command)
-                    session.answered()
-                    if target == 0.0 or target > session.time_s + 1e-9:
-                        self._until_step_s = target
-                        return
-                    if math.isnan(target):
-                        raise FaultError("the controller stepped to time nan")
-                    self._reply += tp.status(SIMULATION_STEP) + session.results()
-                elif command.identifier == CLOSE:
-                    self._reply += tp.status(CLOSE)
-                    self._commands.clear()
-                    self._flush()
-                    if NAME_OF_VUT in session.sumo.at_m:
-                        raise FaultError(
-                            "the controller closed the connection during the episode", gone=True
-                        )
-                    raise ClosedError
-                else:
-                    before_s = monotonic()
-                    self._reply += self._checked(session.handle, command)
-                    until += monotonic() - before_s  # it waits for us, and not we for it
+        while self._until_step_s is None:
+            if not self._commands:
+                self._commands.extend(self._receive(until))
+            command = self._commands.popleft()
+            if command.identifier == SIMULATION_STEP:
+                self._ask_for_step(command)
+            elif command.identifier == CLOSE:
+                self._say_goodbye()
+            else:
+                before_s = monotonic()
+                self._reply += self._checked(self.session.handle, command)
+                until += monotonic() - before_s  # it waits for us, and not we for it
+            if self._until_step_s is None:
                 self._flush()
-            self._commands.extend(self._receive(until))
+
+    def _ask_for_step(self, command: Command) -> None:
+        """Note up to when the client wants to step; a time of the past is answered at once."""
+        session = self.session
+        target_s = self._checked(lambda step: Reader(step.payload).double(), command)
+        session.answered()
+        if target_s == 0.0 or target_s > session.sumo.time_s + 1e-9:
+            self._until_step_s = target_s
+            return
+        if math.isnan(target_s):
+            raise FaultError("the controller stepped to time nan")
+        self._reply += tp.status(SIMULATION_STEP) + session.results()
+
+    def _say_goodbye(self) -> None:
+        """Answer the client's goodbye, which is a fault where the VUT is on the road."""
+        self._reply += tp.status(CLOSE)
+        self._commands.clear()
+        self._flush()
+        if NAME_OF_VUT in self.session.sumo.at_m:
+            raise FaultError("the controller closed the connection during the episode", gone=True)
+        raise ClosedError
 
     def _checked(self, function: Callable[[Command], T], command: Command) -> T:
         """Return what a function makes of a command."""
@@ -291,21 +290,3 @@ class Client:
                 raise FaultError(f"the controller {what}", gone=True)
             parts += part
         return bytes(parts)
-
-
-def _leave(client: Client, _: Mapping[str, Any]) -> dict[str, Any]:
-    client.leave()
-    return {}
-
-
-def _show(client: Client, message: Mapping[str, Any]) -> dict[str, Any]:
-    return {"v_mps": client.show(message["states"], first=message["first"])}
-
-
-def _farewell(client: Client, _: Mapping[str, Any]) -> dict[str, Any]:
-    client.farewell()
-    return {}
-
-
-_DO: Final = {"leave": _leave, "show": _show, "farewell": _farewell}
-"""What the parent asks for, besides a client to be served or dropped."""

@@ -1,11 +1,11 @@
 """A VUT behind TraCI: a controller written for SUMO, in any language, drives the vehicle `vut`.
 
-This process is the server's door: it listens, and looks whose a connection is. Who is served is
-handed to a process of its own with a shadow SUMO (`server.py`), in which the client's
-commands mean what they mean in SUMO. A client makes a step by `simulationStep`, so client and
-rollout go in lockstep: the speed that SUMO gives the VUT in that step becomes the acceleration of
-eq. (4), and the step is answered when ours has been made. Between two episodes the road is empty
-for one step.
+This process listens, and looks whose a connection is (`door.py`). A connection that is served is
+handed to a process of its own with a shadow SUMO (`server.py`), in which the client's commands mean
+what they mean in SUMO. A client makes a step by `simulationStep`, so client and rollout go in
+lockstep: the speed that SUMO gives the VUT in that step becomes the acceleration of eq. (4), and
+the step is answered when the rollout has made it. Between two episodes the road is empty for one
+step.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.child import ChildDiedError, SumoChild
-from merge_sumo.sumo.shadow_sumo import ShadowRoad, write_files
+from merge_sumo.sumo.shadow_sumo import write_files
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, POV, US23, VEHICLES, Scenario
-from merge_sumo.vuts.base import Seen, Vut, VutOptions, seen_in
+from merge_sumo.values.scenario import DT_S, US23, VEHICLES, VUT, Scenario
+from merge_sumo.vuts.base import Vut, VutOptions
 from merge_sumo.vuts.process import TOKEN_VARIABLE, Program, split_command
+from merge_sumo.vuts.traci import server
 from merge_sumo.vuts.traci.door import HOST, Door, Peer
+from merge_sumo.vuts.traci.server import FaultError
 
-SERVER: Final = "merge_sumo.vuts.traci.server:main"
-"""What runs in the process that serves a client."""
 DEFAULT_PORT: Final = 8813
 """Where TraCI clients connect when they are not told otherwise."""
 START_S: Final = 60.0
@@ -66,10 +66,6 @@ def traci_vut(argument: str, options: VutOptions) -> Vut:
         files=tuple(files),
         named_only=True,
     )
-
-
-class FaultError(Exception):
-    """What the client did wrong."""
 
 
 class TraciVut(Driver):
@@ -112,14 +108,13 @@ class TraciVut(Driver):
         """Note that the next scene is the first of an episode."""
         self._reason = None
         self._starting = True
+        self._before_mps.clear()
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration that follows from what the client commanded, or NaN."""
         if self._reason is None:
             try:
-                x_m, v_mps = scene.x_m[:, 0].tolist(), scene.v_mps[:, 0].tolist()
-                seen = seen_in(float(scene.step[0]) * DT_S, POV, x_m, v_mps)
-                return np.array([self._acceleration_mps2(seen)])
+                return np.array([self._acceleration_mps2(scene)])
             except FaultError as error:
                 self._reason = str(error)
                 self._disconnect()
@@ -134,49 +129,43 @@ class TraciVut(Driver):
         ends = True
         if self._client is not None and self._shadow.listens:
             with suppress(FaultError, VutLostError):
-                answer = self._ask({"do": "farewell"})
-                ends = bool(answer.get("closed") or answer.get("gone"))
+                ends = "closed" in self._ask({"do": "farewell"})
         self._disconnect(grace=ends)
         self._shadow.close()
 
-    def _acceleration_mps2(self, seen: Seen) -> float:
+    def _acceleration_mps2(self, scene: Scene) -> float:
         """Show the vehicles, and return what the client commands for the coming step."""
-        if self._starting:
-            self._before_mps.clear()
+        x_m, v_mps = scene.x_m[:, 0].tolist(), scene.v_mps[:, 0].tolist()
         states = {
-            name: (x_m, v_mps, (v_mps - self._before_mps.get(name, v_mps)) / DT_S)
-            for name, (x_m, v_mps) in zip(VEHICLES, seen.vehicles, strict=False)
+            name: (x, v, (v - self._before_mps.get(name, v)) / DT_S)
+            for name, x, v in zip(VEHICLES, x_m, v_mps, strict=False)
         }
-        self._before_mps = {name: v_mps for name, (_, v_mps, _) in states.items()}
-        message = {"do": "show", "states": states, "first": self._starting}
-        answer = self._enter(message) if self._starting else self._ask(message)
-        self._starting = False
+        self._before_mps = {name: v for name, (_, v, _) in states.items()}
+        starting, self._starting = self._starting, False
+        answer = self._enter(states) if starting else self._ask({"do": "step", "states": states})
         if self._program is not None and (ended := self._program.ended(0.0)):
             raise FaultError(f"{ended}, and its connection goes on")
-        v_mps = answer["v_mps"]
-        if v_mps is None:  # it is beyond the end of the net: it keeps its speed
+        wanted_mps = answer["v_mps"]
+        if wanted_mps is None:  # it is beyond the end of the net: it keeps its speed
             return 0.0
-        acceleration_mps2 = (v_mps - seen.v_vut_mps) / DT_S
+        acceleration_mps2 = (wanted_mps - v_mps[VUT]) / DT_S
         if not math.isfinite(acceleration_mps2):
             raise FaultError(f"the controller asked for an acceleration of {acceleration_mps2}")
         return float(acceleration_mps2)
 
-    def _enter(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        """Let the vehicles depart, for the client that is there or for one that comes anew.
+    def _enter(self, states: Mapping[str, Any]) -> dict[str, Any]:
+        """Let the vehicles depart, for the client that is connected or for a new one.
 
         A controller may run once per episode: a goodbye on an empty road is no fault.
         """
         for _ in range(2):
             if self._client is None:
                 self._connect()
-            for part in ({"do": "leave"}, message):
-                answer = self._ask(part)
-                if answer.get("closed"):
-                    # The door stays open: the next client may be waiting already.
-                    self._drop_client()
-                    break
-            else:
+            answer = self._ask({"do": "enter", "states": states})
+            if "closed" not in answer:
                 return answer
+            # The door stays open: the next client may be waiting already.
+            self._drop_client()
         raise FaultError("the controller closed the connection before the vehicles departed")
 
     def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -333,11 +322,7 @@ class Shadow:
         with ExitStack() as opened:
             folder = opened.enter_context(scratch_folder())
             write_files(folder, self._road, self._scenario)
-            settings = {
-                "road": ShadowRoad.of(self._road).to_record(),
-                "vehicles": VEHICLES[: self._scenario.vehicles],
-            }
-            child = SumoChild(SERVER, folder, settings)
+            child = SumoChild(f"{server.__name__}:{server.main.__name__}", folder, {})
             opened.callback(child.kill)
             self._opened = opened.pop_all()
         self._child, self._ready = child, False

@@ -1,122 +1,20 @@
-"""Which function of SUMO a TraCI command calls, how its answer is packed, and what is refused.
-
-Questions and commands carry the numbers of a domain and of a variable; SUMO's own client names the
-functions behind them (`traci_names`), and libsumo has the same functions.
-"""
+"""Which commands of a TraCI client SUMO carries out on the VUT, and why the rest is refused."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import Enum
 from functools import cache
-from typing import Any, Final
+from typing import Final
 
 from merge_sumo.sumo.shadow_sumo import RefusedError
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.vuts.traci import protocol as tp
-from merge_sumo.vuts.traci.protocol import ProtocolError, Reader
-
-Arguments = list[Any]
-Call = tuple[str, Arguments]
-"""A function of libsumo, named as "vehicle.getSpeed", and what it takes behind the object."""
-
-ASKED: Final = {
-    "trafficlight.getNemaPhaseCalls": "trafficlight.getParameter",
-    "trafficlight.getRedYellowGreenState": "trafficlight.getRedYellowGreenState",
-    "trafficlight.getAllProgramLogics": "trafficlight.getAllProgramLogics",
-    "vehicle.couldChangeLane": "vehicle.getLaneChangeState",
-    "vehicle.getLeftFollowers": "vehicle.getNeighbors",
-    "person.getRemainingStages": "person.getRemainingStages",
-}
-"""Of several functions that ask for one variable, the one that SUMO's server calls."""
-WITHOUT_OBJECT: Final = frozenset(
-    {
-        *("getIDList", "getIDCount", "getLoadedIDList", "getTeleportingIDList", "getTaxiFleet"),
-        "getTaxiReservations",
-    }
-)
-NOT_ANSWERED: Final = frozenset(
-    {
-        "trafficlight.getConstraints",
-        "trafficlight.getConstraintsByFoe",
-        "trafficlight.swapConstraints",
-        "simulation.findIntermodalRoute",
-    }
-)
-"""Their answers have a layout that no car needs."""
-COMPOUND_HEAD_BYTES: Final = 5
-"""Its type, and how many values it has."""
-GEO: Final = (tp.POSITION_LON_LAT, tp.POSITION_LON_LAT_ALT)
-DRIVING: Final = 1
-"""A distance by road, as a question for one says; 0 is the one through the air."""
+from merge_sumo.vuts.traci.protocol import Reader
+from merge_sumo.vuts.traci.questions import Call
 
 
-def asked_of(functions: Sequence[str], object_id: str, reader: Reader) -> Call:
-    """Return what a question calls; raises `RefusedError` for what is not answered."""
-    function = ASKED.get(functions[0], functions[0])
-    domain, _, name = function.partition(".")
-    if domain == "gui":  # without a window libsumo's answer is the end of the process
-        raise RefusedError("GUI is not running, command not implemented in command line sumo")
-    if function in NOT_ANSWERED:
-        raise RefusedError(f"merge-sumo does not answer {function}: no car needs it")
-    try:
-        special = SPECIAL.get(function)
-        if special is not None:
-            return special(object_id, reader)
-        arguments = reader.arguments()
-    except (ProtocolError, ValueError, IndexError) as error:
-        raise RefusedError(f"{function} was asked in no form that SUMO has") from error
-    if name in WITHOUT_OBJECT or (domain == "simulation" and not object_id):
-        return function, arguments
-    return function, [object_id, *arguments]
-
-
-def _distance_of_vehicle(object_id: str, reader: Reader) -> Call:
-    reader.raw(COMPOUND_HEAD_BYTES)
-    kind, place = reader.place()
-    on_road = kind == tp.POSITION_ROADMAP
-    return f"vehicle.getDrivingDistance{'' if on_road else '2D'}", [object_id, *place]
-
-
-def _distance(_: str, reader: Reader) -> Call:
-    reader.raw(COMPOUND_HEAD_BYTES)
-    kind, start = reader.place()
-    end = reader.place()[1]
-    driving = reader.ubyte() == DRIVING
-    if kind == tp.POSITION_ROADMAP:
-        return "simulation.getDistanceRoad", [*start[:2], *end[:2], driving]
-    return "simulation.getDistance2D", [*start[:2], *end[:2], kind in GEO, driving]
-
-
-def _converted(_: str, reader: Reader) -> Call:
-    reader.raw(COMPOUND_HEAD_BYTES)
-    kind, place = reader.place()
-    target, *vclass = reader.arguments()
-    if kind == tp.POSITION_ROADMAP:
-        flat = target in (tp.POSITION_2D, tp.POSITION_LON_LAT)
-        return f"simulation.convert{'2D' if flat else '3D'}", [*place, target in GEO]
-    if target == tp.POSITION_ROADMAP:
-        return "simulation.convertRoad", [*place[:2], kind in GEO, *vclass]
-    return "simulation.convertGeo", [*place[:2], kind in GEO]
-
-
-def _foes(object_id: str, reader: Reader) -> Call:
-    (to_lane,) = reader.arguments()
-    if to_lane:
-        return "lane.getFoes", [object_id, to_lane]
-    return "lane.getInternalFoes", [object_id]
-
-
-SPECIAL: Final[dict[str, Callable[[str, Reader], Call]]] = {
-    "vehicle.getDrivingDistance": _distance_of_vehicle,
-    "simulation.getDistance2D": _distance,
-    "simulation.convert2D": _converted,
-    "lane.getFoes": _foes,
-}
-
-
-class Kind(Enum):
+class Effect(Enum):
     """What becomes of a command."""
 
     CARRIED_OUT = "Carried out by SUMO, on the VUT and its type"
@@ -157,7 +55,7 @@ ONLY_SEEN: Final = ("gui", "poi", "polygon")
 OF_OTHERS: Final = frozenset(
     f"{domain}.{f}" for domain in ("vehicle", "vehicletype") for f in LOOKS
 )
-"""Commands that are accepted of other vehicles, too, and change nothing there."""
+"""Commands that are accepted on other vehicles, too, and change nothing there."""
 
 REFUSED: Final = {
     "the route is the scenario's": (
@@ -192,18 +90,18 @@ KEYS_OF_DEVICES: Final = ("device.", "has.")
 
 
 @cache
-def kind_of(functions: tuple[str, ...]) -> Kind:
+def effect_of(functions: tuple[str, ...]) -> Effect:
     """Return what becomes of the commands that share a number."""
     if not CARRIED_OUT.isdisjoint(functions):
-        return Kind.CARRIED_OUT
+        return Effect.CARRIED_OUT
     if any(
         function in NOTHING
         or function.endswith(".setParameter")
         or function.partition(".")[0] in ONLY_SEEN
         for function in functions
     ):
-        return Kind.NOTHING
-    return Kind.REFUSED
+        return Effect.NOTHING
+    return Effect.REFUSED
 
 
 def reason_against(functions: Sequence[str]) -> str:
@@ -222,17 +120,24 @@ class NotFiniteError(Exception):
 
 def _check_number(name: str, value: object) -> None:
     """Raise `RefusedError`, as SUMO's server does, for a number that its models cannot have."""
-    what = INVALID.get(name)
-    if what is None or not isinstance(value, float):
+    if name not in INVALID or not isinstance(value, float):
         return
     if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name == "setMaxSpeed"):
-        raise RefusedError(f"Invalid {what}.")
+        raise RefusedError(f"Invalid {INVALID[name]}.")
 
 
-def told_by(functions: Sequence[str], object_id: str, reader: Reader) -> Call:
-    """Return what a command calls; raises `RefusedError` for a value that is not taken.
+def call_of_command(functions: Sequence[str], object_id: str, reader: Reader) -> Call:
+    """Return the call that carries a command out.
 
-    Raises `NotFiniteError` where that is a speed: the VUT would drive on as if nothing was said.
+    Args:
+        functions: functions of SUMO's client that give it.
+        object_id: object that is commanded.
+        reader: the values behind it.
+
+    Raises:
+        RefusedError: for a value that SUMO's models cannot have, and for a device.
+        NotFiniteError: for a speed that is no number: the VUT would drive on as if nothing was
+            commanded.
     """
     function, arguments = functions[-1], reader.arguments()
     name = function.partition(".")[2]
