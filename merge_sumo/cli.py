@@ -8,26 +8,15 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands import (
-    campaign,
-    cases,
-    certify,
-    experiments,
-    histories,
-    probability,
-    runs,
-    scenarios,
-    training,
-    vuts,
-)
-from merge_sumo.commands.shared import app, say
+from merge_sumo.commands import campaigns, inputs, studies
+from merge_sumo.commands.application import app
+from merge_sumo.commands.printing import say
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.limits import check_limits, exhausted
 from merge_sumo.system.streams import prepare_streams
 
-__all__ = ["app", "campaign", "cases", "certify", "experiments", "main", "probability"]
-__all__ += ["histories", "runs", "scenarios", "training", "vuts"]
+__all__ = ["app", "campaigns", "inputs", "main", "studies"]
 
 
 @app.callback(invoke_without_command=True)

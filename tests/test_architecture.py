@@ -272,6 +272,21 @@ class TestImports:
         others = [file for file in FILES if file not in line]
         assert offenders(others, {"merge_sumo.cli", "merge_sumo.commands", "typer"}) == {}
 
+    def test_of_a_command_are_the_api_and_what_prints(self):
+        beside = {"complete", "options", "printing"}
+        commands = {f for f in files_below("commands") if f.stem not in {*beside, "application"}}
+        assert len(commands) > 1
+        allowed = {"merge_sumo.api", "merge_sumo.errors", "merge_sumo.commands"}
+        others = {
+            module_of(file): {
+                name
+                for name in imports_any(imports_of(file), {"merge_sumo"})
+                if name != "merge_sumo" and not imports_any({name}, allowed)
+            }
+            for file in commands
+        }
+        assert {module: names for module, names in others.items() if names} == {}
+
     def test_unpickle_nothing(self):
         assert offenders(FILES, UNSAFE_MODULES) == {}
 

@@ -1,4 +1,4 @@
-"""merge-sumo from Python: run cases and campaigns, and look at them in a notebook.
+"""Every verb of merge-sumo, once: what the command line calls, and what a notebook calls.
 
 import merge_sumo as ms
 
@@ -7,45 +7,56 @@ run.failures        # rows for pandas.DataFrame(run.failures); a table in a note
 run.report()        # path of the HTML report
 
 A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
-Every verb of the command line is a function here, and the command calls that function.
+Results print as the command prints them, and `to_record()` is what the command's `--json` prints.
 """
 
 from __future__ import annotations
 
+import os
+import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from merge_sumo.analysis.coordinates import outside_of_the_pool
-from merge_sumo.api.recorded import (
-    AnyRun,
-    compare_runs,
-    export,
-    history,
-    open_in_gui,
-    open_run,
-    opened,
-    replay,
-    report,
-    rerun,
-)
-from merge_sumo.api.results import CampaignRun, CaseRun
-from merge_sumo.api.running import Running, concluded, notice_unseen, resume
-from merge_sumo.api.setup import (
+from merge_sumo.analysis.verdict import parse_gates
+from merge_sumo.api.keywords import (
     CaseKeywords,
     Hosting,
     Settings,
     Setup,
     check_keywords,
-    no_check,
     recordable,
     scenario_of,
     settings_for,
 )
-from merge_sumo.api.studies import certify, check_vut, compare, probability, truth, truths
-from merge_sumo.campaigns.campaign import OnCase, run_campaign
+from merge_sumo.api.results import (
+    Benchmark,
+    CampaignRun,
+    CaseRun,
+    CertificateResult,
+    CheckResult,
+    PolicyChecks,
+    ProbabilityResult,
+    Reproduction,
+    ScenarioCheck,
+    ScenarioFile,
+    ScenarioList,
+    TruthResult,
+    VutList,
+)
+from merge_sumo.campaigns.campaign import (
+    SCENARIOS,
+    OnCase,
+    case_name,
+    resume_campaign,
+    run_campaign,
+)
 from merge_sumo.campaigns.one_case import (
     DEBUG_DEADLINE_S,
     FIELDS,
@@ -54,66 +65,107 @@ from merge_sumo.campaigns.one_case import (
     settings_and_case,
 )
 from merge_sumo.campaigns.plan import plan_of
-from merge_sumo.campaigns.settings import DEFAULT_CASES, one_level, povs_of
-from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_of, read_manifest
+from merge_sumo.campaigns.run import SETTINGS, Run, read_settings
+from merge_sumo.campaigns.scenario_suggestion import about, suggested, unseen
+from merge_sumo.campaigns.settings import (
+    CampaignSettings,
+    one_level,
+    parse_levels,
+    povs_of,
+    settings_of,
+)
+from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.engine.simulator import SimulationPlan, road_for
 from merge_sumo.errors import Notice, UserError
-from merge_sumo.reports.progress import TrainingBars
-from merge_sumo.samplers import DEFAULT_SAMPLER
+from merge_sumo.reports import exports, figures
+from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
+from merge_sumo.reports.junit import check_junit, write_junit
+from merge_sumo.reports.progress import Bars, Counter, TrainingBars, is_watched, rate_text
+from merge_sumo.reports.report import check_report, write_report
+from merge_sumo.reports.reproduction_page import write_reproduction_page
+from merge_sumo.reports.version_pages import comparison_page, history_page, write_page
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.drawing import road_svg
+from merge_sumo.road.finder import find_corridor
+from merge_sumo.road.merge import road_of
+from merge_sumo.road.netfile import NetFile
+from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
+from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.studies import benchmark, certificate, reproduction, versions, vut_check
+from merge_sumo.studies import probability as estimates
+from merge_sumo.studies.avoidance import note_avoidance
+from merge_sumo.studies.certificate_runs import runs_points_on
+from merge_sumo.studies.history import History, history_of
+from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth
+from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
+from merge_sumo.sumo import replay as replayer
+from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
+from merge_sumo.sumo.replay import Replay
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.system.folders import check_new, dated
-from merge_sumo.values.scenario import MEMORY_GIB, US23, Scenario, level_name
+from merge_sumo.system.folders import (
+    check_new,
+    check_new_file,
+    check_own,
+    dated,
+    link_latest,
+    write_new,
+)
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.printable import quoted
+from merge_sumo.system.workers import Workers, open_workers, workers_or_cores
+from merge_sumo.values.scenario import (
+    DEADLINE_S,
+    LEVELS,
+    MEMORY_GIB,
+    US23,
+    Scenario,
+    level_name,
+)
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import Car, Seen, VutOptions
-from merge_sumo.vuts.in_memory import AnyVut, drivers_of
-from merge_sumo.vuts.python import SeenBatch
+from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
+from merge_sumo.vuts.onnx_export import export_onnx
+from merge_sumo.vuts.python import SeenBatch, installed_vuts
+from merge_sumo.vuts.registry import KINDS, LEARNED, PYTHON, built_in_vuts, vut_factory
 
 if TYPE_CHECKING:
-    from merge_sumo.campaigns.run import Run
-    from merge_sumo.campaigns.settings import CampaignSettings
-    from merge_sumo.reports.campaign_panel import CampaignPanel
-    from merge_sumo.system.workers import Workers
-    from merge_sumo.training.check import PolicyCheck
     from merge_sumo.values.case import Case
 
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting", "Seen"]
-__all__ += ["SeenBatch", "Settings", "Setup", "campaign", "certify", "check_vut", "compare"]
-__all__ += ["compare_runs", "export", "history", "open_in_gui", "open_run", "probability"]
-__all__ += ["replay", "report", "rerun", "resume", "run_case", "train", "truth", "truths"]
+__all__ += ["SeenBatch", "Settings", "Setup", "campaign", "certify", "check_scenario", "check_vut"]
+__all__ += ["compare", "compare_runs", "dated", "export", "export_policy", "history"]
+__all__ += ["new_scenario", "open_in_gui", "open_run", "probability", "replay", "report"]
+__all__ += ["reproduce", "rerun", "resume", "run_case", "scenarios", "train", "truth", "truths"]
+__all__ += ["vuts"]
+
+AnyPath = Path | str
+AnyRun = CampaignRun | Path | str
+"""A campaign, or its folder."""
+
+
+# Campaigns
 
 
 def campaign(
     vut: AnyVut,
     *,
-    level: int | str = "all",
-    sampler: str = DEFAULT_SAMPLER,
-    cases: int = DEFAULT_CASES,
-    batch: int | None = None,
-    seed: int = 0,
-    v_vut0_mps: float | None = None,
-    stop_after_converged: float | None = None,
-    learn_from: Sequence[Path | str] = (),
-    net: Path | str | None = None,
-    out: Path | str | None = None,
-    workers: int = 1,
+    net: AnyPath | None = None,
+    out: AnyPath | None = None,
+    workers: int | None = 1,
     dask: str | None = None,
     on_case: OnCase | None = None,
     check: Callable[[], None] | None = None,
     progress: bool | None = None,
-    **setup: Unpack[Setup],
+    gates: Iterable[str] = (),
+    junit: AnyPath | None = None,
+    **settings: Unpack[Settings],
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
 
     Args:
         vut: vehicle under test: a spec, a class, a function, or an object.
-        level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
-        sampler: name of what chooses the cases.
-        cases: number of cases.
-        batch: cases per batch; by default as many as the sampler wants.
-        seed: same seed, same outcomes.
-        v_vut0_mps: initial speed of the VUT; the scenario's by default.
-        stop_after_converged: stop when less than this share of new coverage is expected.
-        learn_from: folders of earlier campaigns to learn the VUT from.
         net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/<vut>-<date>` by default.
         workers: processes that run cases; the outcomes are the same.
@@ -121,38 +173,216 @@ def campaign(
         on_case: called with the outcome of every case as it ends.
         check: called after every batch; may raise to stop there.
         progress: show progress; by default in a notebook and on a terminal.
-        setup: how a case is run and judged: `scenario`, `follow_up_s`, `policies`, `pov`,
-            `fail_when`, `require`, `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`;
-            see `Setup`.
+        gates: "failures", "errors", "timeouts" or "fmc>X": what `passed` of the result depends on.
+        junit: new file to write for CI: JUnit XML.
+        settings: which cases are chosen (`level`, `sampler`, `cases`, `batch`, `seed`,
+            `v_vut0_mps`, `stop_after_converged`, `learn_from`), and how a case is run and judged
+            (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`, `vut_command`,
+            `deadline_s`, `vut_memory_gib`, `in_process`); see `Settings` and `Setup`.
 
     An interrupted campaign goes on with `resume`. Raises `UserError` for values that make no
     campaign, or when the folder exists.
     """
-    check_keywords("campaign", setup, Setup)
-    settings, count = settings_for(
-        vut,
-        level,
-        setup,
-        workers=workers,
-        sampler=sampler,
-        cases=cases,
-        batch=batch,
-        seed=seed,
-        v_vut0_mps=v_vut0_mps,
-        stop_after_converged=stop_after_converged,
-        learn_from=learn_from,
-    )
-    folder = dated(settings.vut) if out is None else Path(out)
-    road = road_for(settings.scenario, None if net is None else Path(net))
-    notice_unseen(settings, setup.get("scenario", US23.name), setup.get("policies"))
-    how = Running(
-        workers=count, dask=dask, on_case=on_case, check=check or no_check, progress=progress
-    )
+    check_keywords("campaign", settings, Settings)
+    checked, count = settings_for(vut, settings, workers=workers)
+    folder = dated(checked.vut) if out is None else Path(out)
+    road = _road(checked.scenario, net)
+    _notice_untrained(checked, settings)
+    running = _Running(count, dask, on_case, check or _go_on, progress, gates, junit)
 
-    def run(there: Workers, _: CampaignPanel, told: OnCase) -> Run:
-        return run_campaign(settings, folder, road, told, workers=there, check=how.check)
+    def run(opened: Workers, _: CampaignPanel, on_case: OnCase) -> Run:
+        return run_campaign(checked, folder, road, on_case, workers=opened, check=running.check)
 
-    return concluded(settings, folder, road, run, how)
+    return _concluded(checked, folder, road, run, running)
+
+
+def resume(
+    run: AnyRun,
+    *,
+    vut: AnyVut | None = None,
+    net: AnyPath | None = None,
+    force: bool = False,
+    trust_vut: bool = False,
+    workers: int | None = 1,
+    dask: str | None = None,
+    on_case: OnCase | None = None,
+    check: Callable[[], None] | None = None,
+    progress: bool | None = None,
+    gates: Iterable[str] = (),
+    junit: AnyPath | None = None,
+    **given: Unpack[Settings],
+) -> CampaignRun:
+    """Go on with a campaign that was stopped; the same as `merge-sumo campaign --resume`.
+
+    Args:
+        run: the campaign, or its folder.
+        vut: the VUT again, where it was an object of a process that is gone: only its name tells
+            that it is the same. So with a `pov`.
+        net: net for that; must be the one of the campaign.
+        force: go on although something differs that decides outcomes.
+        trust_vut: run the controller that a folder names although it was not made here.
+        workers: processes that run cases; the outcomes are the same.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        on_case: called with the outcome of every case as it ends.
+        check: called after every batch; may raise to stop there.
+        progress: show progress; by default in a notebook and on a terminal.
+        gates: as of `campaign`.
+        junit: as of `campaign`.
+        given: settings, which must be those of the campaign: `cases` may be more.
+
+    Raises `UserError` for a folder that is no campaign, or something that differs.
+    """
+    check_keywords("resume", given, Settings)
+    folder = run.folder if isinstance(run, CampaignRun) else Path(run)
+    recorded = read_settings(folder)
+    named = {"vut": vut, **given}
+    named = {name: value for name, value in named.items() if value is not None}
+    drivers = {name: named.get(name, recorded.get(name)) for name in ("vut", "pov")}
+    spec, pov_spec, count = drivers_of(drivers["vut"] or "", drivers["pov"], workers)
+    specs = {"vut": spec, "pov": pov_spec}
+    fields = recordable(named | {name: specs[name] for name in specs if name in named})
+    settings = settings_of(folder, recorded, fields, trust=trust_vut)
+    if "level" in named:
+        levels = parse_levels(str(named["level"]), settings.povs)
+        settings, fields = replace(settings, levels=levels), {**fields, "levels": levels}
+    check_report(folder)
+    road = _road(settings.scenario, net)
+    running = _Running(count, dask, on_case, check or _go_on, progress, gates, junit)
+
+    def go_on(opened: Workers, panel: CampaignPanel, on_case: OnCase) -> Run:
+        return resume_campaign(
+            folder,
+            road,
+            on_case,
+            on_before=panel.ran_before,
+            given=fields,
+            force=force,
+            workers=opened,
+            check=running.check,
+            warn=lambda sentence: warnings.warn(sentence, Notice, stacklevel=2),
+            trust=trust_vut,
+        )
+
+    return _concluded(settings, folder, road, go_on, running)
+
+
+@dataclass(frozen=True, slots=True)
+class _Running:
+    """Where a campaign runs and who is told of it: nothing here decides an outcome."""
+
+    workers: int | None
+    dask: str | None
+    on_case: OnCase | None
+    check: Callable[[], None]
+    progress: bool | None
+    gates: Iterable[str]
+    junit: AnyPath | None
+
+
+def _go_on() -> None:
+    """Let a verb go on: the `check` after every batch where none is given."""
+
+
+def _concluded(
+    settings: CampaignSettings,
+    folder: Path,
+    road: Corridor,
+    run: Callable[[Workers, CampaignPanel, OnCase], Run],
+    running: _Running,
+) -> CampaignRun:
+    """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
+
+    `run` runs its cases on workers, with the panel that shows it and what is called with every
+    case. An interruption has a note on how to go on.
+    """
+    gates = list(running.gates)
+    parse_gates(gates)
+    junit = None if running.junit is None else Path(running.junit)
+    if junit is not None:
+        check_junit(junit, folder)
+    shown = is_watched() if running.progress is None else running.progress
+    try:
+        with (
+            open_workers(settings.workers(running.workers), running.dask) as opened,
+            panel_of(
+                _title(settings),
+                settings.cases,
+                settings.levels,
+                folder,
+                workers=opened.count,
+                quiet=not shown,
+            ) as panel,
+        ):
+
+            def case_ended(outcome: Outcome) -> None:
+                panel.case_ended(outcome)
+                if running.on_case is not None:
+                    running.on_case(outcome)
+
+            done = run(opened, panel, case_ended)
+            note_avoidance(
+                done,
+                settings,
+                road,
+                workers=opened,
+                check=running.check,
+                on_part=panel.driven_again,
+            )
+            link_latest(done.folder)
+            result = CampaignRun(done, gates)
+            # Learned on another machine, surrogates may differ in a last bit.
+            local = opened if running.dask is None else None
+            write_report(done, result.summary, local, panel.report_part)
+    except (KeyboardInterrupt, Stopped) as stop:
+        if folder.exists():
+            link_latest(folder)
+            stop.add_note(f"stopped; go on with ms.resume({str(folder)!r})")
+        raise
+    if junit is not None:
+        write_junit(junit, done, result.summary.levels, result.verdict, result.gates)
+    return result
+
+
+def _title(settings: CampaignSettings) -> str:
+    return f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
+
+
+def _road(scenario: Scenario, net: AnyPath | None) -> Corridor:
+    return road_for(scenario, None if net is None else Path(net))
+
+
+def _notice_untrained(settings: CampaignSettings, given: Settings) -> None:
+    """Warn with a `Notice` where learned POVs are missing, or were not trained on the scenario."""
+    if given.get("level", "all") == "all" and not set(settings.levels) >= set(LEVELS):
+        levels = ", ".join(map(level_name, settings.levels))
+        warnings.warn(
+            f"--level all: policies are there for level {levels}; `merge-sumo train` makes others",
+            Notice,
+            stacklevel=3,
+        )
+    learned = {1, 2} & set(settings.levels)
+    if learned and unseen(settings.scenario, settings.povs.policies):
+        scenario, policies = given.get("scenario", US23), given.get("policies")
+        name = scenario.name if isinstance(scenario, Scenario) else str(scenario)
+        option = "" if policies is None else f" --policies {quoted(policies)}"
+        warnings.warn(
+            f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
+            f"`merge-sumo scenario check {quoted(name)}{option}` says in what it differs",
+            Notice,
+            stacklevel=3,
+        )
+
+
+def open_run(folder: AnyPath) -> CampaignRun:
+    """Open the folder of a campaign; `UserError` when it is none."""
+    return CampaignRun(folder)
+
+
+def _opened(run: AnyRun) -> CampaignRun:
+    return run if isinstance(run, CampaignRun) else CampaignRun(run)
+
+
+# Cases
 
 
 def run_case(
@@ -161,10 +391,10 @@ def run_case(
     *,
     recorded: tuple[AnyRun, int] | None = None,
     level: int | str | None = None,
-    net: Path | str | None = None,
+    net: AnyPath | None = None,
     debug: bool = False,
     gui: bool = False,
-    out: Path | str | None = None,
+    out: AnyPath | None = None,
     trust_vut: bool = False,
     on_end: Callable[[CaseRun], None] | None = None,
     **given: Unpack[CaseKeywords],
@@ -189,71 +419,748 @@ def run_case(
 
     Raises `UserError` for values that make no case, or when the folder exists.
     """
-    values = {name: value for name, value in given.items() if name in FIELDS}
+    values = {name: value for name, value in given.items() if name in FIELDS and value is not None}
     setup = {name: value for name, value in given.items() if name not in FIELDS}
     unknown = setup.keys() - Setup.__optional_keys__
     if unknown:
         raise UserError(f"a case has no {min(unknown)}: it has {', '.join(FIELDS)}")
-    settings, one = _settings_and_case(vut, case, recorded, level, setup, values, debug, trust_vut)
+    if debug:
+        setup |= {"in_process": True, "deadline_s": DEBUG_DEADLINE_S}
+    if recorded is not None:
+        settings, one = _recorded_case(vut, recorded, level, setup, values, trust=trust_vut)
+    elif vut is not None:
+        settings, one = _given_case(vut, case or {}, level, setup, values)
+    else:
+        raise UserError("say with --vut who drives, or with --case which recorded case")
     if out is not None:
         check_new(Path(out))
     for sentence in outside_of_the_pool(one):
         warnings.warn(sentence, Notice, stacklevel=2)
-    road = road_for(settings.scenario, None if net is None else Path(net))
+    road = _road(settings.scenario, net)
 
-    def ended(found: Ended) -> None:
+    def ended(result: Ended) -> None:
         if out is not None:
-            write_scenario(Path(out), road, found.outcome, found.trajectory)
+            write_scenario(Path(out), road, result.outcome, result.trajectory)
         if on_end is not None:
-            on_end(CaseRun(found))
+            on_end(CaseRun(result))
 
     return CaseRun(run_one(plan_of(settings, road, cases=1), one, live=gui, on_end=ended))
 
 
-def _settings_and_case(
+def _case_fields(vut: AnyVut | None, setup: Mapping[str, Any]) -> tuple[dict[str, Any], VutOptions]:
+    """Return the settings that are given for one case, and the options of a POV of one's own."""
+    spec, pov_spec, _ = drivers_of("" if vut is None else vut, setup.get("pov"), 1, stacklevel=5)
+    specs = {"vut": None if vut is None else spec, "pov": pov_spec}
+    fields = {**setup, **{name: value for name, value in specs.items() if value is not None}}
+    return recordable(fields), VutOptions(memory_gib=setup.get("vut_memory_gib", MEMORY_GIB))
+
+
+def _recorded_case(
     vut: AnyVut | None,
-    row: Mapping[str, Any] | None,
-    recorded: tuple[AnyRun, int] | None,
+    recorded: tuple[AnyRun, int],
     level: int | str | None,
     setup: Mapping[str, Any],
     values: Mapping[str, Any],
-    debug: bool,
+    *,
     trust: bool,
 ) -> tuple[CampaignSettings, Case]:
-    """Return how a case is run, and the case: see `run_case`."""
-    if vut is None and recorded is None:
-        raise UserError("say with --vut who drives, or with --case which recorded case")
-    spec, pov_spec, _ = drivers_of("" if vut is None else vut, setup.get("pov"), 1, stacklevel=4)
-    specs = {"vut": vut and spec, "pov": pov_spec}
-    given = dict(setup) | {name: value for name, value in specs.items() if value is not None}
-    if debug:
-        given |= {"in_process": True, "deadline_s": DEBUG_DEADLINE_S}
-    if recorded is None:
-        given.setdefault("scenario", US23)
-    given, policies = recordable(given), setup.get("policies")
-    options = VutOptions(memory_gib=setup.get("vut_memory_gib", MEMORY_GIB))
-    if recorded is not None:
-        run, index = opened(recorded[0]).run, recorded[1]
-        number = run.outcome(index).case.level
-        if level is not None:
-            number = one_level(str(level), povs_of(policies, run.scenario, pov_spec, options))
-        return settings_and_case((run, index), number, values, given, trust=trust)
-    known = {name: row[name] for name in FIELDS if row.get(name) is not None} if row else {}
-    wanted = level_name(int((row or {}).get("level", 0))) if level is None else str(level)
-    povs = povs_of(policies, given["scenario"], pov_spec, options)
-    return settings_and_case(None, one_level(wanted, povs), {**known, **values}, given)
+    """Return a case of a campaign with other settings and coordinates, and how it is run."""
+    fields, options = _case_fields(vut, setup)
+    run, index = _opened(recorded[0]).run, recorded[1]
+    number = run.outcome(index).case.level
+    if level is not None:
+        povs = povs_of(setup.get("policies"), run.scenario, fields.get("pov"), options)
+        number = one_level(str(level), povs)
+    return settings_and_case((run, index), number, values, fields, trust=trust)
+
+
+def _given_case(
+    vut: AnyVut,
+    row: Mapping[str, Any],
+    level: int | str | None,
+    setup: Mapping[str, Any],
+    values: Mapping[str, Any],
+) -> tuple[CampaignSettings, Case]:
+    """Return a case by its coordinates, which win over those of a row, and how it is run."""
+    fields, options = _case_fields(vut, {"scenario": US23, **setup})
+    coordinates = {name: row[name] for name in FIELDS if row.get(name) is not None}
+    name = level_name(int(row.get("level", 0))) if level is None else str(level)
+    povs = povs_of(setup.get("policies"), fields["scenario"], fields.get("pov"), options)
+    number = one_level(name, povs)
+    return settings_and_case(None, number, {**coordinates, **values}, fields)
+
+
+def rerun(
+    run: AnyRun,
+    indices: Iterable[int] | int = (),
+    *,
+    vut: AnyVut | None = None,
+    level: int | str | None = None,
+    net: AnyPath | None = None,
+    trust_vut: bool = False,
+    workers: int | None = 1,
+    dask: str | None = None,
+    progress: bool | None = None,
+    **hosting: Unpack[Hosting],
+) -> Rerun:
+    """Run recorded cases again with a changed VUT; the same as `merge-sumo rerun`.
+
+    Args:
+        run: the campaign, or its folder.
+        indices: its cases; all of them by default.
+        vut: as of `campaign`; the campaign's, as its files are now, by default.
+        level: only the cases with a POV of this level; "all" by default.
+        net: net for that; must be the one of the campaign.
+        trust_vut: run the controller that a folder names although it was not made here.
+        workers: processes that run cases.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        progress: show progress; by default in a notebook and on a terminal.
+        hosting: others to change: `policies`, `pov`, `vut_command`, `deadline_s`,
+            `vut_memory_gib`, `in_process`; see `Hosting`.
+
+    Raises `UserError` for a case that does not exist, and for another net or POV than recorded.
+    """
+    check_keywords("rerun", hosting, Hosting)
+    before, count = _opened(run).run, workers_or_cores(workers)
+    wanted = _of_level(before, _listed(indices), level)
+    given: dict[str, Any] = dict(hosting)
+    if vut is not None or hosting.get("pov") is not None:
+        spec, pov, able = drivers_of("" if vut is None else vut, hosting.get("pov"), workers)
+        given |= {name: one for name, one in (("vut", spec), ("pov", pov)) if one}
+        count = able or count
+    today = settings_today(before, recordable(given), trust=trust_vut)
+    total = len(set(wanted) or before.outcomes)
+    with (
+        open_workers(today.workers(count), dask) as opened,
+        Counter(f"{today.vut} again", total, "cases", shown=progress) as counter,
+    ):
+        road = None if net is None else Path(net)
+        return versions.rerun(
+            before, today, wanted, net=road, workers=opened, on_case=counter.ended
+        )
+
+
+def _listed(indices: Iterable[int] | int) -> tuple[int, ...]:
+    return tuple(indices) if isinstance(indices, Iterable) else (int(indices),)
+
+
+def _of_level(run: Run, indices: tuple[int, ...], level: int | str | None) -> tuple[int, ...]:
+    """Return the cases of a level among some, or among all."""
+    if level is None or str(level) == "all":
+        return indices
+    by_name = {level_name(number): number for number in run.settings.get("levels", ())}
+    if str(level) not in by_name:
+        names = ", ".join(by_name)
+        raise UserError(f"{run.folder} has no cases at level {level}: it has {names}, or all")
+    among = [run.outcome(index) for index in indices] or run.outcomes
+    chosen = tuple(o.index for o in among if o.case.level == by_name[str(level)])
+    if not chosen:
+        raise UserError(f"none of these cases of {run.folder} is of level {level}")
+    return chosen
+
+
+EXPORTS: Final = "exports"
+TABLES: Final = ("csv", "parquet")
+FOLDERS: Final = {"sumo": exports.write_sumo, "openscenario": exports.write_openscenario}
+"""Formats of `export`: a table of all cases, or a folder for each."""
+
+
+def export(
+    run: AnyRun,
+    indices: Iterable[int] | int | None = None,
+    *,
+    file_format: str = "sumo",
+    out: AnyPath | None = None,
+    net: AnyPath | None = None,
+) -> list[Path]:
+    """Write cases of a campaign for others, and return the paths; as `merge-sumo export`.
+
+    Args:
+        run: the campaign, or its folder.
+        indices: its cases; of a table all of them when left out.
+        file_format: "sumo" or "openscenario" for folders, "csv" or "parquet" for one table.
+        out: folder; `scenarios` or `exports` in that of the campaign when left out.
+        net: SUMO net to use instead of the scenario's.
+    """
+    loaded = _opened(run).run
+    wanted = None if indices is None else list(_listed(indices))
+    if out is None:
+        check_own(loaded.folder / SCENARIOS, loaded.folder / EXPORTS)
+    if file_format in TABLES:
+        wanted = wanted or [outcome.index for outcome in loaded.outcomes]
+        folder = Path(out) if out is not None else loaded.folder / EXPORTS
+        return [exports.write_table(loaded, wanted, folder, file_format)]
+    if file_format not in FOLDERS:
+        names = ", ".join((*FOLDERS, *TABLES))
+        raise UserError(f"there is no format {file_format!r}: choose one of {names}")
+    if not wanted:
+        raise UserError(f"--format {file_format} needs the indices of cases")
+    below = SCENARIOS if file_format == "sumo" else EXPORTS
+    target = Path(out) if out is not None else loaded.folder / below
+    road = _road(loaded.scenario, net)
+    return list(exports.write_folders(loaded, wanted, target, FOLDERS[file_format], road))
+
+
+def report(run: AnyRun) -> Path:
+    """Write the report of a campaign again and return its path; as `merge-sumo report`."""
+    return _opened(run).report()
+
+
+def replay(folder: AnyRun, index: int | None = None, *, net: AnyPath | None = None) -> Replay:
+    """Replay a case in SUMO and compare every row with its record; as `merge-sumo replay`.
+
+    Args:
+        folder: a scenario folder, or a campaign.
+        index: the case of the campaign, which is exported where it is not yet.
+        net: SUMO net to use instead of the scenario's.
+
+    `diverged_at_s` of the result is None where the replay is identical.
+    """
+    return replayer.replay(_scenario_folder(folder, index, net))
+
+
+def open_in_gui(folder: AnyRun, index: int | None = None, *, net: AnyPath | None = None) -> int:
+    """Show a case in sumo-gui until the window is closed; return the exit code of sumo-gui.
+
+    The arguments are those of `replay`. Raises `UserError` without a display.
+    """
+    return replayer.open_gui(_scenario_folder(folder, index, net))
+
+
+def _scenario_folder(folder: AnyRun, index: int | None, net: AnyPath | None) -> Path:
+    """Return the replay folder of a case, written where it does not exist yet."""
+    path = folder.folder if isinstance(folder, CampaignRun) else Path(folder)
+    if not (path / SETTINGS).is_file():
+        if index is not None:
+            raise UserError(f"{path} is no campaign, so it has no case {index}: leave that away")
+        return path
+    if index is None:
+        raise UserError(
+            f"{path} is a campaign: say which case, as in `merge-sumo replay {quoted(path)} 3`"
+        )
+    exported = path / SCENARIOS / case_name(index)
+    if not exported.is_dir():
+        export(folder, index, net=net)
+    return exported
+
+
+# Versions of a VUT
+
+
+def compare_runs(
+    a: AnyRun,
+    b: AnyRun,
+    *,
+    rerun: bool = True,
+    net: AnyPath | None = None,
+    policies: AnyPath | None = None,
+    trust_vut: bool = False,
+    out: AnyPath | None = None,
+    tolerance: float = 0.0,
+) -> RunComparison:
+    """Compare two campaigns: what got fixed, and what broke; as `merge-sumo compare-runs`.
+
+    `worse(tolerance)` of the result says why B is worse, if it is.
+
+    Args:
+        a: the campaign before, or its folder.
+        b: the campaign after, or its folder.
+        rerun: run the failures, errors and timeouts of each with the other's VUT.
+        net: net for that; must be the one of the campaigns.
+        policies: folder of the learned drivers, where they are elsewhere now.
+        trust_vut: run the controllers that the folders name although they were not made here.
+        out: page to write; nothing may be there. None is written when left out.
+        tolerance: by how much B may be worse before the page says so.
+    """
+    if out is not None:
+        check_new_file(Path(out))
+    first, second = _opened(a).run, _opened(b).run
+    given = {} if policies is None else {"policies": str(policies)}
+    road = _road(first.scenario, net) if rerun else None
+    motions: dict[tuple[str, int], Trajectory] = {}
+
+    def keep(of: str, index: int, trajectory: Trajectory) -> None:
+        motions[of, index] = trajectory
+
+    compared = versions.compare_runs(
+        first, second, rerun=rerun, net=road, given=given, trust=trust_vut, on_motion=keep
+    )
+    if out is not None:
+        write_page(comparison_page(compared, first, second, motions, tolerance), Path(out))
+    return compared
+
+
+def history(runs: Iterable[AnyRun], *, out: AnyPath | None = None) -> History:
+    """Return how a VUT changed over several campaigns; the same as `merge-sumo history`.
+
+    Everything is read from the records: no case runs again, and no VUT.
+
+    Args:
+        runs: the campaigns, or their folders, the oldest first.
+        out: page to write; nothing may be there. None is written when left out.
+
+    Raises `UserError` for fewer than two campaigns, and where scenario, criterion, initial speed
+    of the VUT or POV differ.
+    """
+    if isinstance(runs, str | Path | CampaignRun):
+        raise UserError("give several campaigns in a list, the oldest first")
+    if out is not None:
+        check_new_file(Path(out))
+    result = history_of([_opened(run).run for run in runs])
+    if out is not None:
+        write_page(history_page(result), Path(out))
+    return result
+
+
+# Studies
+
+
+def truth(
+    vut: AnyVut,
+    level: int | str,
+    *,
+    cases: int | None = None,
+    seed: int = 0,
+    workers: int | None = 1,
+    dask: str | None = None,
+    progress: bool | None = None,
+    **setup: Unpack[Setup],
+) -> Truth:
+    """Return the ground truth of a VUT at one level; see `truths`, whose arguments these are."""
+    check_keywords("truth", setup, Setup)
+    settings, count = settings_for(vut, {**setup, "level": level}, workers=workers)
+    number = one_level(str(level), settings.povs)
+    with _study(settings, count, dask, progress) as study:
+        return study.truth(number, cases, seed)
+
+
+def truths(
+    vut: AnyVut,
+    level: int | str = "all",
+    *,
+    cases: int | None = None,
+    seed: int = 0,
+    workers: int | None = 1,
+    dask: str | None = None,
+    progress: bool | None = None,
+    **setup: Unpack[Setup],
+) -> TruthResult:
+    """Find the ground truth of a VUT by uniform cases; the same as `merge-sumo truth`.
+
+    Args:
+        vut: as of `campaign`.
+        level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
+        cases: uniform cases of a level; by default 10,000, and 20,000 at level 2.
+        seed: same seed, same cases.
+        workers: processes that run cases; None is one a core.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        progress: show progress; by default in a notebook and on a terminal.
+        setup: how a case is run and judged: see `Setup`.
+
+    A cached truth is used again. The truth of an object of this process is not kept: its name does
+    not tell it from another object.
+    """
+    check_keywords("truths", setup, Setup)
+    settings, count = settings_for(vut, {**setup, "level": level}, workers=workers)
+    with _study(settings, count, dask, progress) as study:
+        by_level = {number: study.truth(number, cases, seed) for number in settings.levels}
+    if settings.vut_factory.vut.named_only and not is_here(settings.vut):
+        warnings.warn(
+            "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
+            "its command and the files that are named there",
+            Notice,
+            stacklevel=2,
+        )
+    return TruthResult(settings.vut, by_level, settings.criterion)
+
+
+@dataclass(frozen=True, slots=True)
+class _Study:
+    """A plan with the workers and the cache of a study of truths."""
+
+    plan: SimulationPlan
+    workers: Workers
+    cache: Path | None
+    progress: bool | None
+
+    def truth(self, level: int, cases: int | None, seed: int = 0) -> Truth:
+        """Return the truth at a level, from the cache where it is kept."""
+        total = TRUTH_CASES[level] if cases is None else cases
+        title = f"truth of {self.plan.vut.spec} at level {level_name(level)}"
+        with Counter(title, total, "cases", shown=self.progress) as counter:
+            return ground_truth(
+                *(self.plan, level, total, seed),
+                workers=self.workers,
+                cache=self.cache,
+                on_cases=counter.ended,
+            )
+
+    def dense_truths(self, levels: Sequence[int], wanted: bool | None) -> dict[int, Truth]:
+        """Return the dense truths by level: made where `wanted`, where that is None the kept."""
+        if wanted is False:
+            return {}
+        if wanted:
+            return {level: self.truth(level, DENSE_CASES) for level in levels}
+        kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
+        return {level: truth for level, truth in kept.items() if truth is not None}
+
+
+@contextmanager
+def _study(
+    settings: CampaignSettings, workers: int | None, dask: str | None, progress: bool | None
+) -> Iterator[_Study]:
+    """Open a study; the cache of objects of this process is a passing one."""
+    plan = plan_of(settings, _road(settings.scenario, None))
+    with open_workers(settings.workers(workers), dask) as opened:
+        if not (is_here(settings.vut) or is_here(settings.pov or "")):
+            yield _Study(plan, opened, None, progress)
+            return
+        with tempfile.TemporaryDirectory(prefix="merge-sumo-") as passing:
+            yield _Study(plan, opened, Path(passing), progress)
+
+
+def compare(
+    vut: AnyVut,
+    level: int | str = "all",
+    *,
+    samplers: Iterable[str] | None = None,
+    seeds: int = 10,
+    cases: int = 400,
+    batch: int | None = None,
+    truth_cases: int | None = None,
+    dense: bool | None = None,
+    figure: AnyPath | None = None,
+    workers: int | None = 1,
+    dask: str | None = None,
+    progress: bool | None = None,
+    **setup: Unpack[Setup],
+) -> Benchmark:
+    """Compare samplers with each other and with the ground truth; as `merge-sumo compare`.
+
+    Args:
+        vut: as of `campaign`.
+        level: POV level 0, 1 or 2, "own" for a `pov`, or "all", over which coverage is summed.
+        samplers: their names; all by default.
+        seeds: runs of each sampler.
+        cases: cases of each run.
+        batch: cases per batch; by default 20, and for `coverage` as many as it wants.
+        truth_cases: cases of the truth at a level; by default 10,000, and 20,000 at level 2.
+        dense: make the dense truths of 1,000,000 cases, or go without; by default those kept.
+        figure: new file for FMC against cases: .png, .svg or .html.
+        workers: processes that run cases; None is one a core.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        progress: show progress; by default in a notebook and on a terminal.
+        setup: how a case is run and judged: see `Setup`.
+
+    Raises `UserError` for values that make no comparison.
+    """
+    check_keywords("compare", setup, Setup)
+    picture = None if figure is None else Path(figure)
+    if picture is not None:
+        figures.check_figure(picture)
+    names = list(dict.fromkeys(map(str.strip, SAMPLERS if samplers is None else samplers)))
+    if not names:
+        raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}")
+    search = {"level": level, "sampler": names[0], "cases": cases, "batch": batch}
+    settings, count = settings_for(vut, {**setup, **search}, workers=workers)
+    for name in names[1:]:
+        replace(settings, sampler=name)
+    if seeds < 1:
+        raise UserError(f"--seeds is {seeds}: it must be 1 or more")
+    levels = settings.levels
+    with (
+        _study(settings, count, dask, progress) as study,
+        Counter(_title(settings), len(names) * seeds, "runs", shown=progress) as counter,
+    ):
+        by_level = {number: study.truth(number, truth_cases) for number in levels}
+        dense_truths = study.dense_truths(levels, dense)
+        searches = benchmark.search(
+            study.plan,
+            levels,
+            names,
+            seeds=seeds,
+            cases=cases,
+            batch=batch,
+            workers=study.workers,
+            on_search=lambda name, _: counter.ended(1, name),
+        )
+    limit = benchmark.limit_fmc(chain.from_iterable(searches.values()), by_level, dense_truths)
+    result = Benchmark(
+        samplers={name: benchmark.compare(s, by_level, limit) for name, s in searches.items()},
+        truths=by_level,
+        dense=dense_truths,
+        limit_fmc=limit,
+        oracle_fmc=benchmark.oracle(by_level, cases, batch),
+        cases=cases,
+        figure=picture,
+    )
+    if picture is not None:
+        title = f"{_title(settings)}, {seeds} seeds"
+        curves = (result.samplers, result.truth_fmc, result.oracle_fmc, result.limit_fmc)
+        figures.save(figures.coverage_curves(title, *curves), picture)
+    return result
+
+
+def certify(
+    vut: AnyVut,
+    level: int | str = "all",
+    *,
+    radius: float = 0.01,
+    net: AnyPath | None = None,
+    out: AnyPath | None = None,
+    resume: bool = False,
+    workers: int | None = 1,
+    dask: str | None = None,
+    check: Callable[[], None] | None = None,
+    progress: bool | None = None,
+    **setup: Unpack[Setup],
+) -> CertificateResult:
+    """Certify that no ball of a radius in the pool fails throughout; as `merge-sumo certify`.
+
+    Args:
+        vut: as of `campaign`.
+        level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
+        radius: radius of the balls, as a share of the axes of the pool.
+        net: SUMO net to use instead of the scenario's.
+        out: new folder to write; `runs/certify-<vut>-<date>` by default.
+        resume: go on with the certificate in `out`.
+        workers: processes that run cases; None is one a core.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        check: called after every block of cases; may raise to stop there.
+        progress: show progress; by default in a notebook and on a terminal.
+        setup: how a case is run and judged: see `Setup`.
+
+    Raises `UserError` for values that make no certificate, and when the folder exists.
+    """
+    check_keywords("certify", setup, Setup)
+    settings, count = settings_for(vut, {**setup, "level": level}, workers=workers)
+    lattices = certificate.lattices_of(settings, radius)
+    if resume and out is None:
+        raise UserError("say with out= which folder is resumed")
+    folder = dated(f"certify-{settings.vut}") if out is None else Path(out)
+    if not resume:
+        check_new(folder)
+    road = _road(settings.scenario, net)
+    total = sum(map(len, lattices.values()))
+    with (
+        open_workers(settings.workers(count), dask) as opened,
+        Counter(_title(settings), total, "cases", shown=progress) as counter,
+    ):
+        done = certificate.certify(
+            settings,
+            radius,
+            folder,
+            road,
+            runs_points_on(opened, settings, road, folder),
+            resume=resume,
+            on_cases=counter.ended,
+            check=check or _go_on,
+        )
+    return CertificateResult(done, folder / certificate.CERTIFICATE)
+
+
+def probability(
+    run: AnyRun,
+    *,
+    cases: int = estimates.DEFAULT_CASES,
+    distribution: AnyPath | None = None,
+    confidence: float = 0.95,
+    seed: int = 0,
+    net: AnyPath | None = None,
+    out: AnyPath | None = None,
+    trust_vut: bool = False,
+    workers: int | None = 1,
+    dask: str | None = None,
+    progress: bool | None = None,
+    **hosting: Unpack[Hosting],
+) -> ProbabilityResult:
+    """Estimate how likely the VUT of a campaign is to fail; as `merge-sumo probability`.
+
+    Args:
+        run: the campaign, or its folder.
+        cases: fresh cases to run.
+        distribution: JSON file that says how often cases occur; uniform by default.
+        confidence: chance that the interval holds the probability.
+        seed: same seed, same cases.
+        net: net for that; must be the one of the campaign.
+        out: new file to write; `probability.json` in the folder of the campaign by default.
+        trust_vut: run the controller that a folder names although it was not made here.
+        workers: processes that run cases.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        progress: show progress; by default in a notebook and on a terminal.
+        hosting: settings that may be otherwise: `policies`, `pov`, `vut_command`, `deadline_s`,
+            `vut_memory_gib`, `in_process`; see `Hosting`.
+
+    Raises `UserError` for another net or POV than recorded, and when the file exists.
+    """
+    check_keywords("probability", hosting, Hosting)
+    before = _opened(run).run
+    target = before.folder / estimates.RESULT if out is None else Path(out)
+    _, pov, count = drivers_of(before.vut, hosting.get("pov"), workers)
+    given = recordable({**hosting, **({} if pov is None else {"pov": pov})})
+    settings = settings_of(before.folder, before.settings, given, trust=trust_vut)
+    with (
+        open_workers(settings.workers(count), dask) as opened,
+        Counter("fresh cases", cases, "cases", shown=progress) as counter,
+    ):
+        estimate = estimates.failure_probability(
+            before,
+            target,
+            cases=cases,
+            distribution=None if distribution is None else Path(distribution),
+            confidence=confidence,
+            seed=seed,
+            net=_road(before.scenario, net),
+            given=given,
+            trust=trust_vut,
+            workers=opened,
+            on_case=lambda _: counter.ended(1),
+        )
+    return ProbabilityResult(estimate, target, before.criterion, distribution is None)
+
+
+def reproduce(
+    *,
+    seeds: int | None = None,
+    out: AnyPath | None = None,
+    quick: bool = False,
+    dense: bool | None = None,
+    policies: AnyPath | None = None,
+    workers: int | None = 1,
+    dask: str | None = None,
+    progress: bool | None = None,
+) -> Reproduction:
+    """Reproduce Table II and the figures of the paper; the same as `merge-sumo reproduce`.
+
+    Args:
+        seeds: runs of each sampler; by default 10, with `quick` 2.
+        out: new folder to write; `runs/reproduce-<date>` by default.
+        quick: few and short runs and a small truth: a first look.
+        dense: make the dense truths of 1,000,000 cases, or go without; by default those kept.
+        policies: folder of learned drivers instead of the shipped ones.
+        workers: processes that run cases; None is one a core.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        progress: show progress; by default in a notebook and on a terminal.
+
+    Raises `UserError` for no seeds, and when the folder exists.
+    """
+    count = (2 if quick else 10) if seeds is None else seeds
+    scale = reproduction.quick(count) if quick else reproduction.Scale(seeds=count)
+    if dense is not None:
+        scale = replace(scale, dense=dense)
+    povs = povs_of(policies, US23)
+    folder = dated("reproduce") if out is None else Path(out)
+    figures.require_matplotlib()
+    with open_workers(workers, dask) as opened, Bars(shown=progress) as bars:
+
+        def ran(title: str, done: int, total: int, unit: str) -> None:
+            bars.show(title, done, total, rate_text(done, bars.elapsed_s(title), unit))
+
+        reproduction.reproduce(folder, scale, povs=povs, workers=opened, on_run=ran)
+    return Reproduction(write_reproduction_page(folder))
+
+
+# What a person brings: VUTs, scenarios, learned drivers
+
+
+def vuts(policies: AnyPath | None = None) -> VutList:
+    """Return the VUTs that can be tested, and the kinds that a person can bring.
+
+    `policies` is the folder of learned drivers instead of the shipped ones.
+    """
+    trained = read_manifest(policies_of() if policies is None else policies_in(policies))
+    built_in = [name for name in built_in_vuts() if LEARNED.get(name, name) in (name, *trained)]
+    kinds = [kind for kind in (PYTHON, *KINDS.values()) if kind.form]
+    return VutList(built_in, list(installed_vuts()), kinds)
+
+
+def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> CheckResult:
+    """Let a VUT drive a few cases and say what is wrong with it; as `merge-sumo check-vut`.
+
+    Args:
+        vut: as of `campaign`.
+        hosting: `policies`, `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`; see
+            `Hosting`.
+    """
+    check_keywords("check_vut", hosting, Hosting)
+    spec, _, _ = drivers_of(vut, None, 1)
+    policies = hosting.get("policies")
+    options = VutOptions(
+        command=hosting.get("vut_command"),
+        deadline_s=hosting.get("deadline_s", DEADLINE_S),
+        memory_gib=hosting.get("vut_memory_gib", MEMORY_GIB),
+        in_process=hosting.get("in_process", False),
+        policies=None if policies is None else policies_in(policies),
+    )
+    return CheckResult(spec, vut_check.check_vut(vut_factory(spec, options)))
+
+
+def scenarios() -> ScenarioList:
+    """Return the scenarios that the package brings, by name; as `merge-sumo scenario list`."""
+    return ScenarioList({name: named_scenario(name) for name in shipped_scenarios()})
+
+
+def new_scenario(file: AnyPath, *, net: AnyPath, mainline: str, ramp: str) -> ScenarioFile:
+    """Write a scenario for a merge in a net, and a picture of the road; as `scenario new`.
+
+    Args:
+        file: new TOML file to write.
+        net: SUMO net, or a map of which netconvert makes one beside `file`: .osm, .xodr.
+        mainline: edges of the mainline, past M: "e1 e2".
+        ramp: edges of the ramp, past M.
+
+    Raises `UserError` for edges that make no merge, and when a file exists.
+    """
+    file, net = Path(file), Path(net)
+    if file.suffix != SUFFIX:
+        raise UserError(f"{file} is to be a scenario: name it NAME{SUFFIX}")
+    picture = file.with_suffix(".svg")
+    edges = tuple(mainline.split()), tuple(ramp.split())
+    written, map_file = [file, picture], net if is_map(net) else None
+    if map_file is not None:
+        net = file.with_suffix(".net.xml")
+        written.append(net)
+    for path in written:
+        check_new_file(path, "FILE")
+    if map_file is not None:
+        converted = net_of_map(map_file)
+        try:
+            find_corridor(NetFile(map_file, converted), *edges)
+        except UserError as error:
+            raise UserError(f"{error}; to look at its edges: `{command_for(map_file)}`") from error
+        write_new(net, converted, "FILE")
+    road = road_of(net, *edges)
+    scenario = suggested(road, file.stem)
+    relative = os.path.relpath(net.resolve(), file.parent.resolve())
+    write_new(picture, road_svg(road, scenario), "FILE")
+    text = to_toml(replace(scenario, net=relative), about(road))
+    write_new(file, text.encode(), "FILE")
+    return ScenarioFile(about(road), written, map_file)
+
+
+def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None) -> ScenarioCheck:
+    """Say whether a scenario can be hosted, and whether the learned drivers were trained on it.
+
+    Args:
+        scenario: a `Scenario`, its name, or its TOML file.
+        policies: folder of learned drivers instead of the shipped ones.
+    """
+    folder = None if policies is None else policies_in(policies)
+    checked = scenario_of(scenario)
+    name = checked.name if isinstance(scenario, Scenario) else str(scenario)
+    return ScenarioCheck(name, checked, about(road_for(checked)), list(unseen(checked, folder)))
 
 
 def train(
     only: Iterable[str] = (),
     *,
     seed: int = 0,
-    scenario: Scenario | Path | str | None = None,
-    out: Path | str | None = None,
+    scenario: Scenario | AnyPath | None = None,
+    out: AnyPath | None = None,
     check: bool = False,
     cases: int = 300,
     progress: bool | None = None,
-) -> dict[str, PolicyCheck]:
+) -> PolicyChecks:
     """Train the learned drivers in SUMO and return what each loses; as `merge-sumo train`.
 
     Args:
@@ -261,9 +1168,12 @@ def train(
         seed: same seed, same weights on one machine.
         scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
         out: folder; by default that of the shipped policies, for "us23" only.
-        check: train nothing, and measure the regret of what the folder has.
+        check: train nothing, and measure the regret of the networks in the folder.
         cases: random cases of such a check.
         progress: show progress; by default in a notebook and on a terminal.
+
+    Returns:
+        A `PolicyCheck` by the name of the network.
 
     An interrupted training goes on with what is not finished. Raises `UserError` without the extra
     `train`, for a network that does not exist, and for a folder of another scenario.
@@ -310,5 +1220,27 @@ def train(
             f"check it, or --scenario {US23.name}"
         )
     if check:
-        return {n: check_policy(n, folder, count=cases, scenario=played) for n in names}
-    return {name: PolicyCheck(**manifest[name]["check"]) for name in names}
+        checks = {str(n): check_policy(n, folder, count=cases, scenario=played) for n in names}
+        return PolicyChecks(checks)
+    return PolicyChecks({str(n): PolicyCheck(**manifest[n]["check"]) for n in names})
+
+
+def export_policy(
+    network: str,
+    out: AnyPath,
+    *,
+    policies: AnyPath | None = None,
+    scenario: Scenario | AnyPath | None = None,
+) -> Path:
+    """Write a learned driver as an ONNX network and return its path; as `policies export`.
+
+    Args:
+        network: "pov1", "vut1", "pov2" or "vut2".
+        out: ONNX file to write.
+        policies: folder of learned drivers instead of the shipped ones.
+        scenario: scenario to drive in; by default that of the training.
+    """
+    played = None if scenario is None else scenario_of(scenario)
+    folder = policies_of(played or US23) if policies is None else policies_in(policies)
+    export_onnx(network, Path(out), folder, played)
+    return Path(out)

@@ -1,26 +1,53 @@
-"""What `import merge_sumo as ms` gives back: campaigns and cases, with tables for a notebook."""
+"""What the verbs return: campaigns, cases and studies, as lines, as JSON, and for a notebook."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
+from io import StringIO
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from merge_sumo.analysis.coordinates import coordinates
+from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
-from merge_sumo.analysis.summary import Summary, summarise
-from merge_sumo.analysis.verdict import MESSAGE_CHARACTERS, Verdict, judge, shortened
+from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
+from merge_sumo.analysis.verdict import (
+    MESSAGE_CHARACTERS,
+    NOTHING_TESTED,
+    GateResult,
+    Verdict,
+    counted,
+    judge,
+    parse_gates,
+    shortened,
+)
+from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.studies.avoidance import in_a_sentence, read_avoidance
-from merge_sumo.values.scenario import US23, level_name
+from merge_sumo.studies.benchmark import Quartiles, SamplerSummary
+from merge_sumo.studies.certificate import Certificate
+from merge_sumo.studies.interval import Estimate
+from merge_sumo.studies.reproduction import TABLE_JSON, TABLE_MARKDOWN
+from merge_sumo.studies.truth import DENSE_CASES, REAL_REGION, Truth
+from merge_sumo.studies.vut_check import VutCheck
+from merge_sumo.system.printable import quoted
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.fmc import fmc, regions
+from merge_sumo.values.scenario import US23, Scenario, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.registry import VutKind
+
+if TYPE_CHECKING:
+    from merge_sumo.training.check import PolicyCheck
 
 MOST_ROWS: Final = 20
 """Rows that a notebook shows of a table."""
@@ -57,11 +84,12 @@ def _cell(value: object) -> str:
     return escape(shortened(text, MESSAGE_CHARACTERS))
 
 
-class CampaignRun:
-    """A campaign that was run, as it lies in its folder."""
+class CampaignRun(Result):
+    """A campaign that was run, as its folder holds it."""
 
-    def __init__(self, folder: Path | str | Run) -> None:
-        """Open the folder of a campaign, unless it is read already; `UserError` when it is none."""
+    def __init__(self, folder: Path | str | Run, gates: Iterable[str] = ()) -> None:
+        """Open the folder of a campaign, to which gates may apply; `UserError` when it is none."""
+        self._gates = parse_gates(gates)
         self._run = folder if isinstance(folder, Run) else Run(Path(folder))
         if not isinstance(self._run.settings.get("levels"), list):
             raise UserError(f"{self.folder / SETTINGS} is no campaign's: it has no levels")
@@ -118,11 +146,27 @@ class CampaignRun:
 
     @cached_property
     def careful(self) -> str | None:
-        """Which share of the failures a careful driver would have avoided, in a sentence.
+        """Share of the failures that a careful driver would have avoided, in a sentence.
 
-        None where no failure was driven again.
+        None where the drivers of the counterfactuals drove no failure.
         """
         return in_a_sentence(read_avoidance(self._run).values())
+
+    @cached_property
+    def gates(self) -> list[GateResult]:
+        """The gates that were given, and whether the campaign meets them."""
+        return [gate.check(self.verdict, self.summary) for gate in self._gates]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the VUT reached the merge point in some case, and no gate is met."""
+        return self.verdict.tested > 0 and not any(gate.met for gate in self.gates)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the search ended before its number of cases, as nothing new was expected."""
+        may_end = self.settings.get("stop_after_converged") is not None
+        return may_end and len(self._run.outcomes) < self.settings["cases"]
 
     def trajectory(self, index: int) -> Trajectory:
         """Return the motion of a case; `UserError` when there is none."""
@@ -139,20 +183,71 @@ class CampaignRun:
 
         return write_report(self._run)
 
+    def to_record(self) -> dict[str, Any]:
+        """Return what `merge-sumo campaign --json` prints."""
+        outcomes, criterion = self._run.outcomes, self._run.criterion
+        return {
+            **asdict(self.summary),
+            **self.verdict.to_record(),
+            "gates": {gate.name: gate.met for gate in self.gates},
+            "passed": self.passed,
+            "stopped": "converged" if self.converged else "cases",
+            "careful": self.careful,
+            "fail_when": criterion.text,
+            "notes": notes_on(outcomes, criterion),
+            "repeats": [repeat.to_record() for repeat in self.repeats],
+            "run": str(self.folder),
+            "report": str(self.report_file),
+        }
+
+    def lines(self) -> list[str]:
+        """Return the verdict, the levels, and where report and worst case are."""
+        run, levels = self._run, self.summary.levels
+        optional = [
+            self._converged_line() if self.converged else None,
+            unrepeatable(self.repeats),
+            self.verdict.counts,
+            None if run.criterion.is_papers else f"  a case fails when {run.criterion.words}",
+        ]
+        if self.summary.severities:
+            counts = (f"{number} {name}" for name, number in self.summary.severities.items())
+            optional.append(f"  severity of all cases: {', '.join(counts)}")
+        optional += self.verdict.trouble_lines()
+        optional += [f"  {run.ran_again_in_words}"] if run.ran_again else []
+        optional += [f"  note: {note}" for note in doubts(run.outcomes, run.criterion)]
+        optional += [_level_line(level, summary) for level, summary in levels.items()]
+        optional += [self.careful, f"report: {self.report_file}"]
+        worst = failures(run.outcomes)[:1]
+        folders = [run.folder / SCENARIOS / case_name(outcome.index) for outcome in worst]
+        optional += [f"worst case: merge-sumo replay {quoted(path)} --gui" for path in folders]
+        return [line for line in optional if line is not None]
+
+    def remarks(self) -> list[str]:
+        """Return what decided whether the campaign passed: the gates, and whether it tested."""
+        untested = [] if self.verdict.tested else [NOTHING_TESTED]
+        return [*(gate.sentence for gate in self.gates), *untested]
+
+    def _converged_line(self) -> str:
+        cases, share = (self.settings[name] for name in ("cases", "stop_after_converged"))
+        return (
+            f"stopped after {len(self._run.outcomes)} of {cases} cases: three times in a row the "
+            f"next batch was expected to add less than {share:.2%} to the coverage (this says "
+            "nothing of regions that no case has come near)"
+        )
+
     def __repr__(self) -> str:
         """Return folder and result in a line."""
         return f"<campaign {self.folder}: {self.verdict.counts}>"
 
     def _repr_html_(self) -> str:
         rows = "".join(
-            f"<tr><td>{level_name(level)}</td><td>{found.cases}</td><td>{found.failures}</td>"
-            f"<td>{found.regions}</td><td>{found.fmc:.4f}</td></tr>"
-            for level, found in self.summary.levels.items()
+            f"<tr><td>{level_name(level)}</td><td>{one.cases}</td><td>{one.failures}</td>"
+            f"<td>{one.regions}</td><td>{one.fmc:.4f}</td></tr>"
+            for level, one in self.summary.levels.items()
         )
         title = escape(f"{self._run.vut}: {self.verdict.counts}")
-        unsaid = unrepeatable(self.repeats)
-        said = [*([unsaid] if unsaid else []), *self.verdict.sentences]
-        wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in said)
+        warnings = filter(None, [unrepeatable(self.repeats), *self.verdict.sentences])
+        wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in warnings)
         return (
             f"<p><b>{title}</b><br>{escape(str(self.folder))}</p>{wrong}"
             "<table><thead><tr><th>POV level</th><th>cases</th><th>failures</th><th>regions</th>"
@@ -160,11 +255,24 @@ class CampaignRun:
         )
 
 
+def _level_line(level: int, summary: LevelSummary) -> str:
+    """Return the result at a POV level in a line."""
+    title = f"  level {level_name(level)}"
+    if summary.cases and not summary.tested:
+        return f"{title}: nothing was tested in {summary.cases} cases"
+    ball = summary.unseen
+    empty = "" if ball is None else f"; largest ball without a case: {ball.radius:.0%} of the axes"
+    return (
+        f"{title}: {counted(summary.failures, 'failure')} in {counted(summary.cases, 'case')}, "
+        f"FMC {summary.fmc:.4f}, {counted(summary.regions, 'region')}{empty}"
+    )
+
+
 class CaseRun(Result):
     """One case that was run."""
 
     def __init__(self, ended: Ended) -> None:
-        """Take what became of it."""
+        """Take the outcome and the motion of the case."""
         self.outcome, self.trajectory = ended.outcome, ended.trajectory
 
     @property
@@ -178,8 +286,13 @@ class CaseRun(Result):
         return self.outcome.failed
 
     @property
+    def passed(self) -> bool:
+        """Whether the VUT merged, and the case is no failure."""
+        return self.measures.end is End.MERGED and not self.failed
+
+    @property
     def verdict(self) -> str:
-        """What became of it in a sentence."""
+        """Outcome in a sentence."""
         return verdict_of(self.outcome, self.trajectory)
 
     def __repr__(self) -> str:
@@ -194,3 +307,442 @@ class CaseRun(Result):
     def lines(self) -> list[str]:
         """Return verdict, measures and motion, as `merge-sumo run` prints them."""
         return lines_of(self.outcome, self.trajectory)
+
+
+NAMED: Final = 5
+"""Failures of a level of a certificate that are printed; the certificate names more."""
+
+
+@dataclass(frozen=True, repr=False)
+class TruthResult(Result):
+    """The ground truth of a VUT at one or more POV levels.
+
+    Attributes:
+        vut: the VUT.
+        truths: `Truth` by level: `points` in the unit cube, (n, d), their `score`, (n,), and the
+            points of the `failures`, (m, d).
+        criterion: what counts as a failure.
+    """
+
+    vut: str
+    truths: dict[int, Truth]
+    criterion: Criterion
+
+    @property
+    def cases(self) -> int:
+        """Number of cases, over all levels."""
+        return sum(len(truth.score) for truth in self.truths.values())
+
+    @property
+    def failures(self) -> int:
+        """Number of failures, over all levels."""
+        return sum(len(truth.failures) for truth in self.truths.values())
+
+    @property
+    def fmc(self) -> float:
+        """Failure mode coverage, summed over the levels."""
+        return sum(fmc(truth.failures) for truth in self.truths.values())
+
+    @property
+    def real_regions(self) -> int:
+        """Number of failing regions with at least 3 % of the failures of their level."""
+        return sum(len(truth.real_regions()) for truth in self.truths.values())
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints: that of the level, or sums with a list of the levels."""
+        records = [
+            {
+                "vut": self.vut,
+                "level": level,
+                "cases": len(truth.score),
+                "failures": len(truth.failures),
+                "fmc": fmc(truth.failures),
+                "region_sizes": _region_sizes(truth),
+                "real_regions": len(truth.real_regions()),
+                "fail_when": self.criterion.text,
+            }
+            for level, truth in self.truths.items()
+        ]
+        if len(records) == 1:
+            return records[0]
+        sums = {name: getattr(self, name) for name in ("cases", "failures", "fmc", "real_regions")}
+        text = self.criterion.text
+        return {"vut": self.vut, "level": "all", **sums, "fail_when": text, "levels": records}
+
+    def lines(self) -> list[str]:
+        """Return a line for each level, and any criterion but the default one in words."""
+        lines = [
+            f"{self.vut} at level {level_name(level)}: {len(truth.failures)} failures in "
+            f"{len(truth.score)} cases, FMC {fmc(truth.failures):.4f}, "
+            f"{len(truth.real_regions())} regions with at least {REAL_REGION:.0%} of the failures"
+            for level, truth in self.truths.items()
+        ]
+        if not self.criterion.is_papers:
+            lines.append(f"  a case fails when {self.criterion.words}")
+        return lines
+
+
+def _region_sizes(truth: Truth) -> list[int]:
+    labels = regions(truth.failures).tolist()
+    return [labels.count(label) for label in range(max(labels, default=-1) + 1)]
+
+
+HEADINGS: Final = (
+    *("FMC / truth", "FMC / limit", "FMC", "failures", "regions"),
+    *("to 50 %", "to 90 %", "sampler s"),
+)
+
+
+@dataclass(frozen=True, repr=False)
+class Benchmark(Result):
+    """Samplers beside each other, and beside the ground truth, over several seeds.
+
+    Attributes:
+        samplers: `SamplerSummary` by name: medians and quartiles over the seeds.
+        truths: the truth by level.
+        dense: the dense truth by level, where one is known.
+        limit_fmc: coverage of all that truth and searches found, or of the dense truths.
+        oracle_fmc: coverage of an oracle by number of cases.
+        cases: cases of each search.
+        figure: file that was drawn, if any.
+    """
+
+    samplers: dict[str, SamplerSummary]
+    truths: dict[int, Truth]
+    dense: dict[int, Truth]
+    limit_fmc: float
+    oracle_fmc: dict[int, float]
+    cases: int
+    figure: Path | None = None
+
+    @property
+    def truth_fmc(self) -> float:
+        """Failure mode coverage of the truth, summed over the levels."""
+        return sum(fmc(truth.failures) for truth in self.truths.values())
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        first = next(iter(self.samplers.values()))
+        return {
+            "truth_fmc": self.truth_fmc,
+            "limit_fmc": self.limit_fmc,
+            "dense_levels": list(self.dense),
+            "oracle_fmc_by_batch": [self.oracle_fmc[n] for n in first.cases_by_batch],
+            **{name: asdict(result) for name, result in self.samplers.items()},
+        }
+
+    def lines(self) -> list[str]:
+        """Return truth, limit and oracle, and a table of the samplers."""
+        failures = sum(len(truth.failures) for truth in self.truths.values())
+        real = sum(len(truth.real_regions()) for truth in self.truths.values())
+        return [
+            f"truth: FMC {self.truth_fmc:.4f}, {failures} failures, {real} regions",
+            f"limit: FMC {self.limit_fmc:.4f}, {limit_of(self.dense, list(self.truths))}",
+            f"oracle: FMC {self.oracle_fmc[self.cases]:.4f} with {self.cases} cases",
+            *_table(self.samplers),
+            *([] if self.figure is None else [f"figure: {self.figure}"]),
+        ]
+
+
+def limit_of(dense: Collection[int], levels: Sequence[int]) -> str:
+    """Return in words what the limit is the coverage of, with dense truths at some levels."""
+    if not dense:
+        return "of all that truth and searches found (--dense runs 1,000,000 cases)"
+    part = "" if len(dense) == len(levels) else " at some levels"
+    return f"of {DENSE_CASES:,} uniform cases{part}, or of all that was found, where that is more"
+
+
+def _table(compared: Mapping[str, SamplerSummary]) -> list[str]:
+    """Return a line per sampler: medians, with the quartiles in brackets."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, caption=r"medians \[quartiles]", caption_justify="left")
+    table.add_column("sampler")
+    for heading in HEADINGS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, one in compared.items():
+        table.add_row(
+            name,
+            _spread(one.fmc_over_truth_median, one.fmc_over_truth_quartiles, ".3f"),
+            _spread(one.fmc_over_limit_median, one.fmc_over_limit_quartiles, ".3f"),
+            _spread(one.fmc_median, one.fmc_quartiles, ".4f"),
+            _spread(one.failures_median, one.failures_quartiles, ".0f"),
+            _spread(one.regions_found_median, one.regions_found_quartiles, ".1f"),
+            _spread(one.cases_to_50_percent_median, one.cases_to_50_percent_quartiles, ".0f"),
+            _spread(one.cases_to_90_percent_median, one.cases_to_90_percent_quartiles, ".0f"),
+            f"{one.sampler_s_median:.2f}",
+        )
+    text = StringIO()
+    # As wide as it is: a line of a table that is read by a program must not be broken.
+    Console(width=200, highlight=False, soft_wrap=True, file=text).print(table)
+    return [line.rstrip() for line in text.getvalue().splitlines()]
+
+
+def _spread(median: float | None, quartiles: Quartiles, form: str) -> str:
+    median_text, low, high = (
+        "-" if value is None else f"{value:{form}}" for value in (median, *quartiles)
+    )
+    return f"{median_text} [{low}, {high}]"
+
+
+@dataclass(frozen=True, repr=False)
+class CertificateResult(Result):
+    """A certificate that is complete.
+
+    Attributes:
+        certificate: `levels` by level, `radius` and `sentence`.
+        file: `certificate.json` in its folder.
+    """
+
+    certificate: Certificate
+    file: Path
+
+    @property
+    def certain(self) -> bool:
+        """Whether no ball of the radius fails throughout."""
+        return self.certificate.certain
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        one = self.certificate
+        levels = {level: asdict(found) for level, found in one.levels.items()}
+        summary = {"certain": one.certain, "sentence": one.sentence, "radius": one.radius}
+        return {**summary, "levels": levels, "file": str(self.file)}
+
+    def lines(self) -> list[str]:
+        """Return the sentence, and the worst failures by level."""
+        lines = [self.certificate.sentence]
+        for level, found in self.certificate.levels.items():
+            if found.failures or found.untold:
+                lines.append(
+                    f"  level {level_name(level)}: {found.failures:,} failures and "
+                    f"{found.untold:,} without a verdict in {found.cases:,} cases"
+                )
+            for case in found.worst[:NAMED]:
+                values = ", ".join(f"{name} {value:.4g}" for name, value in case.items())
+                lines.append(f"    {values}")
+        return [*lines, f"certificate: {self.file}"]
+
+
+@dataclass(frozen=True, repr=False)
+class ProbabilityResult(Result):
+    """How likely a VUT is to fail.
+
+    Attributes:
+        estimate: `probability`, ends `low` and `high` of the interval, and what they rest on.
+        file: file that was written.
+        criterion: what counts as a failure.
+        is_uniform: whether all cases of the pool are equally likely.
+    """
+
+    estimate: Estimate
+    file: Path
+    criterion: Criterion
+    is_uniform: bool
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {**asdict(self.estimate), "file": str(self.file)}
+
+    def lines(self) -> list[str]:
+        """Return the probability, its interval, and that of the plain cases."""
+        one, arm = self.estimate, self.estimate.uniform_arm
+        cases = "under uniform cases" if self.is_uniform else "under the stated distribution"
+        lines = [
+            f"P(fail) {cases}: {one.probability:.3g}, {100.0 * one.confidence:g} % interval "
+            f"[{one.low:.3g}, {one.high:.3g}] ({counted(one.failures, 'failure')} in "
+            f"{one.cases} fresh cases)"
+        ]
+        if not self.criterion.is_papers:
+            lines.append(f"  a case fails when {self.criterion.words}")
+        if one.without_verdict:
+            lines.append(
+                f"  {one.without_verdict} cases without a verdict: safe for the lower end, "
+                "failures for the upper end"
+            )
+        return [
+            *lines,
+            f"  for comparison, the {arm.cases} plain cases among them alone: {arm.failures} "
+            f"failures, [{arm.low:.3g}, {arm.high:.3g}]",
+            f"written: {self.file}",
+        ]
+
+
+@dataclass(frozen=True, repr=False)
+class CheckResult(Result):
+    """Result of `check_vut`.
+
+    Attributes:
+        vut: the VUT.
+        found: `problems`, `notes`, and the cost of a step in microseconds.
+    """
+
+    vut: str
+    found: VutCheck
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.found.problems
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {"vut": self.vut, "ok": self.ok, **asdict(self.found)}
+
+    def lines(self) -> list[str]:
+        """Return what is wrong in sentences, and the cost of a step."""
+        found = self.found
+        return [
+            *(found.problems or ["nothing wrong"]),
+            *(f"note: {sentence}" for sentence in found.notes),
+            f"a step costs {found.us_per_step_median:.0f} us (median), "
+            f"{found.us_per_step_worst:.0f} us at worst",
+        ]
+
+
+@dataclass(frozen=True, repr=False)
+class Reproduction(Result):
+    """The table and the figures of the paper, reproduced; `index` is the page that shows them."""
+
+    index: Path
+
+    def to_record(self) -> dict[str, Any]:
+        """Return Table II as its JSON file has it."""
+        text = (self.index.parent / TABLE_JSON).read_text(encoding="utf-8")
+        record: dict[str, Any] = json.loads(text)
+        return record
+
+    def lines(self) -> list[str]:
+        """Return Table II, and the path of the page."""
+        table = (self.index.parent / TABLE_MARKDOWN).read_text(encoding="utf-8")
+        return [*table.splitlines(), f"all of it: {self.index}"]
+
+
+@dataclass(frozen=True, repr=False)
+class VutList(Result):
+    """The VUTs that can be tested.
+
+    Attributes:
+        built_in: names of those of the package.
+        installed: names of those of installed packages.
+        kinds: the kinds that a person can bring.
+    """
+
+    built_in: list[str]
+    installed: list[str]
+    kinds: list[VutKind]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return names and kinds."""
+        kinds = [{"form": k.form, "what": k.what, "example": k.example} for k in self.kinds]
+        return {"built in": self.built_in, "installed": self.installed, "kinds": kinds}
+
+    def lines(self) -> list[str]:
+        """Return the names, and form, meaning and example of each kind."""
+        names = {"built in": self.built_in, "installed": self.installed}
+        lines = [f"{title}: {', '.join(vuts)}" for title, vuts in names.items() if vuts]
+        for kind in self.kinds:
+            lines += [kind.form, f"    {kind.what}", f"    {kind.example}"]
+        return lines
+
+
+class ScenarioList(Result, dict[str, Scenario]):
+    """Scenarios by name."""
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the numbers of each scenario."""
+        return {name: asdict(scenario) for name, scenario in self.items()}
+
+    def lines(self) -> list[str]:
+        """Return the initial states of the POV in each scenario."""
+        return [
+            f"{name}: POV from {one.x_pov0_m[0]:g} to {one.x_pov0_m[1]:g} m at "
+            f"{one.v_pov0_mps[0]:g} to {one.v_pov0_mps[1]:g} m/s"
+            for name, one in self.items()
+        ]
+
+
+@dataclass(frozen=True, repr=False)
+class ScenarioFile(Result):
+    """A scenario that was written.
+
+    Attributes:
+        about: description of the road, in lines.
+        written: the scenario, its picture, and its net where it was made of a map.
+        map_file: that map.
+    """
+
+    about: list[str]
+    written: list[Path]
+    map_file: Path | None
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the description, and the paths."""
+        return {"about": self.about, "written": list(map(str, self.written))}
+
+    def lines(self) -> list[str]:
+        """Return the description, and the paths."""
+        file, picture, *nets = self.written
+        made_of = "".join(f", and its net {net}, made of {self.map_file}" for net in nets)
+        return [*self.about, f"written: {file}, and its picture {picture}{made_of}"]
+
+
+@dataclass(frozen=True, repr=False)
+class ScenarioCheck(Result):
+    """Whether a scenario can be hosted, and whether the learned drivers were trained on it.
+
+    Attributes:
+        name: name or file of the scenario, as it was given.
+        scenario: the scenario.
+        about: description of the road, in lines.
+        unseen: in what the scenario is unlike those of the training, in sentences.
+    """
+
+    name: str
+    scenario: Scenario
+    about: list[str]
+    unseen: list[str]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the description, and the sentences."""
+        return {"about": self.about, "unseen": self.unseen}
+
+    def lines(self) -> list[str]:
+        """Return the description, and how to train where the learned drivers extrapolate."""
+        if not self.unseen:
+            last = (
+                "the learned drivers (levels 1 and 2) were trained on such starts, or on like ones"
+            )
+            return [*self.about, last]
+        folder = quoted(f"{self.scenario.name}-policies")
+        return [
+            *self.about,
+            "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",
+            *(f"  {sentence}" for sentence in self.unseen),
+            f"train them: merge-sumo train --scenario {quoted(self.name)} --out {folder}",
+            f"then add to a campaign: --policies {folder}",
+        ]
+
+
+class PolicyChecks(Result, dict[str, "PolicyCheck"]):
+    """`PolicyCheck` by the name of the network."""
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the checks by network."""
+        return {name: asdict(check) for name, check in self.items()}
+
+    def lines(self) -> list[str]:
+        """Return a table of the checks."""
+        titles = (
+            "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0"
+        )
+        return [
+            titles,
+            *(
+                f"{name:<7}  {one.mean_regret:11.2%}  {one.p99_regret:10.2%}  "
+                f"{one.collisions:10d}  {one.avoidable_collisions:9d}  "
+                f"{one.mean_return:11.3f}  {one.mean_best:.3f}  {one.mean_level0:.3f}"
+                for name, one in self.items()
+            ),
+        ]

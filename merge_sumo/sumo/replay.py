@@ -6,12 +6,13 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from lxml import etree
 
+from merge_sumo.analysis.result import Result
 from merge_sumo.errors import UserError
 from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
@@ -47,13 +48,34 @@ MIN_TIMESTEPS: Final = 1 + HOLD_STEPS
 MAX_TIMESTEPS: Final = round(MAX_EPISODE_S / DT_S) + 1 + HOLD_STEPS
 
 
-@dataclass(frozen=True, slots=True)
-class Replay:
-    """What a headless replay showed: rows compared, and where the first differed, if one did."""
+@dataclass(frozen=True, slots=True, repr=False)
+class Replay(Result):
+    """A headless replay beside its record.
+
+    Attributes:
+        rows: rows that were compared.
+        diverged_at_s: time of the first row that differs; None where none does.
+        detail: in what it differs.
+    """
 
     rows: int
     diverged_at_s: float | None
     detail: str
+
+    @property
+    def identical(self) -> bool:
+        """Whether no row differs."""
+        return self.diverged_at_s is None
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {"identical": self.identical, **asdict(self)}
+
+    def lines(self) -> list[str]:
+        """Return whether the replay is identical, in a line."""
+        if self.diverged_at_s is None:
+            return [f"identical: {self.rows} rows of x, y, position and speed"]
+        return [f"diverged at t = {self.diverged_at_s:.1f} s: {self.detail}"]
 
 
 def replay(folder: Path) -> Replay:

@@ -367,7 +367,7 @@ class TestACampaignWithGates:
 
         monkeypatch.setattr("merge_sumo.system.interrupt.Interrupt.check", stop)
         said: list = []
-        monkeypatch.setattr("merge_sumo.commands.campaign.say", said.append)
+        monkeypatch.setattr("merge_sumo.commands.printing.say", said.append)
         file = tmp_path / "a file.xml"
         with pytest.raises(Stopped):
             campaign("design2", tmp_path / "run", "--gate", "fmc>0.5", "--junit", file)

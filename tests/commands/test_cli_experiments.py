@@ -60,7 +60,7 @@ class TestCompare:
         }
 
     def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
-        for module in ("merge_sumo.api.studies", "merge_sumo.api.study_results"):
+        for module in ("merge_sumo.api", "merge_sumo.api.results"):
             monkeypatch.setattr(f"{module}.DENSE_CASES", 900)
         tiny = (*COMPARE, "--samplers", "uniform", "--seeds", 1, "--cases", 10, "--batch", 10)
         found: dict = {}

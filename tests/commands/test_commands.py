@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.commands import complete
-from merge_sumo.commands.grouped import GROUP_OF, GROUPS, unwrapped
+from merge_sumo.commands.application import unwrapped
+from merge_sumo.commands.options import GROUP_OF, GROUPS
 
 ENDS = ".", ":", "!", "?"
 

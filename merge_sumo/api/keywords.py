@@ -1,4 +1,4 @@
-"""The keywords that the verbs of the API share, and the settings that they make."""
+"""The keywords that the verbs share, and the settings of a campaign that they make."""
 
 from __future__ import annotations
 
@@ -16,37 +16,45 @@ from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
 
 
-class Setup(TypedDict, total=False):
-    """How a case is run and judged: keywords of `campaign`, `truth` and others, none required.
+class Hosting(TypedDict, total=False):
+    """How the drivers run: keywords that a recorded campaign may have otherwise.
 
     Attributes:
-        scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
-        follow_up_s: time in s for which both drive on after the merge; the scenario's by default.
         policies: folder of learned drivers instead of the shipped ones.
         pov: a POV of your own, at level "own": anything that `vut` takes, but not "traci".
-        fail_when: what counts as a failure: the name of a criterion, or a condition over the
-            measures.
-        require: what must hold over time instead, in signal temporal logic.
         vut_command: command that starts the controller of `vut="traci"`.
         deadline_s: time in s that a VUT may take for a step before the case is a VUT_ERROR.
         vut_memory_gib: memory in GiB that the process of a VUT of your own may take.
         in_process: run such a VUT in this process, where a debugger reaches it.
     """
 
-    scenario: Scenario | Path | str
-    follow_up_s: float | None
     policies: Path | str | None
     pov: AnyVut | None
-    fail_when: str
-    require: str | None
     vut_command: str | None
     deadline_s: float
     vut_memory_gib: float
     in_process: bool
 
 
+class Setup(Hosting, total=False):
+    """How a case is run and judged: the keywords of `Hosting`, and these; none is required.
+
+    Attributes:
+        scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
+        follow_up_s: time in s for which both drive on after the merge; the scenario's by default.
+        fail_when: what counts as a failure: the name of a criterion, or a condition over the
+            measures.
+        require: what must hold over time instead, in signal temporal logic.
+    """
+
+    scenario: Scenario | Path | str
+    follow_up_s: float | None
+    fail_when: str
+    require: str | None
+
+
 class CaseKeywords(Setup, total=False):
-    """What `run_case` may be given: the keywords of `Setup`, and the coordinates of the case.
+    """Keywords of `run_case`: those of `Setup`, and the coordinates of the case.
 
     Attributes:
         x_pov0_m: initial position of the POV's front bumper, relative to M, in m.
@@ -66,9 +74,19 @@ class CaseKeywords(Setup, total=False):
 
 
 class Settings(Setup, total=False):
-    """What `resume` may be given again: the keywords of `campaign` that decide its outcomes."""
+    """Settings of a campaign: the keywords of `Setup`, and which cases are chosen.
 
-    vut: AnyVut
+    Attributes:
+        level: POV level 0, 1 or 2, "own" for a `pov`, or "all", which is the default.
+        sampler: name of the sampler that chooses the cases.
+        cases: number of cases; 800 by default.
+        batch: cases per batch; by default as many as the sampler wants.
+        seed: same seed, same outcomes.
+        v_vut0_mps: initial speed of the VUT; the scenario's by default.
+        stop_after_converged: stop when less than this share of new coverage is expected.
+        learn_from: folders of earlier campaigns to learn the VUT from.
+    """
+
     level: int | str
     sampler: str
     cases: int
@@ -76,22 +94,7 @@ class Settings(Setup, total=False):
     seed: int
     v_vut0_mps: float | None
     stop_after_converged: float | None
-    learn_from: Sequence[Path | str]
-
-
-class Hosting(TypedDict, total=False):
-    """What `rerun` and `probability` may have otherwise than the campaign: see `Setup`."""
-
-    policies: Path | str | None
-    pov: AnyVut | None
-    vut_command: str | None
-    deadline_s: float
-    vut_memory_gib: float
-    in_process: bool
-
-
-def no_check() -> None:
-    """Let a verb go on: what is called after every batch where nothing else is."""
+    learn_from: Sequence[Path | str] | None
 
 
 def check_keywords(function: str, given: Mapping[str, Any], known: Any) -> None:
@@ -113,52 +116,48 @@ def scenario_of(scenario: Scenario | Path | str, follow_up_s: float | None = Non
 
 
 def recordable(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return keywords of a person as `CampaignSettings` has them; `level` stays out.
+    """Return keywords as the fields of `CampaignSettings`, without `level`.
 
     Drivers are specs by now. Raises `UserError` for a follow-up of a scenario that is not named.
     """
-    named = {name: value for name, value in given.items() if name not in ("level", "follow_up_s")}
+    fields = {name: value for name, value in given.items() if name not in ("level", "follow_up_s")}
     follow_up_s = given.get("follow_up_s")
-    if "scenario" in named:
-        named["scenario"] = scenario_of(named["scenario"], follow_up_s)
+    if "scenario" in fields:
+        fields["scenario"] = scenario_of(fields["scenario"], follow_up_s)
     elif follow_up_s is not None:
         raise UserError("--follow-up is of the scenario: name that, too, with --scenario")
-    if named.get("policies") is not None:
-        named["policies"] = str(named["policies"])
-    if "learn_from" in named:
-        named["learn_from"] = tuple(map(str, named["learn_from"] or ()))
-    return named
+    if fields.get("policies") is not None:
+        fields["policies"] = str(fields["policies"])
+    if "learn_from" in fields:
+        fields["learn_from"] = tuple(map(str, fields["learn_from"] or ()))
+    return fields
 
 
 def settings_for(
-    vut: AnyVut,
-    level: int | str,
-    setup: Mapping[str, Any],
-    *,
-    workers: int | None = 1,
-    **search: Any,
+    vut: AnyVut, given: Mapping[str, Any], *, workers: int | None = 1
 ) -> tuple[CampaignSettings, int | None]:
-    """Return what a verb is to run, and on how many workers it can.
+    """Return the settings that keywords make, and the number of workers that they allow.
 
     Args:
-        vut: a spec, or what Python has.
-        level: POV level, or "all".
-        setup: keywords of `Setup`.
-        workers: number that is asked for; None is one a core.
-        search: settings of a search, by their names in `CampaignSettings`.
+        vut: a spec, or a class, function or object of this process.
+        given: keywords of `Settings`.
+        workers: number of workers that is wanted; None is one a core.
 
-    Raises `UserError` for values that make no settings, and warns with a `Notice` of what is odd
-    about the criterion.
+    Raises:
+        UserError: for values that make no settings.
+
+    Warns with a `Notice` of what is odd about the criterion.
     """
-    spec, pov_spec, workers = drivers_of(vut, setup.get("pov"), workers, stacklevel=4)
-    named = recordable({"scenario": US23, **setup, **search, "pov": pov_spec})
+    spec, pov_spec, workers = drivers_of(vut, given.get("pov"), workers, stacklevel=4)
+    fields = recordable({"scenario": US23, **given, "pov": pov_spec})
     options = VutOptions(
-        deadline_s=named.get("deadline_s", DEADLINE_S),
-        memory_gib=named.get("vut_memory_gib", MEMORY_GIB),
-        in_process=named.get("in_process", False),
+        deadline_s=fields.get("deadline_s", DEADLINE_S),
+        memory_gib=fields.get("vut_memory_gib", MEMORY_GIB),
+        in_process=fields.get("in_process", False),
     )
-    povs = povs_of(named.get("policies"), named["scenario"], pov_spec, options)
-    settings = CampaignSettings(vut=spec, levels=parse_levels(str(level), povs), **named)
+    povs = povs_of(fields.get("policies"), fields["scenario"], pov_spec, options)
+    levels = parse_levels(str(given.get("level", "all")), povs)
+    settings = CampaignSettings(vut=spec, levels=levels, **fields)
     for note in settings.criterion.notes(settings.scenario):
         warnings.warn(f"note: {note}", Notice, stacklevel=3)
     return settings, workers

@@ -1,0 +1,166 @@
+"""The application: commands whose options stand in groups and are given once."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+from typer.core import TyperCommand, TyperOption
+
+from merge_sumo.commands.options import GROUP_OF, GROUPS, KEYWORDS, OPTIONS
+from merge_sumo.commands.printing import notices_printed, print_result, say
+from merge_sumo.errors import UserError
+from merge_sumo.system.suggestions import either
+
+if TYPE_CHECKING:
+    from merge_sumo.analysis.result import Result
+
+
+def unwrapped(text: str) -> str:
+    """Return a docstring with each paragraph in one line, so that only the terminal wraps it."""
+    paragraphs = re.split(r"\n\s*\n", inspect.cleandoc(text))
+    return "\n\n".join(" ".join(paragraph.split("\n")) for paragraph in paragraphs)
+
+
+class GroupedCommand(TyperCommand):
+    """A command whose options are grouped by `GROUPS`; it prints the notices of the API."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        """Set the group of each option, and sort the options by group."""
+        super().__init__(*arguments, **options)
+        order = {group: place for place, group in enumerate(GROUPS)}
+        for parameter in self.params:
+            if isinstance(parameter, TyperOption):
+                parameter.rich_help_panel = GROUP_OF.get(parameter.name or "")
+        # Arguments stay in front, in their order.
+        self.params.sort(key=lambda p: order.get(getattr(p, "rich_help_panel", None) or "", -1))
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the options; `{samplers}` in a help text becomes the names of a registry."""
+        for parameter in self.params:
+            text = getattr(parameter, "help", None) or ""
+            if isinstance(parameter, TyperOption) and "{samplers}" in text:
+                from merge_sumo.samplers.registry import SAMPLERS
+
+                parameter.help = text.replace("{samplers}", either(SAMPLERS))
+        return super().get_params(ctx)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments; `UserError` where an option would win over itself."""
+        # Parsing empties the list.
+        _, _, given = self.make_parser(ctx).parse_args(args=list(args))
+        for option, times in Counter(given).items():
+            single = not (getattr(option, "multiple", False) or getattr(option, "count", False))
+            chooses = not getattr(option, "is_flag", False) or bool(option.secondary_opts)
+            if option.param_type_name == "option" and single and chooses and times > 1:
+                name = max(option.opts, key=len)
+                raise UserError(f"{name} is given {times} times: give it once")
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; a `Notice` becomes a sentence on standard error, and so does Ctrl-C."""
+        with notices_printed():
+            try:
+                return super().invoke(ctx)
+            except KeyboardInterrupt:
+                say("stopped")
+                raise
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """The shared options of a command, as keywords of the API.
+
+    Attributes:
+        keywords: all of them, written or by default.
+        written: those that a person wrote, and `progress`.
+        as_json: whether to print JSON.
+    """
+
+    keywords: dict[str, Any]
+    written: dict[str, Any]
+    as_json: bool
+
+    def print(self, result: Result, **more: object) -> None:
+        """Print a result, and paths that belong to it: see `print_result`."""
+        print_result(result, as_json=self.as_json, **more)
+
+
+KEYWORD_ONLY: Final = inspect.Parameter.KEYWORD_ONLY
+JSON: Final = Annotated[
+    bool, typer.Option("--json", help="Print the result as one JSON object on standard output.")
+]
+
+
+class Commands(typer.Typer):
+    """An application whose commands are `GroupedCommand`s, with options of `OPTIONS` and --json."""
+
+    def __init__(self, *, help: str, **options: Any) -> None:
+        """Take the help, each paragraph of which may stand in several lines."""
+        super().__init__(help=unwrapped(help), **options)
+
+    def verb(
+        self, name: str | None = None, *, options: Sequence[str] = ()
+    ) -> Callable[[Callable[..., None]], Callable[..., None]]:
+        """Register a function as a command; its docstring is the help.
+
+        Its first parameter is `Given`, which has the shared `options`; the others are its own.
+        """
+
+        def register(function: Callable[..., None]) -> Callable[..., None]:
+            _, *own = inspect.signature(function, eval_str=True).parameters.values()
+            shared = [OPTIONS[option].parameter(option) for option in options]
+            keywords = {option: KEYWORDS.get(option, option) for option in options}
+
+            def command(context: typer.Context, as_json: bool, **values: Any) -> None:
+                written = {
+                    name
+                    for name in options
+                    if (source := context.get_parameter_source(name)) is not None
+                    and source.name == "COMMANDLINE"
+                }
+                given = {keywords[name]: values.pop(name) for name in options}
+                named = {keywords[name]: given[keywords[name]] for name in written}
+                if "quiet" in given:
+                    given["progress"] = named["progress"] = not given.pop("quiet")
+                    named.pop("quiet", None)
+                function(Given(given, named, as_json), **values)
+
+            parameters = [
+                _parameter("context", typer.Context),
+                *(parameter.replace(kind=KEYWORD_ONLY) for parameter in (*own, *shared)),
+                _parameter("as_json", JSON, default=False),
+            ]
+            command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+            command.__name__, command.__annotations__ = function.__name__, {}
+            self.command(name, cls=GroupedCommand, help=unwrapped(function.__doc__ or ""))(command)
+            return function
+
+        return register
+
+
+def _parameter(
+    name: str, annotation: Any, default: object = inspect.Parameter.empty
+) -> inspect.Parameter:
+    return inspect.Parameter(name, KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+app = Commands(
+    help="""Find where a merging controller fails against drivers who react to it.
+
+    A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO while a primary other
+    vehicle (POV) on the mainline interacts with it. A sampler chooses the test cases; a case fails
+    where both reach the merge point within 6 m, or by a rule of your own, and failure mode
+    coverage (FMC) says how much of the failing region was found.
+
+    Start with:  merge-sumo campaign --vut design2
+    """,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)

@@ -1,0 +1,402 @@
+"""Commands that run a campaign or a case, and that read the folder of a campaign."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from merge_sumo.commands import complete
+from merge_sumo.commands.application import Given, app
+from merge_sumo.commands.options import HOSTING, RUNNING, SETUP, RunArgument
+from merge_sumo.commands.printing import print_json, quoted, say, show, stoppable
+from merge_sumo.errors import UserError
+
+if TYPE_CHECKING:
+    from merge_sumo.api import CaseRun
+
+SETTINGS: Final = ("vut", "level", "sampler", "cases", "batch", "seed", "learn_from", "v_vut0")
+COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
+SETUP_OF_A_CASE: Final = tuple(name for name in SETUP if name != "in_process")
+
+
+@app.verb(options=(*SETTINGS, "stop_after_converged", *SETUP, "net", *RUNNING, "trust_vut"))
+def campaign(
+    given: Given,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder to write.", show_default="runs/VUT-DATE")
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Go on with the campaign in this folder; --cases may be more.",
+            autocompletion=complete.runs,
+        ),
+    ] = None,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force", help="Resume although something differs; campaign.json records it."
+        ),
+    ] = False,
+    gate: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GATE",
+            help='Exit with 1 if there are failures, errors, timeouts, or "fmc>X": an FMC above X '
+            "at some level. May be given several times.",
+            autocompletion=complete.gates,
+        ),
+    ] = None,
+    junit: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="New file to write for CI: JUnit XML.")
+    ] = None,
+) -> None:
+    """Test a VUT: run cases in SUMO, find failures, write a report and replayable scenarios.
+
+    Ctrl-C lets the running batch end and says how to go on; twice stops at once.
+
+    Exit code 1 when a --gate is met, and always when the VUT reached the merge point in no case:
+    then nothing was tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
+
+    Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
+    """
+    from merge_sumo import api
+
+    if resume is not None and out is not None:
+        raise UserError("--resume names the folder: leave --out away")
+    folder, gates = resume or out or api.dated(given.keywords["vut"]), gate or []
+    for_ci: dict[str, Any] = {"gates": gates, "junit": junit}
+
+    def how_to_go_on() -> str:
+        if not folder.exists():
+            return "stopped before the first case; nothing was written"
+        # None of these is a setting of the campaign, which its folder would remember.
+        options = {"--resume": [folder], "--net": [given.keywords["net"]]}
+        options |= {"--gate": gates, "--junit": [junit]}
+        words = [
+            f"{option} {quoted(value)}"
+            for option, values in options.items()
+            for value in values
+            if value is not None
+        ]
+        return f"stopped; go on with: merge-sumo campaign {' '.join(words)}"
+
+    with stoppable("batch", how_to_go_on) as check:
+        if resume is None:
+            del given.keywords["trust_vut"]  # The controllers of a new campaign are named here.
+            run = api.campaign(**given.keywords, **for_ci, out=folder, check=check)
+        else:
+            run = api.resume(folder, **given.written, **for_ci, force=force, check=check)
+    given.print(run)
+    for remark in run.remarks():
+        say(remark)
+    raise typer.Exit(0 if run.passed else 1)
+
+
+@app.verb(options=(*COORDINATES, *SETUP_OF_A_CASE, "net", "trust_vut"))
+def run(
+    given: Given,
+    vut: Annotated[
+        str,
+        typer.Option(
+            metavar="SPEC",
+            help="Vehicle under test.",
+            show_default="with --case the campaign's",
+            autocompletion=complete.vuts,
+        ),
+    ] = "",
+    level: Annotated[
+        str | None,
+        typer.Option(
+            help="POV level: 0, 1, 2 or own.",
+            show_default="0, with --case the campaign's",
+            autocompletion=complete.one_level,
+        ),
+    ] = None,
+    case: Annotated[
+        tuple[Path, int] | None,
+        typer.Option(
+            metavar="RUN INDEX", help="A case of a campaign instead; options given beside it win."
+        ),
+    ] = None,
+    gui: Annotated[
+        bool, typer.Option("--gui", help="Show it in sumo-gui while it runs, in real time.")
+    ] = False,
+    debug: Annotated[
+        bool,
+        typer.Option(
+            "--debug", help="Run the VUT in this process without a deadline: breakpoints work."
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder to keep it in, for `replay` and sumo-gui.")
+    ] = None,
+) -> None:
+    """Run one case and show what happens: verdict, measures, and the motion second by second.
+
+    Exit code 0 when the case passes, 1 when it fails, errs or times out, 2 for bad use.
+
+    Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
+    """
+    from merge_sumo import api
+
+    def ended(result: CaseRun) -> None:
+        if given.as_json:
+            given.print(result, out=out)
+            return
+        given.print(result)
+        if out is not None:
+            show(f"kept: merge-sumo replay {quoted(out)} --gui")
+        if gui:
+            say("close the window to go on")
+
+    result = api.run_case(
+        vut or None,
+        recorded=case,
+        level=level,
+        debug=debug,
+        gui=gui,
+        out=out,
+        on_end=ended,
+        **(given.keywords if case is None else given.written),
+    )
+    raise typer.Exit(0 if result.passed else 1)
+
+
+@app.verb(options=("level", *HOSTING, "policies", "net", "tolerance", *RUNNING, "trust_vut"))
+def rerun(
+    given: Given,
+    run: RunArgument,
+    case: Annotated[
+        list[int] | None,
+        typer.Argument(help="Indices of cases in outcomes.jsonl; all if left out."),
+    ] = None,
+    vut: Annotated[
+        str,
+        typer.Option(
+            metavar="SPEC",
+            help="The changed VUT.",
+            show_default="the campaign's, as its files are now",
+            autocompletion=complete.vuts,
+        ),
+    ] = "",
+) -> None:
+    """Run recorded cases again with a changed VUT, and say which verdicts changed.
+
+    Exit code 1 when it is worse than what was recorded, as in compare-runs: at some level the share
+    of cases with an error, with an error or a timeout, or the failure mode coverage (FMC) grew by
+    more than the tolerance, or it reached the merge point in no case.
+
+    Example:  merge-sumo rerun runs/design2 3 7 --vut design2
+    """
+    from merge_sumo import api
+
+    tolerance = given.keywords["tolerance"]
+    changed = {name: value for name, value in given.written.items() if name != "tolerance"}
+    result = api.rerun(run, case or (), vut=vut or None, **changed)
+    why = result.compared.worse(tolerance)
+    if given.as_json:
+        judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
+        print_json(result.to_record() | judged)
+        raise typer.Exit(1 if why else 0)
+    given.print(result)
+    for one in result.changed[:1]:
+        show(
+            f"look at one: merge-sumo run --case {quoted(run)} {one.before.index} "
+            f"--vut {quoted(result.vut)} --gui"
+        )
+    show(f"it is {'worse' if why else 'not worse'}, with a tolerance of {tolerance:g}")
+    for sentence in why:
+        show(f"  {sentence} (A is what was recorded, B is now)")
+    raise typer.Exit(1 if why else 0)
+
+
+class Format(StrEnum):
+    """Formats of `export`."""
+
+    SUMO = "sumo"
+    OPENSCENARIO = "openscenario"
+    CSV = "csv"
+    PARQUET = "parquet"
+
+
+@app.verb(options=["net"])
+def export(
+    given: Given,
+    run: RunArgument,
+    case: Annotated[
+        list[int] | None,
+        typer.Argument(help="Indices of cases in outcomes.jsonl; csv, parquet: all if left out."),
+    ] = None,
+    file_format: Annotated[
+        Format,
+        typer.Option(
+            "--format",
+            help="sumo: folders that sumo-gui replays. openscenario: folders with OpenSCENARIO "
+            "and OpenDRIVE. csv, parquet: one table of motion.",
+        ),
+    ] = Format.SUMO,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder to write into.", show_default="RUN/scenarios for sumo, else RUN/exports"
+        ),
+    ] = None,
+) -> None:
+    """Write cases of a campaign for SUMO, for other simulators, or as a table.
+
+    Example:  merge-sumo export runs/design2 17 42
+    """
+    from merge_sumo import api
+
+    paths = api.export(run, case or None, file_format=file_format.value, out=out, **given.keywords)
+    if given.as_json:
+        print_json({"written": list(map(str, paths))})
+        return
+    for path in paths:
+        show(path)
+
+
+@app.verb(options=["net"])
+def replay(
+    given: Given,
+    folder: Annotated[
+        Path,
+        typer.Argument(help="A scenario folder, or a campaign's.", autocompletion=complete.runs),
+    ],
+    case: Annotated[
+        int | None, typer.Argument(help="Index of the campaign's case in outcomes.jsonl.")
+    ] = None,
+    gui: Annotated[bool, typer.Option("--gui", help="Open it in sumo-gui.")] = False,
+) -> None:
+    """Replay a scenario in SUMO and check every position and speed against its record.
+
+    A case of a campaign is exported first, where it is not yet. Says "identical" (exit code 0) or
+    "diverged at t = ..." (exit code 1).
+
+    Example:  merge-sumo replay scenarios/stalemate --gui
+    """
+    from merge_sumo import api
+
+    if gui:
+        raise typer.Exit(api.open_in_gui(folder, case, **given.keywords))
+    result = api.replay(folder, case, **given.keywords)
+    given.print(result)
+    raise typer.Exit(0 if result.identical else 1)
+
+
+@app.verb()
+def report(given: Given, run: RunArgument) -> None:
+    """Write the report of a campaign again and print its path.
+
+    Example:  merge-sumo report runs/design2
+    """
+    from merge_sumo import api
+
+    path = api.report(run)
+    if given.as_json:
+        print_json({"report": str(path)})
+    else:
+        show(path)
+
+
+@app.verb("compare-runs", options=["tolerance", "net", "policies", "trust_vut"])
+def compare_runs(
+    given: Given,
+    a: Annotated[
+        Path,
+        typer.Argument(help="Folder of the campaign before.", autocompletion=complete.runs),
+    ],
+    b: Annotated[
+        Path, typer.Argument(help="Folder of the campaign after.", autocompletion=complete.runs)
+    ],
+    rerun: Annotated[
+        bool,
+        typer.Option(
+            "--rerun/--no-rerun",
+            help="Run the failures, errors and timeouts of each with the other's VUT.",
+        ),
+    ] = True,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="New HTML page to write: what changed, in which cases, and both motions.",
+        ),
+    ] = None,
+) -> None:
+    """Compare two VUTs, or two versions of one: what got fixed, and what broke.
+
+    The failures, errors and timeouts of each campaign are run again with the other's VUT. Exit
+    code 1 when B is worse at some level: when one of these grew by more than the tolerance, the
+    share of cases with an error, the share of cases with an error or a timeout, or the failure
+    mode coverage (FMC); and whenever B reached the merge point in no case of its campaign.
+
+    Example:  merge-sumo compare-runs runs/design1 runs/design2 --out changes.html
+    """
+    from merge_sumo import api
+
+    tolerance, folders = given.keywords["tolerance"], {"A": a, "B": b}
+    runs = {name: api.open_run(folder) for name, folder in folders.items()}
+    compared = api.compare_runs(runs["A"], runs["B"], rerun=rerun, out=out, **given.keywords)
+    why = compared.worse(tolerance)
+    if given.as_json:
+        own = {
+            name.lower(): one.verdict.to_record() | {"careful": one.careful}
+            for name, one in runs.items()
+        }
+        judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
+        print_json({**own, **compared.to_record(), **judged})
+        raise typer.Exit(1 if why else 0)
+    for name, one in runs.items():
+        show(f"{name}: {one.folder} ({one.run.vut}): {one.verdict.counts}")
+        if one.careful is not None:
+            show(f"  {one.careful}")
+        for line in one.verdict.trouble_lines():
+            show(line)
+    given.print(compared)
+    first = compared.look_first()
+    if first:
+        show("look first at:")
+    for case in first:
+        show(f"  {case.change}: merge-sumo export {quoted(folders[case.run])} {case.index}")
+    alone = sum(level.changes["not run again"] for level in compared.levels.values())
+    unknown = f"; {alone} failure{'s'[: alone > 1]} ran with one of them alone" if alone else ""
+    worse = "worse" if why else "not worse"
+    show(f"B is {worse} than A, with a tolerance of {tolerance:g}{unknown}")
+    for sentence in why:
+        show(f"  {sentence}")
+    if out is not None:
+        show(f"page: {out}")
+    raise typer.Exit(1 if why else 0)
+
+
+@app.verb()
+def history(
+    given: Given,
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Folders of campaigns, the oldest first.", autocompletion=complete.runs
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Page to write; nothing may be there.")] = Path(
+        "history.html"
+    ),
+) -> None:
+    """Show several versions of a VUT in one page: what was found, what got fixed, what broke.
+
+    Everything is read from the records: no case runs again, and no VUT. A region in which the
+    earlier version failed counts as fixed when the later one tested cases there and none failed;
+    `compare-runs` runs the failures of two versions again and is the better evidence. Campaigns of
+    different scenarios, criteria, initial speeds or POVs are refused.
+
+    Example:  merge-sumo history runs/design1 runs/design2 --out runs/history.html
+    """
+    from merge_sumo import api
+
+    given.print(api.history(runs, out=out), page=out)

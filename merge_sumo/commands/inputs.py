@@ -1,0 +1,183 @@
+"""Commands on what a person brings: VUTs, scenarios and learned drivers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from merge_sumo.commands import complete
+from merge_sumo.commands.application import Commands, Given, app
+from merge_sumo.commands.options import HOSTING
+from merge_sumo.commands.printing import print_json, show
+
+scenario = Commands(help="The road and the numbers of a merge.", no_args_is_help=True)
+policies = Commands(help="The learned drivers as files for others.", no_args_is_help=True)
+app.add_typer(scenario, name="scenario")
+app.add_typer(policies, name="policies")
+
+
+@app.verb(options=["policies"])
+def vuts(given: Given) -> None:
+    """List the vehicles that can be tested: by name, and the kinds that you can bring.
+
+    Example:  merge-sumo vuts
+    """
+    from merge_sumo import api
+
+    given.print(api.vuts(**given.keywords))
+
+
+@app.verb("check-vut", options=(*HOSTING, "policies"))
+def check_vut(
+    given: Given,
+    vut: Annotated[
+        str,
+        typer.Argument(help="What you would write after --vut.", autocompletion=complete.vuts),
+    ],
+) -> None:
+    """Let a VUT drive a few cases and say what is wrong with it, and what a step of it costs.
+
+    Says "nothing wrong" (exit code 0), or what is wrong in sentences (exit code 1).
+
+    Example:  merge-sumo check-vut design1
+    """
+    from merge_sumo import api
+
+    result = api.check_vut(vut, **given.keywords)
+    given.print(result)
+    raise typer.Exit(0 if result.ok else 1)
+
+
+@scenario.verb("list")
+def list_scenarios(given: Given) -> None:
+    """List the scenarios that the package brings.
+
+    Example:  merge-sumo scenario list
+    """
+    from merge_sumo import api
+
+    given.print(api.scenarios())
+
+
+@scenario.verb("new")
+def new_scenario(
+    given: Given,
+    file: Annotated[Path, typer.Argument(help="New TOML file to write.")],
+    net: Annotated[
+        Path,
+        typer.Option(
+            help="SUMO net, or a map of which netconvert makes one beside FILE: .osm, .xodr."
+        ),
+    ],
+    mainline: Annotated[str, typer.Option(help='Edges of the mainline, past M: "e1 e2".')],
+    ramp: Annotated[str, typer.Option(help='Edges of the ramp, past M: "r1 e2".')],
+) -> None:
+    """Write a scenario for a merge in a net of your own: what was found, and a suggested pool.
+
+    A picture of the road is written beside it, as SVG.
+
+    Example:  merge-sumo scenario new my-ramp.toml --net my.net.xml --mainline "a b" --ramp "r b"
+    """
+    from merge_sumo import api
+
+    given.print(api.new_scenario(file, net=net, mainline=mainline, ramp=ramp))
+
+
+@scenario.verb("check", options=["policies"])
+def check_scenario(
+    given: Given,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME|FILE", help="Scenario to check.", autocompletion=complete.scenarios
+        ),
+    ],
+) -> None:
+    """Say whether a scenario can be hosted, and whether the learned drivers know it.
+
+    Example:  merge-sumo scenario check us23
+    """
+    from merge_sumo import api
+
+    given.print(api.check_scenario(name, **given.keywords))
+
+
+@app.verb(options=["quiet"])
+def train(
+    given: Given,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Network to train: pov1, vut1, pov2 or vut2.", autocompletion=complete.networks
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same weights on one machine.")] = 0,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Scenario, or a file of one.",
+            show_default="us23",
+            autocompletion=complete.scenarios,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write.", show_default="the shipped policies, for us23 only"),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Train nothing: measure regret of what is there.")
+    ] = False,
+    cases: Annotated[int, typer.Option(help="Random cases of a check.")] = 300,
+) -> None:
+    """Train the learned drivers in SUMO, level by level, and measure their regret.
+
+    The regret is what a driver loses to its best response, as a share of what that gains over
+    level-0 behaviour. An interrupted training goes on with what is not finished.
+
+    Example:  merge-sumo train --out my-policies --seed 1
+    """
+    from merge_sumo import api
+
+    result = api.train(
+        only or (),
+        seed=seed,
+        scenario=scenario,
+        out=out,
+        check=check,
+        cases=cases,
+        **given.keywords,
+    )
+    given.print(result)
+
+
+@policies.verb("export", options=["policies"])
+def export_policy(
+    given: Given,
+    name: Annotated[
+        str, typer.Argument(help="pov1, vut1, pov2 or vut2.", autocompletion=complete.networks)
+    ],
+    out: Annotated[Path, typer.Option(help="ONNX file to write.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Scenario that it is to drive in.",
+            show_default="the one it was trained for",
+            autocompletion=complete.scenarios,
+        ),
+    ] = None,
+) -> None:
+    """Write a learned driver as an ONNX network, from the state to the action values.
+
+    Example:  merge-sumo policies export vut1 --out vut1.onnx
+    """
+    from merge_sumo import api
+
+    path = api.export_policy(name, out, scenario=scenario, **given.keywords)
+    if given.as_json:
+        print_json({"written": [str(path)]})
+    else:
+        show(path)

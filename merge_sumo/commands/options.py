@@ -1,0 +1,229 @@
+"""The options that several commands have, and the groups in which all options are shown.
+
+An option has one name, one meaning and one group in all commands.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple
+
+import typer
+
+from merge_sumo.commands import complete
+from merge_sumo.errors import UserError
+from merge_sumo.samplers import DEFAULT_SAMPLER
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
+
+GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
+    "What is tested": (
+        *("vut", "vut_command", "level", "pov", "policies", "scenario", "net", "v_vut0"),
+        *("mainline", "ramp", "follow_up", "case", "x", "v", "psi", "headway_ahead"),
+        *("headway_behind", "only", "check"),
+    ),
+    "How many cases, and which": (
+        *("sampler", "samplers", "cases", "batch", "seed", "seeds", "radius", "truth_cases"),
+        *("dense", "quick", "distribution", "learn_from", "stop_after_converged"),
+    ),
+    "Verdict": ("fail_when", "require", "gate", "tolerance", "rerun", "confidence"),
+    "Where it runs, and what it writes": (
+        *("out", "resume", "force", "workers", "dask", "junit", "figure", "file_format"),
+        *("gui", "debug", "quiet", "as_json"),
+    ),
+    "Trust and limits": ("trust_vut", "deadline", "vut_memory", "in_process"),
+}
+"""Options of the command line by group, in the order in which the groups are shown."""
+GROUP_OF: Final = {name: group for group, names in GROUPS.items() for name in names}
+
+KEYWORDS: Final = {
+    "v_vut0": "v_vut0_mps",
+    "deadline": "deadline_s",
+    "vut_memory": "vut_memory_gib",
+    "follow_up": "follow_up_s",
+    "x": "x_pov0_m",
+    "v": "v_pov0_mps",
+    "psi": "svo_rad",
+    "headway_ahead": "headway_ahead_s",
+    "headway_behind": "headway_behind_s",
+}
+"""Keywords of the API, by the shared options whose names are others."""
+
+
+class Shared(NamedTuple):
+    """An option that several commands share, or that is a setting of a campaign."""
+
+    annotation: Any
+    default: object = None
+
+    def parameter(self, name: str) -> inspect.Parameter:
+        """Return the option as a parameter of a command."""
+        kind = inspect.Parameter.KEYWORD_ONLY
+        return inspect.Parameter(name, kind, default=self.default, annotation=self.annotation)
+
+
+def _option(kind: Any, default: object, help: str, *flags: str, **others: Any) -> Shared:
+    return Shared(Annotated[kind, typer.Option(*flags, help=help, **others)], default)
+
+
+VUT_HELP: Final = (
+    "Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
+    "`merge-sumo vuts` lists the kinds."
+)
+VutOption = Annotated[
+    str, typer.Option(metavar="SPEC", help=VUT_HELP, autocompletion=complete.vuts)
+]
+CoresOption = Annotated[
+    int | None,
+    typer.Option(
+        help="Processes that run cases; the outcomes are the same.", show_default="one a core"
+    ),
+]
+RunArgument = Annotated[
+    Path, typer.Argument(help="Folder of a campaign.", autocompletion=complete.runs)
+]
+
+
+def _checked_tolerance(tolerance: float) -> float:
+    if not tolerance >= 0.0:
+        raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
+    return tolerance
+
+
+OPTIONS: Final[Mapping[str, Shared]] = {
+    "vut": Shared(VutOption, ""),
+    "level": _option(str, "all", "POV level: 0, 1, 2, own or all.", autocompletion=complete.levels),
+    "pov": _option(
+        str | None,
+        None,
+        "A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
+        metavar="SPEC",
+        autocompletion=complete.vuts,
+    ),
+    "policies": _option(
+        Path | None,
+        None,
+        "Folder of learned drivers, as `train --out DIR` makes it, instead of the shipped ones.",
+        metavar="DIR",
+    ),
+    "scenario": _option(
+        str,
+        "us23",
+        "Scenario that `merge-sumo scenario list` names, or a TOML file of your own: "
+        "`merge-sumo scenario new` writes one.",
+        metavar="NAME|FILE",
+        autocompletion=complete.scenarios,
+    ),
+    "net": _option(Path | None, None, "SUMO net to use instead of the shipped US-23 ramp."),
+    "follow_up": _option(
+        float | None,
+        None,
+        "How long both drive on behind M: what happens there is measured.",
+        metavar="SECONDS",
+        show_default="the scenario's, 0",
+    ),
+    "x": _option(float | None, None, "Where the POV starts, in m: M is 0.", "--x"),
+    "v": _option(float | None, None, "How fast it starts, in m/s.", "--v"),
+    "psi": _option(float | None, None, "Its social value orientation in rad, at level 2."),
+    "v_vut0": _option(
+        float | None,
+        None,
+        "Initial speed of the VUT in m/s.",
+        show_default="the scenario's, 18 in us23",
+    ),
+    "headway_ahead": _option(float | None, None, "Headway to the car ahead in s, in traffic."),
+    "headway_behind": _option(float | None, None, "Headway of the car behind in s, in traffic."),
+    "sampler": _option(
+        str,
+        DEFAULT_SAMPLER,
+        "What chooses the cases: {samplers}.",
+        autocompletion=complete.samplers,
+    ),
+    "cases": _option(int, 800, "Number of test cases."),
+    "batch": _option(
+        int | None,
+        None,
+        "Cases per batch.",
+        show_default="few, later more, for coverage; 40 for others",
+    ),
+    "seed": _option(int, 0, "Same seed, same outcomes."),
+    "learn_from": _option(
+        list[Path] | None,
+        None,
+        "An earlier campaign, of another version or at other levels, to learn the VUT from. May be "
+        "given several times.",
+        metavar="RUN",
+        autocompletion=complete.runs,
+    ),
+    "stop_after_converged": _option(
+        float | None,
+        None,
+        "Stop early when, three batches in a row, the next batch is expected to add less than this "
+        "share to the coverage. Needs a sampler that can tell: coverage.",
+        metavar="SHARE",
+    ),
+    "dense": _option(
+        bool | None,
+        None,
+        "Make the dense truths, of 1,000,000 cases, or go without.",
+        "--dense/--no-dense",
+        show_default="those kept",
+    ),
+    "fail_when": _option(
+        str,
+        "paper",
+        "What counts as a failure: paper (front bumpers within 6 m at M), contact, unsafe, or a "
+        "condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
+        metavar="EXPR",
+    ),
+    "require": _option(
+        str | None,
+        None,
+        "What is to hold over time, instead of --fail-when, in signal temporal logic: "
+        "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
+        metavar="STL",
+    ),
+    "tolerance": _option(
+        float,
+        0.0,
+        "Growth of FMC, or of the share of cases without a verdict, at a level that is still no "
+        "regression.",
+        callback=_checked_tolerance,
+    ),
+    "workers": _option(int, 1, "Processes that run cases; the outcomes are the same."),
+    "dask": _option(
+        str | None,
+        None,
+        "Address of a Dask scheduler whose workers run the cases: tcp://HOST:PORT.",
+    ),
+    "quiet": _option(bool, False, "Show no progress.", "--quiet", "-q"),
+    "trust_vut": _option(
+        bool,
+        False,
+        "Run the controller that a folder names although it is not known to be yours.",
+        "--trust-vut",
+    ),
+    "vut_command": _option(
+        str | None,
+        None,
+        "Command that starts the controller of --vut traci; {port} stands for the port.",
+    ),
+    "deadline": _option(
+        float, DEADLINE_S, "Seconds that a VUT may take for a step before it is a VUT_ERROR."
+    ),
+    "vut_memory": _option(
+        float, MEMORY_GIB, "GiB of memory that the process of a VUT of your own may take."
+    ),
+    "in_process": _option(
+        bool,
+        False,
+        "Run a VUT of your own in this process, where a debugger reaches it, instead of in one of "
+        "its own that it may ruin.",
+        "--in-process",
+    ),
+}
+
+HOSTING: Final = ("vut_command", "deadline", "vut_memory", "in_process")
+SETUP: Final = ("scenario", "policies", "pov", "fail_when", "require", "follow_up", *HOSTING)
+RUNNING: Final = ("workers", "dask", "quiet")

@@ -1,0 +1,85 @@
+"""How commands print: results on standard output, sentences for a person on standard error."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TextIO
+
+import typer
+
+from merge_sumo.errors import Notice
+from merge_sumo.system.interrupt import Interrupt, Stopped
+from merge_sumo.system.printable import printable, quoted
+
+if TYPE_CHECKING:
+    from merge_sumo.analysis.result import Result
+
+__all__ = ["notices_printed", "print_json", "print_result", "quoted", "say", "show", "stoppable"]
+
+
+def show(line: object) -> None:
+    """Print a line of a result on standard output."""
+    typer.echo(printable(str(line)))
+
+
+def say(line: str) -> None:
+    """Print a line for a person on standard error."""
+    typer.echo(printable(line), err=True)
+
+
+def print_json(record: dict[str, Any]) -> None:
+    """Print a JSON object in one line."""
+    typer.echo(json.dumps(record, allow_nan=False))
+
+
+def print_result(result: Result, *, as_json: bool, **more: object) -> None:
+    """Print a result in lines or as one JSON object; `more` are paths that belong to it, or None.
+
+    In lines, such a path stands behind its name.
+    """
+    paths = {name: str(path) for name, path in more.items() if path is not None}
+    if as_json:
+        print_json({**result.to_record(), **paths})
+        return
+    for line in (*result.lines(), *(f"{name}: {path}" for name, path in paths.items())):
+        show(line)
+
+
+@contextmanager
+def stoppable(unit: str, how_to_go_on: Callable[[], str | None]) -> Iterator[Callable[[], None]]:
+    """Give the `check` of a verb: at Ctrl-C the running `unit` ends, and a sentence is printed."""
+    try:
+        with Interrupt(f"finishing the running {unit}; once more stops at once") as interrupt:
+            yield interrupt.check
+    except Stopped:
+        sentence = how_to_go_on()
+        if sentence is not None:
+            say(sentence)
+        raise
+
+
+@contextmanager
+def notices_printed() -> Iterator[None]:
+    """Print each `Notice` on standard error; other warnings are shown as always."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Notice)
+        show_warning = warnings.showwarning
+
+        def print_notice(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, Notice):
+                say(str(message))
+            else:
+                show_warning(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = print_notice
+        yield

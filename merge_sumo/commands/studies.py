@@ -1,0 +1,219 @@
+"""Commands that measure: truth, compare, certify, probability, reproduce."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from merge_sumo.commands import complete
+from merge_sumo.commands.application import Given, app
+from merge_sumo.commands.options import HOSTING, RUNNING, SETUP, CoresOption, RunArgument, VutOption
+from merge_sumo.commands.printing import quoted, say, stoppable
+from merge_sumo.errors import UserError
+
+
+@app.verb(options=("level", *SETUP, "dask", "quiet"))
+def truth(
+    given: Given,
+    vut: VutOption,
+    cases: Annotated[
+        int | None,
+        typer.Option(help="Uniform cases of a level.", show_default="10000, at level 2 20000"),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
+    workers: CoresOption = None,
+) -> None:
+    """Find the ground truth of a VUT at each level, by uniform cases on all cores.
+
+    It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of what it
+    depends on, and used again while all files that the VUT has loaded are the same.
+
+    Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
+    """
+    from merge_sumo import api
+
+    given.print(api.truths(vut, cases=cases, seed=seed, workers=workers, **given.keywords))
+
+
+@app.verb(options=("level", "dense", *SETUP, "dask", "quiet"))
+def compare(
+    given: Given,
+    vut: VutOption,
+    samplers: Annotated[
+        str | None,
+        typer.Option(
+            help="Names, separated by commas: {samplers}.",
+            show_default="all",
+            autocompletion=complete.samplers,
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="Runs of each sampler.")] = 10,
+    cases: Annotated[int, typer.Option(help="Cases of each run.")] = 400,
+    batch: Annotated[
+        int | None,
+        typer.Option(
+            help="Cases per batch.", show_default="what coverage wants, 20 for the others"
+        ),
+    ] = None,
+    truth_cases: Annotated[
+        int | None,
+        typer.Option(help="Cases of the truth.", show_default="10000, at level 2 20000"),
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="New file for FMC against cases: .png, .svg or .html.", metavar="FILE"),
+    ] = None,
+    workers: CoresOption = None,
+) -> None:
+    """Compare samplers with each other and with the ground truth, over several seeds.
+
+    With all levels, each run shares its cases out over them, and coverage is summed over them.
+    The truth of the paper's size misses places that searches find, so coverage is also shown as a
+    share of a limit: the coverage of 1,000,000 uniform cases, or of all that truth and searches
+    found together, whichever is more. Such a dense truth is kept as any truth is, and used where it
+    is there; to make it takes minutes, and --dense does.
+
+    Example:  merge-sumo compare --vut design1 --level 0 --samplers uniform,gpr --seeds 3
+    """
+    from merge_sumo import api
+
+    result = api.compare(
+        vut,
+        samplers=None if samplers is None else samplers.split(","),
+        seeds=seeds,
+        cases=cases,
+        batch=batch,
+        truth_cases=truth_cases,
+        figure=figure,
+        workers=workers,
+        **given.keywords,
+    )
+    given.print(result)
+
+
+@app.verb(options=("level", *SETUP, "net", "dask", "quiet"))
+def certify(
+    given: Given,
+    vut: VutOption,
+    radius: Annotated[
+        float, typer.Option(help="Radius of the balls, as a share of the axes of the pool.")
+    ] = 0.01,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="New folder to write.", show_default="runs/certify-VUT-DATE"),
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Go on with the certificate in this folder."),
+    ] = None,
+    workers: CoresOption = None,
+) -> None:
+    """Certify that no ball of a radius in the pool fails throughout, or find one that may.
+
+    Tests a lattice that covers the pool: in every ball of that radius, in coordinates of the unit
+    cube, there is a case of it. Where none of them fails, no such ball fails throughout: certain,
+    as the simulation is deterministic; that the VUT is, some cases that run twice are to show. A
+    failing region that is thinner than the balls may be between the cases.
+    `tools/check_certificate.py` checks the folder, and shares nothing with it.
+
+    Exit code 0 when it is certain, 1 when a case fails, gives no verdict or ends otherwise the
+    second time.
+
+    Example:  merge-sumo certify --vut design2 --radius 0.01
+    """
+    from merge_sumo import api
+
+    if out is not None and resume is not None:
+        raise UserError("--resume names the folder: leave --out away")
+    folder = resume or out or api.dated(f"certify-{vut}")
+
+    def how_to_go_on() -> str | None:
+        same = f"stopped; go on with the same command and --resume {quoted(folder)}"
+        return same if folder.exists() else None
+
+    with stoppable("block", how_to_go_on) as check:
+        result = api.certify(
+            vut,
+            radius=radius,
+            out=folder,
+            resume=resume is not None,
+            workers=workers,
+            check=check,
+            **given.keywords,
+        )
+    given.print(result)
+    raise typer.Exit(0 if result.certain else 1)
+
+
+@app.verb(options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"))
+def probability(
+    given: Given,
+    run: RunArgument,
+    cases: Annotated[int, typer.Option(help="Fresh cases to run.")] = 4000,
+    distribution: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="JSON: how often cases occur.", show_default="uniform"),
+    ] = None,
+    confidence: Annotated[
+        float, typer.Option(help="Chance that the interval holds the probability.")
+    ] = 0.95,
+    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="New file to write.", show_default="RUN/probability.json"
+        ),
+    ] = None,
+) -> None:
+    """Estimate how likely a VUT is to fail, with an interval that is valid.
+
+    The cases of the campaign were chosen to fail: they only say where fresh cases are worth most.
+    These are drawn independently, run in SUMO, and weighted; the interval is by betting, and holds
+    for any number of cases.
+
+    Example:  merge-sumo probability runs/design2 --cases 4000
+    """
+    from merge_sumo import api
+
+    result = api.probability(
+        run,
+        cases=cases,
+        distribution=distribution,
+        confidence=confidence,
+        seed=seed,
+        out=out,
+        **given.written,
+    )
+    given.print(result)
+
+
+@app.verb(options=["dense", "policies", "dask", "quiet"])
+def reproduce(
+    given: Given,
+    seeds: Annotated[
+        int | None,
+        typer.Option(help="Runs of each sampler.", show_default="10, with --quick 2"),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="New folder to write.", show_default="runs/reproduce-DATE"),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few and short runs and a small truth: a first look.")
+    ] = False,
+    workers: CoresOption = None,
+) -> None:
+    """Reproduce the paper: Table II and every figure of its results, beside the paper's numbers.
+
+    Writes reproduction.md, reproduction.json, the figures as PNG, and index.html that shows it all.
+
+    Example:  merge-sumo reproduce --seeds 10 --out reproduction
+    """
+    from merge_sumo import api
+
+    result = api.reproduce(seeds=seeds, out=out, quick=quick, workers=workers, **given.keywords)
+    given.print(result)
+    if given.as_json:
+        say(f"all of it: {result.index}")
