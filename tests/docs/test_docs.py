@@ -50,7 +50,7 @@ class TestTheArchitecture:
         assert all((ROOT / "merge_sumo" / file).is_file() for file in files)
 
 
-NAMED_FILE = re.compile(r"`((?:merge_sumo|tests|tools)/[\w/.-]+\.\w+)")
+NAMED_FILE = re.compile(r"(?<![\w/])((?:merge_sumo|tests|tools)/[\w/-]+\.py)\b")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
