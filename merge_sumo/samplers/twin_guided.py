@@ -59,66 +59,118 @@ def twin_guided_batch(
     the predictions so far. Without outcomes at the level there is no surrogate, and half of the
     batch is spread over the cube.
     """
-    dims = history.dims
-    reach = radius_for(dims)
-    failing = history.points[history.failed]
-    grid = CoverageGrid(dims)
-    grid.cover(grid.balls(failing), 1.0)
-    belief = Belief(history) if len(history.points) >= FEWEST else None
-    calibration = Calibration(history) if skill.is_doubted else None
+    candidates = _Candidates(history, predict, skill)
+    candidates.add(_first_candidates(candidates, history, n, rng))
+    reach = REFINED_REACH * radius_for(history.dims)
+    for _ in range(ROUNDS):
+        batch, _ = greedy(
+            candidates.grid.copy(), candidates.points, candidates.p_fail, candidates.p_fail, n
+        )
+        best = candidates.best(candidates.points, candidates.p_fail, n)
+        centres = np.concatenate([best, candidates.points[batch]])
+        candidates.add(around(centres, REFINED, reach, rng))
+    first: list[int] = []
+    if candidates.surrogate is None:
+        spread = spread_out(n - n // 2, history.dims, rng)
+        first = [*range(len(candidates.points), len(candidates.points) + len(spread))]
+        candidates.add(spread)
+        candidates.grid.cover(candidates.grid.balls(spread), PICKED)
+    explores = n >= EXPLORES_FROM and not skill.is_doubted
+    information = skill.disagreement(candidates.gaps_m) if explores else None
+    p_fail = candidates.p_fail
+    picks, gain = greedy(
+        candidates.grid, candidates.points, p_fail, p_fail, n - len(first), information
+    )
+    gain = np.concatenate([np.ones(len(first)), gain]) * skill.trust
+    return candidates.proposal(first + picks, gain)
 
-    def surrogate_chance(belief: Belief, points: FloatArray) -> FloatArray:
-        return belief.of(points) if calibration is None else calibration.of(belief, points)
 
-    def best(points: FloatArray, probability: FloatArray, most: int) -> FloatArray:
-        """Return the candidates with the largest expected gain of their own."""
-        worth = probability * (grid.new(grid.balls(points)) + EVEN_IF_COVERED)
+class _Candidates:
+    """Candidates of a batch with their predictions.
+
+    Attributes:
+        grid: coverage by the failures so far.
+        surrogate: None without outcomes at the level.
+        points: candidates, (m, d).
+        gaps_m: predicted gaps at M, (E, G, m).
+        p_fail: P(fail) by twin and surrogate together, (m,).
+    """
+
+    def __init__(self, history: LevelHistory, predict: PredictGaps, skill: PredictionSkill) -> None:
+        self.predict, self.skill = predict, skill
+        self.grid = CoverageGrid(history.dims)
+        self.grid.cover(self.grid.balls(history.points[history.failed]), 1.0)
+        self.surrogate = Belief(history) if len(history.points) >= FEWEST else None
+        self._calibration = Calibration(history) if skill.is_doubted else None
+        self.points = np.empty((0, history.dims))
+        self._predictions: tuple[FloatArray, ...] = ()
+
+    @property
+    def gaps_m(self) -> FloatArray:
+        return self._predictions[0]
+
+    @property
+    def p_fail(self) -> FloatArray:
+        return self._predictions[-1]
+
+    def add(self, points: FloatArray) -> None:
+        """Add candidates, (k, d), with the predictions of all members."""
+        gaps_m = self.predict(points)
+        p_twin = self.skill.chance(gaps_m)
+        p_surrogate = (
+            p_twin if self.surrogate is None else self.surrogate_chance(self.surrogate, points)
+        )
+        p_fail = self.skill.mixed(gaps_m, p_twin, p_surrogate)
+        fresh = gaps_m, p_twin, p_surrogate, p_fail
+        self._predictions = (
+            tuple(
+                np.concatenate(pair, axis=-1) for pair in zip(self._predictions, fresh, strict=True)
+            )
+            if self._predictions
+            else fresh
+        )
+        self.points = np.concatenate([self.points, points])
+
+    def surrogate_chance(self, surrogate: Belief, points: FloatArray) -> FloatArray:
+        """Return P(fail), (m,), by the surrogate, calibrated where the twin is doubted."""
+        if self._calibration is None:
+            return surrogate.of(points)
+        return self._calibration.of(surrogate, points)
+
+    def best(self, points: FloatArray, probability: FloatArray, most: int) -> FloatArray:
+        """Return the `most` points with the largest expected gain of their own."""
+        worth = probability * (self.grid.new(self.grid.balls(points)) + EVEN_IF_COVERED)
         return points[np.argsort(-worth, kind="stable")[:most]]
 
-    def predicted(points: FloatArray) -> tuple[FloatArray, ...]:
-        """Return gaps, (E, G, m), and P(fail) of twin, surrogate and both, (m,) each."""
-        gaps_m = predict(points)
-        p_twin = skill.chance(gaps_m)
-        p_surrogate = p_twin if belief is None else surrogate_chance(belief, points)
-        return gaps_m, p_twin, p_surrogate, skill.mixed(gaps_m, p_twin, p_surrogate)
+    def proposal(self, picks: list[int], gain: FloatArray) -> Proposal:
+        """Return the batch of some candidates, by index, with their gains."""
+        gaps_m, p_twin, p_surrogate, p_fail = self._predictions
+        predictions = tuple(
+            Prediction.of(gaps_m[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks
+        )
+        return Proposal(self.points[picks], gain, p_fail[picks], predictions)
 
-    uniform = anywhere(ANYWHERE, dims, ON_FACES, rng)
+
+def _first_candidates(
+    candidates: _Candidates, history: LevelHistory, n: int, rng: np.random.Generator
+) -> FloatArray:
+    """Return the candidates, (m, d), that all members predict first.
+
+    One member of one expert screens many; the surrogate chooses among its own.
+    """
+    skill, surrogate = candidates.skill, candidates.surrogate
+    failing = history.points[history.failed]
+    uniform = anywhere(ANYWHERE, history.dims, ON_FACES, rng)
     screened, chosen = [uniform], [uniform[:AT_RANDOM]]
-    if belief is not None:
-        screened.append(between(belief, BETWEEN, rng))
-        proposed = rng.permutation(of_belief(history, belief, rng, n))[:SURROGATE_CANDIDATES]
-        chosen.append(best(proposed, surrogate_chance(belief, proposed), OF_SURROGATE))
+    if surrogate is not None:
+        screened.append(between(surrogate, BETWEEN, rng))
+        own = rng.permutation(of_belief(history, surrogate, rng, n))[:SURROGATE_CANDIDATES]
+        chance = candidates.surrogate_chance(surrogate, own)
+        chosen.append(candidates.best(own, chance, OF_SURROGATE))
     if len(failing):
-        screened.append(around(failing, NEAR, LOCAL_REACH * reach, rng))
-    candidates = np.concatenate(screened)
+        screened.append(around(failing, NEAR, LOCAL_REACH * radius_for(history.dims), rng))
+    points = np.concatenate(screened)
     expert = skill.expert(rng)
-    near = skill.chance(predict(candidates, expert), expert)
-    chosen.append(best(candidates, near, SCREENED))
-    points = np.concatenate(chosen)
-    known = predicted(points)
-    for _ in range(ROUNDS):
-        batch, _ = greedy(grid.copy(), points, known[-1], known[-1], n)
-        centres = np.concatenate([best(points, known[-1], n), points[batch]])
-        fresh = around(centres, REFINED, REFINED_REACH * reach, rng)
-        points = np.concatenate([points, fresh])
-        known = tuple(
-            np.concatenate(pair, axis=-1) for pair in zip(known, predicted(fresh), strict=True)
-        )
-    first: list[int] = []
-    if belief is None:
-        spread = spread_out(n - n // 2, dims, rng)
-        first = [*range(len(points), len(points) + len(spread))]
-        points = np.concatenate([points, spread])
-        known = tuple(
-            np.concatenate(pair, axis=-1) for pair in zip(known, predicted(spread), strict=True)
-        )
-        grid.cover(grid.balls(spread), PICKED)
-    gaps_m, p_twin, p_surrogate, p_fail = known
-    explores = n >= EXPLORES_FROM and not skill.is_doubted
-    information = skill.disagreement(gaps_m) if explores else None
-    picks, gain = greedy(grid, points, p_fail, p_fail, n - len(first), information)
-    picks, gain = first + picks, np.concatenate([np.ones(len(first)), gain])
-    predictions = tuple(
-        Prediction.of(gaps_m[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks
-    )
-    return Proposal(points[picks], gain * skill.trust, p_fail[picks], predictions)
+    chance = skill.chance(candidates.predict(points, expert), expert)
+    chosen.append(candidates.best(points, chance, SCREENED))
+    return np.concatenate(chosen)

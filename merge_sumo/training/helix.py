@@ -1,7 +1,7 @@
 """The double helix: each level-k driver is trained against level k-1 (Wang et al., Fig. 2b).
 
-The two networks of a level do not depend on each other: they are trained beside each other, in a
-process each. A network is first trained by DDQN in SUMO (`ddqn`), then refined (`refine`).
+The two networks of a level do not depend on each other and are trained in parallel, in a process
+each. A network is first trained by DDQN in SUMO (`ddqn`), then refined (`refine`).
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import json
 import os
 import queue
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from multiprocessing import get_context
@@ -67,12 +68,12 @@ WEIGHTS: Final = ".safetensors"
 GAMES: Final = 64
 """Corridors in which transitions are collected."""
 REGRET_EVERY: Final = 5
-"""The regret is told with every fifth report of DDQN: it costs a second."""
+"""Reports of DDQN between two measurements of the regret, which costs a second."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrainingSettings:
-    """How a network is trained, and in how many cases it is checked."""
+    """Settings of the training of a network, and the number of cases of its check."""
 
     ddqn: DdqnSettings = field(default_factory=DdqnSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
@@ -88,17 +89,17 @@ LEVEL_SETTINGS: Final = {
     ),
 }
 """Settings by the level of the driver. An opponent that reacts makes the game harder: level 2 takes
-more games, nearly all from the pool's own starts, and forgets what earlier policies were worth.
-Level 1 is not driven as far: where it was, level 2 stayed farther from its own best response
+more games, nearly all from the pool's own starts, and discards the returns of earlier policies.
+Level 1 is refined less: with more refinement, level 2 stayed farther from its own best response
 (`policies/README.md`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingProgress:
-    """Where the training of a network is: a line of its log.
+    """The progress of the training of a network: a line of its log.
 
     Attributes:
-        network: its name.
+        network: name of the network.
         stage: "ddqn" or "refine".
         done: updates or rounds done in this stage.
         total: updates or rounds of this stage.
@@ -120,7 +121,7 @@ class TrainingProgress:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """What a process needs to train a network."""
+    """The inputs of a process that trains a network."""
 
     name: str
     role: Role
@@ -173,7 +174,7 @@ def train_library(
                 tasks.append(_Task(name, role, network, reward, road, seed, of_level))
             elif on_done is not None:
                 on_done(name, None)
-        for trained, network, check, seconds in _train_beside(folder, tasks, on_progress):
+        for trained, network, check, seconds in _train_in_parallel(folder, tasks, on_progress):
             entry = {**plans[trained], "training_s": round(seconds, 1)}
             _keep(folder, trained, network, entry, check)
             if on_done is not None:
@@ -181,9 +182,9 @@ def train_library(
 
 
 def _take(folder: Path) -> None:
-    """Make a folder ours; its manifest, empty at first, says that what is in it is of our making.
+    """Create a folder of policies with an empty manifest, which marks the folder as ours.
 
-    Raises `UserError` where there is none and the folder is not empty.
+    Raises `UserError` for a folder that has other contents and no manifest.
     """
     make_place(folder)
     manifest = folder / MANIFEST
@@ -202,7 +203,7 @@ def _take(folder: Path) -> None:
 
 
 def _is_of(known: dict[str, Any], plan: dict[str, Any]) -> bool:
-    """Return whether what a manifest says of a network, if anything, is of a plan."""
+    """Return whether the entry of a manifest, perhaps empty, follows a plan."""
     others = plan.keys() - {"scenario"}
     same = all(known.get(key) == plan[key] for key in others)
     return same and plays_as(scenario_of(known), scenario_of(plan))
@@ -239,46 +240,49 @@ def _plan(
 
 
 _Trained = tuple[str, QNetwork, PolicyCheck, float]
-"""Name, network, how near it is to its best response, and the seconds that training took."""
+"""Name, network, its check against the best response, and the seconds of the training."""
 
 
-def _train_beside(
+def _train_in_parallel(
     folder: Path, tasks: list[_Task], on_progress: Callable[[TrainingProgress], None] | None
 ) -> list[_Trained]:
-    """Train networks beside each other; write their logs as they go."""
+    """Train networks in a process each; write their logs while they train."""
     if not tasks:
         return []
     context = get_context("spawn")
     for task in tasks:
         _log(folder, task.name, "w")
     with without_cwd():
-        told = context.Queue()
+        reports = context.Queue()
         # Spawned, because libsumo's simulation must not be forked.
-        pool = ProcessPoolExecutor(len(tasks), context, _report_into, (told,))
+        pool = ProcessPoolExecutor(len(tasks), context, _report_into, (reports,))
         results = [pool.submit(_train_one, task) for task in tasks]
     with pool:
         running: set[Future[_Trained]] = set(results)
         try:
             while running:
                 running = wait(running, timeout=0.2).not_done
-                while True:
-                    try:
-                        now = told.get_nowait()
-                    except queue.Empty:
-                        break
-                    _log(folder, now.network, "a", json.dumps(asdict(now)) + "\n")
+                for progress in _pending(reports):
+                    _log(folder, progress.network, "a", json.dumps(asdict(progress)) + "\n")
                     if on_progress is not None:
-                        on_progress(now)
+                        on_progress(progress)
         except BaseException:
-            # Nobody waits for what they would find in an hour.
+            # An interrupted training does not wait for the hour that a process still needs.
             for process in list(pool._processes.values()):
                 process.kill()
             raise
         return [result.result() for result in results]
 
 
+def _pending(reports: Any) -> Iterator[TrainingProgress]:
+    """Take the reports that have arrived from a queue."""
+    with suppress(queue.Empty):
+        while True:
+            yield reports.get_nowait()
+
+
 def _log(folder: Path, name: str, mode: str, line: str = "") -> None:
-    """Begin the log of a network's training, or add to it; `UserError` when it is not written."""
+    """Begin the log of a network's training, or append to it; `UserError` if that fails."""
     path = folder / f"{name}{LOG}"
     try:
         with open(
@@ -289,13 +293,13 @@ def _log(folder: Path, name: str, mode: str, line: str = "") -> None:
         raise cannot_write(path, error) from error
 
 
-_told: Any = None
-"""Where a training process reports to."""
+_reports: Any = None
+"""The queue to which a training process reports."""
 
 
-def _report_into(told: Any) -> None:
-    global _told  # noqa: PLW0603 (one process, one queue)
-    _told = told
+def _report_into(reports: Any) -> None:
+    global _reports  # noqa: PLW0603 (one process, one queue)
+    _reports = reports
     forget_safe_path()
     leave_signals_to_parent()
 
@@ -307,15 +311,22 @@ def _train_one(task: _Task) -> _Trained:
     regret = QuickRegret(played_out, sees_svo=sees_svo)
     ddqn, refinement = task.settings.ddqn, task.settings.refine
 
-    def covering(now: DdqnProgress) -> None:
+    def report_ddqn(now: DdqnProgress) -> None:
         measured = now.updates % (1000 * REGRET_EVERY) == 0
         bound = regret(now.network) if measured else None
-        told = (now.updates, ddqn.updates, now.loss, now.mean_return, now.crash_share, bound)
-        _told.put(TrainingProgress(task.name, "ddqn", *told))
+        values = (now.updates, ddqn.updates, now.loss, now.mean_return, now.crash_share, bound)
+        _reports.put(TrainingProgress(task.name, "ddqn", *values))
 
-    def refining(now: RefineProgress) -> None:
-        told = (now.round, refinement.rounds, now.cost, now.mean_return, None, regret(now.network))
-        _told.put(TrainingProgress(task.name, "refine", *told))
+    def report_refinement(now: RefineProgress) -> None:
+        values = (
+            now.round,
+            refinement.rounds,
+            now.cost,
+            now.mean_return,
+            None,
+            regret(now.network),
+        )
+        _reports.put(TrainingProgress(task.name, "refine", *values))
 
     started = time.perf_counter()
     if task.opponent is None:
@@ -324,10 +335,10 @@ def _train_one(task: _Task) -> _Trained:
         opponent = LevelKDriver(GAMES, task.opponent)
     game = MergeGame(task.role, opponent, task.reward, task.road)
     try:
-        network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=covering)
+        network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=report_ddqn)
     finally:
         game.close()
-    network = refine(played_out, network, task.seed, refinement, refining)
+    network = refine(played_out, network, task.seed, refinement, report_refinement)
     seconds = time.perf_counter() - started
     check = check_network(task.name, network, task.opponent, task.reward, task.settings.check_cases)
     return task.name, network, check, seconds
