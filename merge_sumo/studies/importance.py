@@ -1,4 +1,5 @@
-"""The mixture from which fresh cases are drawn:
+"""The mixture from which fresh cases are drawn.
+
 
     q = DEFENSIVE p + (1 - DEFENSIVE) g,    g in proportion to p sqrt(P(fail | surrogate)),
 
