@@ -286,7 +286,7 @@ class PerCorridor(Driver):
     def __init__(self, corridors: int, deadline_s: float) -> None:
         """Prepare for a number of corridors; a subclass makes the controllers."""
         super().__init__(corridors)
-        self._watch = Deadline(deadline_s)
+        self._deadline = Deadline(deadline_s)
         self._reasons: list[str | None] = [None] * corridors
         self._renew_first = [False] * corridors
         self._signals: dict[int, Left] = {}
@@ -308,14 +308,14 @@ class PerCorridor(Driver):
         self._reasons[corridor] = None
         doing = self.renewal
         try:
-            with self._watch as watch:
+            with self._deadline as deadline:
                 if self._renew_first[corridor]:
-                    watch.call(corridor, self.renew, corridor)
+                    deadline.call(corridor, self.renew, corridor)
                     self._renew_first[corridor] = False
                 doing = "reset"
-                watch.call(corridor, self.reset, corridor, seen_at_start(case))
+                deadline.call(corridor, self.reset, corridor, seen_at_start(case))
         except BaseException as error:
-            self._fault(corridor, f"{doing}: {self._watch.reason(error)}")
+            self._fault(corridor, f"{doing}: {self._deadline.reason(error)}")
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
@@ -324,7 +324,7 @@ class PerCorridor(Driver):
         met = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
         rows = (scene.active, scene.step, scene.x_m.T, scene.v_mps.T)
         states = zip(*(row.tolist() for row in rows), met, strict=True)
-        with self._watch as watch:
+        with self._deadline as deadline:
             for k, (active, step, x_m, v_mps, row) in enumerate(states):
                 if not active:
                     continue
@@ -333,9 +333,9 @@ class PerCorridor(Driver):
                     continue
                 try:
                     seen = seen_in(round(step * DT_S, 1), row, x_m, v_mps)
-                    answers[k] = watch.call(k, self._number, k, seen)
+                    answers[k] = deadline.call(k, self._number, k, seen)
                 except BaseException as error:
-                    self._fault(k, watch.reason(error))
+                    self._fault(k, deadline.reason(error))
                     answers[k] = math.nan
         return np.array(answers)
 

@@ -6,7 +6,6 @@ here under a name of its own, `here:Name`, and drives in the process that runs t
 
 from __future__ import annotations
 
-import copy
 import inspect
 import sys
 import warnings
@@ -16,20 +15,10 @@ from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any, Final, Protocol, SupportsFloat
 
-from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.world import World
 from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.vuts.base import Seen, Vut, VutOptions, text_of
-from merge_sumo.vuts.python import (
-    BatchedVut,
-    CallableVut,
-    PythonVut,
-    SeenBatch,
-    takes_one,
-    vut_of,
-)
-from merge_sumo.vuts.signatures import check_methods
+from merge_sumo.vuts.python import SeenBatch, vut_of
 
 
 class Acts(Protocol):
@@ -145,42 +134,15 @@ def here_vut(argument: str, options: VutOptions) -> Vut:
     return vut_of_object(_objects[argument], f"{HERE}:{argument}", options)
 
 
-def vut_of_object(vut: Any, name: str, options: VutOptions) -> Vut:
-    """Return the VUT that an object is; `UserError` for one that is none."""
-    made: Vut
-    check_methods(vut)
-    if isinstance(vut, type) or inspect.isroutine(vut):
-        made = vut_of(vut, name, options)
-    elif callable(getattr(vut, "act_batch", None)):
-
-        def make_batched(corridors: int, _world: World | None) -> Driver:
-            return BatchedVut(corridors, lambda: vut, options.deadline_s)
-
-        made = Vut(make=make_batched)
-    elif callable(getattr(vut, "act", None)) or (callable(vut) and takes_one(vut)):
-        kind = PythonVut if callable(getattr(vut, "act", None)) else CallableVut
-
-        def make(corridors: int, _world: World | None) -> Driver:
-            return kind(corridors, lambda: _copy(vut, name), options.deadline_s)
-
-        made = Vut(make=make)
-    else:
+def vut_of_object(thing: Any, name: str, options: VutOptions) -> Vut:
+    """Return the VUT that an object, a class or a function is; `UserError` for one that is none."""
+    vut = vut_of(thing, name, options)
+    if vut is None:
         raise UserError(
-            f"{text_of(vut, repr)[:80]} is no VUT: give a spec as after --vut, a class or an "
+            f"{text_of(thing, repr)[:80]} is no VUT: give a spec as after --vut, a class or an "
             "object with `act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
         )
-    return replace(made, files=_files(vut), named_only=True)
-
-
-def _copy(vut: Any, name: str) -> Any:
-    """Return a copy of an object as it was given: none that drives is what another episode left."""
-    try:
-        return copy.deepcopy(vut)
-    except Exception as error:
-        raise UserError(
-            f"{name} cannot be copied for the episodes that run at a time ({text_of(error)}): give "
-            "its class, or a function that makes no difference between them"
-        ) from error
+    return replace(vut, files=_files(thing), named_only=True)
 
 
 def _importable(target: Any) -> str | None:

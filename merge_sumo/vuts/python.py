@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import importlib.util
 import inspect
@@ -33,7 +34,7 @@ from merge_sumo.vuts.base import (
     text_of,
 )
 from merge_sumo.vuts.blame_cell import EVERYBODY, NOBODY, asked
-from merge_sumo.vuts.signatures import check_call, check_methods
+from merge_sumo.vuts.signatures import check_call, check_methods, fits
 
 GROUP: Final = "merge_sumo.vuts"
 """Entry points of this group are VUTs by their name."""
@@ -50,12 +51,11 @@ def installed_vut(name: str, options: VutOptions) -> Vut:
         target = installed_vuts()[name].load()
     except (Exception, SystemExit) as error:
         raise UserError(_cannot_load(name, error)) from error
-    file = getattr(sys.modules.get(getattr(target, "__module__", "")), "__file__", None)
-    return replace(vut_of(target, name, options), files=(Path(file),) if file else ())
+    return _named_vut(target, name, sys.modules.get(getattr(target, "__module__", "")), options)
 
 
 def python_vut(spec: str, options: VutOptions) -> Vut:
-    """Return the VUT `module:Name` or `file.py:Name`; `UserError` when there is none."""
+    """Return the VUT `module:Name` or `file.py:Name`; `UserError` when it cannot be loaded."""
     source, _, name = spec.rpartition(":")
     module = _load_file(Path(source)) if source.endswith(".py") else _load_module(source)
     target: Any = module
@@ -63,116 +63,101 @@ def python_vut(spec: str, options: VutOptions) -> Vut:
         target = getattr(target, part, None)
     if target is None:
         raise UserError(f"{source} has no {name!r}: name a class or a function of it")
+    return _named_vut(target, spec, module, options)
+
+
+def _named_vut(target: Any, spec: str, module: ModuleType | None, options: VutOptions) -> Vut:
+    vut = vut_of(target, spec, options) if _is_code(target) else None
+    if vut is None:
+        raise UserError(
+            f"{spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)`, a "
+            "class with `act_batch(self, seen)`, or a function `f(seen)`"
+        )
     file = getattr(module, "__file__", None)
-    return replace(vut_of(target, spec, options), files=(Path(file),) if file else ())
+    return replace(vut, files=(Path(file),) if file else ())
 
 
-def vut_of(target: Any, spec: str, options: VutOptions) -> Vut:
-    """Return the VUT that a class or a function makes; `UserError` for anything else.
+def _is_code(target: Any) -> bool:
+    """Return whether something is a class or a function, and no other object."""
+    return isinstance(target, type) or inspect.isroutine(target)
 
-    Also where it cannot be called as VUTs are.
+
+def vut_of(target: Any, name: str, options: VutOptions) -> Vut | None:
+    """Return the VUT that a class, a function or an object makes; None where it makes none.
+
+    Each corridor has an object of its own: a new one of a class, a copy of an object. One that acts
+    in all corridors at once is not copied.
+
+    Raises:
+        UserError: where a method or a function cannot be called as VUTs are.
     """
-    if isinstance(target, type):
-        check_methods(target)
-    elif inspect.isroutine(target):
+    if inspect.isroutine(target):
         check_call(target, ("seen",))
-    if isinstance(target, type) and callable(getattr(target, "act_batch", None)):
+    else:
+        check_methods(target)
+    is_class = isinstance(target, type)
+    batched, acts = (callable(getattr(target, method, None)) for method in ("act_batch", "act"))
+    if not (batched or acts or (not is_class and callable(target) and fits(target, 1))):
+        return None
 
-        def make_batched(corridors: int, _world: World | None) -> Driver:
-            return BatchedVut(corridors, lambda: _made(target, spec, corridors), options.deadline_s)
+    def make(corridors: int, _world: World | None) -> Driver:
+        def new(*arguments: int) -> Any:
+            if is_class:
+                return _made(target, name, *arguments)
+            return target if batched or inspect.isroutine(target) else _copied(target, name)
 
-        return Vut(make=make_batched)
-    if isinstance(target, type) and callable(getattr(target, "act", None)):
+        if batched:
+            return BatchedVut(corridors, lambda: new(corridors), options.deadline_s)
+        return PythonVut(corridors, new, options.deadline_s, acts=acts)
 
-        def make(corridors: int, _world: World | None) -> Driver:
-            return PythonVut(corridors, lambda: _made(target, spec), options.deadline_s)
-
-        return Vut(make=make)
-    if inspect.isroutine(target) and takes_one(target):
-
-        def make_function(corridors: int, _world: World | None) -> Driver:
-            return FunctionVut(corridors, target, options.deadline_s)
-
-        return Vut(make=make_function)
-    raise UserError(
-        f"{spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)`, a class "
-        "with `act_batch(self, seen)`, or a function `f(seen)`"
-    )
+    return Vut(make=make)
 
 
 class PythonVut(PerCorridor):
-    """Drives by objects with `act(seen)`, and `reset(seen)` and `close()` where they have them.
+    """Drives by one object per corridor, with `act(seen)` or called itself.
 
-    An object with `reset` drives one episode after the other in its corridor. One without is never
-    told that an episode begins, so each episode has a new one.
+    An object with `reset(seen)` drives one episode after the other in its corridor. One without is
+    never told that an episode begins, so each episode has a new one; a function has nothing to
+    begin anew. `close()` is called in the end where an object has it.
     """
 
-    def __init__(self, corridors: int, make: Callable[[], Any], deadline_s: float) -> None:
-        """Make an object for each corridor."""
+    def __init__(
+        self, corridors: int, new: Callable[[], Any], deadline_s: float, *, acts: bool
+    ) -> None:
+        """Make an object for each corridor by `new`; `acts` says whether it has `act`."""
         super().__init__(corridors, deadline_s)
-        self._make = make
+        self._new, self._acts = new, acts
         self._objects: list[Any] = [None] * corridors
         for corridor in range(corridors):
             self.renew(corridor)
 
     def renew(self, corridor: int) -> None:
         """Replace the object of a corridor."""
-        _close(self._objects[corridor], self._watch.deadline_s)
-        self._objects[corridor] = self._make()
+        _close(self._objects[corridor], self._deadline.deadline_s)
+        self._objects[corridor] = self._new()
 
     def reset(self, corridor: int, seen: Seen) -> None:
-        """Call `reset`; where there is none, have the next episode begin with a new object."""
+        """Call `reset`; an object without is replaced before the next episode."""
         vut = self._objects[corridor]
         if _has(vut, "reset"):
             vut.reset(seen)
-        else:
+        elif not inspect.isroutine(vut):
             self.renewal = "made anew for this episode, as it has no `reset`"
             self.renew_next(corridor)
 
     def answer(self, corridor: int, seen: Seen) -> Any:
-        """Call `act`, and keep the `signals` that it leaves."""
+        """Ask the object, and keep the `signals` that it leaves as an attribute."""
         vut = self._objects[corridor]
-        answer = vut.act(seen)
+        answer = vut.act(seen) if self._acts else vut(seen)
         left = getattr(vut, "signals", None)
         if left is not None:
             self.leave(corridor, left)
         return answer
 
     def close(self) -> None:
-        """Call `close`, if there is one; what it raises comes too late to matter."""
+        """Call `close` of every object that has it; what it raises is printed."""
         for vut in self._objects:
-            _close(vut, self._watch.deadline_s)
-
-
-class CallableVut(PythonVut):
-    """Drives by objects that are called with what is seen."""
-
-    def answer(self, corridor: int, seen: Seen) -> Any:
-        """Call the object."""
-        return self._objects[corridor](seen)
-
-
-class FunctionVut(PerCorridor):
-    """Drives by a function of what is seen, which has nothing to begin anew with an episode."""
-
-    def __init__(self, corridors: int, function: Callable[[Seen], Any], deadline_s: float) -> None:
-        """Take the function."""
-        super().__init__(corridors, deadline_s)
-        self._function = function
-
-    def renew(self, corridor: int) -> None:
-        """Do nothing."""
-
-    def reset(self, corridor: int, seen: Seen) -> None:
-        """Do nothing."""
-
-    def answer(self, corridor: int, seen: Seen) -> Any:
-        """Call the function, and keep the `signals` that it leaves as its attribute."""
-        answer = self._function(seen)
-        left = getattr(self._function, "signals", None)
-        if left is not None:
-            self.leave(corridor, left)
-        return answer
+            _close(vut, self._deadline.deadline_s)
 
 
 class BatchedVut(Driver):
@@ -185,7 +170,7 @@ class BatchedVut(Driver):
     def __init__(self, corridors: int, make: Callable[[], Any], deadline_s: float) -> None:
         """Make the object."""
         super().__init__(corridors)
-        self._watch = Deadline(deadline_s)
+        self._deadline = Deadline(deadline_s)
         self._make = make
         self._object = make()
         self._renew_first = False
@@ -199,15 +184,15 @@ class BatchedVut(Driver):
         """
         self._reset_raised.pop(corridor, None)
         try:
-            with self._watch as watch:
+            with self._deadline as deadline:
                 if self._renew_first:
-                    self._object = watch.call(corridor, self._make)
+                    self._object = deadline.call(corridor, self._make)
                     self._renew_first = False
                 reset = getattr(self._object, "reset", None)
                 if reset is not None:
-                    watch.call(corridor, reset, corridor, seen_at_start(case))
+                    deadline.call(corridor, reset, corridor, seen_at_start(case))
         except BaseException as error:
-            self._reset_raised[corridor] = f"reset: {self._watch.reason(error)}"
+            self._reset_raised[corridor] = f"reset: {self._deadline.reason(error)}"
 
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
@@ -216,15 +201,15 @@ class BatchedVut(Driver):
         """
         self._raised = None
         try:
-            with self._watch as watch:
-                answer = np.asarray(watch.call(EVERYBODY, self._object.act_batch, _batch(scene)))
+            with self._deadline as deadline:
+                answer = np.asarray(deadline.call(EVERYBODY, self._object.act_batch, _batch(scene)))
             if answer.shape != (self.corridors,) or answer.dtype.kind not in "fiu":
                 raise WrongAnswerError(
                     f"answered shape {answer.shape} of {answer.dtype} instead of "
                     f"{self.corridors} numbers"
                 )
         except BaseException as error:
-            self._raised = self._watch.reason(error)
+            self._raised = self._deadline.reason(error)
             self._renew_first = True
             if scene.active.sum() > 1:
                 raise VutLostError(self._raised, final=True) from None
@@ -239,7 +224,7 @@ class BatchedVut(Driver):
 
     def close(self) -> None:
         """Call `close`, if there is one."""
-        _close(self._object, self._watch.deadline_s)
+        _close(self._object, self._deadline.deadline_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,6 +264,17 @@ def _made(target: type, spec: str, *arguments: int) -> Any:
         raise UserError(f"{spec} cannot be made{given}: {what}") from error
 
 
+def _copied(target: Any, name: str) -> Any:
+    """Return a copy of an object as it was given, so that no episode changes that of another."""
+    try:
+        return copy.deepcopy(target)
+    except Exception as error:
+        raise UserError(
+            f"{name} cannot be copied for the episodes that run at a time ({text_of(error)}): give "
+            "its class, or a function that makes no difference between them"
+        ) from error
+
+
 def _has(vut: Any, name: str) -> bool:
     return getattr(vut, name, None) is not None
 
@@ -287,27 +283,13 @@ def _close(vut: Any, deadline_s: float) -> None:
     """Call `close`, if there is one; what it raises comes too late to matter, and is printed."""
     if vut is None:
         return
-    watch = Deadline(deadline_s)  # of its own: this may be part of another call
+    deadline = Deadline(deadline_s)  # of its own: this may be part of another call
     try:
-        with watch:
+        with deadline:
             if _has(vut, "close"):
-                watch.call(NOBODY, vut.close)
+                deadline.call(NOBODY, vut.close)
     except BaseException as error:
-        sys.stderr.write(f"closing the VUT: {watch.reason(error)}\n")
-
-
-_VARIABLE: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-
-
-def takes_one(function: Callable[..., Any]) -> bool:
-    """Return whether something can be called with one positional argument."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return False
-    needed = [p for p in parameters if p.default is p.empty and p.kind not in _VARIABLE]
-    positional = [p for p in parameters if p.kind not in (p.KEYWORD_ONLY, p.VAR_KEYWORD)]
-    return bool(positional) and len(needed) <= 1 and all(p in positional for p in needed)
+        sys.stderr.write(f"closing the VUT: {deadline.reason(error)}\n")
 
 
 def _load_module(name: str) -> ModuleType:

@@ -1,4 +1,4 @@
-"""Whether a user's class, object or function can be called as a VUT is; if not, where it stands."""
+"""Whether a class, object or function can be called as VUTs are; if not, its file and line."""
 
 from __future__ import annotations
 
@@ -44,13 +44,9 @@ def check_methods(vut: Any) -> None:
 
 def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None:
     """Raise `UserError` where a function cannot be called with so many arguments in order."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
+    if fits(function, len(arguments)) in (True, None):
         return
-    parameters = list(signature.parameters.values())
-    if _fit(parameters, len(arguments)):
-        return
+    parameters = inspect.signature(function).parameters.values()
     name, count = printable(getattr(function, "__name__", "it")), len(parameters)
     taken = f"{count} argument{'' if count == 1 else 's'}"
     shown = ", ".join(map(_parameter, parameters))
@@ -59,14 +55,18 @@ def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None
     )
 
 
-def _fit(parameters: list[Parameter], count: int) -> bool:
-    """Return whether parameters take exactly so many positional arguments."""
+def fits(function: Callable[..., Any], count: int) -> bool | None:
+    """Return whether a function takes exactly `count` positional arguments; None if unknown."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
     in_order = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
     places = [parameter for parameter in parameters if parameter.kind in in_order]
     needed = [p for p in parameters if p.default is p.empty and p.kind not in _VARIABLE]
     more = any(parameter.kind is Parameter.VAR_POSITIONAL for parameter in parameters)
-    named = any(parameter.kind is Parameter.KEYWORD_ONLY for parameter in needed)
-    return len(needed) <= count and (more or count <= len(places)) and not named
+    by_name = any(parameter.kind is Parameter.KEYWORD_ONLY for parameter in needed)
+    return len(needed) <= count and (more or count <= len(places)) and not by_name
 
 
 def _parameter(parameter: Parameter) -> str:
