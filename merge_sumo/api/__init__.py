@@ -95,6 +95,7 @@ from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies import benchmark, certificate, reproduction, versions, vut_check
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies.avoidance import note_avoidance
+from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.certificate_runs import runs_points_on
 from merge_sumo.studies.history import History, history_of
 from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth
@@ -332,6 +333,7 @@ def _concluded(
             result = CampaignRun(done, gates)
             # Learned on another machine, surrogates may differ in a last bit.
             local = opened if running.dask is None else None
+            note_expectation(done)
             write_report(done, result.summary, local, panel.report_part)
     except (KeyboardInterrupt, Stopped) as stop:
         if folder.exists():

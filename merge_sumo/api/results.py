@@ -180,7 +180,9 @@ class CampaignRun(Result):
     def report(self) -> Path:
         """Write the HTML report and return its path."""
         from merge_sumo.reports.report import write_report
+        from merge_sumo.studies.expectation import note_expectation
 
+        note_expectation(self._run)
         return write_report(self._run)
 
     def to_record(self) -> dict[str, Any]:

@@ -16,11 +16,11 @@ from merge_sumo.analysis.diagnosis import (
     Diagnosis,
     Kind,
 )
+from merge_sumo.analysis.predictions import off_m
 from merge_sumo.analysis.verdict import shortened
 from merge_sumo.reports.report_maps import maps_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
 from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.studies.prediction_quality import off_m
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.measures import MEASURES, Measure
@@ -162,7 +162,7 @@ def _maps(facts: ReportModel) -> dict[int, dict[str, Any]]:
             [o for o in others if o.case.level == level],
             facts.surfaces[level],
             facts.truths[level],
-            facts.expected,
+            facts.expected.get(level),
         )
         for level in facts.levels
     }

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.analysis.surface import Grid, Surface, nodes
-from merge_sumo.studies.prediction_quality import Expected
 from merge_sumo.studies.truth import Truth
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
@@ -27,8 +26,6 @@ from merge_sumo.values.score import FAILURE_SCORE, Outcome
 COUNT_GRID: Final = (32, 20)
 GRID: Final = {2: (97, 97, 1), 3: (49, 49, 17)}
 """Nodes of a map in its two coordinates and in the one that it moves through."""
-COARSE_GRID: Final = {2: (41, 41, 1), 3: (25, 25, 9)}
-"""And of one at whose nodes games are played out."""
 NEIGHBOURS: Final = 3
 """Cases of the truth that decide whether a node of the map fails."""
 PAIR_NODES: Final = 41
@@ -90,7 +87,7 @@ def maps_of(
     others: Sequence[Outcome],
     surface: Surface | None,
     truth: Truth | None,
-    expected: Expected | None = None,
+    expected: tuple[Grid, NDArray[np.uint8]] | None = None,
 ) -> dict[str, Any]:
     """Return what the script draws the map of a level from.
 
@@ -100,7 +97,7 @@ def maps_of(
         others: outcomes of the level that the page does not show one by one: they are counted.
         surface: what the surrogate says.
         truth: the truth of the level.
-        expected: where the twin of the VUT expects failures.
+        expected: how near the twin of the VUT expects gaps, (n,), at the nodes of a grid.
     """
     dims = len(scenario.dimensions(level))
     pairs = pairs_of(dims, surface)
@@ -113,7 +110,7 @@ def maps_of(
             {
                 "chance": None if surface is None else _chance(surface, dims, pair.axes),
                 "truth": None if truth is None else _truth(truth, dims, pair.axes),
-                "expected": None if expected is None else _expected(expected, level, dims),
+                "expected": None if expected is None else _expected(*expected),
                 "counts": _counts(others, scenario, level, pair.axes) if others else None,
             }
             for pair in pairs
@@ -153,21 +150,15 @@ def _truth(truth: Truth, dims: int, axes: Axes) -> dict[str, Any]:
     return _means(truth.points[:, list(axes)], failed.astype(np.float64))
 
 
-def _expected(expected: Expected, level: int, dims: int) -> dict[str, Any] | None:
+def _expected(grid: Grid, near: NDArray[np.uint8]) -> dict[str, Any]:
     from scipy.ndimage import maximum_filter
 
-    grid = COARSE_GRID.get(dims)
-    if grid is None:
-        return None
-    near = expected.nearness(nodes(grid), level)
-    if near is None:
-        return None
     # Failures may lie on a thin curve: what is drawn is what they would cover.
     shape = [n for n in grid[::-1] if n > 1]
-    reach = [int(radius_for(dims) * (n - 1) + 0.5) for n in shape]
+    reach = [int(radius_for(len(shape)) * (n - 1) + 0.5) for n in shape]
     steps = np.meshgrid(*[np.arange(-r, r + 1) / max(r, 1) for r in reach], indexing="ij")
     ball = np.square(steps).sum(axis=0) <= 1.0
-    return _packed(grid, maximum_filter(near.reshape(shape), footprint=ball).ravel())
+    return _packed(grid, maximum_filter(near.reshape(shape), footprint=ball).ravel() / 255.0)
 
 
 def _means(points: FloatArray, values: FloatArray) -> dict[str, Any]:

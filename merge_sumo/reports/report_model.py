@@ -15,6 +15,7 @@ from merge_sumo.analysis.diagnosis import (
     diagnose,
     failure_boxes,
 )
+from merge_sumo.analysis.predictions import surprises
 from merge_sumo.analysis.summary import Summary, summarise
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.analysis.verdict import Trouble, judge
@@ -27,7 +28,7 @@ from merge_sumo.reports.report_maps import GRID
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.studies.avoidance import read_avoidance
-from merge_sumo.studies.prediction_quality import Expected, has_predictions, surprises
+from merge_sumo.studies.expectation import read_expectation
 from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey, read_truth
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, LEVELS, OWN
@@ -88,7 +89,7 @@ class ReportModel:
             key=lambda o: (o.score, o.index),
         )
         self.surprises = surprises(run.outcomes, run.scenario.dx_crash_m)[:LISTED]
-        self.expected = _expected(run, levels, self.road)
+        self.expected = read_expectation(run)
         self.untested = [o for o in run.outcomes if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
         listed = [*(*examples, *self.spread, *self.near[:LISTED], *self.surprises)]
@@ -155,16 +156,6 @@ def _surfaces(
             surface.work_out(GRID.get(len(run.scenario.dimensions(level))))
         on_level()
     return surfaces
-
-
-def _expected(run: Run, levels: Sequence[int], road: Corridor) -> Expected | None:
-    """Return where the twin of a run expects failures, if the run had one."""
-    if not has_predictions(run.outcomes):
-        return None
-    try:
-        return Expected(run, levels, road)
-    except UserError:
-        return None
 
 
 def _is_told(outcome: Outcome) -> bool:

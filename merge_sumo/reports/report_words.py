@@ -12,6 +12,7 @@ from merge_sumo.analysis.diagnosis import (
     MEANING,
 )
 from merge_sumo.analysis.plausibility import notes_on
+from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.analysis.verdict import counted, in_words
 from merge_sumo.campaigns import repeats
@@ -21,7 +22,6 @@ from merge_sumo.reports.headline import Rule, after_words, avoidable_words, befo
 from merge_sumo.reports.report_levels import Level, levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
 from merge_sumo.studies.avoidance import in_a_sentence
-from merge_sumo.studies.prediction_quality import prediction_in_words
 from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.printable import printable
 from merge_sumo.values.fmc import radius_for

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 from conftest import some
 from plans import plan_for
 
+from merge_sumo.analysis.predictions import off_m, prediction_in_words, surprises
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -25,7 +27,13 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.prediction_skill import PredictionSkill
-from merge_sumo.studies.prediction_quality import Expected, off_m, prediction_in_words, surprises
+from merge_sumo.studies.expectation import (
+    EXPECTED,
+    learned_twin,
+    nearness,
+    note_expectation,
+    read_expectation,
+)
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.records import decode, to_plain
 from merge_sumo.twin.observation import NOW, Observation
@@ -363,9 +371,21 @@ class TestTheReport:
         assert off_m(missed) is None
 
     def test_expects_failures_where_they_are(self, whole):
-        expected = Expected(whole, [0, 1], road_for(whole.scenario))
+        twin = learned_twin(whole, [0, 1])
         fails = [o.case for o in whole.outcomes if o.failed and o.case.level == 1]
-        near = expected.nearness(to_unit(fails, 1), 1)
-        assert near is not None
-        assert np.median(near) > 0.5
-        assert expected.nearness(to_unit(fails, 1), 3) is None
+        assert np.median(nearness(twin, 1, to_unit(fails, 1), 6.0)) > 0.5
+
+    def test_shows_what_a_file_says_that_is_as_we_write_it(self, whole, tmp_path):
+        run = Run(Path(shutil.copytree(whole.folder, tmp_path / "run")))
+        assert read_expectation(run) == {} or (run.folder / EXPECTED).exists()
+        note_expectation(run)
+        found = read_expectation(run)
+        assert set(found) == {0, 1}
+        assert all(len(row) == np.prod(grid) and row.max() > 0 for grid, row in found.values())
+        record = json.loads((run.folder / EXPECTED).read_text())["levels"]
+        first = next(iter(record))
+        bad: object
+        for bad in ({"9": record[first]}, {first: record[first][1:]}, {first: [256] * 1681}, []):
+            (run.folder / EXPECTED).write_text(json.dumps({"levels": bad}))
+            with pytest.raises(UserError, match="is not as it was written"):
+                read_expectation(run)

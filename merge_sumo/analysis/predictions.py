@@ -1,0 +1,68 @@
+"""How well the cases of a campaign were predicted by the twin of its VUT."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.samplers.prediction_skill import compressed
+from merge_sumo.values.score import Outcome
+
+LAST: Final = 200
+"""Cases, the last ones, whose prediction error is summarised."""
+LIKELY: Final = 0.5
+"""Predicted chance of failing from which a case is a likely failure. Chosen, not tuned."""
+
+
+def has_predictions(outcomes: Sequence[Outcome]) -> bool:
+    """Return whether anything was predicted of some of the cases."""
+    return any(outcome.prediction is not None for outcome in outcomes)
+
+
+def off_m(outcome: Outcome) -> float | None:
+    """Return how many metres the predicted gap was off; None where there was none to compare."""
+    if outcome.prediction is None or outcome.measures.score is None:
+        return None
+    said, came = outcome.prediction.median_dx_m, outcome.signed_gap_m
+    return None if said is None or came is None else abs(said - came)
+
+
+def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:
+    """Return the cases that were predicted, the largest surprise first.
+
+    A metre counts more where the gap is small, and a case in which the VUT never arrived, or was
+    predicted not to, counts as one with a large gap.
+    """
+
+    def surprise(outcome: Outcome) -> float:
+        assert outcome.prediction is not None, "only these are asked"  # noqa: S101
+        gaps = np.array([outcome.prediction.median_dx_m, outcome.signed_gap_m], dtype=np.float64)
+        return abs(float(np.diff(compressed(gaps, limit_m))[0]))
+
+    predicted = [o for o in outcomes if o.prediction is not None and o.measures.score is not None]
+    return sorted(predicted, key=lambda o: (-surprise(o), o.index))
+
+
+def prediction_in_words(outcomes: Sequence[Outcome]) -> str | None:
+    """Return how well the last cases were predicted; None where none was."""
+    last = [outcome for outcome in outcomes if outcome.prediction is not None][-LAST:]
+    off = [gap for outcome in last if (gap := off_m(outcome)) is not None]
+    if not off:
+        return None
+    likely = [o for o in last if o.prediction is not None and o.prediction.p_fail >= LIKELY]
+    failed = sum(outcome.failed for outcome in likely)
+    middle, most = np.quantile(off, (0.5, 0.9)).tolist()
+    words = f"In half of the last {len(last)} cases the error was below {_metres(middle)}, and in "
+    words += f"nine of ten below {_metres(most)}."
+    if likely:
+        words += f" Of {len(likely)} that were given a chance of failing of {LIKELY:.0%} or more, "
+        words += f"{failed} failed."
+    return words
+
+
+def _metres(length_m: float) -> str:
+    """Return a length that is rounded up, in centimetres or metres."""
+    return f"{max(math.ceil(100.0 * length_m), 1)} cm" if length_m < 1.0 else f"{length_m:.1f} m"
