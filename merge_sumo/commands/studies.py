@@ -207,7 +207,7 @@ def reproduce(
 ) -> None:
     """Reproduce the paper: Table II and every figure of its results, beside the paper's numbers.
 
-    Writes reproduction.md, reproduction.json, the figures as PNG, and index.html that shows it all.
+    Writes table2.md, table2.json, the figures as PNG, and index.html that shows it all.
 
     Example:  merge-sumo reproduce --seeds 10 --out reproduction
     """

@@ -1,6 +1,5 @@
 """The mixture from which fresh cases are drawn.
 
-
     q = DEFENSIVE p + (1 - DEFENSIVE) g,    g in proportion to p sqrt(P(fail | surrogate)),
 
 with p the stated distribution. The square root is what has the least variance where a case fails
