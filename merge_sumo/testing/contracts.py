@@ -34,7 +34,7 @@ def bare_measures(
     values: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
     values |= {"end": end, "score": score, "dx_m": dx_m, "t_end_s": 8.3, "error": error}
     values |= {"vut_max_brake_mps2": 0.0, "pov_max_brake_mps2": 0.0, "clipped_steps": 0}
-    return Measures(**values | {"nearest": "pov"})
+    return Measures(**values | {"nearest": "pov", "further": ()})
 
 
 def play_case(index: int, batch: int, case: Case) -> Outcome:

@@ -13,11 +13,10 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import PATIENCE, StoppingRule, covered_balls, gained
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.uniform import UniformSampler
+from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import Case, Pool
-from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
-
-NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 
 
 class Oracle(UniformSampler):
@@ -43,7 +42,7 @@ def outcomes(*failures_by_batch: int, safe: int = 1) -> list[Outcome]:
             found += failed
             case = Case(level=0, x_pov0_m=x, v_pov0_mps=30.0)
             end, score = End.MERGED, -600.0 if failed else -1.0
-            measures = Measures(**{**NOTHING, "end": end, "score": score})
+            measures = bare_measures(end, score)
             ran.append(Outcome(len(ran), batch, case, measures))
     return ran
 

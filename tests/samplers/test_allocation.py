@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -15,8 +14,9 @@ from merge_sumo.samplers.allocation import (
     softmax_shares,
     whole_shares,
 )
+from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import Case
-from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
 
@@ -38,11 +38,10 @@ batch_sizes = st.integers(0, 300)
 
 
 def outcome(index: int, batch: int, level: int, *, failed: bool) -> Outcome:
-    nothing: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
     end, score = End.MERGED, -700.0 if failed else -3.0
     svo = 0.5 if level == 2 else None
     case = Case(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo)
-    return Outcome(index, batch, case, Measures(**{**nothing, "end": end, "score": score}))
+    return Outcome(index, batch, case, bare_measures(end, score))
 
 
 class TestByHand:

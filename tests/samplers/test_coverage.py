@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import statistics
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,12 +19,11 @@ from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin
+from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import fmc, radius_for
-from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
-
-NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 
 
 def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = True) -> Outcome:
@@ -35,8 +33,8 @@ def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = Tr
     overlap_m = 6.0 - abs(dx_m)
     end = End.MERGED
     score = -560.0 - 75.0 * overlap_m if overlap_m > 0.0 else -450.0 * math.exp(overlap_m / 15.0)
-    values = {**NOTHING, "end": end, "score": score, "dx_m": None if blind else dx_m}
-    return Outcome(index, batch, case, Measures(**values))
+    measures = bare_measures(end, score, dx_m=None if blind else dx_m)
+    return Outcome(index, batch, case, measures)
 
 
 def play(

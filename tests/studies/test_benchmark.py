@@ -10,7 +10,6 @@ import shutil
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,12 +20,11 @@ from merge_sumo.errors import UserError
 from merge_sumo.studies.benchmark import Search, compare, limit_fmc, oracle, search
 from merge_sumo.studies.truth import Truth, ground_truth, known_truth
 from merge_sumo.system.workers import open_workers
+from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
-from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
-
-NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +171,7 @@ def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float 
         for failed, point in [(False, (0.0, 0.0)), *((True, point) for point in points)]:
             (case,) = from_unit(np.array([point]), 0)
             end, score = End.MERGED, -600.0 if failed else -1.0
-            measures = Measures(**{**NOTHING, "end": end, "score": score})
+            measures = bare_measures(end, score)
             outcomes.append(Outcome(len(outcomes), batch, case, measures))
         curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0)))
     return Search(outcomes, curve, sampler_s)

@@ -8,7 +8,6 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,6 +35,7 @@ from merge_sumo.studies.expectation import (
 )
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.records import decode, to_plain
+from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.twin.observation import NOW, Observation
 from merge_sumo.twin.rollout import TwinRollout
 from merge_sumo.twin.twin import Twin
@@ -43,10 +43,9 @@ from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
-NOTHING: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
 SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2)
 SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 
@@ -223,7 +222,7 @@ def outcome(
 ) -> Outcome:
     case = Case(level=level, x_pov0_m=-300.0, v_pov0_mps=30.0, svo_rad=0.5 if level == 2 else None)
     score = -600.0 if abs(dx_m) < 6.0 else -100.0
-    measures = Measures(**{**NOTHING, "end": End.MERGED, "score": score, "dx_m": dx_m})
+    measures = bare_measures(End.MERGED, score, dx_m=dx_m)
     return Outcome(index, 0, case, measures, prediction)
 
 
