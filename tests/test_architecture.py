@@ -233,6 +233,23 @@ def offenders(files: list[Path], modules: set[str]) -> dict[str, set[str]]:
     return {module: names for module, names in found.items() if names}
 
 
+SIMULATING = ("sumo", "drivers", "vuts", "engine", "twin", "training")
+"""The rooms that take part in a simulation. Reports read: what they need of these are values."""
+REPORTS_READ = {
+    "merge_sumo.drivers.reference.REFERENCES",  # names of the reference drivers
+    "merge_sumo.engine.plan.plan_key",  # what names a truth in the cache
+    "merge_sumo.engine.plan.versions",
+    "merge_sumo.engine.simulator.road_for",  # reads a net as data, to draw it
+    "merge_sumo.engine.versions.versions",
+    "merge_sumo.sumo.opendrive.opendrive",  # writes files for other simulators
+    "merge_sumo.sumo.replay_folder.write_scenario",
+    "merge_sumo.training.check.PolicyCheck",  # types of what is shown of a training
+    "merge_sumo.training.helix.TrainingProgress",
+    "merge_sumo.vuts.output.LOG",  # the end of what a controller printed
+    "merge_sumo.vuts.output.end_of",
+}
+
+
 class TestImports:
     def test_of_sumo_are_only_in_the_sumo_folder(self):
         others = [file for file in FILES if file not in files_below("sumo")]
@@ -262,6 +279,18 @@ class TestImports:
     def test_are_known_for_every_folder_of_the_package(self):
         folders = {f.relative_to(PACKAGE).parts[0] for f in FILES if f.parent != PACKAGE}
         assert folders == set(LAYERS)
+
+    def test_of_a_report_open_no_simulation(self):
+        simulating = {f"merge_sumo.{room}" for room in SIMULATING}
+        others = {
+            module_of(file): {
+                name
+                for name in imports_any(imports_of(file), simulating)
+                if not any(f"{value}.".startswith(f"{name}.") for value in REPORTS_READ)
+            }
+            for file in files_below("reports")
+        }
+        assert {module: names for module, names in others.items() if names} == {}
 
     def test_of_learning_libraries_are_only_in_the_training_folder(self):
         others = [file for file in FILES if file not in files_below("training")]

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +29,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.studies.benchmark import (
-    LevelShare,
     SamplerSummary,
     Search,
     compare,
@@ -376,72 +376,25 @@ def _level_batches(searches: Sequence[Search]) -> LevelBatches:
 
 
 def _write(folder: Path, result: Reproduction) -> None:
-    text = json.dumps(_plain(result), allow_nan=False) + "\n"
-    replace_own(folder / REPRODUCTION, text.encode())
-
-
-def _plain(value: Any) -> Any:
-    """Return dataclasses and arrays as JSON has them; a NaN in an array is null."""
-    if isinstance(value, np.ndarray):
-        rows = value.astype(object)
-        rows[value != value] = None  # noqa: PLR0124
-        return rows.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if hasattr(value, "__dataclass_fields__"):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    return value
+    replace_own(folder / REPRODUCTION, msgspec.json.encode(result, enc_hook=np.ndarray.tolist))
 
 
 def read_reproduction(folder: Path) -> Reproduction:
     """Return what `reproduce` left in a folder; `UserError` where it left nothing readable."""
     path = folder / REPRODUCTION
     try:
-        record = json.loads(regular(path).read_text(encoding="utf-8"))
-        return Reproduction(
-            Scale(**record["scale"]),
-            {title: _column_result(column) for title, column in record["columns"].items()},
-            {
-                name: LevelBatches(_by_number(one["cases"]), _by_number(one["score"]))
-                for name, one in record["levels"].items()
-            },
-            record["versions"],
-        )
+        content = regular(path).read_bytes()
+        return msgspec.json.decode(content, type=Reproduction, dec_hook=_array)
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{path} is not as it was written") from error
 
 
-def _by_number(rows: Mapping[str, Any]) -> dict[int, FloatArray]:
-    return {int(number): np.array(row, dtype=np.float64) for number, row in rows.items()}
-
-
-def _column_result(record: dict[str, Any]) -> ColumnResult:
-    return ColumnResult(
-        **record
-        | {
-            "column": Column(**record["column"]),
-            "compared": {
-                name: SamplerSummary(
-                    **one | {"levels": {int(k): LevelShare(**v) for k, v in one["levels"].items()}}
-                )
-                for name, one in record["compared"].items()
-            },
-            "oracle": {int(cases): value for cases, value in record["oracle"].items()},
-            "panels": {name: _read_panel(panel) for name, panel in record["panels"].items()},
-            "predicted": {
-                int(batch): PredictedScores(np.array(one["score"]), _read_panel(one["learned"]))
-                for batch, one in record["predicted"].items()
-            },
-        }
-    )
-
-
-def _read_panel(record: Mapping[str, Any]) -> Panel:
-    failed = np.array(record["failed"], dtype=np.bool_)
-    points = np.array(record["points"], dtype=np.float64).reshape(len(failed), -1)
-    return Panel(points, failed, record["fmc"])
+def _array(kind: Any, values: Any) -> NDArray[Any]:
+    """Return lists of numbers as an array of a type; null is NaN."""
+    (dtype,) = get_args(get_args(kind)[1])
+    return np.array(values, dtype=dtype)
 
 
 # Table II.
