@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from merge_sumo.analysis.verdict import counted
-from merge_sumo.values.criterion import NAMED, Criterion, condition_of, values_of
+from merge_sumo.values.criteria import CRITERIA
+from merge_sumo.values.criterion import Criterion, condition_of, values_of
 from merge_sumo.values.expression import (
     AllOf,
     AnyOf,
@@ -54,7 +55,11 @@ def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> str | Non
     """Return a criterion beside one that says the same of all cases, where it tells them apart."""
     judged = [outcome for outcome in outcomes if outcome.margin is not None]
     failures = sum(outcome.failed for outcome in judged)
-    if criterion.require is not None or criterion.fail_when in NAMED or 0 < failures < len(judged):
+    if (
+        criterion.require is not None
+        or criterion.fail_when in CRITERIA
+        or 0 < failures < len(judged)
+    ):
         return None
     condition = condition_of(criterion.words)
     values = [values_of(outcome.measures, names_of(condition)) for outcome in judged]

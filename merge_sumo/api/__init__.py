@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from merge_sumo.analysis.coordinates import outside_of_the_pool
 from merge_sumo.analysis.verdict import parse_gates
@@ -80,6 +80,7 @@ from merge_sumo.engine.simulator import SimulationPlan, road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
 from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
+from merge_sumo.reports.formats import EXPORTS, FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import Bars, Counter, TrainingBars, is_watched, rate_text
 from merge_sumo.reports.report import check_report, write_report
@@ -561,12 +562,6 @@ def _of_level(run: Run, indices: tuple[int, ...], level: int | str | None) -> tu
     return chosen
 
 
-EXPORTS: Final = "exports"
-TABLES: Final = ("csv", "parquet")
-FOLDERS: Final = {"sumo": exports.write_sumo, "openscenario": exports.write_openscenario}
-"""Formats of `export`: a table of all cases, or a folder for each."""
-
-
 def export(
     run: AnyRun,
     indices: Iterable[int] | int | None = None,
@@ -580,27 +575,25 @@ def export(
     Args:
         run: the campaign, or its folder.
         indices: its cases; of a table all of them when left out.
-        file_format: "sumo" or "openscenario" for folders, "csv" or "parquet" for one table.
+        file_format: "sumo" or "openscenario" for folders, "csv" or "parquet" for one table, or the
+            name of a format that an installed package brings.
         out: folder; `scenarios` or `exports` in that of the campaign when left out.
         net: SUMO net to use instead of the scenario's.
     """
     loaded = _opened(run).run
     wanted = None if indices is None else list(_listed(indices))
+    export_format = FORMATS[file_format]
     if out is None:
-        check_own(loaded.folder / SCENARIOS, loaded.folder / EXPORTS)
-    if file_format in TABLES:
+        below = dict.fromkeys((SCENARIOS, EXPORTS, export_format.below))
+        check_own(*(loaded.folder / name for name in below))
+    target = Path(out) if out is not None else loaded.folder / export_format.below
+    if export_format.write_table is not None:
         wanted = wanted or [outcome.index for outcome in loaded.outcomes]
-        folder = Path(out) if out is not None else loaded.folder / EXPORTS
-        return [exports.write_table(loaded, wanted, folder, file_format)]
-    if file_format not in FOLDERS:
-        names = ", ".join((*FOLDERS, *TABLES))
-        raise UserError(f"there is no format {file_format!r}: choose one of {names}")
-    if not wanted:
+        return [export_format.write_table(loaded, wanted, target)]
+    if not wanted or export_format.write_case is None:
         raise UserError(f"--format {file_format} needs the indices of cases")
-    below = SCENARIOS if file_format == "sumo" else EXPORTS
-    target = Path(out) if out is not None else loaded.folder / below
     road = _road(loaded.scenario, net)
-    return list(exports.write_folders(loaded, wanted, target, FOLDERS[file_format], road))
+    return list(exports.write_folders(loaded, wanted, target, export_format.write_case, road))
 
 
 def report(run: AnyRun) -> Path:

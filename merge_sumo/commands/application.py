@@ -15,10 +15,19 @@ from typer.core import TyperCommand, TyperOption
 from merge_sumo.commands.options import GROUP_OF, GROUPS, KEYWORDS, OPTIONS
 from merge_sumo.commands.printing import notices_printed, print_result, say
 from merge_sumo.errors import UserError
+from merge_sumo.system.registry import import_object
 from merge_sumo.system.suggestions import either
 
 if TYPE_CHECKING:
     from merge_sumo.analysis.result import Result
+
+
+REGISTRIES: Final = {
+    "{samplers}": "merge_sumo.samplers.registry:SAMPLERS",
+    "{criteria}": "merge_sumo.values.criteria:CRITERIA",
+    "{formats}": "merge_sumo.reports.formats:FORMATS",
+}
+"""Registries whose names stand in help texts: they are imported where a command is used."""
 
 
 def unwrapped(text: str) -> str:
@@ -43,11 +52,10 @@ class GroupedCommand(TyperCommand):
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the options; `{samplers}` in a help text becomes the names of a registry."""
         for parameter in self.params:
-            text = getattr(parameter, "help", None) or ""
-            if isinstance(parameter, TyperOption) and "{samplers}" in text:
-                from merge_sumo.samplers.registry import SAMPLERS
-
-                parameter.help = text.replace("{samplers}", either(SAMPLERS))
+            for placeholder, registry in REGISTRIES.items():
+                if isinstance(parameter, TyperOption) and placeholder in (parameter.help or ""):
+                    names = either(import_object(registry))
+                    parameter.help = (parameter.help or "").replace(placeholder, names)
         return super().get_params(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -215,15 +214,6 @@ def rerun(
     raise typer.Exit(1 if why else 0)
 
 
-class Format(StrEnum):
-    """Formats of `export`."""
-
-    SUMO = "sumo"
-    OPENSCENARIO = "openscenario"
-    CSV = "csv"
-    PARQUET = "parquet"
-
-
 @app.verb(options=["net"])
 def export(
     given: Given,
@@ -233,13 +223,14 @@ def export(
         typer.Argument(help="Indices of cases in outcomes.jsonl; csv, parquet: all if left out."),
     ] = None,
     file_format: Annotated[
-        Format,
+        str,
         typer.Option(
             "--format",
-            help="sumo: folders that sumo-gui replays. openscenario: folders with OpenSCENARIO "
-            "and OpenDRIVE. csv, parquet: one table of motion.",
+            help="Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders with "
+            "OpenSCENARIO and OpenDRIVE. csv, parquet: one table of motion.",
+            autocompletion=complete.formats,
         ),
-    ] = Format.SUMO,
+    ] = "sumo",
     out: Annotated[
         Path | None,
         typer.Option(
@@ -253,7 +244,7 @@ def export(
     """
     from merge_sumo import api
 
-    paths = api.export(run, case or None, file_format=file_format.value, out=out, **given.keywords)
+    paths = api.export(run, case or None, file_format=file_format, out=out, **given.keywords)
     if given.as_json:
         print_json({"written": list(map(str, paths))})
         return

@@ -100,9 +100,16 @@ def scenarios(incomplete: str) -> Completions:
 
 def criteria(incomplete: str) -> Completions:
     """Return the names of criteria."""
-    from merge_sumo.values.criterion import NAMED
+    from merge_sumo.values.criteria import CRITERIA
 
-    return _beginning(incomplete, [(name, "") for name in NAMED])
+    return _beginning(incomplete, [(name, "") for name in CRITERIA])
+
+
+def formats(incomplete: str) -> Completions:
+    """Return the formats of an export."""
+    from merge_sumo.reports.formats import FORMATS
+
+    return _beginning(incomplete, [(name, item.about) for name, item in FORMATS.items()])
 
 
 def gates(incomplete: str) -> Completions:

@@ -173,7 +173,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "fail_when": _option(
         str,
         "paper",
-        "What counts as a failure: paper (front bumpers within 6 m at M), contact, unsafe, or a "
+        "What counts as a failure: {criteria} (paper: front bumpers within 6 m at M), or a "
         "condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
         metavar="EXPR",
     ),

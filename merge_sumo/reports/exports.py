@@ -11,15 +11,17 @@ import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.campaigns.campaign import case_name
+from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
+from merge_sumo.reports.formats import ExportFormat
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
@@ -300,3 +302,17 @@ def _car(xosc: Any, who: str, scenario: Scenario) -> Any:
     front = xosc.Axle(0.5, WHEEL_M, width - 0.2, -0.2 * length, WHEEL_M / 2.0)
     rear = xosc.Axle(0.0, WHEEL_M, width - 0.2, -0.8 * length, WHEEL_M / 2.0)
     return xosc.Vehicle(who, xosc.VehicleCategory.car, box, front, rear, 70.0, *limits)
+
+
+SUMO: Final = ExportFormat(
+    about="folders that sumo-gui replays", write_case=write_sumo, below=SCENARIOS
+)
+OPENSCENARIO: Final = ExportFormat(
+    about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario
+)
+CSV: Final = ExportFormat(
+    about="one table of motion", write_table=partial(write_table, file_format="csv")
+)
+PARQUET: Final = ExportFormat(
+    about="one table of motion, as columns", write_table=partial(write_table, file_format="parquet")
+)

@@ -10,10 +10,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import EntryPoint, distributions
-from pathlib import Path
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.suggestions import meant
@@ -110,7 +110,9 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def _entries(self) -> dict[str, dict[str, EntryPoint]]:
         """Return the installed entries, by name and then by package."""
-        return installed_entries(self.group, tuple(sys.path), str(Path.cwd()))
+        with suppress(OSError):  # the working folder may be gone
+            return installed_entries(self.group, tuple(sys.path), os.getcwd())  # noqa: PTH109
+        return {}
 
     def _loaded(self, entry: EntryPoint, package: str) -> T:
         try:
@@ -126,6 +128,11 @@ class Registry(Mapping[str, T], Generic[T]):
         if not self._accepts(item):
             raise UserError(f"the {self.noun} {name!r} of {package} is not {self._contract}")
         return item
+
+
+def import_object(at: str) -> Any:
+    """Return the object `module:attribute`."""
+    return EntryPoint(at, at, "").load()
 
 
 @lru_cache(maxsize=64)

@@ -18,6 +18,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 from merge_sumo.system.suggestions import nearest
 from merge_sumo.values.bodies import CentreLines
+from merge_sumo.values.criteria import CRITERIA, PAPER
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
 from merge_sumo.values.measures import MEASURES, OURS
 from merge_sumo.values.ranges import Speeds
@@ -27,14 +28,6 @@ from merge_sumo.values.severity import Severity
 from merge_sumo.values.soundness import domain_of, emptiness, idle_parts
 from merge_sumo.values.temporal import check_formula, formula_range, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
-
-PAPER: Final = "paper"
-NAMED: Final = {
-    PAPER: "score < -500",
-    "contact": "clearance_m <= 0",
-    "unsafe": "clearance_m <= 0 or brake_after_mps2 > 3",
-}
-"""Criteria by name, and the condition that each one is."""
 
 SHORT: Final = 120
 """Characters of a condition in a headline."""
@@ -71,10 +64,10 @@ class Criterion:
     def __post_init__(self) -> None:
         """Check the condition; however it is spaced, it is the same."""
         name = self.fail_when.strip()
-        if name not in NAMED:
-            if name.isidentifier() and (near := nearest(name, NAMED)):
+        if name not in CRITERIA:
+            if name.isidentifier() and (near := nearest(name, CRITERIA)):
                 raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
-            _, name = parse_condition(self.fail_when, vocabulary(), "--fail-when", NAMED)
+            _, name = parse_condition(self.fail_when, vocabulary(), "--fail-when", _conditions())
         object.__setattr__(self, "fail_when", name)
         if self.require is not None:
             if name != PAPER:
@@ -109,7 +102,7 @@ class Criterion:
         """
         what = "--fail-when" if self.require is None else "--require"
         found = []
-        if self.require is None and self.fail_when not in NAMED:
+        if self.require is None and self.fail_when not in CRITERIA:
             domain = domain_of(scenario, Speeds.possible(scenario), _texts())
             found += [f"{what}: {part}" for part in idle_parts(condition_of(self.words), domain)]
         usual = Speeds.usual(scenario)
@@ -140,12 +133,12 @@ class Criterion:
     @property
     def words(self) -> str:
         """Return when a case fails, as a condition."""
-        return NAMED.get(self.text, self.text)
+        return CRITERIA[self.text].condition if self.text in CRITERIA else self.text
 
     @property
     def in_short(self) -> str:
         """Return when a case fails, by name where there is one, at a length for a headline."""
-        said = f"{self.text}: {self.words}" if self.text in NAMED else self.text
+        said = f"{self.text}: {self.words}" if self.text in CRITERIA else self.text
         return said if len(said) <= SHORT else f"{said[: SHORT - 3]}..."
 
     def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
@@ -190,13 +183,18 @@ PAPER_CRITERION: Final = Criterion()
 @lru_cache
 def condition_of(text: str) -> Condition:
     """Return the condition that a criterion states, by its words."""
-    return parse_condition(text, vocabulary(), "--fail-when", NAMED)[0]
+    return parse_condition(text, vocabulary(), "--fail-when", _conditions())[0]
 
 
 def vocabulary() -> Vocabulary:
     """Return what a condition may speak of: None for a number, or all that a text may be."""
     numbers = (name for name, one in MEASURES.items() if one.missing is not None)
     return {**dict.fromkeys(numbers), **TEXTS}
+
+
+def _conditions() -> dict[str, str]:
+    """Return the conditions of the named criteria."""
+    return {name: criterion.condition for name, criterion in CRITERIA.items()}
 
 
 def _texts() -> dict[str, frozenset[str]]:

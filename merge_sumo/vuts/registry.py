@@ -16,6 +16,7 @@ from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.registry import Registry
 from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.vuts.base import Vut, VutOptions
@@ -88,43 +89,49 @@ RAMP_ONLY: Final = replace(
     BUILT_IN,
     no_pov="that is a VUT for the ramp; --level chooses the POVs of levels 0 to 2",
 )
-KINDS: Final[dict[str, VutKind]] = {
-    "traci": VutKind(
-        form="traci[:PORT]",
-        what="a program in any language that drives `vut` by TraCI, started by --vut-command",
-        example='--vut traci --vut-command "python my_controller.py {port}"',
-        prepare=traci_vut,
-        by_command=True,
-        no_pov=(
-            "a TraCI client drives the vehicle `vut` and no other; bring the POV as Python, an "
-            "FMU, a network or sumo:MODEL"
+KINDS: Final[Registry[VutKind]] = Registry(
+    "merge_sumo.vut_kinds",
+    "kind of VUT",
+    {
+        "traci": VutKind(
+            form="traci[:PORT]",
+            what="a program in any language that drives `vut` by TraCI, started by --vut-command",
+            example='--vut traci --vut-command "python my_controller.py {port}"',
+            prepare=traci_vut,
+            by_command=True,
+            no_pov=(
+                "a TraCI client drives the vehicle `vut` and no other; bring the POV as Python, an "
+                "FMU, a network or sumo:MODEL"
+            ),
         ),
-    ),
-    "sumo": VutKind(
-        form="sumo:MODEL[?OPTION=VALUE&...]",
-        what="SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic",
-        example='--vut "sumo:IDM?tau=1.2"',
-        prepare=sumo_vut,
-        own_code=False,
-    ),
-    "onnx": VutKind(
-        form="onnx:FILE[?decision_period_s=SECONDS]",
-        what="a network from the state to an acceleration, or to values of the 7 actions",
-        example="--vut onnx:policy.onnx",
-        prepare=onnx_vut,
-        hosted=True,
-        file_of=_file_before_options,
-    ),
-    "fmu": VutKind(
-        form="fmu:FILE[?VARIABLE=NAME&...]",
-        what="an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables",
-        example='--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"',
-        prepare=fmu_vut,
-        hosted=True,
-        file_of=_file_before_options,
-    ),
-    HERE: VutKind(prepare=here_vut, in_memory=True),
-}
+        "sumo": VutKind(
+            form="sumo:MODEL[?OPTION=VALUE&...]",
+            what="SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic",
+            example='--vut "sumo:IDM?tau=1.2"',
+            prepare=sumo_vut,
+            own_code=False,
+        ),
+        "onnx": VutKind(
+            form="onnx:FILE[?decision_period_s=SECONDS]",
+            what="a network from the state to an acceleration, or to values of the 7 actions",
+            example="--vut onnx:policy.onnx",
+            prepare=onnx_vut,
+            hosted=True,
+            file_of=_file_before_options,
+        ),
+        "fmu": VutKind(
+            form="fmu:FILE[?VARIABLE=NAME&...]",
+            what="an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables",
+            example='--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"',
+            prepare=fmu_vut,
+            hosted=True,
+            file_of=_file_before_options,
+        ),
+        HERE: VutKind(prepare=here_vut, in_memory=True),
+    },
+    accepts=lambda item: isinstance(item, VutKind),
+    contract="a merge_sumo.vuts.registry.VutKind",
+)
 """The kinds that have a name of their own before the colon."""
 
 

@@ -24,8 +24,8 @@ from merge_sumo.analysis.plausibility import doubts
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.criterion import (
-    NAMED,
     NUMBERS,
     TEXTS,
     Criterion,
@@ -44,7 +44,7 @@ SCENARIOS = ["us23", "roundabout", "us23-traffic"]
 
 class TestACriterion:
     @pytest.mark.parametrize("name", SCENARIOS)
-    @pytest.mark.parametrize("criterion", NAMED)
+    @pytest.mark.parametrize("criterion", CRITERIA)
     def test_that_has_a_name_is_sound(self, name, criterion):
         named = Criterion(criterion)
         named.check(named_scenario(name))
