@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperOption
 from merge_sumo.commands.options import GROUP_OF, GROUPS, KEYWORDS, OPTIONS
 from merge_sumo.commands.printing import notices_printed, print_result, say
 from merge_sumo.errors import UserError
-from merge_sumo.system.registry import import_object
+from merge_sumo.system.spawning import named
 from merge_sumo.system.suggestions import either
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class GroupedCommand(TyperCommand):
         for parameter in self.params:
             for placeholder, registry in REGISTRIES.items():
                 if isinstance(parameter, TyperOption) and placeholder in (parameter.help or ""):
-                    names = either(import_object(registry))
+                    names = either(named(registry))
                     parameter.help = (parameter.help or "").replace(placeholder, names)
         return super().get_params(ctx)
 

@@ -226,8 +226,8 @@ def export(
         str,
         typer.Option(
             "--format",
-            help="Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders with "
-            "OpenSCENARIO and OpenDRIVE. csv, parquet: one table of motion.",
+            help="Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders "
+            "with OpenSCENARIO and OpenDRIVE. csv, parquet: one table of motion.",
             autocompletion=complete.formats,
         ),
     ] = "sumo",

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import EntryPoint, distributions
-from typing import Any, Final, Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.suggestions import meant
@@ -128,11 +128,6 @@ class Registry(Mapping[str, T], Generic[T]):
         if not self._accepts(item):
             raise UserError(f"the {self.noun} {name!r} of {package} is not {self._contract}")
         return item
-
-
-def import_object(at: str) -> Any:
-    """Return the object `module:attribute`."""
-    return EntryPoint(at, at, "").load()
 
 
 @lru_cache(maxsize=64)

@@ -6,7 +6,7 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final
 
@@ -73,8 +73,7 @@ def python_command(main: str, settings: Mapping[str, Any]) -> list[str]:
     return [sys.executable, "-P", "-c", BOOT, json.dumps(told)]
 
 
-def named(name: str) -> Callable[..., Any]:
-    """Return the function "MODULE:FUNCTION"."""
-    module, _, function = name.partition(":")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
-    return found
+def named(name: str) -> Any:
+    """Return the object "MODULE:NAME"."""
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module), attribute)

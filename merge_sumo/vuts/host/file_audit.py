@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import site
 import sys
 import sysconfig
@@ -12,6 +13,7 @@ from typing import Any, Final
 from merge_sumo.system.resources import resource
 
 SYSTEM: Final = ("/proc", "/sys", "/dev", "/etc", "/usr/lib", "/usr/share", "/lib", "/run")
+METADATA: Final = re.compile(r"\.dist-info.(entry_points\.txt|METADATA)$")
 MOST_FILES: Final = 10_000
 """That are remembered; a VUT may open files for ever."""
 
@@ -40,8 +42,10 @@ class LoadedFiles:
         return {path for path in found if self._theirs(path) and Path(path).is_file()}
 
     def _theirs(self, path: str) -> bool:
-        # Compiled modules stand for their sources, which are in `sys.modules`.
-        return not path.startswith(self._not_theirs) and not path.endswith(".pyc")
+        # Compiled modules stand for their sources, which are in `sys.modules`; what packages are
+        # installed is read to find the kind of the VUT.
+        no_source = path.endswith(".pyc") or METADATA.search(path) is not None
+        return not path.startswith(self._not_theirs) and not no_source
 
     def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
         if len(self._read) + len(self._written) > MOST_FILES:
