@@ -80,7 +80,8 @@ from merge_sumo.engine.simulator import SimulationPlan, road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
 from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
-from merge_sumo.reports.formats import EXPORTS, FORMATS
+from merge_sumo.reports.export_format import EXPORTS
+from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import Bars, Counter, TrainingBars, is_watched, rate_text
 from merge_sumo.reports.report import check_report, write_report

@@ -21,7 +21,7 @@ from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
-from merge_sumo.reports.formats import ExportFormat
+from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
