@@ -2,31 +2,74 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.records import Record, convert, decode, replaced, to_plain
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import US23, Dimension, Scenario
 
+Weights = Annotated[
+    tuple[Annotated[float, Meta(ge=0.0)], ...],
+    Meta(min_length=1, description="weights, numbers of 0 or more"),
+]
 
-@dataclass(frozen=True, slots=True)
-class Marginal:
-    """The distribution of one coordinate inside the pool.
 
-    Attributes:
-        quantile: maps chances, (n,), to values in the coordinate's unit, (n,).
-        record: what a file says of it.
-    """
+class Uniform(Record, frozen=True, tag_field="kind", tag="uniform"):
+    """All values from `low` to `high` alike; the bounds of the pool where none are stated."""
 
-    quantile: Callable[[FloatArray], FloatArray]
-    record: dict[str, Any]
+    low: float | None = None
+    high: float | None = None
+
+    def quantile(self, chance: FloatArray) -> FloatArray:
+        """Return the values, (n,), at chances, (n,), in the unit of the coordinate."""
+        assert self.low is not None and self.high is not None, "bounded"  # noqa: S101, PT018
+        return self.low + chance * (self.high - self.low)
+
+
+class Normal(Record, frozen=True, tag_field="kind", tag="normal"):
+    """A normal distribution, cut off at `low` and `high`, by default the bounds of the pool."""
+
+    mean: float
+    sd: Annotated[float, Meta(gt=0.0)]
+    low: float | None = None
+    high: float | None = None
+
+    def quantile(self, chance: FloatArray) -> FloatArray:
+        """Return the values, (n,), at chances, (n,), in the unit of the coordinate."""
+        from scipy.stats import truncnorm
+
+        assert self.low is not None and self.high is not None, "bounded"  # noqa: S101, PT018
+        low, high = (self.low - self.mean) / self.sd, (self.high - self.mean) / self.sd
+        values = truncnorm(low, high, loc=self.mean, scale=self.sd).ppf(chance)
+        return np.asarray(values, dtype=np.float64)
+
+
+class Histogram(Record, frozen=True, tag_field="kind", tag="histogram"):
+    """Weights of bins between rising edges, uniform within a bin."""
+
+    edges: tuple[float, ...]
+    weights: Weights
+
+    def quantile(self, chance: FloatArray) -> FloatArray:
+        """Return the values, (n,), at chances, (n,), in the unit of the coordinate."""
+        edges, weights = np.array(self.edges), np.array(self.weights)
+        below = np.concatenate([[0.0], np.cumsum(weights) / weights.sum()])
+        bin_ = np.clip(np.searchsorted(below, chance, side="right") - 1, 0, len(weights) - 1)
+        share = (chance - below[bin_]) / np.maximum(np.diff(below)[bin_], 1e-300)
+        values = edges[bin_] + np.clip(share, 0.0, 1.0) * np.diff(edges)[bin_]
+        return np.asarray(values, dtype=np.float64)
+
+
+Marginal = Uniform | Normal | Histogram
+"""The distribution of one coordinate inside the pool."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +96,8 @@ class Distribution:
 
     def record(self) -> dict[str, Any]:
         """Return the distribution as a file says it."""
-        named = {name: marginal.record for name, marginal in self.marginals.items()}
-        return {"levels": {str(level): weight for level, weight in self.levels.items()}, **named}
+        levels = {str(level): weight for level, weight in self.levels.items()}
+        return {"levels": levels, **to_plain(self.marginals)}
 
 
 def read_distribution(
@@ -72,118 +115,73 @@ def read_distribution(
     A normal distribution is cut off at the pool's bounds. Raises `UserError` with the place in the
     file where it is no distribution over the cases of `levels`.
     """
-    stated: Any = {}
-    if path is not None:
-        try:
-            stated = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise UserError(f"cannot read {path}: {error.strerror}") from error
-        except ValueError as error:
-            raise UserError(f"{path} is not readable JSON: {error}") from error
-    where = str(path)
-    if not isinstance(stated, dict):
-        raise UserError(f"{where} is not a JSON object")
-    coordinates = {d.field: d for d in scenario.dimensions(2)}
-    unknown = sorted(set(stated) - {"levels", *coordinates})
-    if unknown:
-        known = ", ".join(["levels", *coordinates])
-        raise UserError(f"{where} has {unknown[0]!r}: it may have {known}")
-    weights = _level_weights(stated.get("levels"), levels, where)
-    marginals = {
-        name: _marginal(stated.get(name, {"kind": "uniform"}), d, f"{where}: {name}")
-        for name, d in coordinates.items()
-    }
+    stated: dict[str, Any] = {}
+    try:
+        if path is not None:
+            stated = decode(path.read_bytes(), dict[str, Any])
+        coordinates = {d.field: d for d in scenario.dimensions(2)}
+        for name in stated.keys() - {"levels", *coordinates}:
+            known = ", ".join(["levels", *coordinates])
+            raise UserError(f"it has {name!r}: it may have {known}")
+        weights = _level_weights(stated.get("levels"), levels)
+        marginals = {
+            name: _marginal(stated.get(name, {"kind": "uniform"}), d)
+            for name, d in coordinates.items()
+        }
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
     return Distribution(weights, marginals, scenario)
 
 
-def _level_weights(stated: Any, levels: Sequence[int], where: str) -> dict[int, float]:
+def _level_weights(stated: object, levels: Sequence[int]) -> dict[int, float]:
+    """Return the chance of each level that has one; they add up to 1."""
     if stated is None:
         return {level: 1.0 / len(levels) for level in levels}
+    try:
+        weights = convert(stated, dict[str, Annotated[float, Meta(ge=0.0)]])
+    except UserError as error:
+        raise UserError("levels must be weights, numbers of 0 or more, by level") from error
     able = {str(level) for level in levels}
-    if not isinstance(stated, dict) or not stated or not set(stated) <= able:
+    if not weights or not weights.keys() <= able:
+        known = ", ".join(sorted(able))
+        raise UserError(f"levels must give weights to levels of the campaign: {known}")
+    total = sum(weights.values())
+    if not 0.0 < total < math.inf:
+        raise UserError("levels must have weights that are not all 0, and finite")
+    return {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
+
+
+def _marginal(stated: object, d: Dimension) -> Marginal:
+    """Return a distribution of a coordinate that lies within the pool."""
+    try:
+        found: Marginal = convert(stated, Marginal)  # type: ignore[arg-type]
+        return _bins_within(found, d) if isinstance(found, Histogram) else _bounded(found, d)
+    except UserError as error:
+        raise UserError(f"{d.field}: {error}") from error
+
+
+def _bounded(stated: Uniform | Normal, d: Dimension) -> Marginal:
+    low = d.low if stated.low is None else stated.low
+    high = d.high if stated.high is None else stated.high
+    if not d.low <= low < high <= d.high:
         raise UserError(
-            f"{where}: levels must give weights to levels of the campaign: "
-            f"{', '.join(sorted(able))}"
+            f"low is {low:g} and high {high:g}: choose low < high within the pool, "
+            f"{d.low:g} to {d.high:g}"
         )
-    weights = _numbers(list(stated.values()), f"{where}: levels")
-    if min(weights) < 0.0 or sum(weights) <= 0.0:
-        raise UserError(f"{where}: weights of levels must be 0 or more, and not all 0")
-    return {int(level): w / sum(weights) for level, w in zip(stated, weights, strict=True) if w > 0}
+    bounded = replaced(stated, low=low, high=high)
+    if not np.isfinite(bounded.quantile(np.array([0.01, 0.5, 0.99]))).all():
+        raise UserError("such a normal distribution never comes to the pool")
+    return bounded
 
 
-def _marginal(stated: Any, d: Dimension, where: str) -> Marginal:
-    if not isinstance(stated, dict):
-        raise UserError(f"{where} is not a JSON object with a kind")
-    kinds: dict[Any, tuple[tuple[str, ...], Callable[..., Marginal]]] = {
-        "uniform": (("low", "high"), _uniform),
-        "normal": (("mean", "sd", "low", "high"), _normal),
-        "histogram": (("edges", "weights"), _histogram),
-    }
-    kind = stated.get("kind")
-    if not isinstance(kind, str) or kind not in kinds:
-        raise UserError(f"{where}: kind is {kind!r}: choose {', '.join(kinds)}")
-    names, make = kinds[kind]
-    for name in stated:
-        if name not in ("kind", *names):
-            raise UserError(f"{where}: {kind} has no {name!r}: it has {', '.join(names)}")
-    bounds = {"low": d.low, "high": d.high} if "low" in names else {}
-    values = {**bounds, **stated}
-    for name in names:
-        if name not in values:
-            raise UserError(f"{where}: {kind} needs {name!r}")
-    if bounds:
-        low, high = _numbers([values["low"], values["high"]], where)
-        if not d.low <= low < high <= d.high:
-            raise UserError(
-                f"{where}: low is {low:g} and high {high:g}: choose low < high within the pool, "
-                f"{d.low:g} to {d.high:g}"
-            )
-    return make(values, d, where)
-
-
-def _uniform(values: dict[str, Any], _: Dimension, __: str) -> Marginal:
-    low, high = float(values["low"]), float(values["high"])
-    return Marginal(lambda chance: low + chance * (high - low), values)
-
-
-def _normal(values: dict[str, Any], _: Dimension, where: str) -> Marginal:
-    from scipy.stats import truncnorm
-
-    mean, sd = _numbers([values["mean"], values["sd"]], where)
-    if sd <= 0.0:
-        raise UserError(f"{where}: sd is {sd:g}: it must be above 0")
-    low, high = ((float(values[end]) - mean) / sd for end in ("low", "high"))
-    curve = truncnorm(low, high, loc=mean, scale=sd)
-    if not np.isfinite(curve.ppf([0.01, 0.5, 0.99])).all():
-        raise UserError(f"{where}: a normal around {mean:g} with sd {sd:g} never comes to the pool")
-    return Marginal(lambda chance: np.asarray(curve.ppf(chance), dtype=np.float64), values)
-
-
-def _histogram(values: dict[str, Any], d: Dimension, where: str) -> Marginal:
-    edges = np.array(_numbers(values["edges"], f"{where}: edges"))
-    weights = np.array(_numbers(values["weights"], f"{where}: weights"))
-    if len(edges) != len(weights) + 1 or len(weights) < 1:
-        raise UserError(f"{where}: {len(weights)} weights need {len(weights) + 1} edges")
+def _bins_within(stated: Histogram, d: Dimension) -> Histogram:
+    edges, weights = np.array(stated.edges), stated.weights
+    if len(edges) != len(weights) + 1:
+        raise UserError(f"{len(weights)} weights need {len(weights) + 1} edges")
     if (np.diff(edges) <= 0.0).any() or edges[0] < d.low or edges[-1] > d.high:
-        raise UserError(f"{where}: edges must rise within the pool, {d.low:g} to {d.high:g}")
-    if (weights < 0.0).any() or weights.sum() <= 0.0:
-        raise UserError(f"{where}: weights must be 0 or more, and not all 0")
-    below = np.concatenate([[0.0], np.cumsum(weights) / weights.sum()])
-    width = np.diff(edges)
-
-    def quantile(chance: FloatArray) -> FloatArray:
-        bin_ = np.clip(np.searchsorted(below, chance, side="right") - 1, 0, len(weights) - 1)
-        within = (chance - below[bin_]) / np.maximum(np.diff(below)[bin_], 1e-300)
-        return np.asarray(edges[bin_] + np.clip(within, 0.0, 1.0) * width[bin_], dtype=np.float64)
-
-    return Marginal(quantile, values)
-
-
-def _numbers(values: Any, where: str) -> list[float]:
-    """Return finite numbers from JSON; `UserError` for anything else."""
-    if not isinstance(values, list) or not values:
-        raise UserError(f"{where} is not a list of numbers")
-    for value in values:
-        if type(value) not in (int, float) or not math.isfinite(value):
-            raise UserError(f"{where}: {value!r} is not a number")
-    return [float(value) for value in values]
+        raise UserError(f"edges must rise within the pool, {d.low:g} to {d.high:g}")
+    if not 0.0 < sum(weights) < math.inf:
+        raise UserError("weights must be not all 0, and finite")
+    return stated

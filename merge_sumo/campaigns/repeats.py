@@ -14,7 +14,7 @@ The file of a folder that somebody sent is data as everything in it.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -24,9 +24,9 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.simulator import CaseResult, RunCases
 from merge_sumo.errors import UserError
-from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VEHICLES
+from merge_sumo.system.records import read_indexed
+from merge_sumo.values.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.registry import built_in_vuts, waits_for_client
@@ -52,8 +52,8 @@ class Repeat:
     """
 
     index: int
-    differs_from_s: float | None
-    first: str | None
+    differs_from_s: EpisodeTime | None
+    first: Vehicle | None
     end: End
     failed: bool
     other_verdict: bool
@@ -124,7 +124,7 @@ def compared(outcome: Outcome, recorded: Trajectory, ran: CaseResult) -> Repeat:
     return Repeat(outcome.index, differs_from_s, first, end, now.failed, other)
 
 
-def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, str | None]:
+def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicle | None]:
     """Return from when on two motions differ, and which vehicle differs first."""
     rows = min(len(one.motion), len(other.motion))
     pairs = [trajectory.motion[:rows].copy() for trajectory in (one, other)]
@@ -159,35 +159,8 @@ def read_repeats(run: Run) -> list[Repeat]:
 
     Raises `UserError` for a line that is of no case of the campaign.
     """
-    path = run.folder / REPEATS
-    try:
-        lines = regular(path).read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        return []
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
-    found: dict[int, Repeat] = {}
-    for number, line in enumerate(lines, start=1):
-        try:
-            one = _of_record(json.loads(line))
-            if not 0 <= one.index < len(run.outcomes) or one.index in found:
-                raise ValueError(f"case {one.index}")
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
-            raise UserError(f"line {number} of {path} is of no case of the campaign") from error
-        found[one.index] = one
-    return list(found.values())
-
-
-def _of_record(record: Mapping[str, Any]) -> Repeat:
-    one = Repeat(**{**record, "end": End(record["end"])})
-    from_s = one.differs_from_s
-    if type(one.index) is not int or {type(one.failed), type(one.other_verdict)} != {bool}:
-        raise TypeError("not as it is written")
-    if not (from_s is None or (type(from_s) is float and 0.0 <= from_s <= MAX_EPISODE_S)):
-        raise ValueError("differs_from_s")
-    if one.first not in (None, *VEHICLES):
-        raise ValueError("first")
-    return one
+    known = read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
+    return list(known.values())
 
 
 def unrepeatable(found: Iterable[Repeat]) -> str | None:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.printable import printable
-from merge_sumo.system.records import decode
+from merge_sumo.system.records import convert, decode
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.fmc import regions
@@ -206,7 +206,7 @@ def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
     """
     recorded = settings.get("scenario")
     try:
-        return US23 if recorded is None else Scenario.from_record(recorded)
+        return US23 if recorded is None else convert(recorded, Scenario)
     except UserError as error:
         raise UserError(f"{path} has no scenario: {error}") from error
 

@@ -6,9 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, get_args, get_origin, get_type_hints
-
-import numpy as np
+from typing import Any, Final
 
 from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
@@ -21,6 +19,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.system.records import RecordError, check_fields, convert
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import (
@@ -64,7 +63,7 @@ class CampaignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers, the names and the levels; the scenario says what is left out."""
-        self._check_types()
+        check_fields(self)
         if self.policies is not None:
             object.__setattr__(self, "policies", str(policies_in(self.policies)))
         fixed = self.scenario.v_vut0_mps
@@ -111,16 +110,6 @@ class CampaignSettings:
         if self.v_vut0_mps is not None and not 0.0 <= self.v_vut0_mps <= most_mps:
             raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
         self.stopping_rule()
-
-    def _check_types(self) -> None:
-        hints = get_type_hints(CampaignSettings)
-        for name, value in ((spec.name, getattr(self, spec.name)) for spec in fields(self)):
-            if isinstance(value, np.generic):  # a number of an array is as good as one of Python
-                object.__setattr__(self, name, value := value.item())
-            if not _fits(value, hints[name]):
-                parts = (hints[name], *get_args(hints[name]))
-                wanted = next((words for kind, words in KINDS.items() if kind in parts), "")
-                raise UserError(f"{name} is {value!r}: it must be {wanted or hints[name]}")
 
     def _check_sampler(self) -> None:
         sampler = make_sampler(self.sampler, self.pool, self.seed)
@@ -290,21 +279,17 @@ def settings_of(
     _check_begun_here(folder, record, given or {})
     if not trust:
         check_own_code(folder, recorded, given or {})
-    hints = get_type_hints(CampaignSettings)
-    values: dict[str, Any] = {}
-    for spec in fields(CampaignSettings):
-        value: Any = record.get(spec.name, spec.default)
-        if spec.name == "scenario" and isinstance(value, dict):
-            value = scenario_of(record, folder / SETTINGS)
-        value = tuple(value) if isinstance(value, list) else value
-        if not _fits(value, hints[spec.name]):
-            raise UserError(f"{folder / SETTINGS} has no {spec.name}, or something else there")
-        # 18 is 18.0, and outcomes are to show it as the same number.
-        is_real = float in (hints[spec.name], *get_args(hints[spec.name]))
-        values[spec.name] = float(value) if is_real and type(value) is int else value
-    if values["policies"] is not None and "policies" not in (given or {}):
-        _check_still_there(folder, values["policies"])
-    return CampaignSettings(**values)
+    known = {
+        spec.name: record[spec.name] for spec in fields(CampaignSettings) if spec.name in record
+    }
+    if isinstance(known.get("scenario"), dict):
+        known["scenario"] = scenario_of(record, folder / SETTINGS)
+    if isinstance(known.get("policies"), str) and "policies" not in (given or {}):
+        _check_still_there(folder, known["policies"])
+    try:
+        return convert(known, CampaignSettings)
+    except RecordError as error:
+        raise UserError(f"{folder / SETTINGS}: {error}") from error
 
 
 def _check_begun_here(folder: Path, record: Mapping[str, Any], given: Mapping[str, object]) -> None:
@@ -334,22 +319,3 @@ def _check_still_there(folder: Path, policies: str) -> None:
             f"{folder} was run with the policies in {policies}, and there are none any more: name "
             "the folder where they are now with --policies"
         ) from None
-
-
-KINDS: Final = {
-    bool: "True or False",
-    int: "a whole number",
-    float: "a number",
-    str: "a text",
-}
-"""What a setting may be, in words."""
-
-
-def _fits(value: object, hint: Any) -> bool:
-    """Return whether a value read from JSON is of the type of a setting."""
-    parts = get_args(hint)
-    if get_origin(hint) is tuple:
-        return isinstance(value, tuple) and all(_fits(item, parts[0]) for item in value)
-    if parts:
-        return any(_fits(value, part) for part in parts)
-    return type(value) is hint or (hint is float and type(value) is int and abs(value) < 2**53)

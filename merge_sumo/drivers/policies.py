@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import stat
 from functools import cache
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import quoted
+from merge_sumo.system.records import Record, convert, decode
 from merge_sumo.system.resources import resource
 from merge_sumo.values.scenario import US23, Scenario
 
@@ -62,20 +62,23 @@ def policies_sha256(folder: Path) -> dict[str, str]:
     return {name: entry["sha256"] for name, entry in read_manifest(folder).items()}
 
 
+class _Manifest(Record, frozen=True):
+    networks: dict[str, dict[str, Any]]
+
+
 def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
     """Return what is known of each network, by name; empty where nothing was trained yet."""
     path = (folder or resource("policies")) / MANIFEST
     if not path.is_file():
         return {}
     try:
-        networks = json.loads(_content(path))["networks"]
-        found = {name: dict(networks[name]) for name in NETWORKS if name in networks}
-        for name, entry in found.items():
-            if not isinstance(entry["sha256"], str):
-                raise TypeError(f"the sha256 of {name} is no text")
+        networks = decode(_content(path), _Manifest).networks
+        known = {name: networks[name] for name in NETWORKS if name in networks}
+        for entry in known.values():
+            convert(entry.get("sha256"), str)
             scenario_of(entry)
-        return found
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, UserError) as error:
+        return known
+    except (OSError, UserError) as error:
         raise UserError(f"{path} is not a readable manifest of policies: {error}") from error
 
 
@@ -94,9 +97,9 @@ def scenario_of(entry: dict[str, Any]) -> Scenario:
     Raises `UserError` when the manifest describes none.
     """
     record = entry.get("scenario", scenario_record(US23))
-    if not isinstance(record, dict) or not set(record) <= {"name", *PLAYED, *LIMITS}:
+    if not set(convert(record, dict[str, Any])) <= {"name", *PLAYED, *LIMITS}:
         raise UserError("the scenario of a policy is a table of its numbers")
-    return Scenario.from_record(record)
+    return convert(record, Scenario)
 
 
 def plays_as(one: Scenario, other: Scenario) -> bool:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.records import convert
 from merge_sumo.system.resources import resource
 from merge_sumo.system.suggestions import meant
 from merge_sumo.values.scenario import US23, Scenario
@@ -69,10 +70,10 @@ def _read(path: Path) -> Scenario:
         raise UserError(f"the scenario {path} is no text in UTF-8") from error
     try:
         record: dict[str, Any] = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"the scenario {path} is no TOML: {error}") from error
     try:
-        return Scenario.from_record({"name": path.stem, **record})
+        return convert({"name": path.stem, **record}, Scenario)
     except UserError as error:
         raise UserError(f"{path}{_line(text, str(error))}: {error}") from error
 

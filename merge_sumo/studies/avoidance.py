@@ -29,14 +29,12 @@ from merge_sumo.campaigns.campaign import workers_or_here
 from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.studies.counterfactuals import CAREFUL, Avoidance, Failure, drive_again
-from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
+from merge_sumo.system.records import read_indexed
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.scenario import MAX_EPISODE_S
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.output import LOG
@@ -137,40 +135,16 @@ def read_avoidance(run: Run) -> dict[int, Avoidance]:
 
     Empty where it says nothing. Raises `UserError` for a line that is not of one of its failures.
     """
-    path = run.folder / AVOIDANCE
-    try:
-        lines = regular(path).read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
     failing = {outcome.index for outcome in run.outcomes if outcome.failed}
-    found: dict[int, Avoidance] = {}
-    for number, line in enumerate(lines, start=1):
-        try:
-            one = _of_record(json.loads(line))
-            if one.index not in failing or one.index in found:
-                raise ValueError(f"case {one.index}")
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
-            raise UserError(f"line {number} of {path} is of no failure of the campaign") from error
-        found[one.index] = one
-    return found
+    return read_indexed(run.folder / AVOIDANCE, Avoidance, failing, _upgrade_from_0_1)
 
 
-def _of_record(record: Any) -> Avoidance:
-    if isinstance(record, dict) and "careful_until_s" in record:
-        # Up to 0.1.0: another driver took over, so the time is none of this one's.
-        record = {**record, "latest_takeover_s": None}
+def _upgrade_from_0_1(record: dict[str, Any]) -> dict[str, Any]:
+    # Another driver took over in that release, so the time says nothing of this one.
+    if "careful_until_s" in record:
+        record["latest_takeover_s"] = None
         del record["careful_until_s"]
-    one = Avoidance(**record)
-    until, names = one.latest_takeover_s, record["avoided_by"]
-    if type(one.index) is not int or type(one.pov_careful) is not bool or type(names) is not list:
-        raise TypeError("not as it is written")
-    if not (until is None or (type(until) is float and 0.0 <= until <= MAX_EPISODE_S)):
-        raise ValueError("latest_takeover_s")
-    if [name for name in REFERENCES if name in names] != names:
-        raise ValueError("avoided_by")
-    return Avoidance(one.index, tuple(names), until, one.pov_careful)
+    return record
 
 
 def in_a_sentence(found: Iterable[Avoidance]) -> str | None:

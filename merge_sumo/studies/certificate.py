@@ -38,6 +38,7 @@ from merge_sumo.studies.truth import OnCases, sources_sha256
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
 from merge_sumo.system.printable import two_digits
+from merge_sumo.system.records import convert, decode
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import Dimension, level_name
 from merge_sumo.vuts.files import Files, changed
@@ -200,14 +201,15 @@ def _again(folder: Path, asked: Mapping[str, Any]) -> Files:
     path = folder / CERTIFICATE
     check_own(path)
     try:
-        there = json.loads(regular(path).read_text(encoding="utf-8"))
-        was, files = {name: there[name] for name in asked}, dict(there["files"])
+        record = decode(regular(path).read_bytes(), dict[str, Any])
+        was = {name: record.get(name) for name in asked}
+        files: Files = convert(record.get("files"), dict[str, str | None])
     except OSError as error:
         raise UserError(
             f"{folder} is no certificate to go on with: it has no {path.name}"
         ) from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise UserError(f"{path} is not as it was written") from error
+    except UserError as error:
+        raise UserError(f"{path} is not as it was written: {error}") from error
     now = json.loads(json.dumps(asked))
     for name, (before, today) in differences(was, now).items():
         raise UserError(

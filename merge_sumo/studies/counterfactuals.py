@@ -20,13 +20,14 @@ from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.pov_library import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.engine.simulator import SimulationPlan, opened_simulator
+from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.world import World
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import brake_after_mps2
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, EpisodeTime
 from merge_sumo.values.score import is_close
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -56,8 +57,13 @@ class Avoidance:
 
     index: int
     avoided_by: tuple[str, ...]
-    latest_takeover_s: float | None
+    latest_takeover_s: EpisodeTime | None
     pov_careful: bool
+
+    def __post_init__(self) -> None:
+        """Raise `UserError` for other drivers than the reference drivers, or another order."""
+        if [name for name in REFERENCES if name in self.avoided_by] != list(self.avoided_by):
+            raise UserError(f"avoided_by is {self.avoided_by}: choose from {', '.join(REFERENCES)}")
 
     @property
     def by_careful(self) -> bool:

@@ -22,6 +22,7 @@ from merge_sumo.engine.versions import versions
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
+from merge_sumo.system.records import decode
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.signature import CACHE, signed, user_key, verified
 from merge_sumo.system.workers import Workers
@@ -242,10 +243,11 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
         if content is None:
             return None
         data = read_arrays(io.BytesIO(content), "points", "score", "files", "of")
-        points, score, files = data["points"], data["score"], json.loads(str(data["files"]))
-        if str(data["of"]) != path.stem or not isinstance(files, dict) or changed(files):
+        points, score = data["points"], data["score"]
+        files = decode(str(data["files"]), dict[str, str | None])
+        if str(data["of"]) != path.stem or changed(files):
             return None
-    except UNREADABLE_NPZ:
+    except (*UNREADABLE_NPZ, UserError):
         return None
     fits = points.shape == (cases, dims) and score.shape == (cases,)
     numbers = points.dtype == score.dtype == np.float64

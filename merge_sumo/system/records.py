@@ -9,7 +9,7 @@ file may be somebody else's.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import is_dataclass
 from enum import Enum
 from functools import cache
@@ -35,8 +35,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.suggestions import meant
 
-__all__ = ["Meta", "Record", "check_fields", "convert", "decode", "read_lines", "to_plain"]
-
 T = TypeVar("T")
 
 WORDS: Final[dict[Any, str]] = {
@@ -53,6 +51,10 @@ WORDS: Final[dict[Any, str]] = {
 _NAMED: Final = re.compile(r"Object (missing required|contains unknown) field `(.*?)`", re.DOTALL)
 
 
+class RecordError(UserError):
+    """What is read is no record of its type."""
+
+
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of values that are a line or a table of a file."""
 
@@ -63,40 +65,40 @@ def record_type(name: str, fields: Sequence[tuple[Any, ...]]) -> Any:
 
 
 def decode(content: bytes | str, kind: Any = Any) -> Any:
-    """Return what JSON says as a value of a type; `UserError` where it is none."""
+    """Return what JSON says as a value of a type; `RecordError` where it is none."""
     try:
         return msgspec.json.decode(content, type=kind)
     except msgspec.ValidationError as error:
         record = None if kind is Any else decode(content)
-        raise UserError(_sentence(error, record, kind)) from error
+        raise RecordError(_sentence(error, record, kind)) from error
     except RecursionError as error:
-        raise UserError("it is nested too deeply") from error
+        raise RecordError("it is nested too deeply") from error
     except ValueError as error:
-        raise UserError(f"it is no JSON ({error})") from error
+        raise RecordError(f"it is no JSON ({error})") from error
 
 
 def convert(record: object, kind: type[T]) -> T:
     """Return plain values, as JSON and TOML have them, as a value of a type.
 
-    Raises `UserError` for other values, and for names that a dataclass does not have.
+    Raises `RecordError` for other values, and for names that a dataclass does not have.
     """
     if is_dataclass(kind) and isinstance(record, dict):
         known = list(_hints(kind))
         for name in record:
             if name not in known:
-                raise UserError(_unknown(name, kind))
+                raise RecordError(_unknown(name, kind))
     try:
         return msgspec.convert(record, kind)
     except msgspec.ValidationError as error:
-        raise UserError(_sentence(error, record, kind)) from error
+        raise RecordError(_sentence(error, record, kind)) from error
     except RecursionError as error:
-        raise UserError("it is nested too deeply") from error
+        raise RecordError("it is nested too deeply") from error
 
 
 def check_fields(value: Any) -> None:
     """Check and convert the fields of a dataclass in place: 18 to 18.0, a list to a tuple.
 
-    Numbers of numpy are as good as those of Python. Raises `UserError` for another type.
+    Numbers of numpy are as good as those of Python. Raises `RecordError` for another type.
     """
     kind: Any = type(value)
     for name, hint in _hints(kind).items():
@@ -105,25 +107,39 @@ def check_fields(value: Any) -> None:
         try:
             object.__setattr__(value, name, msgspec.convert(plain, hint))
         except msgspec.ValidationError as error:
-            raise UserError(_not_a_value(name, known, hint, str(error))) from error
+            raise RecordError(_not_a_value(name, known, hint, str(error))) from error
 
 
-def read_lines(path: Path, kind: type[T]) -> Iterator[tuple[int, T]]:
-    """Yield the number and the value of each line of a JSON-lines file, if it exists.
+def read_indexed(
+    path: Path, kind: type[T], indices: Container[int], upgrade: Callable[[Any], Any] = lambda r: r
+) -> dict[int, T]:
+    """Return the lines of a JSON-lines file by their `index`; nothing without the file.
 
-    Raises `UserError` with the number of a line that is no such value.
+    Args:
+        path: the file.
+        kind: a dataclass with an `index`.
+        indices: the indices that lines may have, each at most once.
+        upgrade: gives the record of an older version the fields of today.
+
+    Raises:
+        RecordError: with the number of a line that is something else.
     """
     try:
         lines = regular(path).read_bytes().splitlines()
     except FileNotFoundError:
-        return
+        return {}
     except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+        raise RecordError(f"{path} cannot be read: {error.strerror}") from error
+    values: dict[int, T] = {}
     for number, line in enumerate(lines, start=1):
         try:
-            yield number, decode(line, kind)
+            value: Any = convert(upgrade(decode(line, dict[str, Any])), kind)
+            if value.index not in indices or value.index in values:
+                raise RecordError(f"index is {value.index}")
         except UserError as error:
-            raise UserError(f"line {number} of {path}: {error}") from error
+            raise RecordError(f"line {number} of {path} is of no such case: {error}") from error
+        values[value.index] = value
+    return values
 
 
 def to_plain(value: object) -> Any:
@@ -131,17 +147,23 @@ def to_plain(value: object) -> Any:
     return msgspec.to_builtins(value)
 
 
+def replaced(value: T, **changes: Any) -> T:
+    """Return a record with other values in some fields."""
+    return msgspec.structs.replace(value, **changes)  # type: ignore[type-var]
+
+
 def in_words(hint: Any) -> str:
     """Return what a field of a type may hold, for "it must be ..."."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        bounds: Meta = parts[1]
-        limits = "" if bounds.ge is None else f" from {bounds.ge:g} up"
-        if bounds.le is not None:
-            limits = f" from {bounds.ge:g} to {bounds.le:g}"
-        return bounds.description or in_words(parts[0]) + limits
+        meta: Meta = parts[1]
+        limits = "" if meta.gt is None else f" above {meta.gt:g}"
+        limits += "" if meta.ge is None else f" of {meta.ge:g} or more"
+        limits += "" if meta.le is None else f", up to {meta.le:g}"
+        return meta.description or in_words(parts[0]) + limits
     if origin in (Union, UnionType):
-        return " or ".join(in_words(part) for part in parts if part is not NoneType)
+        words = dict.fromkeys(in_words(part) for part in parts if part is not NoneType)
+        return " or ".join(words)
     if origin is Literal:
         return f"one of {', '.join(parts)}"
     if isinstance(hint, type) and issubclass(hint, Enum):
@@ -157,8 +179,7 @@ def _hints(kind: type) -> dict[str, Any]:
 def _unknown(name: object, kind: Any) -> str:
     known = list(_hints(kind))
     hint = meant(str(name), known) or f"it has {', '.join(known)}"
-    noun = kind.__name__.lower()
-    return f"a{'n' if noun[0] in 'aeiou' else ''} {noun} has no {name!r:.60}: {hint.strip()}"
+    return f"{kind.__name__.lower()} has no {name!r:.60}: {hint.strip()}"
 
 
 def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:
@@ -167,14 +188,36 @@ def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:
     place = re.search(r" - at `\$([^`]*)`$", message)
     names = re.findall(r"\.(\w+)", place[1]) if place else []
     for name in names:
-        kind = _hints(_class_in(kind))[name]
-        record = record.get(name) if isinstance(record, dict) else None
+        table = record if isinstance(record, dict) else {}
+        kind, record = _type_of(name, table, kind), table.get(name)
+    name = names[-1] if names else "it"
     wrong = _NAMED.match(message)
     if wrong and wrong[1] == "missing required":
-        return f"{names[-1] if names else 'it'} has no {wrong[2]}"
+        return f"{name} has no {wrong[2]}"
     if wrong:
-        return _unknown(wrong[2], _class_in(kind))
-    return _not_a_value(names[-1] if names else "it", record, kind, message)
+        return _unknown(wrong[2], _class_of(record, kind))
+    return _not_a_value(name, record, kind, message)
+
+
+def _type_of(name: str, table: dict[str, Any], hint: Any) -> Any:
+    """Return the type of a field, or the tags that tell records of a union apart."""
+    tags = tuple(_tag(known) for known in get_args(hint) if _is_record(known))
+    return _hints(_class_of(table, hint)).get(name, Literal[tags])
+
+
+def _class_of(table: dict[str, Any], hint: Any) -> Any:
+    """Return the class that a type means; of a union, the record of the kind that a table names."""
+    classes = [part for part in get_args(hint) if _is_record(part) or is_dataclass(part)] or [hint]
+    named = (known for known in classes if _is_record(known) and _tag(known) == table.get("kind"))
+    return next(named, classes[0])
+
+
+def _is_record(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Record)
+
+
+def _tag(kind: Any) -> Any:
+    return kind.__struct_config__.tag
 
 
 def _not_a_value(name: str, value: object, hint: Any, message: str) -> str:
@@ -184,8 +227,3 @@ def _not_a_value(name: str, value: object, hint: Any, message: str) -> str:
         shown = "something endless"
     finite = "out of range" in message
     return f"{name} is {shown}: it must be {'finite' if finite else in_words(hint)}"
-
-
-def _class_in(hint: Any) -> Any:
-    """Return the class of records that a type is or may be."""
-    return next((part for part in get_args(hint) if hasattr(part, "__annotations__")), hint)

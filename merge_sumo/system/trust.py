@@ -26,6 +26,7 @@ from typing import Final
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import make_place, replace_own
 from merge_sumo.system.hashing import sha256_of
+from merge_sumo.system.records import decode
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.signature import CACHE, others_can_write, signed, user_key, verified
 
@@ -160,15 +161,8 @@ def _known(folder: Path) -> _OwnRun | None:
         return None
     if content is None:
         return None
-    said = json.loads(content)  # our own words
-    code = said["code"]
-    return _OwnRun(
-        said["folder"],
-        said["inode"],
-        (said["record"][0], said["record"][1]),
-        said["begun"],
-        Code(tuple(code["named"]), code["files"], code["here"]),
-    )
+    known: _OwnRun = decode(content, _OwnRun)
+    return known
 
 
 def _path(folder: Path) -> Path:

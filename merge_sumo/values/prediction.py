@@ -6,9 +6,10 @@ import math
 from typing import Annotated, Final, Self
 
 import numpy as np
+from msgspec import Meta
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.records import Meta, Record
+from merge_sumo.system.records import Record
 from merge_sumo.values.case import FloatArray
 
 DIGITS: Final = 4

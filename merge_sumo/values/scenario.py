@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import Annotated, Final
+
+from msgspec import Meta
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.suggestions import meant
 
 DT_S: Final = 0.1
 """Step of the equations of motion, eq. (4)."""
@@ -36,6 +37,7 @@ ROOM_AFTER_M: Final = 2000.0
 """Length behind M that the road has at least."""
 
 Bounds = tuple[float, float]
+Edges = Annotated[tuple[str, ...], Meta(min_length=1, description='edges, as in ["e1", "e2"]')]
 
 
 def level_name(level: int) -> str:
@@ -63,6 +65,10 @@ BEHIND: Final = 3
 on by the POV and, in traffic, by a car ahead of it and one behind it."""
 VEHICLES: Final = ("pov", "vut", "ahead", "behind")
 """Their names."""
+Vehicle = Annotated[str, Meta(pattern="^(pov|vut|ahead|behind)$", description="a vehicle's name")]
+
+EpisodeTime = Annotated[float, Meta(ge=0.0, le=MAX_EPISODE_S)]
+"""A time of an episode in a record, in s."""
 
 
 _LENGTH_M: Final = (0.1, 100.0)
@@ -144,8 +150,8 @@ class Scenario:
 
     name: str = "us23"
     net: str | None = None
-    mainline: tuple[str, ...] = ("main_in", "main_out")
-    ramp: tuple[str, ...] = ("ramp", "main_out")
+    mainline: Edges = ("main_in", "main_out")
+    ramp: Edges = ("ramp", "main_out")
     x_pov0_m: Bounds = (-340.0, -180.0)
     v_pov0_mps: Bounds = (25.0, 35.0)
     x_vut0_m: float = -182.0
@@ -213,23 +219,6 @@ class Scenario:
         if not all(low <= x <= high for x in numbers):
             raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
 
-    @classmethod
-    def from_record(cls, record: Any) -> Scenario:
-        """Return the scenario that JSON or TOML describes; `UserError` where it is none.
-
-        What is left out is as in the paper's scenario.
-        """
-        if not isinstance(record, dict):
-            raise UserError("a scenario is a table of names and values")
-        known = {field.name: field for field in fields(cls)}
-        values: dict[str, Any] = {}
-        for name, value in record.items():
-            if name not in known:
-                hint = meant(str(name), known) or f"it has {', '.join(known)}"
-                raise UserError(f"a scenario has no {name!r}: {hint.strip()}")
-            values[name] = _read(name, value, known[name].type)
-        return cls(**values)
-
     @property
     def _ahead(self) -> str:
         return f"metres before M, -{self.reach_m:g} to 0, low < high"
@@ -295,42 +284,6 @@ class Scenario:
             if isinstance(value := getattr(self, name), tuple)
         ]
         return (*found, SVO) if level == 2 else tuple(found)
-
-
-def _as_float(number: float) -> float:
-    """Return a number as a float; infinity for a whole number that no float holds."""
-    try:
-        return float(number)
-    except OverflowError:
-        return math.inf
-
-
-def _read(name: str, value: Any, kind: Any) -> Any:
-    """Return a value from JSON or TOML as what a field of a scenario holds."""
-
-    def is_number(value: Any) -> bool:
-        return type(value) in (int, float)
-
-    if kind.startswith("float") and is_number(value):
-        return _as_float(value)
-    if "Bounds" in kind and isinstance(value, list | tuple):
-        if len(value) == 2 and all(map(is_number, value)):
-            return tuple(map(_as_float, value))
-    elif kind == "tuple[str, ...]" and isinstance(value, list | tuple):
-        if value and all(isinstance(item, str) for item in value):
-            return tuple(value)
-    elif kind.startswith("str") and isinstance(value, str):
-        return value
-    elif kind.endswith("None") and value is None:
-        return None
-    wanted = {
-        "float": "a number",
-        "float | Bounds": "a number, or two, [low, high]",
-        "Bounds": "two numbers, [low, high]",
-        "Bounds | None": "two numbers, [low, high]",
-        "tuple[str, ...]": 'edges, as in ["e1", "e2"]',
-    }
-    raise UserError(f"{name} is {value!r:.60}: it must be {wanted.get(kind, 'a text')}")
 
 
 US23: Final = Scenario()

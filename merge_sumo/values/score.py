@@ -16,7 +16,6 @@ from typing import Any, Final, Literal, get_type_hints
 
 import numpy as np
 
-from merge_sumo.errors import UserError
 from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.records import convert, decode, record_type, to_plain
 from merge_sumo.values.bodies import CentreLines, closest_before_m
@@ -25,7 +24,7 @@ from merge_sumo.values.former import upgrade_from_0_1
 from merge_sumo.values.measures import OURS, Further, further_measures, further_of
 from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario
+from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario, Vehicle
 from merge_sumo.values.severity import Severity, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 from merge_sumo.values.way_out import last_way_out_s
@@ -82,7 +81,7 @@ class Measures:
     avoidable: bool | None
     clipped_steps: int
     error: str | None
-    nearest: str = VEHICLES[POV]
+    nearest: Vehicle = VEHICLES[POV]
     after_gap_m: float | None = None
     after_ttc_s: float | None = None
     after_drac_mps2: float | None = None
@@ -178,8 +177,6 @@ class Outcome:
             **{name: getattr(known, name) for name in measure_names},
             further=tuple((name, getattr(known, name)) for name in further_measures()),
         )
-        if measures.nearest not in VEHICLES:
-            raise UserError(f"nearest is {measures.nearest!r}: it must be one of {VEHICLES}")
         return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
 
 

@@ -12,10 +12,10 @@ from itertools import groupby, islice
 from typing import Annotated, Any, Final
 
 import numpy as np
+from msgspec import Meta
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
-from merge_sumo.system.records import Meta
 
 Left = dict[str, float | str]
 """What is left at one step, by name."""

@@ -216,7 +216,7 @@ class TestTheFile:
         lines = path.read_text().splitlines()
         lines[0] = json.dumps(json.loads(lines[0]) | change)
         path.write_text("\n".join(lines) + "\n")
-        with pytest.raises(UserError, match=r"line 1 of .* is of no failure of the campaign"):
+        with pytest.raises(UserError, match=r"line 1 of .* is of no such case"):
             read_avoidance(Run(folder))
 
     def test_of_an_older_version_is_read(self, folder, found):
