@@ -9,13 +9,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 from accounts import Account, second_account
+from calling import Said
 from foreign_nets import corridor_of
 
 from merge_sumo import cli
@@ -105,14 +106,21 @@ def command_line(monkeypatch, capfd):
     It returns the exit code, the output and the errors; SUMO's own output counts too.
     """
 
-    def main(*arguments: object) -> tuple[int, str, str]:
+    def main(*arguments: object) -> Said:
         monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
         capfd.readouterr()
         with pytest.raises(SystemExit) as end:
             cli.main()
-        return int(end.value.code or 0), *capfd.readouterr()
+        return Said(int(end.value.code or 0), *capfd.readouterr())
 
     return main
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path, command_line) -> Callable[..., Said]:
+    """Return what runs the command line, from a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    return command_line
 
 
 @pytest.fixture(scope="session")

@@ -136,7 +136,8 @@ from merge_sumo.vuts.registry import KINDS, LEARNED, PYTHON, built_in_vuts, vut_
 if TYPE_CHECKING:
     from merge_sumo.values.case import Case
 
-__all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting", "Seen"]
+__all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
+__all__ += ["RunComparison", "Seen"]
 __all__ += ["SeenBatch", "Settings", "Setup", "campaign", "certify", "check_scenario", "check_vut"]
 __all__ += ["compare", "compare_runs", "dated", "export", "export_policy", "history"]
 __all__ += ["new_scenario", "open_in_gui", "open_run", "probability", "replay", "report"]

@@ -14,7 +14,7 @@ from merge_sumo.commands.printing import print_json, quoted, say, show, stoppabl
 from merge_sumo.errors import UserError
 
 if TYPE_CHECKING:
-    from merge_sumo.api import CaseRun
+    from merge_sumo.api import CampaignRun, CaseRun, RunComparison
 
 SETTINGS: Final = ("vut", "level", "sampler", "cases", "batch", "seed", "learn_from", "v_vut0")
 COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
@@ -71,18 +71,7 @@ def campaign(
     for_ci: dict[str, Any] = {"gates": gates, "junit": junit}
 
     def how_to_go_on() -> str:
-        if not folder.exists():
-            return "stopped before the first case; nothing was written"
-        # None of these is a setting of the campaign, which its folder would remember.
-        options = {"--resume": [folder], "--net": [given.keywords["net"]]}
-        options |= {"--gate": gates, "--junit": [junit]}
-        words = [
-            f"{option} {quoted(value)}"
-            for option, values in options.items()
-            for value in values
-            if value is not None
-        ]
-        return f"stopped; go on with: merge-sumo campaign {' '.join(words)}"
+        return _how_to_go_on(folder, given.keywords["net"], gates, junit)
 
     with stoppable("batch", how_to_go_on) as check:
         if resume is None:
@@ -94,6 +83,16 @@ def campaign(
     for remark in run.remarks():
         say(remark)
     raise typer.Exit(0 if run.passed else 1)
+
+
+def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path | None) -> str:
+    if not folder.exists():
+        return "stopped before the first case; nothing was written"
+    # None of these is a setting of the campaign, which its folder would remember.
+    options = [("--resume", folder), ("--net", net), *(("--gate", gate) for gate in gates)]
+    options.append(("--junit", junit))
+    words = " ".join(f"{option} {quoted(value)}" for option, value in options if value is not None)
+    return f"stopped; go on with: merge-sumo campaign {words}"
 
 
 @app.verb(options=(*COORDINATES, *SETUP_OF_A_CASE, "net", "trust_vut"))
@@ -199,19 +198,22 @@ def rerun(
     result = api.rerun(run, case or (), vut=vut or None, **changed)
     why = result.compared.worse(tolerance)
     if given.as_json:
-        judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
-        print_json(result.to_record() | judged)
-        raise typer.Exit(1 if why else 0)
-    given.print(result)
-    for one in result.changed[:1]:
-        show(
-            f"look at one: merge-sumo run --case {quoted(run)} {one.before.index} "
-            f"--vut {quoted(result.vut)} --gui"
-        )
-    show(f"it is {'worse' if why else 'not worse'}, with a tolerance of {tolerance:g}")
-    for sentence in why:
-        show(f"  {sentence} (A is what was recorded, B is now)")
+        print_json({**result.to_record(), **_judgement(why, tolerance)})
+    else:
+        given.print(result)
+        for one in result.changed[:1]:
+            show(
+                f"look at one: merge-sumo run --case {quoted(run)} {one.before.index} "
+                f"--vut {quoted(result.vut)} --gui"
+            )
+        show(f"it is {'worse' if why else 'not worse'}, with a tolerance of {tolerance:g}")
+        for sentence in why:
+            show(f"  {sentence} (A is what was recorded, B is now)")
     raise typer.Exit(1 if why else 0)
+
+
+def _judgement(why: list[str], tolerance: float) -> dict[str, Any]:
+    return {"tolerance": tolerance, "worse": bool(why), "why": why}
 
 
 @app.verb(options=["net"])
@@ -331,39 +333,42 @@ def compare_runs(
     """
     from merge_sumo import api
 
-    tolerance, folders = given.keywords["tolerance"], {"A": a, "B": b}
-    runs = {name: api.open_run(folder) for name, folder in folders.items()}
+    tolerance, runs = given.keywords["tolerance"], {"A": api.open_run(a), "B": api.open_run(b)}
     compared = api.compare_runs(runs["A"], runs["B"], rerun=rerun, out=out, **given.keywords)
     why = compared.worse(tolerance)
     if given.as_json:
-        own = {
-            name.lower(): one.verdict.to_record() | {"careful": one.careful}
-            for name, one in runs.items()
+        campaigns = {
+            name.lower(): run.verdict.to_record() | {"careful": run.careful}
+            for name, run in runs.items()
         }
-        judged = {"tolerance": tolerance, "worse": bool(why), "why": why}
-        print_json({**own, **compared.to_record(), **judged})
-        raise typer.Exit(1 if why else 0)
-    for name, one in runs.items():
-        show(f"{name}: {one.folder} ({one.run.vut}): {one.verdict.counts}")
-        if one.careful is not None:
-            show(f"  {one.careful}")
-        for line in one.verdict.trouble_lines():
+        print_json({**campaigns, **compared.to_record(), **_judgement(why, tolerance)})
+    else:
+        _print_comparison(compared, runs)
+        alone = sum(level.changes["not run again"] for level in compared.levels.values())
+        known = f"; {alone} failure{'s'[: alone > 1]} ran with one of them alone" if alone else ""
+        worse = "worse" if why else "not worse"
+        show(f"B is {worse} than A, with a tolerance of {tolerance:g}{known}")
+        for sentence in why:
+            show(f"  {sentence}")
+        if out is not None:
+            show(f"page: {out}")
+    raise typer.Exit(1 if why else 0)
+
+
+def _print_comparison(compared: RunComparison, runs: dict[str, CampaignRun]) -> None:
+    for name, run in runs.items():
+        show(f"{name}: {run.folder} ({run.run.vut}): {run.verdict.counts}")
+        if run.careful is not None:
+            show(f"  {run.careful}")
+        for line in run.verdict.trouble_lines():
             show(line)
-    given.print(compared)
+    for line in compared.lines():
+        show(line)
     first = compared.look_first()
     if first:
         show("look first at:")
     for case in first:
-        show(f"  {case.change}: merge-sumo export {quoted(folders[case.run])} {case.index}")
-    alone = sum(level.changes["not run again"] for level in compared.levels.values())
-    unknown = f"; {alone} failure{'s'[: alone > 1]} ran with one of them alone" if alone else ""
-    worse = "worse" if why else "not worse"
-    show(f"B is {worse} than A, with a tolerance of {tolerance:g}{unknown}")
-    for sentence in why:
-        show(f"  {sentence}")
-    if out is not None:
-        show(f"page: {out}")
-    raise typer.Exit(1 if why else 0)
+        show(f"  {case.change}: merge-sumo export {quoted(runs[case.run].folder)} {case.index}")
 
 
 @app.verb()

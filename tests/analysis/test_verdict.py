@@ -10,12 +10,12 @@ import signal
 from pathlib import Path
 
 import pytest
+from calling import invoke
 from handmade import write_run
 from lxml import etree
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import merge_sumo as ms
-from merge_sumo import cli
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
 from merge_sumo.analysis.verdict import Gate, judge, parse_gates
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
@@ -44,10 +44,6 @@ def vuts(tmp_path_factory) -> dict[str, str]:
         (folder / f"{name}.py").write_text(f"def act(seen):\n    {body}\n")
         specs[name] = f"{folder / name}.py:act"
     return specs
-
-
-def invoke(*words: object) -> Result:
-    return CliRunner().invoke(cli.app, [str(word) for word in words])
 
 
 def campaign(vut: str, folder: Path, *options: object) -> Result:

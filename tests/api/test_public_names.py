@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reference" / "python.md"
 KNOWN = {
     *("Any", "FloatArray", "ForwardRef", "Mapping", "NDArray", "None", "Path", "Sequence"),
-    *("AnyVut", "Bounds", "Chance", "Literal", "POV", "Quartiles", "Signals", "VUT"),
+    *("AnyVut", "Bounds", "Chance", "Further", "Literal", "POV", "Quartiles", "Signals", "VUT"),
 }
 """Names of the standard library and of numpy, and of unions that the page writes out."""
 FUNCTIONS = sorted(name for name in ms.__all__ if inspect.isfunction(getattr(ms, name)))

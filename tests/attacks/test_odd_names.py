@@ -43,13 +43,6 @@ def made(tmp_path_factory) -> Run:
     return write_run(tmp_path_factory.mktemp("made") / "run", per_level=20)
 
 
-@pytest.fixture
-def call(monkeypatch, tmp_path, command_line):
-    """Return what runs the command line, from a folder of its own."""
-    monkeypatch.chdir(tmp_path)
-    return command_line
-
-
 def in_a_process(terminal: dict[str, str], *arguments: object) -> tuple[int, str, str]:
     done = subprocess.run(
         [sys.executable, "-m", "merge_sumo.cli", *map(str, arguments)],

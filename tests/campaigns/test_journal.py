@@ -10,10 +10,10 @@ import os
 import resource
 import shutil
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from calling import contents
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -98,11 +98,6 @@ def episode(index: int, batch: int = 0, steps: int = 60) -> tuple[Outcome, Traje
 
 def lines_of(count: int) -> list[bytes]:
     return [to_line(episode(index)[0]).encode() for index in range(count)]
-
-
-def contents(folder: Path) -> dict[Path, bytes]:
-    """Return every file below a folder with its bytes."""
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def assert_sentence(error: pytest.ExceptionInfo[UserError], *parts: str) -> None:

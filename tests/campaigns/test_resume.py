@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import pytest
+from calling import contents
 from conftest import some
 from processes import wait_for
 from typer.testing import CliRunner
@@ -60,10 +61,6 @@ def stopped_after(batches: int, folder: Path, sampler: str = "annealing") -> Pat
 
 def outcomes(folder: Path) -> bytes:
     return (folder / OUTCOMES).read_bytes()
-
-
-def contents(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture(scope="module")

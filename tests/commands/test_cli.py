@@ -7,13 +7,10 @@ from __future__ import annotations
 import importlib
 import json
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from calling import Said, assert_refused, contents, run_in_a_process
 from lxml import etree
 from typer.testing import CliRunner
 
@@ -27,27 +24,6 @@ COMMANDS = [command.name or command.callback.__name__ for command in cli.app.reg
 SMALL = ("campaign", "--vut", "design1", "--level", "0")
 
 
-@dataclass(frozen=True)
-class Said:
-    """What a command printed, and its exit code."""
-
-    code: int
-    out: str
-    err: str
-
-
-Call = Callable[..., Said]
-
-
-@pytest.fixture
-def call(monkeypatch, tmp_path, command_line) -> Call:
-    """Return what runs the command line, from an empty folder."""
-    folder = tmp_path / "cwd"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    return lambda *arguments: Said(*command_line(*arguments))
-
-
 @pytest.fixture
 def campaign(run, tmp_path) -> Path:
     """Return a copy of the finished campaign."""
@@ -59,22 +35,6 @@ def scenario(run, tmp_path) -> Path:
     """Return a copy of an exported failure."""
     (first, *_) = sorted((run.folder / "scenarios").iterdir())
     return Path(shutil.copytree(first, tmp_path / "scenario"))
-
-
-def contents(folder: Path) -> dict[Path, bytes | None]:
-    """Return everything below a folder: files with their bytes, folders with None."""
-    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
-
-
-def assert_refused(said: Said, *parts: str) -> None:
-    """One sentence on standard error, nothing on standard output, exit code 2."""
-    assert said.code == 2
-    assert said.out == ""
-    assert said.err.startswith("merge-sumo: ")
-    assert said.err.endswith("\n")
-    assert said.err.count("\n") == 1
-    for part in parts:
-        assert part in said.err
 
 
 def diverge(scenario: Path) -> None:
@@ -206,17 +166,6 @@ def cannot_import(monkeypatch, module: str, error: ImportError) -> None:
 def test_the_debian_packages_are_those_that_the_wheels_need():
     needed = ("libgl1", "libx11-6", "libxext6", "libxrender1", "libatomic1", "libexpat1")
     assert sorted(DEBIAN_PACKAGES.split()) == sorted(needed)
-
-
-def run_in_a_process(folder: Path, *arguments: object) -> Said:
-    done = subprocess.run(
-        [sys.executable, "-m", "merge_sumo.cli", *map(str, arguments)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return Said(done.returncode, done.stdout, done.stderr)
 
 
 @pytest.fixture(scope="module")

@@ -6,22 +6,14 @@ import json
 import shutil
 
 import pytest
+from calling import assert_refused
 
 from merge_sumo.studies.reproduction import TABLE_II, TABLE_JSON, Scale
 
 
-@pytest.fixture
-def call(monkeypatch, tmp_path, command_line):
-    """Return what runs the command line, from a folder of its own."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(autouse=True)
+def cache(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
-    return command_line
-
-
-def refused(said: tuple[int, str, str], *parts: str) -> bool:
-    code, out, err = said
-    one_sentence = err.startswith("merge-sumo: ") and err.count("\n") == 1
-    return code == 2 and out == "" and one_sentence and all(part in err for part in parts)
 
 
 COMPARE = ("compare", "--vut", "design1", "--level", "0", "--truth-cases", 300, "--workers", 1)
@@ -82,7 +74,7 @@ class TestCompare:
     @pytest.mark.parametrize("figure", ["f.pdf", "gone/f.png", "mine.png"])
     def test_refuses_a_figure_that_cannot_be_before_it_runs_anything(self, call, tmp_path, figure):
         (tmp_path / "mine.png").write_text("mine")
-        assert refused(call(*COMPARE, *SMALL, "--figure", figure), "--figure")
+        assert_refused(call(*COMPARE, *SMALL, "--figure", figure), "--figure")
         assert not (tmp_path / "cache").exists()
         assert (tmp_path / "mine.png").read_text() == "mine"
 
@@ -100,11 +92,11 @@ class TestReproduce:
         assert out.startswith("| FMC: ours (the paper's) |")
         assert "here/index.html" in out.splitlines()[-1]
         assert json.loads((tmp_path / "here" / TABLE_JSON).read_text())["scale"]["seeds"] == 1
-        assert refused(call("reproduce", "--quick", "--out", "here"), "here exists")
+        assert_refused(call("reproduce", "--quick", "--out", "here"), "here exists")
 
     def test_refuses_no_seeds_and_no_workers(self, call, tmp_path):
-        assert refused(call("reproduce", "--seeds", 0, "--out", "here"), "--seeds is 0")
-        assert refused(call("reproduce", "--workers", 0, "--out", "here"), "--workers is 0")
+        assert_refused(call("reproduce", "--seeds", 0, "--out", "here"), "--seeds is 0")
+        assert_refused(call("reproduce", "--workers", 0, "--out", "here"), "--workers is 0")
         assert not (tmp_path / "here").exists()
 
 
@@ -117,7 +109,7 @@ class TestProbability:
         assert found["low"] <= found["probability"] <= found["high"]
         assert json.loads((folder / "probability.json").read_text())["high"] == found["high"]
         assert (folder / "probability.jsonl").read_bytes().count(b"\n") == 50
-        assert refused(call("probability", folder, "--cases", 50), "probability.json exists")
+        assert_refused(call("probability", folder, "--cases", 50), "probability.json exists")
 
     def test_says_what_the_interval_is_of(self, call, run, tmp_path):
         (tmp_path / "d.json").write_text('{"x_pov0_m": {"kind": "uniform", "high": -250}}')
@@ -129,7 +121,7 @@ class TestProbability:
         assert "written: p.json" in out
 
     def test_refuses_a_folder_that_is_no_campaign(self, call, tmp_path):
-        assert refused(call("probability", tmp_path), "not a campaign")
+        assert_refused(call("probability", tmp_path), "not a campaign")
 
 
 def test_a_campaign_that_converged_says_so(call):
@@ -139,4 +131,4 @@ def test_a_campaign_that_converged_says_so(call):
     assert code == 0, err
     assert out.startswith("stopped after ")
     assert "of 300 cases" in out
-    assert refused(call(*plan[:5], "--sampler", "gpr", *share), "--sampler coverage")
+    assert_refused(call(*plan[:5], "--sampler", "gpr", *share), "--sampler coverage")

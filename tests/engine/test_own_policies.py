@@ -67,12 +67,6 @@ def one(home) -> Path:
     return folder
 
 
-@pytest.fixture
-def call(monkeypatch, tmp_path, command_line):
-    monkeypatch.chdir(tmp_path)
-    return command_line
-
-
 def networks(folder: Path) -> dict:
     return json.loads((folder / MANIFEST).read_text())["networks"]
 

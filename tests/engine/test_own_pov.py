@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,6 @@ from processes import none_left
 from vut_contract import cases_of, factory
 
 import merge_sumo as ms
-from merge_sumo import cli
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -72,21 +70,6 @@ def of_a_user(tmp_path, monkeypatch):
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "mine"))
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-
-
-@pytest.fixture
-def call(monkeypatch, capfd):
-    def main(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["merge-sumo", *map(str, arguments)])
-        capfd.readouterr()
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        return code, *capfd.readouterr()
-
-    return main
 
 
 def pov(source: str, name: str = "my_pov.py") -> str:

@@ -16,11 +16,10 @@ from pathlib import Path
 import make_scenarios
 import numpy as np
 import pytest
+from calling import invoke
 from lxml import etree
 from plans import plan_for
-from typer.testing import CliRunner
 
-from merge_sumo import cli
 from merge_sumo.analysis.diagnosis import Kind, diagnose
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
@@ -248,10 +247,6 @@ def test_a_game_on_it_is_played_by_its_numbers(road):
     assert not over[0]
 
 
-def call(*arguments: object):
-    return CliRunner().invoke(cli.app, [*map(str, arguments)])
-
-
 class TestACampaignOnIt:
     @pytest.fixture(scope="class")
     @classmethod
@@ -265,7 +260,7 @@ class TestACampaignOnIt:
         folders = sorted((run.folder / "scenarios").iterdir())
         assert len(folders) == 10
         for folder in folders[:3]:
-            replayed = call("replay", folder)
+            replayed = invoke("replay", folder)
             assert replayed.stdout.startswith("identical"), replayed.output
 
     def test_is_shown_in_sumo_gui_as_large_as_the_ring_with_cars_of_their_size(self, run):
@@ -332,7 +327,9 @@ def test_a_shipped_scenario_is_one_data_file_and_no_code(tmp_path):
     run = Run(tmp_path / "run")
     assert run.scenario.name == "another-arm"
     assert any(outcome.failed for outcome in run.outcomes)
-    assert call("replay", next((run.folder / "scenarios").iterdir())).stdout.startswith("identical")
+    assert invoke("replay", next((run.folder / "scenarios").iterdir())).stdout.startswith(
+        "identical"
+    )
 
 
 def test_every_shipped_scenario_has_a_road_with_room_for_its_starts():

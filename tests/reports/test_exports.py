@@ -14,12 +14,11 @@ import warnings
 import numpy as np
 import polars
 import pytest
+from calling import invoke
 from handmade import write_run
 from lxml import etree
 from scenariogeneration import xosc
-from typer.testing import CliRunner
 
-from merge_sumo import cli
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
@@ -230,32 +229,28 @@ class TestATable:
         assert (tmp_path / "trajectories.csv").read_text() == "mine"
 
 
-def call(*arguments: object):
-    return CliRunner().invoke(cli.app, ["export", *map(str, arguments)])
-
-
 class TestTheCommand:
     def test_writes_all_cases_as_a_table_when_none_is_named(self, made, tmp_path):
-        said = call(made.folder, "--format", "csv", "--out", tmp_path)
+        said = invoke("export", made.folder, "--format", "csv", "--out", tmp_path)
         assert said.exit_code == 0, said.output
         assert said.stdout == f"{tmp_path / 'trajectories.csv'}\n"
         with (tmp_path / "trajectories.csv").open() as file:
             assert len({line.split(",")[0] for line in file}) == len(made.outcomes) + 1
 
     def test_writes_a_folder_for_each_openscenario(self, made, tmp_path):
-        said = call(made.folder, 1, 2, "--format", "openscenario", "--out", tmp_path)
+        said = invoke("export", made.folder, 1, 2, "--format", "openscenario", "--out", tmp_path)
         assert said.exit_code == 0, said.output
         names = ("case-00001", "case-00002")
         assert said.stdout.split() == [str(tmp_path / n / f"{n}.xosc") for n in names]
 
     def test_writes_nothing_when_one_of_the_cases_is_not_there(self, made, tmp_path):
-        said = call(made.folder, 1, 999, "--format", "openscenario", "--out", tmp_path)
+        said = invoke("export", made.folder, 1, 999, "--format", "openscenario", "--out", tmp_path)
         assert isinstance(said.exception, UserError)
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.parametrize("file_format", ["sumo", "openscenario"])
     def test_asks_for_cases_where_it_needs_them(self, made, file_format):
-        said = call(made.folder, "--format", file_format)
+        said = invoke("export", made.folder, "--format", file_format)
         assert isinstance(said.exception, UserError)
         assert "indices" in str(said.exception)
 
@@ -272,7 +267,7 @@ class TestTheCommand:
             return load(name, *rest)
 
         monkeypatch.setattr(importlib, "import_module", refuse)
-        said = call(made.folder, 1, "--format", file_format, "--out", tmp_path)
+        said = invoke("export", made.folder, 1, "--format", file_format, "--out", tmp_path)
         assert isinstance(said.exception, UserError)
         assert "merge-sumo[export]" in str(said.exception)
         assert list(tmp_path.iterdir()) == []

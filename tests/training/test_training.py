@@ -12,13 +12,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from calling import invoke
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import vector as vector_wrappers
 from merges import HALF, LIKE_A_ROUNDABOUT
-from typer.testing import CliRunner
 
 from merge_sumo.campaigns.scenario_suggestion import unseen
-from merge_sumo.cli import app
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, QNetwork, actions_mps2
 from merge_sumo.drivers.policies import (
@@ -539,7 +538,7 @@ class TestTrainingForAnotherScenario:
         out = tmp_path_factory.mktemp("own") / "policies"
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(helix, "LEVEL_SETTINGS", {1: SMALL, 2: SMALL})
-            done = call("train", "--scenario", ring, "--out", out, "--only", "pov1")
+            done = invoke("train", "--scenario", ring, "--out", out, "--only", "pov1")
         assert done.exit_code == 0, done.output
         return out, done.output
 
@@ -556,19 +555,19 @@ class TestTrainingForAnotherScenario:
 
     def test_its_drivers_know_the_scenario_and_the_shipped_ones_do_not(self, trained, ring):
         assert unseen(LIKE_A_ROUNDABOUT, trained[0]) == []
-        said = call("scenario", "check", ring, "--policies", trained[0]).output
+        said = invoke("scenario", "check", ring, "--policies", trained[0]).output
         assert "were trained on such starts" in said
-        said = call("scenario", "check", ring).output
+        said = invoke("scenario", "check", ring).output
         assert "a_min_mps2 -4 is like -8.51 in us23 (trained on -4)" in said
         assert f"merge-sumo train --scenario {ring} --out ring-policies" in said
 
     def test_a_check_measures_the_regret_on_the_scenario(self, trained, ring):
         words = ("train", "--check", "--scenario", ring, "--only", "pov1", "--cases", 12, "--json")
-        done = call(*words, "--out", trained[0])
+        done = invoke(*words, "--out", trained[0])
         assert json.loads(done.stdout)["pov1"] == read_manifest(trained[0])["pov1"]["check"]
 
     def test_a_check_without_the_scenario_says_what_is_missing(self, trained):
-        done = call("train", "--check", "--out", trained[0], "--only", "pov1")
+        done = invoke("train", "--check", "--out", trained[0], "--only", "pov1")
         assert "was trained for ring: say with --scenario" in str(done.exception)
 
     def test_other_cars_are_not_trained_for(self):
@@ -578,7 +577,7 @@ class TestTrainingForAnotherScenario:
         assert {len(case.starts()) for case in check_cases("pov2", 3, scenario=traffic)} == {2}
 
     def test_without_a_folder_nothing_is_written_into_the_shipped_policies(self, ring):
-        done = call("train", "--scenario", ring)
+        done = invoke("train", "--scenario", ring)
         assert "the shipped policies are for us23: say with --out" in str(done.exception)
 
     def test_networks_of_two_scenarios_do_not_mix_in_a_folder(self, trained):
@@ -597,7 +596,3 @@ class TestTrainingForAnotherScenario:
         (tmp_path / MANIFEST).write_text(json.dumps(manifest))
         with pytest.raises(UserError, match="is not a readable manifest of policies"):
             read_manifest(tmp_path)
-
-
-def call(*words):
-    return CliRunner().invoke(app, list(map(str, words)))

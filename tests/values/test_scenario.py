@@ -7,11 +7,10 @@ from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
+from calling import invoke
 from foreign_nets import FOREIGN
 from merges import SMALLER
-from typer.testing import CliRunner
 
-from merge_sumo import cli
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
@@ -203,26 +202,22 @@ def test_a_campaign_of_the_paper_is_recorded_with_all_numbers(run):
     assert run.scenario == US23
 
 
-def call(*arguments: object):
-    return CliRunner().invoke(cli.app, [*map(str, arguments)])
-
-
 @pytest.mark.parametrize("name", ["curved", "priority", "zipper", "lane drop", "OSM", "OpenDRIVE"])
 def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
     build, mainline, ramp = FOREIGN[name]
     net, file = build(tmp_path), tmp_path / "mine.toml"
     edges = ("--mainline", mainline, "--ramp", ramp)
-    made = call("scenario", "new", file, "--net", net, *edges)
+    made = invoke("scenario", "new", file, "--net", net, *edges)
     assert made.exit_code == 0, made.output
     assert made.stdout.splitlines()[0] == f"net: {net.name}"
     assert "\nright of way: " in made.stdout
     assert b"<svg" in (tmp_path / "mine.svg").read_bytes()
-    again = call("scenario", "new", file, "--net", net, *edges)
+    again = invoke("scenario", "new", file, "--net", net, *edges)
     assert isinstance(again.exception, UserError)
     assert "exists" in str(again.exception)
-    assert call("scenario", "check", file).exit_code == 0
+    assert invoke("scenario", "check", file).exit_code == 0
     options = ("--vut", "level0", "--level", "0", "--cases", "24", "--batch", "24")
-    ended = call("campaign", *options, "--scenario", file, "--out", tmp_path / "run", "--quiet")
+    ended = invoke("campaign", *options, "--scenario", file, "--out", tmp_path / "run", "--quiet")
     assert ended.exit_code == 0, ended.output
     run = Run(tmp_path / "run")
     assert all(o.measures.end.is_tested for o in run.outcomes)
@@ -231,9 +226,9 @@ def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
         x, v, a = run.trajectory(index).motion[:, 1].T
         assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
         assert v[1:] == pytest.approx(v[:-1] + a[:-1] * 0.1, abs=1e-9)
-    exported = call("export", run.folder, 0, "--out", tmp_path / "exported")
+    exported = invoke("export", run.folder, 0, "--out", tmp_path / "exported")
     assert exported.exit_code == 0, exported.output
-    replayed = call("replay", tmp_path / "exported" / "case-00000")
+    replayed = invoke("replay", tmp_path / "exported" / "case-00000")
     assert replayed.stdout.startswith("identical"), replayed.output
 
 
