@@ -158,6 +158,7 @@ def test_one_index_is_as_good_as_a_list(run, tmp_path):
     assert path.is_file()
 
 
+@pytest.mark.long
 def test_the_example_of_the_tutorial_runs(tmp_path, monkeypatch):
     page = Path(__file__).parents[2] / "docs" / "tutorials" / "python.md"
     code = page.read_text(encoding="utf-8").split("```python", 1)[1].split("```", 1)[0]

@@ -241,6 +241,7 @@ class TestACampaign:
         assert "http:" not in page
         assert "https:" not in page
 
+    @pytest.mark.long
     def test_with_the_same_seed_gives_the_same_bytes_and_with_another_seed_others(self, call):
         arguments = (*SMALL, "--cases", 16, "--batch", 8)
         for folder, seed in (("first", 7), ("second", 7), ("third", 8)):

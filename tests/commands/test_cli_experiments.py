@@ -51,6 +51,7 @@ class TestCompare:
             line.split()[0] for line in out.splitlines() if line.strip()
         }
 
+    @pytest.mark.long
     def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
         for module in ("merge_sumo.api", "merge_sumo.api.results"):
             monkeypatch.setattr(f"{module}.DENSE_CASES", 900)
@@ -124,6 +125,7 @@ class TestProbability:
         assert_refused(call("probability", tmp_path), "not a campaign")
 
 
+@pytest.mark.long
 def test_a_campaign_that_converged_says_so(call):
     plan = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "coverage", "--seed", 1)
     share = ("--stop-after-converged", 0.95)

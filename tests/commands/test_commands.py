@@ -151,7 +151,9 @@ class TestCtrlC:
         "command",
         [
             "campaign --vut design1 --level 0 --cases 4000 --batch 20 --out run",
-            "truth --vut design1 --level 0 --cases 9000 --workers 1",
+            pytest.param(
+                "truth --vut design1 --level 0 --cases 9000 --workers 1", marks=pytest.mark.long
+            ),
         ],
         ids=lambda command: command.split()[0],
     )
@@ -163,6 +165,7 @@ class TestCtrlC:
         assert last.startswith("stopped")
         assert "Traceback" not in text
 
+    @pytest.mark.long
     def test_prints_no_control_sequence_where_there_is_no_terminal(self, tmp_path):
         command = "campaign --vut design1 --level 0 --cases 4000 --batch 20 --out run"
         process = subprocess.Popen(

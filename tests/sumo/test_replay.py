@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import contents
 from lxml import etree
 
 from merge_sumo.campaigns.campaign import export_case
@@ -82,6 +81,10 @@ def write(folder: Path, trajectory: Trajectory) -> Path:
         folder, road_of(), Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory
     )
     return folder
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def edit_number(path: Path, who: str, column: str, by: float, row: int = ROW) -> None:
