@@ -34,7 +34,7 @@ from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.studies.avoidance import in_a_sentence, read_avoidance
 from merge_sumo.studies.benchmark import Quartiles, SamplerSummary
 from merge_sumo.studies.certificate import Certificate
-from merge_sumo.studies.interval import Estimate
+from merge_sumo.studies.importance import Estimate
 from merge_sumo.studies.reproduction import TABLE_JSON, TABLE_MARKDOWN
 from merge_sumo.studies.truth import DENSE_CASES, REAL_REGION, Truth
 from merge_sumo.studies.vut_check import VutCheck

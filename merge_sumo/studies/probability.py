@@ -1,9 +1,9 @@
 """How likely a VUT is to fail under a stated distribution over the pool, with an interval.
 
-The cases of a campaign were chosen because they were expected to fail, each in the light of those
-before it. No share of them says how likely a failure is, and no binomial interval of theirs is
-valid. So they only shape a proposal (`proposal.py`); the estimate rests on fresh cases, drawn
-independently from it (`interval.py`).
+A sampler chose the cases of a campaign because they were expected to fail, given those before. No
+share of them is the probability of a failure, and no binomial interval of theirs is valid. So they
+only shape the mixture from which fresh cases are drawn independently; the estimate rests on these
+(`importance.py`).
 """
 
 from __future__ import annotations
@@ -25,8 +25,15 @@ from merge_sumo.engine.simulator import road_for, runs_on
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.importance import DEFENSIVE, Draws, Proposal, cells, expected_chance
-from merge_sumo.studies.interval import Estimate, estimate
+from merge_sumo.studies.importance import (
+    DEFENSIVE,
+    DefensiveMixture,
+    Draws,
+    Estimate,
+    cells,
+    estimate,
+    expected_chance,
+)
 from merge_sumo.system.folders import add_to, check_new_file, write_new
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
@@ -89,12 +96,12 @@ def failure_probability(
     for level in stated.levels:
         history = told.history(level)
         chance[level] = expected_chance(history, stated.points(level, cells(history.dims)))
-    proposal = Proposal(stated.levels, chance, settings.scenario)
-    draws = proposal.draw(cases, np.random.default_rng([seed, STREAM]))
+    mixture = DefensiveMixture(stated.levels, chance, settings.scenario)
+    draws = mixture.draw(cases, np.random.default_rng([seed, STREAM]))
     outcomes = _run(settings, net, stated, draws, lines, on_case, workers)
     failed = np.array([outcome.failed for outcome in outcomes])
     judged = np.array([outcome.score is not None for outcome in outcomes])
-    result = estimate(draws, failed, judged, proposal.bound, confidence)
+    result = estimate(draws, failed, judged, mixture.bound, confidence)
     record = {
         **asdict(result),
         "distribution": stated.record(),

@@ -15,11 +15,19 @@ from merge_sumo.analysis.exposure import read_distribution
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.studies.importance import CELLS, DEFENSIVE, Proposal, cells
-from merge_sumo.studies.interval import clopper_pearson, estimate, mean_at_least
+from merge_sumo.studies.importance import (
+    CELLS,
+    DEFENSIVE,
+    DefensiveMixture,
+    cells,
+    clopper_pearson,
+    estimate,
+    mean_at_least,
+)
 from merge_sumo.studies.probability import failure_probability
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import V_POV0, dimensions
+from merge_sumo.values.scenario import US23
 
 LEVELS = (0, 1, 2)
 UNIFORM = read_distribution(None, LEVELS)
@@ -36,11 +44,15 @@ def band_area(half_width):
     return 2.0 * half_width / 0.8
 
 
+def mixture(weights, chance) -> DefensiveMixture:
+    return DefensiveMixture(weights, chance, US23)
+
+
 def aimed_at(half_width, blur=0.02):
     """Return a proposal whose surrogate knows the band, but not sharply."""
     middle = cells(2)
     beyond = np.abs(0.6 * middle[:, 0] + 0.8 * middle[:, 1] - 0.7) - half_width
-    return Proposal({1: 1.0}, {1: 1.0 / (1.0 + np.exp(beyond / blur))})
+    return mixture({1: 1.0}, {1: 1.0 / (1.0 + np.exp(beyond / blur))})
 
 
 def estimate_band(proposal, half_width, n, seed, confidence=0.95):
@@ -49,13 +61,18 @@ def estimate_band(proposal, half_width, n, seed, confidence=0.95):
     return estimate(draws, failed, np.ones(n, dtype=bool), proposal.bound, confidence)
 
 
-class TestTheProposal:
+class TestTheMixture:
     @pytest.mark.parametrize("seed", range(3))
     def test_has_a_density_that_integrates_to_1(self, seed):
         rng = np.random.default_rng(seed)
         chance = {level: rng.random(len(cells(3 if level == 2 else 2))) ** 4 for level in LEVELS}
-        proposal = Proposal({0: 0.2, 1: 0.5, 2: 0.3}, chance)
-        assert proposal.total() == pytest.approx(1.0, abs=1e-12)
+        shares = {0: 0.2, 1: 0.5, 2: 0.3}
+        density = mixture(shares, chance)
+        means = [
+            share * (1.0 / density.weight(level, cells(3 if level == 2 else 2))).mean()
+            for level, share in shares.items()
+        ]
+        assert sum(means) == pytest.approx(1.0, abs=1e-12)
 
     def test_never_weighs_a_case_by_more_than_the_defensive_share_allows(self):
         proposal = aimed_at(0.01)
@@ -66,7 +83,7 @@ class TestTheProposal:
     def test_draws_what_its_weights_say(self):
         """E_q[w 1(A)] = p(A), for a set A far from any cell's edge."""
         chance = {1: cells(2)[:, 0] ** 8, 2: cells(3)[:, 2] ** 8}
-        proposal = Proposal({1: 0.25, 2: 0.75}, chance)
+        proposal = mixture({1: 0.25, 2: 0.75}, chance)
         draws = proposal.draw(40_000, np.random.default_rng(1))
         inside = (draws.level == 2) & (draws.chances[:, 2] > 0.9)
         x = draws.weight * inside
@@ -76,7 +93,7 @@ class TestTheProposal:
         assert draws.weight.mean() == pytest.approx(1.0, abs=0.02)
 
     def test_gives_each_draw_the_weight_of_its_place(self):
-        proposal = Proposal({0: 0.5, 2: 0.5}, {0: cells(2)[:, 1], 2: cells(3)[:, 1]})
+        proposal = mixture({0: 0.5, 2: 0.5}, {0: cells(2)[:, 1], 2: cells(3)[:, 1]})
         draws = proposal.draw(500, np.random.default_rng(2))
         for level in (0, 2):
             at = draws.level == level
@@ -85,7 +102,7 @@ class TestTheProposal:
             assert np.array_equal(draws.weight[at], again)
 
     def test_is_the_stated_distribution_where_nothing_is_expected(self):
-        proposal = Proposal({1: 1.0}, {1: np.zeros(CELLS[2] ** 2)})
+        proposal = mixture({1: 1.0}, {1: np.zeros(CELLS[2] ** 2)})
         draws = proposal.draw(100, np.random.default_rng(0))
         assert np.array_equal(draws.weight, np.ones(100))
         assert proposal.bound == 1.0
@@ -103,7 +120,7 @@ class TestTheInterval:
 
     def test_holds_with_a_surrogate_that_looks_in_the_wrong_place(self):
         middle = cells(2)
-        wrong = Proposal({1: 1.0}, {1: np.exp(-50.0 * middle.sum(axis=1))})
+        wrong = mixture({1: 1.0}, {1: np.exp(-50.0 * middle.sum(axis=1))})
         truth = band_area(0.02)
         held = 0
         for seed in range(100):
@@ -119,7 +136,7 @@ class TestTheInterval:
 
     @pytest.mark.parametrize(("fails", "p"), [(False, 0.0), (True, 1.0)])
     def test_of_certain_cases_ends_at_the_certain_probability(self, fails, p):
-        proposal = Proposal({1: 1.0}, {1: np.ones(CELLS[2] ** 2)})
+        proposal = mixture({1: 1.0}, {1: np.ones(CELLS[2] ** 2)})
         draws = proposal.draw(1000, np.random.default_rng(0))
         failed = np.full(1000, fails)
         e = estimate(draws, failed, np.ones(1000, dtype=bool), proposal.bound, 0.95)
@@ -129,7 +146,7 @@ class TestTheInterval:
         assert e.high - e.low == pytest.approx(math.log(40.0) / 1000, rel=0.2)
 
     def test_takes_a_case_without_a_verdict_as_safe_below_and_as_a_failure_above(self):
-        proposal = Proposal({1: 1.0}, {1: np.ones(CELLS[2] ** 2)})
+        proposal = mixture({1: 1.0}, {1: np.ones(CELLS[2] ** 2)})
         draws = proposal.draw(400, np.random.default_rng(0))
         part = np.random.default_rng(1).permutation(400)
         failed, judged = part < 100, part < 300
@@ -207,7 +224,7 @@ class TestADistribution:
             tmp_path, {"levels": {"1": 1}, "v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 1}}
         )
         middle = found.points(1, cells(2))
-        proposal = Proposal(found.levels, {1: (middle[:, 1] > 0.68).astype(float)})
+        proposal = mixture(found.levels, {1: (middle[:, 1] > 0.68).astype(float)})
         draws = proposal.draw(3000, np.random.default_rng(0))
         failed = found.points(1, draws.chances[:, :2])[:, 1] > 0.7
         e = estimate(draws, failed, np.ones(3000, dtype=bool), proposal.bound, 0.99)
