@@ -17,13 +17,13 @@ from typing import Any
 import pytest
 from accounts import Account, second_account
 from calling import Said
+from campaigning import run_campaign
 from foreign_nets import corridor_of
 
 from merge_sumo import cli
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine import simulator as ground
+from merge_sumo.engine import evaluate
 from merge_sumo.road.corridor import Corridor
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
@@ -54,7 +54,7 @@ def some(values: Iterable[Any], *kept: object) -> list[Any]:
 def no_simulation_left() -> Iterator[None]:
     """Close what `run_cases` keeps open in this process: libsumo holds one simulation at a time."""
     yield
-    ground._close_simulator()
+    evaluate.close_simulator()
 
 
 @pytest.fixture(scope="session")

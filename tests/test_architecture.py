@@ -240,7 +240,6 @@ REPORTS_READ = {
     "merge_sumo.engine.plan.plan_key",  # what names a truth in the cache
     "merge_sumo.engine.plan.versions",
     "merge_sumo.engine.simulator.road_for",  # reads a net as data, to draw it
-    "merge_sumo.engine.versions.versions",
     "merge_sumo.sumo.opendrive.opendrive",  # writes files for other simulators
     "merge_sumo.sumo.replay_folder.write_scenario",
     "merge_sumo.training.check.PolicyCheck",  # types of what is shown of a training

@@ -27,16 +27,17 @@ from bench_record import add_record_option, append_record
 
 from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.engine.simulator import CaseResult, SimulationPlan, run_cases
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.evaluate import CaseResult, run_cases
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.studies.truth import Truth, ground_truth
 from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
-from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import RADIUS, fmc
-from merge_sumo.values.scenario import LEVELS, US23
+from merge_sumo.values.scenario import LEVELS
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
@@ -176,7 +177,7 @@ def print_trials(trials: Sequence[str], seeds: int, first: int) -> dict[str, dic
     print("FMC / truth" + " ".join(f"{f'N={n}':>7s}" for n in SHOWN) + " lowest   all regions")
     for trial in trials:
         vut = f"{Path(__file__).with_name('trial_vuts.py')}:{trial}"
-        plan = resolve(vut, scenario=US23, criterion=Criterion())
+        plan = resolve(CampaignSettings(vut=vut, levels=LEVELS))
         for level in LEVELS:
             truth = ground_truth(plan, level)
             if len(truth.failures) < FEWEST_FAILURES:
@@ -221,7 +222,8 @@ def main() -> None:
 
 def print_searches(options: argparse.Namespace, names: list[str]) -> dict[str, dict[str, float]]:
     """Print and return what samplers, or `gpr` with other constants, find of one VUT's failures."""
-    plan = resolve(options.vut, scenario=US23, criterion=Criterion(), corridors=BATCH)
+    settings = CampaignSettings(vut=options.vut, levels=(options.level,))
+    plan = resolve(settings).for_cases(BATCH)
     truth = ground_truth(plan, options.level)
     print(f"{options.vut}, level {options.level}, FMC of the truth {fmc(truth.failures):.4f}")
     heads = [*(f"N={n}" for n in SHOWN), "lowest"]

@@ -32,7 +32,6 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -41,18 +40,16 @@ from bench_record import add_record_option, append_record
 from merge_sumo.campaigns.campaign import conduct, run_campaign
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.prefetch import Ahead, proposals
+from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.simulator import CaseResult, SimulationPlan, run_cases
+from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate, run_cases
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.studies.truth import _scores
 from merge_sumo.system.workers import LocalProcesses, Workers
-from merge_sumo.values.case import Case, FloatArray, Pool, from_unit, to_unit
-from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.case import Case, Pool, from_unit, to_unit
 from merge_sumo.values.fmc import fmc, regions
-from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
 
 VUT = "design1"
@@ -68,9 +65,9 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def scores_and_memory(plan: SimulationPlan, points: Sequence[FloatArray]) -> list[tuple[Any, ...]]:
-    """Run cases of level 0 as `truth` does; say which process did and how large it is."""
-    return [(score, os.getpid(), memory_mb()) for score in _scores(plan, 0, points)]
+def scores_and_memory(results: Sequence[CaseResult]) -> list[tuple[Any, ...]]:
+    """Return what `truth` keeps of cases, which process ran them, and how large it is."""
+    return [(score, os.getpid(), memory_mb()) for score in _scores(results)]
 
 
 def compute(seconds: Sequence[float]) -> list[int]:
@@ -97,15 +94,19 @@ def local(count: int) -> Workers:
 
 def truth(most: int) -> Iterator[dict[str, float]]:
     """Yield cost and memory for 100, 1,000, ... cases, all in the same worker process."""
-    plan = resolve(VUT, scenario=US23, criterion=Criterion())
+    plan = resolve(CampaignSettings(vut=VUT, levels=(0,)))
     rng = np.random.default_rng(0)
     with local(1) as workers:
-        list(workers.run(partial(scores_and_memory, plan), list(rng.random((32, 2))), never))
+        pool = Pool(levels=(0,))
+        warm = CasesAt(pool, 0, rng.random((32, 2)))
+        list(evaluate(plan, warm, workers, scores_and_memory))
         cases = 100
         while cases <= most:
             points: Any = rng.random((cases, 2))
             start, memory = time.perf_counter(), 0.0
-            for _, (_, _, now) in workers.run(partial(scores_and_memory, plan), points, never):
+            for _, (_, _, now) in evaluate(
+                plan, CasesAt(pool, 0, points), workers, scores_and_memory
+            ):
                 memory = max(memory, now)
             spent = time.perf_counter() - start
             yield {
@@ -119,14 +120,16 @@ def truth(most: int) -> Iterator[dict[str, float]]:
 
 def two_workers() -> dict[str, list[float]]:
     """Return the rates on two workers over those on one, round by round."""
-    plan = resolve(VUT, scenario=US23, criterion=Criterion())
+    plan = resolve(CampaignSettings(vut=VUT, levels=(0,)))
     points: Any = np.random.default_rng(1).random((PAIR_CASES, 2))
     found: dict[str, list[float]] = {"cases": [], "computing": [], "cases_per_s_on_one": []}
     with local(1) as one, local(2) as two:
 
         def seconds(workers: Workers) -> float:
             start = time.perf_counter()
-            list(workers.run(partial(scores_and_memory, plan), points, never, chunk=250))
+            for first in range(0, PAIR_CASES, 500):  # chunks of 250 on two workers
+                some = CasesAt(Pool(levels=(0,)), 0, points[first : first + 500])
+                list(evaluate(plan, some, workers, scores_and_memory))
             return time.perf_counter() - start
 
         def rate(workers: Workers, count: int) -> float:
@@ -166,8 +169,6 @@ class Served:
 
     def __init__(self, ran: Sequence[CaseResult]) -> None:
         """Serve what became of `MAX_CHUNK` cases."""
-        # So quick that every chunk but the first is as large as can be.
-        self.workers = SimpleNamespace(count=1e-9)
         self._sent = pickle.dumps(list(ran))
 
     def chunks(
@@ -182,17 +183,17 @@ class Served:
 
 def parent(cases: int) -> float:
     """Return how many cases per second a campaign takes that workers have run."""
-    plan = resolve(VUT, scenario=US23, criterion=Criterion())
+    plan = resolve(CampaignSettings(vut=VUT, levels=(0,)))
     pool = Pool(levels=(0,))
     served: Any = Served(run_cases(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
     sampler, scout = (make_sampler("uniform", pool, 0) for _ in range(2))
     with (
         tempfile.TemporaryDirectory() as scratch,
         Journal.create(Path(scratch) / "run", {}) as journal,
-        Ahead(served, proposals(scout, (), cases, BATCH)) as ahead,
+        Prefetch(served.chunks, 1, proposals(scout, (), cases, BATCH)) as ahead,
     ):
         start = time.perf_counter()
-        for batches in ahead.together(conduct(sampler, ahead, cases, BATCH)):
+        for batches in ahead.together(conduct(sampler, ahead.run, cases, BATCH)):
             journal.append(*batches)
         return cases / (time.perf_counter() - start)
 
@@ -247,7 +248,7 @@ def of_campaigns(chosen: argparse.Namespace, tell: Callable[[str], None]) -> dic
     result: dict[str, Any] = {"samplers": {}, "files": []}
     with tempfile.TemporaryDirectory() as scratch:
         settings = CampaignSettings(vut=VUT, levels=(0,), sampler="uniform", cases=400, batch=400)
-        run = run_campaign(settings, Path(scratch) / "run")
+        run = run_campaign(settings, resolve(settings), Path(scratch) / "run")
         count = 100
         while count <= chosen.history and "samplers" in chosen.only:
             history = history_of(count, run.outcomes)

@@ -27,8 +27,10 @@ import numpy as np
 
 from merge_sumo.campaigns import journal
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.settings import settings_of as settings_in
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.system.workers import open_workers
 
@@ -124,7 +126,7 @@ def disturb(
         if place == "torn":
             kill_at_write(int(rng.integers(1, WRITES + 1)), float(rng.random()))
         with open_workers(2 if place == "worker" else 1) as workers:
-            run_campaign(settings, folder, workers=workers)
+            run_campaign(settings, resolve(settings), folder, workers=workers)
 
     pid = forked(campaign)
     if place == "moment":
@@ -147,6 +149,17 @@ def disturb(
     return ended(pid)
 
 
+def begin(settings: CampaignSettings, folder: Path) -> None:
+    """Run a campaign."""
+    run_campaign(settings, resolve(settings), folder)
+
+
+def go_on(folder: Path) -> None:
+    """Go on with a campaign."""
+    settings = settings_in(folder, read_settings(folder))
+    resume_campaign(settings, resolve(settings), folder)
+
+
 def main() -> None:
     """Kill and resume, and exit with 1 unless all outcomes are the same."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -160,7 +173,7 @@ def main() -> None:
         for sampler in SAMPLERS:
             folder = Path(scratch) / sampler
             start = time.monotonic()
-            if ended(forked(partial(run_campaign, settings_of(sampler), folder))) != 0:
+            if ended(forked(partial(begin, settings_of(sampler), folder))) != 0:
                 sys.exit("a campaign that nobody disturbed failed")
             whole_s = max(whole_s, time.monotonic() - start)
             expected[sampler] = (folder / OUTCOMES).read_bytes()
@@ -172,7 +185,7 @@ def main() -> None:
             there = (folder / SETTINGS).is_file()
             lines = (folder / OUTCOMES).read_bytes().count(b"\n") if there else 0
             again: Callable[[Path], object] = (
-                resume_campaign if there else partial(run_campaign, settings_of(sampler))
+                go_on if there else partial(begin, settings_of(sampler))
             )
             resumed = ended(forked(partial(again, folder)))
             equal = resumed == 0 and (folder / OUTCOMES).read_bytes() == expected[sampler]

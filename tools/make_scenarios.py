@@ -14,12 +14,12 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.simulator import Simulator, road_for
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.values.case import Case
-from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import DT_S, US23, Scenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import Trajectory
@@ -80,8 +80,9 @@ EXAMPLES = {
 def play(example: Example) -> Trajectory:
     """Play one example in SUMO."""
     scenario = example.case.scenario
-    plan = resolve(example.vut, scenario=scenario, criterion=Criterion(), corridors=1)
-    with plan.open() as ground:
+    level = example.case.level
+    settings = CampaignSettings(vut=example.vut, levels=(level,), scenario=scenario)
+    with Simulator(resolve(settings).for_cases(1)) as ground:
         ((_, trajectory),) = ground.run([example.case])
     return trajectory
 

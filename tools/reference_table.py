@@ -17,13 +17,13 @@ from pathlib import Path
 
 from merge_sumo.analysis.summary import summarise
 from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.studies.avoidance import avoidance
 from merge_sumo.studies.counterfactuals import CAREFUL, TAKES_OVER
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import LEVELS, US23
+from merge_sumo.values.scenario import LEVELS
 from merge_sumo.values.trajectory import End
 
 MODELS = ("Krauss", "IDM", "EIDM", "ACC", "CACC")
@@ -42,15 +42,15 @@ def row(vut: str, cases: int, workers: int | None) -> str:
     """Run uniform cases at each level and return the line of the table."""
     failures, timeouts, coverage, known, times = [], 0, [], 0, []
     avoided = dict.fromkeys((CAREFUL, TAKES_OVER), 0)
-    net = road_for(US23)
     with tempfile.TemporaryDirectory() as folder:
         for level in LEVELS:
             settings = CampaignSettings(
                 vut=vut, levels=(level,), sampler="uniform", cases=cases, batch=min(cases, 500)
             )
-            with open_workers(settings.workers(workers)) as there:
-                run = run_campaign(settings, Path(folder) / str(level), net, workers=there)
-                failing = avoidance(run, settings, net, workers=there)
+            plan = resolve(settings)
+            with open_workers(plan.workers(workers)) as there:
+                run = run_campaign(settings, plan, Path(folder) / str(level), workers=there)
+                failing = avoidance(run, plan, workers=there)
             found = summarise(run.outcomes, (level,)).levels[level]
             failures.append(found.failures)
             coverage.append(f"{found.fmc:.4f}")

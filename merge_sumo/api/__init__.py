@@ -64,19 +64,19 @@ from merge_sumo.campaigns.one_case import (
     run_one,
     settings_and_case,
 )
-from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import SETTINGS, Run, read_settings
 from merge_sumo.campaigns.scenario_suggestion import about, suggested, unseen
 from merge_sumo.campaigns.settings import (
     CampaignSettings,
-    one_level,
-    parse_levels,
-    povs_of,
     settings_of,
 )
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
-from merge_sumo.engine.simulator import SimulationPlan, road_for
+from merge_sumo.engine.evaluate import evaluation_workers
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.povs import Povs, one_level, parse_levels, policies_folder
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
 from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
@@ -87,7 +87,6 @@ from merge_sumo.reports.progress import Bars, Counter, TrainingBars, is_watched,
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction_page
 from merge_sumo.reports.version_pages import comparison_page, history_page, write_page
-from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import road_of
@@ -116,22 +115,20 @@ from merge_sumo.system.folders import (
 )
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.workers import Workers, open_workers, workers_or_cores
+from merge_sumo.system.workers import Workers, workers_or_cores
 from merge_sumo.values.scenario import (
-    DEADLINE_S,
     LEVELS,
-    MEMORY_GIB,
     US23,
     Scenario,
     level_name,
 )
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
-from merge_sumo.vuts.base import Car, Seen, VutOptions
+from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 from merge_sumo.vuts.onnx_export import export_onnx
 from merge_sumo.vuts.python import SeenBatch, installed_vuts
-from merge_sumo.vuts.registry import KINDS, LEARNED, PYTHON, built_in_vuts, vut_factory
+from merge_sumo.vuts.registry import KINDS, LEARNED, PYTHON, built_in_vuts
 
 if TYPE_CHECKING:
     from merge_sumo.values.case import Case
@@ -190,14 +187,14 @@ def campaign(
     check_keywords("campaign", settings, Settings)
     checked, count = settings_for(vut, settings, workers=workers)
     folder = dated(checked.vut) if out is None else Path(out)
-    road = _road(checked.scenario, net)
-    _notice_untrained(checked, settings)
+    plan = resolve(checked, _path(net))
+    _notice_untrained(checked, plan, settings)
     running = _Running(count, dask, on_case, check or _go_on, progress, gates, junit)
 
     def run(opened: Workers, _: CampaignPanel, on_case: OnCase) -> Run:
-        return run_campaign(checked, folder, road, on_case, workers=opened, check=running.check)
+        return run_campaign(checked, plan, folder, on_case, workers=opened, check=running.check)
 
-    return _concluded(checked, folder, road, run, running)
+    return _concluded(checked, plan, folder, run, running)
 
 
 def resume(
@@ -247,27 +244,27 @@ def resume(
     fields = recordable(named | {name: specs[name] for name in specs if name in named})
     settings = settings_of(folder, recorded, fields, trust=trust_vut)
     if "level" in named:
-        levels = parse_levels(str(named["level"]), settings.povs)
-        settings, fields = replace(settings, levels=levels), {**fields, "levels": levels}
+        policies = policies_folder(settings.policies, settings.scenario)
+        levels = parse_levels(str(named["level"]), policies, own=settings.pov is not None)
+        settings = replace(settings, levels=levels)
     check_report(folder)
-    road = _road(settings.scenario, net)
+    plan = resolve(settings, _path(net))
     running = _Running(count, dask, on_case, check or _go_on, progress, gates, junit)
 
     def go_on(opened: Workers, panel: CampaignPanel, on_case: OnCase) -> Run:
         return resume_campaign(
+            settings,
+            plan,
             folder,
-            road,
             on_case,
             on_before=panel.ran_before,
-            given=fields,
             force=force,
             workers=opened,
             check=running.check,
             warn=lambda sentence: warnings.warn(sentence, Notice, stacklevel=2),
-            trust=trust_vut,
         )
 
-    return _concluded(settings, folder, road, go_on, running)
+    return _concluded(settings, plan, folder, go_on, running)
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,8 +286,8 @@ def _go_on() -> None:
 
 def _concluded(
     settings: CampaignSettings,
+    plan: SimulationPlan,
     folder: Path,
-    road: Corridor,
     run: Callable[[Workers, CampaignPanel, OnCase], Run],
     running: _Running,
 ) -> CampaignRun:
@@ -307,7 +304,7 @@ def _concluded(
     shown = is_watched() if running.progress is None else running.progress
     try:
         with (
-            open_workers(settings.workers(running.workers), running.dask) as opened,
+            evaluation_workers(plan.workers(running.workers), running.dask) as opened,
             panel_of(
                 _title(settings),
                 settings.cases,
@@ -326,8 +323,7 @@ def _concluded(
             done = run(opened, panel, case_ended)
             note_avoidance(
                 done,
-                settings,
-                road,
+                plan,
                 workers=opened,
                 check=running.check,
                 on_part=panel.driven_again,
@@ -352,11 +348,11 @@ def _title(settings: CampaignSettings) -> str:
     return f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 
 
-def _road(scenario: Scenario, net: AnyPath | None) -> Corridor:
-    return road_for(scenario, None if net is None else Path(net))
+def _path(path: AnyPath | None) -> Path | None:
+    return None if path is None else Path(path)
 
 
-def _notice_untrained(settings: CampaignSettings, given: Settings) -> None:
+def _notice_untrained(settings: CampaignSettings, plan: SimulationPlan, given: Settings) -> None:
     """Warn with a `Notice` where learned POVs are missing, or were not trained on the scenario."""
     if given.get("level", "all") == "all" and not set(settings.levels) >= set(LEVELS):
         levels = ", ".join(map(level_name, settings.levels))
@@ -366,7 +362,7 @@ def _notice_untrained(settings: CampaignSettings, given: Settings) -> None:
             stacklevel=3,
         )
     learned = {1, 2} & set(settings.levels)
-    if learned and unseen(settings.scenario, settings.povs.policies):
+    if learned and unseen(settings.scenario, plan.povs.policies):
         scenario, policies = given.get("scenario", US23), given.get("policies")
         name = scenario.name if isinstance(scenario, Scenario) else str(scenario)
         option = "" if policies is None else f" --policies {quoted(policies)}"
@@ -441,23 +437,23 @@ def run_case(
         check_new(Path(out))
     for sentence in outside_of_the_pool(one):
         warnings.warn(sentence, Notice, stacklevel=2)
-    road = _road(settings.scenario, net)
+    plan = resolve(settings, _path(net))
 
     def ended(result: Ended) -> None:
         if out is not None:
-            write_scenario(Path(out), road, result.outcome, result.trajectory)
+            write_scenario(Path(out), plan.road, result.outcome, result.trajectory)
         if on_end is not None:
             on_end(CaseRun(result))
 
-    return CaseRun(run_one(plan_of(settings, road, cases=1), one, live=gui, on_end=ended))
+    return CaseRun(run_one(plan, one, live=gui, on_end=ended))
 
 
-def _case_fields(vut: AnyVut | None, setup: Mapping[str, Any]) -> tuple[dict[str, Any], VutOptions]:
-    """Return the settings that are given for one case, and the options of a POV of one's own."""
+def _case_fields(vut: AnyVut | None, setup: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that are given for one case."""
     spec, pov_spec, _ = drivers_of("" if vut is None else vut, setup.get("pov"), 1, stacklevel=5)
     specs = {"vut": None if vut is None else spec, "pov": pov_spec}
     fields = {**setup, **{name: value for name, value in specs.items() if value is not None}}
-    return recordable(fields), VutOptions(memory_gib=setup.get("vut_memory_gib", MEMORY_GIB))
+    return recordable(fields)
 
 
 def _recorded_case(
@@ -470,12 +466,12 @@ def _recorded_case(
     trust: bool,
 ) -> tuple[CampaignSettings, Case]:
     """Return a case of a campaign with other settings and coordinates, and how it is run."""
-    fields, options = _case_fields(vut, setup)
+    fields = _case_fields(vut, setup)
     run, index = _opened(recorded[0]).run, recorded[1]
     number = run.outcome(index).case.level
     if level is not None:
-        povs = povs_of(setup.get("policies"), run.scenario, fields.get("pov"), options)
-        number = one_level(str(level), povs)
+        policies = policies_folder(setup.get("policies"), run.scenario)
+        number = one_level(str(level), policies, own=fields.get("pov") is not None)
     return settings_and_case((run, index), number, values, fields, trust=trust)
 
 
@@ -487,11 +483,11 @@ def _given_case(
     values: Mapping[str, Any],
 ) -> tuple[CampaignSettings, Case]:
     """Return a case by its coordinates, which win over those of a row, and how it is run."""
-    fields, options = _case_fields(vut, {"scenario": US23, **setup})
+    fields = _case_fields(vut, {"scenario": US23, **setup})
     coordinates = {name: row[name] for name in FIELDS if row.get(name) is not None}
     name = level_name(int(row.get("level", 0))) if level is None else str(level)
-    povs = povs_of(setup.get("policies"), fields["scenario"], fields.get("pov"), options)
-    number = one_level(name, povs)
+    policies = policies_folder(setup.get("policies"), fields["scenario"])
+    number = one_level(name, policies, own=fields.get("pov") is not None)
     return settings_and_case(None, number, {**coordinates, **values}, fields)
 
 
@@ -534,15 +530,13 @@ def rerun(
         given |= {name: one for name, one in (("vut", spec), ("pov", pov)) if one}
         count = able or count
     today = settings_today(before, recordable(given), trust=trust_vut)
+    plan = resolve(today, _path(net))
     total = len(set(wanted) or before.outcomes)
     with (
-        open_workers(today.workers(count), dask) as opened,
+        evaluation_workers(plan.workers(count), dask) as opened,
         Counter(f"{today.vut} again", total, "cases", shown=progress) as counter,
     ):
-        road = None if net is None else Path(net)
-        return versions.rerun(
-            before, today, wanted, net=road, workers=opened, on_case=counter.ended
-        )
+        return versions.rerun(before, today, plan, wanted, workers=opened, on_case=counter.ended)
 
 
 def _listed(indices: Iterable[int] | int) -> tuple[int, ...]:
@@ -594,7 +588,7 @@ def export(
         return [export_format.write_table(loaded, wanted, target)]
     if not wanted or export_format.write_case is None:
         raise UserError(f"--format {file_format} needs the indices of cases")
-    road = _road(loaded.scenario, net)
+    road = road_for(loaded.scenario, _path(net))
     return list(exports.write_folders(loaded, wanted, target, export_format.write_case, road))
 
 
@@ -673,7 +667,7 @@ def compare_runs(
         check_new_file(Path(out))
     first, second = _opened(a).run, _opened(b).run
     given = {} if policies is None else {"policies": str(policies)}
-    road = _road(first.scenario, net) if rerun else None
+    road = road_for(first.scenario, _path(net)) if rerun else None
     motions: dict[tuple[str, int], Trajectory] = {}
 
     def keep(of: str, index: int, trajectory: Trajectory) -> None:
@@ -726,7 +720,8 @@ def truth(
     """Return the ground truth of a VUT at one level; see `truths`, whose arguments these are."""
     check_keywords("truth", setup, Setup)
     settings, count = settings_for(vut, {**setup, "level": level}, workers=workers)
-    number = one_level(str(level), settings.povs)
+    policies = policies_folder(settings.policies, settings.scenario)
+    number = one_level(str(level), policies, own=settings.pov is not None)
     with _study(settings, count, dask, progress) as study:
         return study.truth(number, cases, seed)
 
@@ -761,7 +756,7 @@ def truths(
     settings, count = settings_for(vut, {**setup, "level": level}, workers=workers)
     with _study(settings, count, dask, progress) as study:
         by_level = {number: study.truth(number, cases, seed) for number in settings.levels}
-    if settings.vut_factory.vut.named_only and not is_here(settings.vut):
+    if study.plan.vut.vut.named_only and not is_here(settings.vut):
         warnings.warn(
             "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
             "its command and the files that are named there",
@@ -807,8 +802,8 @@ def _study(
     settings: CampaignSettings, workers: int | None, dask: str | None, progress: bool | None
 ) -> Iterator[_Study]:
     """Open a study; the cache of objects of this process is a passing one."""
-    plan = plan_of(settings, _road(settings.scenario, None))
-    with open_workers(settings.workers(workers), dask) as opened:
+    plan = resolve(settings)
+    with evaluation_workers(plan.workers(workers), dask) as opened:
         if not (is_here(settings.vut) or is_here(settings.pov or "")):
             yield _Study(plan, opened, None, progress)
             return
@@ -937,18 +932,18 @@ def certify(
     folder = dated(f"certify-{settings.vut}") if out is None else Path(out)
     if not resume:
         check_new(folder)
-    road = _road(settings.scenario, net)
+    plan = resolve(settings, _path(net))
     total = sum(map(len, lattices.values()))
     with (
-        open_workers(settings.workers(count), dask) as opened,
+        evaluation_workers(plan.workers(count), dask) as opened,
         Counter(_title(settings), total, "cases", shown=progress) as counter,
     ):
         done = certificate.certify(
             settings,
             radius,
             folder,
-            road,
-            runs_points_on(opened, settings, road, folder),
+            plan,
+            runs_points_on(opened, settings, plan, folder),
             resume=resume,
             on_cases=counter.ended,
             check=check or _go_on,
@@ -996,20 +991,20 @@ def probability(
     _, pov, count = drivers_of(before.vut, hosting.get("pov"), workers)
     given = recordable({**hosting, **({} if pov is None else {"pov": pov})})
     settings = settings_of(before.folder, before.settings, given, trust=trust_vut)
+    plan = resolve(settings, _path(net))
     with (
-        open_workers(settings.workers(count), dask) as opened,
+        evaluation_workers(plan.workers(count), dask) as opened,
         Counter("fresh cases", cases, "cases", shown=progress) as counter,
     ):
         estimate = estimates.failure_probability(
             before,
+            settings,
+            plan,
             target,
             cases=cases,
             distribution=None if distribution is None else Path(distribution),
             confidence=confidence,
             seed=seed,
-            net=_road(before.scenario, net),
-            given=given,
-            trust=trust_vut,
             workers=opened,
             on_case=lambda _: counter.ended(1),
         )
@@ -1045,10 +1040,10 @@ def reproduce(
     scale = reproduction.quick(count) if quick else reproduction.Scale(seeds=count)
     if dense is not None:
         scale = replace(scale, dense=dense)
-    povs = povs_of(policies, US23)
+    povs = Povs(policies=policies_folder(policies, US23))
     folder = dated("reproduce") if out is None else Path(out)
     figures.require_matplotlib()
-    with open_workers(workers, dask) as opened, Bars(shown=progress) as bars:
+    with evaluation_workers(workers, dask) as opened, Bars(shown=progress) as bars:
 
         def ran(title: str, done: int, total: int, unit: str) -> None:
             bars.show(title, done, total, rate_text(done, bars.elapsed_s(title), unit))
@@ -1081,15 +1076,9 @@ def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> CheckResult:
     """
     check_keywords("check_vut", hosting, Hosting)
     spec, _, _ = drivers_of(vut, None, 1)
-    policies = hosting.get("policies")
-    options = VutOptions(
-        command=hosting.get("vut_command"),
-        deadline_s=hosting.get("deadline_s", DEADLINE_S),
-        memory_gib=hosting.get("vut_memory_gib", MEMORY_GIB),
-        in_process=hosting.get("in_process", False),
-        policies=None if policies is None else policies_in(policies),
-    )
-    return CheckResult(spec, vut_check.check_vut(vut_factory(spec, options)))
+    fields = recordable({name: value for name, value in hosting.items() if name != "pov"})
+    settings = CampaignSettings(vut=spec, levels=(0,), scenario=US23, **fields)
+    return CheckResult(spec, vut_check.check_vut(resolve(settings)))
 
 
 def scenarios() -> ScenarioList:

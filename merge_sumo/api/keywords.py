@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypedDict
 
-from merge_sumo.campaigns.settings import CampaignSettings, parse_levels, povs_of
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, US23, Scenario
-from merge_sumo.vuts.base import VutOptions
+from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
 
 
@@ -150,13 +150,8 @@ def settings_for(
     """
     spec, pov_spec, workers = drivers_of(vut, given.get("pov"), workers, stacklevel=4)
     fields = recordable({"scenario": US23, **given, "pov": pov_spec})
-    options = VutOptions(
-        deadline_s=fields.get("deadline_s", DEADLINE_S),
-        memory_gib=fields.get("vut_memory_gib", MEMORY_GIB),
-        in_process=fields.get("in_process", False),
-    )
-    povs = povs_of(fields.get("policies"), fields["scenario"], pov_spec, options)
-    levels = parse_levels(str(given.get("level", "all")), povs)
+    policies = policies_folder(fields.get("policies"), fields["scenario"])
+    levels = parse_levels(str(given.get("level", "all")), policies, own=pov_spec is not None)
     settings = CampaignSettings(vut=spec, levels=levels, **fields)
     for note in settings.criterion.notes(settings.scenario):
         warnings.warn(f"note: {note}", Notice, stacklevel=3)

@@ -1,35 +1,29 @@
-"""The conductor: a sampler proposes, the world runs, the journal remembers."""
+"""A campaign: a sampler proposes cases, the simulator runs them, the journal keeps them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.ownership import FILES
-from merge_sumo.campaigns.plan import plan_of
-from merge_sumo.campaigns.prefetch import Ahead, proposals
+from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.repeats import repeat, write_repeats
 from merge_sumo.campaigns.run import RAN_AGAIN, SETTINGS, Run, spread_failures
-from merge_sumo.campaigns.settings import (
-    RECORDED_BY_DEFAULT,
-    CampaignSettings,
-    record_of,
-    settings_of,
-)
+from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
 from merge_sumo.campaigns.transfer import lessons
-from merge_sumo.engine.simulator import (
+from merge_sumo.engine.evaluate import (
     CaseResult,
-    OnWorkers,
-    RunCases,
-    SimulationPlan,
-    road_for,
-    runs_on,
+    evaluate,
+    evaluate_chunks,
+    open_simulators,
+    workers_or_here,
 )
-from merge_sumo.engine.versions import differences
+from merge_sumo.engine.plan import SimulationPlan, differences
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
@@ -38,7 +32,7 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
 from merge_sumo.system.hashing import sha256_of
-from merge_sumo.system.workers import Workers, open_workers
+from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.score import Outcome
@@ -54,7 +48,9 @@ SEAL: Final = "seal"
 """Key of `campaign.json` in folders of version 0.1; it means nothing any more."""
 
 OnCase = Callable[[Outcome], None]
-"""Told of every case as it ends, in the order in which cases end."""
+"""Called with every case as it ends, in the order in which cases end."""
+RunCases = Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]]
+"""Runs cases; gives (place, result) in any order."""
 
 
 def conduct(
@@ -67,23 +63,26 @@ def conduct(
     motions: Mapping[int, FloatArray] | None = None,
     stop: Callable[[Sequence[Outcome]], bool] | None = None,
 ) -> Iterator[list[tuple[Outcome, Trajectory]]]:
-    """Ask, run, tell, batch by batch; yield what each batch gave, in order of the cases.
+    """Ask, run and tell, batch by batch; yield the cases of each batch in order.
 
-    Without a `batch`, the sampler says how many cases it wants. It ends after `cases`, or earlier
-    where `stop` says so of the outcomes so far. A campaign goes on after `history`, whole batches
-    of its own outcomes: the sampler is told them, and as it is pure in what it was told, it
-    proposes what it would have proposed then. One that uses_predictions is told the `motions`,
-    (T + 1, A, 3), of the history by index, too.
+    Args:
+        sampler: proposes the cases, and is told the outcomes.
+        run: runs them.
+        cases: number of cases after which the search ends.
+        batch: cases of a batch; by default as many as the sampler wants.
+        on_case: called with every outcome.
+        history: outcomes of whole batches that ran before; as a sampler is pure in what it was
+            told, it goes on as if it had just run them.
+        motions: their motions, (T + 1, A, 3), by index, for a sampler that uses predictions.
+        stop: says of the outcomes so far whether the search is over.
     """
     sampler.tell(history, motions)
     number, first = (history[-1].batch + 1 if history else 0), len(history)
     while first < cases and not (stop is not None and stop(sampler.observed())):
         ran: list[tuple[Outcome, Trajectory]] = []
-        for place, done in run(sampler.ask(min(batch or sampler.batch_size(), cases - first))):
-            case, prediction = done.trajectory.case, sampler.prediction(place)
-            index, margin = first + place, done.margin
-            outcome = Outcome(index, number, case, done.measures, prediction, margin)
-            ran.append((outcome, done.trajectory))
+        for place, result in run(sampler.ask(min(batch or sampler.batch_size(), cases - first))):
+            outcome = result.outcome(first + place, number, sampler.prediction(place))
+            ran.append((outcome, result.trajectory))
             if on_case is not None:
                 on_case(outcome)
         ran.sort(key=lambda pair: pair[0].index)
@@ -94,8 +93,8 @@ def conduct(
 
 def run_campaign(
     settings: CampaignSettings,
+    plan: SimulationPlan,
     folder: Path,
-    net: Corridor | None = None,
     on_case: OnCase | None = None,
     *,
     workers: Workers | None = None,
@@ -108,103 +107,114 @@ def run_campaign(
 
     Args:
         settings: what to run.
+        plan: how its cases run: that of the settings (`resolve`).
         folder: where to.
-        net: the road, by default the shipped one.
-        on_case: told of every case.
+        on_case: called with every outcome.
         workers: where cases run, by default in this process.
         check: called after every batch; may raise to stop there, and `resume_campaign` goes on.
     """
     check_new(folder)
     check_new(folder / SCENARIOS / case_name(settings.cases))
-    net = net or road_for(settings.scenario)
-    with workers_or_here(workers) as there:
-        run = runs_on(there, _plan(settings, net, folder))
-        record = record_of(settings, net)
+    plan = _plan_in(folder, settings, plan)
+    with workers_or_here(workers) as available:
+        open_simulators(plan, available)
+        record = record_of(settings, plan)
         with Journal.create(folder, record) as journal:
-            return _go_on(settings, record, net, journal, run, None, on_case, check)
+            return _run(settings, plan, record, journal, available, None, on_case, check)
 
 
 def resume_campaign(
+    settings: CampaignSettings,
+    plan: SimulationPlan,
     folder: Path,
-    net: Corridor | None = None,
     on_case: OnCase | None = None,
     *,
     on_before: OnCase | None = None,
-    given: Mapping[str, object] | None = None,
     force: bool = False,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
     warn: Callable[[str], None] = lambda _: None,
-    trust: bool = False,
 ) -> Run:
     """Go on with a campaign that was stopped, however it was; return it as `run_campaign` does.
 
-    The result is the same to the last byte as if it had never been stopped; also where more cases
-    are `given` than it had, if those ended with a whole batch. Raises `UserError` with the name of
-    the field where something differs that decides outcomes: settings that are `given`, versions,
-    net, policies. With `force` it goes on and records that they did.
+    The result is the same to the last byte as if it had never been stopped; also where the settings
+    have more cases than it had, if those ended with a whole batch. Raises `UserError` with the name
+    of the field where something differs that decides outcomes: settings, versions, net, policies.
+    With `force` it goes on and records that they did.
 
     Args:
+        settings: those of the folder, and what a person named again (`settings_of`).
+        plan: how the cases run: that of the settings (`resolve`).
         folder: where the campaign is.
-        net: the net with which it was started, by default the shipped one.
-        on_case: told of every case, also of those that ran before, unless there is an
-        on_before: told of those.
-        given: settings that a person named again, by their names in `CampaignSettings`.
+        on_case: called with every outcome, also of cases that ran before without `on_before`.
+        on_before: called with the outcomes of cases that ran before.
         force: go on although something differs.
         workers: where cases run, by default in this process.
         check: called after every batch; may raise to stop there.
-        warn: told in a sentence what was dropped.
-        trust: run the controller that the folder names although the folder may be a stranger's.
+        warn: called with a sentence on what was dropped.
     """
     check_own(folder / SCENARIOS)
     journal, before, dropped = Journal.reopen(folder)
-    net = net or road_for(before.scenario)
-    with journal, workers_or_here(workers) as there:
-        recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, RAN_AGAIN, SEAL)}
-        settings = settings_of(folder, before.settings, given, trust=trust)
-        record = record_of(settings, net)
-        # Where policies are decides nothing: what is in them does.
-        moved = recorded.get("policies") != record["policies"]
-        recorded["policies"] = record["policies"]
-        # What was loaded while it ran must be the same, too, although it is not loaded yet.
-        for name in FILES:
-            record[name] = _files_again(recorded, name, record[name] or {}) or None
-        was = recorded.get("cases")
-        grown = isinstance(was, int) and was < settings.cases
-        if grown:  # which cases come next does not depend on how many there are to be
-            recorded["cases"] = settings.cases
-        changes = differences(RECORDED_BY_DEFAULT | recorded, record)
-        if before.criterion != settings.criterion:
-            raise UserError(
-                f"in {folder} a case fails when {before.criterion.text}, and not when "
-                f"{settings.criterion.text}: a campaign has one criterion; begin another one"
-            )
-        if changes and not force:
-            name, (was, now) = next(iter(changes.items()))
-            raise UserError(
-                f"{name} differs: {folder} was run with {was}, now it is {now}; make it the same, "
-                "or go on with --force, which is recorded"
-            )
+    plan = _plan_in(folder, settings, plan)
+    with journal, workers_or_here(workers) as available:
+        record, changes, rewrite = _compared(before, settings, plan, force=force)
         if dropped:
             warn(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
-        run = runs_on(there, _plan(settings, net, folder))
+        open_simulators(plan, available)
         if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
             record[FORCED] = [*_forced(before), *([forced] if changes else [])]
         if before.ran_again:
             record[RAN_AGAIN] = before.ran_again
-        if changes or moved or grown:
+        if rewrite:
             journal.rewrite_settings(record)
         else:
             journal.note_own(record)
-        told = on_before or on_case
-        if told is not None:
+        if (on_outcome := on_before or on_case) is not None:
             for outcome in before.outcomes:
-                told(outcome)
-        return _go_on(settings, record, net, journal, run, before, on_case, check)
+                on_outcome(outcome)
+        return _run(settings, plan, record, journal, available, before, on_case, check)
 
 
-def _files_again(recorded: Mapping[str, Any], name: str, known: Files) -> Files:
+Changes = dict[str, tuple[Any, Any]]
+"""By name, what was recorded and what is so now."""
+
+
+def _compared(
+    before: Run, settings: CampaignSettings, plan: SimulationPlan, *, force: bool
+) -> tuple[dict[str, Any], Changes, bool]:
+    """Return the record of a campaign that goes on, what differs, and whether to write it.
+
+    Raises `UserError` where something differs and it is not to go on with `force`.
+    """
+    recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, RAN_AGAIN, SEAL)}
+    record = record_of(settings, plan)
+    # Where policies are decides nothing: what is in them does.
+    moved = recorded.get("policies") != record["policies"]
+    recorded["policies"] = record["policies"]
+    # What was loaded while it ran must be the same, too, although it is not loaded yet.
+    for name in FILES:
+        record[name] = _files_now(recorded, name, record[name] or {}) or None
+    cases = recorded.get("cases")
+    grown = isinstance(cases, int) and cases < settings.cases
+    if grown:  # which cases come next does not depend on how many there are to be
+        recorded["cases"] = settings.cases
+    changes = differences(RECORDED_BY_DEFAULT | recorded, record)
+    if before.criterion != settings.criterion:
+        raise UserError(
+            f"in {before.folder} a case fails when {before.criterion.text}, and not when "
+            f"{settings.criterion.text}: a campaign has one criterion; begin another one"
+        )
+    if changes and not force:
+        name, (was, now) = next(iter(changes.items()))
+        raise UserError(
+            f"{name} differs: {before.folder} was run with {was}, now it is {now}; make it the "
+            "same, or go on with --force, which is recorded"
+        )
+    return record, changes, bool(changes or moved or grown)
+
+
+def _files_now(recorded: Mapping[str, Any], name: str, known: Files) -> Files:
     """Return the files that a record names as they are now, and those that are known by now.
 
     A name in the record is relative to where the campaign was begun, which may be elsewhere.
@@ -223,92 +233,95 @@ def _files_again(recorded: Mapping[str, Any], name: str, known: Files) -> Files:
     return again | known
 
 
-def _go_on(
+def _run(
     settings: CampaignSettings,
+    plan: SimulationPlan,
     record: dict[str, Any],
-    net: Corridor,
     journal: Journal,
-    run: OnWorkers,
+    workers: Workers,
     before: Run | None,
     on_case: OnCase | None,
     check: Callable[[], None],
 ) -> Run:
-    taught = lessons(settings.learn_from, settings.scenario)
-    others = [motion for motions in taught.values() for motion in motions]
-    games = Twin(
-        settings.pool,
-        settings.povs,
-        settings.seed,
-        others,
-        settings.criterion,
-        centre_lines(net),
-    )
-    sampler = make_sampler(settings.sampler, settings.pool, settings.seed, games)
-    stop = settings.stopping_rule()
-    files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
-    again = record.get(RAN_AGAIN, 0)
-
-    def noting_files(cases: Sequence[Case]) -> Iterator[tuple[int, CaseResult]]:
-        nonlocal again
-        for place, done in ahead(cases):
-            again += done.again
-            for name, loaded in zip(FILES, (done.files, done.pov_files), strict=True):
-                files[name] = loaded | files[name]  # what was known stays
-            yield place, done
-
+    """Run what is missing of a campaign, then some cases a second time; export the worst."""
     history = [] if before is None else before.outcomes
-    ended: list[Outcome] = []
+    sampler = make_sampler(settings.sampler, settings.pool, settings.seed, _twin(settings, plan))
     motions = None
     if before is not None and sampler.uses_predictions:
         motions = {o.index: before.trajectory(o.index).motion for o in history}
-    scout = make_sampler(settings.sampler, settings.pool, settings.seed)
-    proposed = proposals(scout, history, settings.cases, settings.batch)
-    with Ahead(run, proposed, settings.cases - len(history)) as ahead:
+    proposed = proposals(
+        make_sampler(settings.sampler, settings.pool, settings.seed),
+        *(history, settings.cases, settings.batch),
+    )
+    noted, ended = _Noted(record), list(history)
+    run_chunks = partial(evaluate_chunks, plan, workers=workers)
+    missing = settings.cases - len(history)
+    with Prefetch(run_chunks, workers.count, proposed, missing) as prefetch:
         batches = conduct(
             sampler,
-            noting_files,
+            lambda cases: noted.noting(prefetch.run(cases)),
             settings.cases,
             settings.batch,
             on_case,
             history,
             motions,
-            stop,
+            settings.stopping_rule(),
         )
-        for ran in ahead.together(batches):
-            journal.append(*ran)
-            ended += [outcome for batch in ran for outcome, _ in batch]
-            noted: dict[str, object] = {name: known or None for name, known in files.items()}
-            if again:
-                noted[RAN_AGAIN] = again
-            if noted != {name: record.get(name) for name in noted}:
-                record |= noted
+        for together in prefetch.together(batches):
+            journal.append(*together)
+            ended += [outcome for batch in together for outcome, _ in batch]
+            if noted.update(record):
                 journal.rewrite_settings(record)
             check()
-    done = Run(journal.folder, [*history, *ended])
-    repeats = repeat(done, settings, run)
+    done = Run(journal.folder, ended)
+    repeats = repeat(done, settings, partial(evaluate, plan, workers=workers))
     if repeats:
         write_repeats(done, repeats)
     for outcome in spread_failures(done.outcomes)[:EXPORTED_FAILURES]:
         folder = journal.folder / SCENARIOS / case_name(outcome.index)
         if not os.path.lexists(folder):  # written whole, before the campaign was stopped
-            export_case(done, outcome.index, folder, net)
+            export_case(done, outcome.index, folder, plan.road)
     return done
 
 
-@contextmanager
-def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
-    """Give the workers, which stay open, or this process as the only one."""
-    if workers is not None:
-        yield workers
-        return
-    with open_workers(1) as here:
-        yield here
+class _Noted:
+    """What the record of a campaign says of its cases: files that were loaded, runs again."""
+
+    def __init__(self, record: Mapping[str, Any]) -> None:
+        self._files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
+        self._ran_again = record.get(RAN_AGAIN, 0)
+
+    def noting(self, results: Iterable[tuple[int, CaseResult]]) -> Iterator[tuple[int, CaseResult]]:
+        """Pass results on, and note what they say."""
+        for place, result in results:
+            self._ran_again += result.again
+            for name, loaded in zip(FILES, (result.files, result.pov_files), strict=True):
+                self._files[name] = loaded | self._files[name]  # what was known stays
+            yield place, result
+
+    def update(self, record: dict[str, Any]) -> bool:
+        """Bring a record up to date; return whether it was not."""
+        noted: dict[str, object] = {name: known or None for name, known in self._files.items()}
+        if self._ran_again:
+            noted[RAN_AGAIN] = self._ran_again
+        if noted == {name: record.get(name) for name in noted}:
+            return False
+        record |= noted
+        return True
 
 
-def _plan(settings: CampaignSettings, net: Corridor, folder: Path) -> SimulationPlan:
-    log = folder.resolve() / LOG
+def _twin(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
+    """Return the twin of the VUT, which has learned from earlier campaigns."""
+    learned = lessons(settings.learn_from, settings.scenario)
+    others = [motion for motions in learned.values() for motion in motions]
+    lines = centre_lines(plan.road)
+    return Twin(settings.pool, plan.povs, settings.seed, others, plan.criterion, lines)
+
+
+def _plan_in(folder: Path, settings: CampaignSettings, plan: SimulationPlan) -> SimulationPlan:
+    """Return the plan of a campaign in its folder, where the log of its drivers is."""
     at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
-    return plan_of(settings, net, cases=at_once or settings.cases, log=log)
+    return plan.for_cases(at_once or settings.cases).with_log(folder.resolve() / LOG)
 
 
 def _forced(run: Run) -> list[Any]:
@@ -321,7 +334,7 @@ def case_name(index: int) -> str:
     return f"case-{index:05d}"
 
 
-def export_case(run: Run, index: int, folder: Path, net: Corridor | None = None) -> Path:
+def export_case(run: Run, index: int, folder: Path, road: Corridor | None = None) -> Path:
     """Write a case of a run as a replay folder; return the path of its SUMO configuration."""
-    road = net or road_for(run.scenario)
+    road = road or road_for(run.scenario)
     return write_scenario(folder, road, run.outcome(index), run.trajectory(index))

@@ -9,7 +9,8 @@ from typing import Any, Final
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.engine.simulator import SimulationPlan
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.live import Window
@@ -119,13 +120,13 @@ def run_one(
     """
     with (
         Window() if live else nullcontext() as window,
-        plan.open(window) as ground,
+        Simulator(plan.for_cases(1), window) as simulator,
     ):
         if window is not None:
             window.write(case_line(case))
-        episodes = ground.run([case])
+        episodes = simulator.run([case])
         _, trajectory = next(episodes)
-        lines = centre_lines(plan.net)
+        lines = centre_lines(plan.road)
         ended = Ended(plan.criterion.outcome(0, 0, trajectory, lines), trajectory)
         on_end(ended)
         if window is not None:

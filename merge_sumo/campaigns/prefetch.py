@@ -1,4 +1,4 @@
-"""Cases that run before they are asked for.
+"""Cases that run before they are requested.
 
 Where outcomes do not decide what a sampler proposes, nobody has to wait for a batch to end: cases
 go to the workers in chunks of a size that suits them, and are handed out batch by batch. What is
@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import chain, islice
 from typing import Final, Self
 
 from merge_sumo.campaigns.journal import Batch
-from merge_sumo.engine.simulator import MAX_CORRIDORS, CaseResult, OnWorkers
+from merge_sumo.engine.evaluate import CaseResult
+from merge_sumo.engine.plan import MAX_CORRIDORS
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.system.workers import MAX_CHUNK
 from merge_sumo.values.case import Case
@@ -42,47 +43,63 @@ def proposals(
         first += len(proposed)
 
 
-class Ahead:
-    """Runs batches on workers, those ahead before they are asked for; to be used in `with`."""
+RunChunks = Callable[
+    [Iterable[Sequence[Case]]], Generator[tuple[int, Sequence[CaseResult]], None, None]
+]
+"""Runs chunks of cases; yields (place of the first case, results) in any order."""
+
+
+class Prefetch:
+    """Runs batches on workers before they are requested; to be used in `with`."""
 
     def __init__(
-        self, run: OnWorkers, ahead: Iterable[Sequence[Case]], cases: float = math.inf
+        self,
+        run_chunks: RunChunks,
+        workers: int,
+        proposed: Iterable[Sequence[Case]],
+        cases: float = math.inf,
     ) -> None:
-        """Take the batches that will be asked for, in that order, and of how many cases they are.
+        """Take what runs chunks on a number of workers, and the batches that will be requested.
 
-        Where there are none, nothing runs ahead.
+        `cases` is how many cases they are. Without such batches, each runs when it is requested.
         """
-        self._run = run
+        self._run_chunks, self._workers = run_chunks, workers
         self._cases = cases
-        self._chunks = run.chunks(self._cut(chain.from_iterable(ahead)))
+        self._chunks = run_chunks(self._cut(chain.from_iterable(proposed)))
         self._sent: dict[int, Case] = {}
-        """Cases that were not asked for yet, by their place,"""
+        """Cases that were not requested yet, by their place."""
         self._ran: dict[int, CaseResult] = {}
-        """and what became of those that have ended."""
-        self._asked = self._ended = 0
+        """Results of those that have ended."""
+        self._requested = self._ended = 0
         self._start_s = time.perf_counter()
 
-    def __call__(self, cases: Sequence[Case]) -> Iterator[tuple[int, CaseResult]]:
-        """Run the next batch; yield (place in `cases`, what became of the case)."""
-        first = self._asked
-        self._asked += len(cases)
+    def run(self, cases: Sequence[Case]) -> Iterator[tuple[int, CaseResult]]:
+        """Run the next batch; yield (place in `cases`, result)."""
+        first = self._requested
+        self._requested += len(cases)
         for place, case in enumerate(cases):
             while first + place not in self._ran:
                 chunk = next(self._chunks, None)
                 if chunk is None:
-                    yield from self._run(cases)
+                    yield from self._run_now(cases)
                     return
                 self._ran.update(enumerate(chunk[1], start=chunk[0]))
                 self._ended += len(chunk[1])
             assert self._sent.pop(first + place) == case, "what it proposes is sure"  # noqa: S101
             yield place, self._ran.pop(first + place)
 
+    def _run_now(self, cases: Sequence[Case]) -> Iterator[tuple[int, CaseResult]]:
+        size = min(MAX_CHUNK, math.ceil(len(cases) / self._workers))
+        chunks = (cases[first : first + size] for first in range(0, len(cases), size))
+        for first, results in self._run_chunks(chunks):
+            yield from enumerate(results, start=first)
+
     def together(self, batches: Iterable[Batch]) -> Iterator[list[Batch]]:
         """Yield the batches that this has run, those that ended at the same time together."""
         ended: list[Batch] = []
         for batch in batches:
             ended.append(batch)
-            if self._asked + len(batch) - 1 not in self._ran:
+            if self._requested + len(batch) - 1 not in self._ran:
                 yield ended
                 ended = []
         if ended:
@@ -92,9 +109,9 @@ class Ahead:
         """Yield chunks that grow as far as workers are quick."""
         first = 0
         while True:
-            rate = self._ended / (time.perf_counter() - self._start_s) / self._run.workers.count
+            rate = self._ended / (time.perf_counter() - self._start_s) / self._workers
             # Smaller ones at the end, so that workers end at the same time.
-            share = min(CHUNK_S * rate, (self._cases - first) / self._run.workers.count)
+            share = min(CHUNK_S * rate, (self._cases - first) / self._workers)
             size = min(max(MAX_CORRIDORS, round(share)), MAX_CHUNK)
             chunk = list(islice(cases, size))
             if not chunk:
@@ -104,9 +121,9 @@ class Ahead:
             yield chunk
 
     def __enter__(self) -> Self:
-        """Return what runs cases."""
+        """Return this object."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave what runs ahead, where somebody stopped."""
+        """Leave what still runs, where the campaign was stopped."""
         self._chunks.close()

@@ -14,7 +14,7 @@ The file of a folder that somebody sent is data as everything in it.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -22,10 +22,11 @@ import numpy as np
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.simulator import CaseResult, RunCases
+from merge_sumo.engine.evaluate import CaseResult
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import read_indexed
+from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
@@ -68,7 +69,11 @@ class Repeat:
         return asdict(self)
 
 
-def repeat(run: Run, settings: CampaignSettings, run_cases: RunCases) -> list[Repeat]:
+def repeat(
+    run: Run,
+    settings: CampaignSettings,
+    run_cases: Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]],
+) -> list[Repeat]:
     """Run some cases of a campaign again; return what became of them, in the order of the cases.
 
     None run again where the package brings all that drives, nor of a TraCI client that nobody
@@ -92,7 +97,7 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
     over the campaign, and run before those. What ended in an error is left out: that may have been
     a slow machine's doing.
     """
-    built_in, own = built_in_vuts(), settings.povs.own
+    built_in = built_in_vuts()
     if waits_for_client(settings.vut, settings.vut_command):
         return []
     tested = [
@@ -101,7 +106,7 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
         if not outcome.measures.end.is_error
         and (
             settings.vut not in built_in
-            or (outcome.case.level == OWN and own is not None and own.spec not in built_in)
+            or (outcome.case.level == OWN and settings.pov not in (None, *built_in))
         )
     ]
     places = spread_places(len(tested), min(MOST, -(-len(tested) // ONE_IN)))
@@ -118,7 +123,7 @@ def spread_places(cases: int, count: int) -> list[int]:
 def compared(outcome: Outcome, recorded: Trajectory, ran: CaseResult) -> Repeat:
     """Return how the second run of a case compares with the recorded one."""
     differs_from_s, first = _difference(recorded, ran.trajectory)
-    now = Outcome(outcome.index, outcome.batch, outcome.case, ran.measures, margin=ran.margin)
+    now = ran.outcome(outcome.index, outcome.batch)
     end = now.measures.end
     other = (end, now.failed) != (outcome.measures.end, outcome.failed)
     return Repeat(outcome.index, differs_from_s, first, end, now.failed, other)

@@ -12,28 +12,24 @@ from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.stopping import StoppingRule
 from merge_sumo.campaigns.transfer import hashes, lessons
-from merge_sumo.drivers.policies import how_to_train, policies_in, policies_of
-from merge_sumo.engine.povs import POLICIES, Povs, own_pov
-from merge_sumo.engine.versions import versions
+from merge_sumo.drivers.policies import policies_in
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.system.records import RecordError, check_fields, convert
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import (
-    ALL_LEVELS,
     DEADLINE_S,
     MEMORY_GIB,
     OWN,
     US23,
     Scenario,
-    level_name,
 )
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory, vut_factory
 
 DEFAULT_CASES: Final = 800
 
@@ -62,10 +58,32 @@ class CampaignSettings:
     require: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers, the names and the levels; the scenario says what is left out."""
+        """Check numbers and names; `resolve` looks for what they name."""
         check_fields(self)
-        if self.policies is not None:
-            object.__setattr__(self, "policies", str(policies_in(self.policies)))
+        self._check_texts()
+        self._take_speed()
+        criterion = self.criterion
+        object.__setattr__(self, "fail_when", criterion.fail_when)
+        object.__setattr__(self, "require", criterion.require)
+        criterion.check(self.scenario)
+        self.vut_options(None)
+        if not self.levels or len(set(self.levels)) < len(self.levels):
+            raise UserError(f"the levels are {list(self.levels)}: name each level once")
+        self._check_sampler()
+        for name in ("cases", "batch"):
+            if (number := getattr(self, name)) is not None and number < 1:
+                raise UserError(f"--{name} is {number}: it must be 1 or more")
+        if self.batch is not None and self.batch > self.cases:
+            raise UserError(
+                f"--batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
+                "cases than the campaign"
+            )
+        if self.seed < 0:
+            raise UserError(f"--seed is {self.seed}: it must be 0 or more")
+        self.stopping_rule()
+
+    def _take_speed(self) -> None:
+        """Take the initial speed of the VUT from the scenario, or narrow the scenario to it."""
         fixed = self.scenario.v_vut0_mps
         if self.v_vut0_mps is None and isinstance(fixed, float):
             object.__setattr__(self, "v_vut0_mps", fixed)
@@ -73,6 +91,11 @@ class CampaignSettings:
             # Then it is no coordinate of the pool any more.
             narrowed = replace(self.scenario, v_vut0_mps=float(self.v_vut0_mps))
             object.__setattr__(self, "scenario", narrowed)
+        most_mps = self.scenario.v_start_max_mps
+        if self.v_vut0_mps is not None and not 0.0 <= self.v_vut0_mps <= most_mps:
+            raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
+
+    def _check_texts(self) -> None:
         for option, text in (
             ("--vut", self.vut),
             ("--vut-command", self.vut_command),
@@ -85,31 +108,6 @@ class CampaignSettings:
                     f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
                     "rename it"
                 )
-        criterion = self.criterion
-        object.__setattr__(self, "fail_when", criterion.fail_when)
-        object.__setattr__(self, "require", criterion.require)
-        criterion.check(self.scenario)
-        _ = self.vut_factory
-        if not self.levels or len(set(self.levels)) < len(self.levels):
-            raise UserError(f"the levels are {list(self.levels)}: name each level once")
-        povs = self.povs
-        for level in self.levels:
-            check_level(level, povs)
-        self._check_sampler()
-        for name in ("cases", "batch"):
-            if (number := getattr(self, name)) is not None and number < 1:
-                raise UserError(f"--{name} is {number}: it must be 1 or more")
-        if self.batch is not None and self.batch > self.cases:
-            raise UserError(
-                f"--batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
-                "cases than the campaign"
-            )
-        if self.seed < 0:
-            raise UserError(f"--seed is {self.seed}: it must be 0 or more")
-        most_mps = self.scenario.v_start_max_mps
-        if self.v_vut0_mps is not None and not 0.0 <= self.v_vut0_mps <= most_mps:
-            raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
-        self.stopping_rule()
 
     def _check_sampler(self) -> None:
         sampler = make_sampler(self.sampler, self.pool, self.seed)
@@ -128,32 +126,18 @@ class CampaignSettings:
         return StoppingRule(self.stop_after_converged, self.batch, fresh)
 
     @property
-    def vut_factory(self) -> VutFactory:
-        """What makes the VUT."""
-        return vut_factory(self.vut, self._options)
-
-    @property
-    def povs(self) -> Povs:
-        """Who drives the POV."""
-        return povs_of(self.policies, self.scenario, self.pov, self._options)
-
-    @property
     def criterion(self) -> Criterion:
         """What counts as a failure."""
         return Criterion(self.fail_when, self.require)
 
-    def workers(self, asked: int | None) -> int:
-        """Return in how many processes the cases run: see `VutFactory.workers`."""
-        return self.povs.workers(self.vut_factory, asked)
-
-    @property
-    def _options(self) -> VutOptions:
+    def vut_options(self, policies: Path | None) -> VutOptions:
+        """Return how the VUT is hosted, with the learned drivers of a folder."""
         return VutOptions(
             command=self.vut_command,
             deadline_s=self.deadline_s,
             memory_gib=self.vut_memory_gib,
             in_process=self.in_process,
-            policies=policies_folder(self.policies, self.scenario),
+            policies=policies,
         )
 
     @property
@@ -179,75 +163,17 @@ def _is_text(text: str) -> bool:
     return True
 
 
-def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:
-    """Return the folder of the policies that a person names, else of those for a scenario."""
-    return policies_of(scenario) if policies is None else policies_in(policies)
-
-
-def povs_of(
-    policies: str | Path | None,
-    scenario: Scenario,
-    pov: str | None = None,
-    options: VutOptions | None = None,
-) -> Povs:
-    """Return the POVs by the policies and the own POV that a person names, if any.
-
-    One of their own is hosted with the options of the VUT.
-    """
-    own = None if pov is None else own_pov(pov, options or VutOptions())
-    return Povs(policies=policies_folder(policies, scenario), own=own)
-
-
-CHOICE: Final = "0, 1, 2 or all, or own with --pov"
-ONE: Final = "0, 1 or 2, or own with --pov"
-
-
-def parse_levels(text: str, povs: Povs, choice: str = CHOICE) -> tuple[int, ...]:
-    """Return the levels that `--level` names: one, or all for which there is a POV.
-
-    Raises `UserError` for a name of none, and where a POV of a person's own would not drive.
-    """
-    if text == "all":
-        return povs.levels
-    by_name = {level_name(level): level for level in ALL_LEVELS}
-    if text not in by_name:
-        raise UserError(f"there is no POV level {text!r}: choose {choice}")
-    level = by_name[text]
-    check_level(level, povs)
-    if povs.own is not None and level != OWN:
-        raise UserError(f"--pov drives at --level own or all, not at --level {text}")
-    return (level,)
-
-
-def check_level(level: int, povs: Povs) -> None:
-    """Raise `UserError` when there is no POV of a level."""
-    if level not in ALL_LEVELS:
-        raise UserError(f"there is no POV level {level}: choose {CHOICE}")
-    if level == OWN and povs.own is None:
-        raise UserError("--level own is a POV that you bring: name it with --pov")
-    if level not in povs.levels:
-        raise UserError(
-            f"there is no policy for a POV of level {level}{how_to_train(povs.policies)}"
-        )
-
-
-def one_level(text: str, povs: Povs) -> int:
-    """Return the one level that `--level` names."""
-    if text == "all":
-        raise UserError(f"--level all does not go here: choose {ONE}")
-    return parse_levels(text, povs, ONE)[0]
-
-
-def record_of(settings: CampaignSettings, net: Corridor) -> dict[str, Any]:
+def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
-    povs = settings.povs
+    folder = None if settings.policies is None else str(plan.povs.policies)
     return {
         **asdict(settings),
-        "versions": versions(),
-        "vut_files": settings.vut_factory.files or None,
-        "pov_files": povs.files or None,
-        "net_sha256": net.sha256,
-        "policies_sha256": povs.sha256(),
+        "policies": folder,
+        "versions": dict(plan.versions),
+        "vut_files": plan.vut.files or None,
+        "pov_files": plan.povs.files or None,
+        "net_sha256": plan.road.sha256,
+        "policies_sha256": dict(plan.policies_sha256),
         "learn_from_sha256": hashes(lessons(settings.learn_from, settings.scenario)) or None,
     }
 

@@ -21,8 +21,8 @@ from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.analysis.verdict import Trouble, judge
 from merge_sumo.campaigns.repeats import read_repeats
 from merge_sumo.campaigns.run import SETTINGS, Run, failures, regions_of, spread_failures
+from merge_sumo.engine.plan import plan_key, versions
 from merge_sumo.engine.simulator import road_for
-from merge_sumo.engine.versions import versions
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report_maps import GRID
 from merge_sumo.road.corridor import Corridor
@@ -188,16 +188,16 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
     )
     if not same:
         return None
-    kept = TruthKey(
+    plan = plan_key(
         vut=str(settings.get("vut")),
-        level=level,
-        cases=TRUTH_CASES[level],
-        seed=0,
-        command=settings.get("vut_command"),
+        vut_command=settings.get("vut_command"),
         deadline_s=settings.get("deadline_s", DEADLINE_S),
-        scenario=run.scenario,
-        policies=settings.get("policies_sha256", {}),
         pov=settings.get("pov") if level == OWN else None,
+        policies_sha256=settings.get("policies_sha256", {}),
+        road_sha256=road.sha256,
+        scenario=run.scenario,
         criterion=run.criterion,
+        versions=versions(),
     )
-    return read_truth(kept.path(), level, kept.cases, kept.scenario)
+    kept = TruthKey(plan, level, TRUTH_CASES[level], seed=0)
+    return read_truth(kept.path(), level, kept.cases, run.scenario)

@@ -20,17 +20,15 @@ import json
 import math
 from collections.abc import Callable, Iterable
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.campaign import workers_or_here
-from merge_sumo.campaigns.plan import plan_of
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.evaluate import workers_or_here
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
 from merge_sumo.studies.counterfactuals import CAREFUL, Avoidance, Failure, drive_again
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import read_indexed
@@ -49,8 +47,7 @@ CHUNK: Final = 64
 
 def avoidance(
     run: Run,
-    settings: CampaignSettings,
-    net: Corridor,
+    plan: SimulationPlan,
     *,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
@@ -59,13 +56,12 @@ def avoidance(
     """Return who would have avoided each failure of a campaign, in the order of its cases.
 
     Of more than `MOST` failures, of the worst ones. Failures whose trajectory is lost, and those
-    that end a worker each time, are left out. The POVs are those of `settings`; a POV of the
+    that end a worker each time, are left out. The POVs are those of the plan; a POV of the
     tester's own runs again.
 
     Args:
         run: the campaign.
-        settings: what it was run with.
-        net: the road.
+        plan: how it was run.
         workers: where the failures are driven again, by default in this process.
         check: called whenever a worker is done with some of them; may raise to stop there.
         on_part: told how many failures are done, and how many there are, from 0 on.
@@ -75,8 +71,7 @@ def avoidance(
     if not known:
         return []
     # No code of the VUT: a driver of the package is in its place.
-    log = run.folder.resolve() / LOG
-    plan = plan_of(settings, net, log=log, vut=vut_factory(CAREFUL))
+    plan = replace(plan, vut=vut_factory(CAREFUL)).with_log(run.folder.resolve() / LOG)
     again, failing = partial(drive_again, plan), list(known.items())
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as there:
@@ -104,8 +99,7 @@ def _nothing_known(_: Failure) -> None:
 
 def note_avoidance(
     run: Run,
-    settings: CampaignSettings,
-    net: Corridor,
+    plan: SimulationPlan,
     *,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
@@ -115,7 +109,7 @@ def note_avoidance(
 
     The arguments are those of `avoidance`.
     """
-    found = avoidance(run, settings, net, workers=workers, check=check, on_part=on_part)
+    found = avoidance(run, plan, workers=workers, check=check, on_part=on_part)
     if not found:
         return None
     write_avoidance(run.folder, found)

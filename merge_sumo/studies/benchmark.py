@@ -15,9 +15,9 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from merge_sumo.campaigns.campaign import conduct, workers_or_here
-from merge_sumo.campaigns.settings import check_level
-from merge_sumo.engine.simulator import SimulationPlan, run_cases
+from merge_sumo.campaigns.campaign import conduct
+from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate, workers_or_here
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.coverage_grid import CoverageGrid
@@ -71,7 +71,7 @@ def _search(
     seed: int,
 ) -> Search:
     pool = Pool(levels=levels, scenario=plan.scenario)
-    lines = centre_lines(plan.net)
+    lines = centre_lines(plan.road)
     games = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
     sampler = make_sampler(name, pool, seed, games)
     spent = _Stopwatch()
@@ -79,7 +79,8 @@ def _search(
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
     search = Search([], [], 0.0)
     batch = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-    for ran in conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), cases, batch):
+    run = partial(evaluate, plan, workers=THIS_PROCESS)
+    for ran in conduct(sampler, run, cases, batch):
         search.outcomes.extend(outcome for outcome, _ in ran)
         search.fmc.append(sum(fmc(search.failures(level)) for level in levels))
     return replace(search, sampler_s=spent.seconds)
@@ -160,8 +161,8 @@ def search(
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
     for level in levels:
-        check_level(level, plan.povs)
-    plan = replace(plan, corridors=min(plan.corridors, batch or COMPARED_BATCH))
+        plan.povs.check_level(level)
+    plan = plan.for_cases(batch or COMPARED_BATCH)
     found: dict[int, Search] = {}
     with workers_or_here(workers) as there:
         for place, one in there.run(partial(_searches, plan), tasks, _lost_search, chunk=1):

@@ -28,13 +28,12 @@ import numpy as np
 
 from merge_sumo.campaigns.repeats import spread_places
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
-from merge_sumo.engine.versions import differences
+from merge_sumo.engine.plan import SimulationPlan, differences
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
 from merge_sumo.studies.certificate_blocks import Blocks, block_key
 from merge_sumo.studies.certificate_runs import CheckedCase, RunPoints
 from merge_sumo.studies.lattice import Covering, covering
-from merge_sumo.studies.truth import OnCases, sources_sha256
+from merge_sumo.studies.truth import OnCases
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
 from merge_sumo.system.printable import two_digits
@@ -99,7 +98,7 @@ def certify(
     settings: CampaignSettings,
     radius: float,
     folder: Path,
-    net: Corridor,
+    plan: SimulationPlan,
     run: RunPoints,
     *,
     resume: bool = False,
@@ -115,7 +114,7 @@ def certify(
         settings: VUT, levels and scenario; those of a search decide nothing.
         radius: of the balls, as a share of the axes.
         folder: new; with `resume`, that of a certificate that was stopped.
-        net: the road.
+        plan: how cases run: that of the settings.
         run: runs cases: `runs_points_on`.
         resume: go on with what the folder holds.
         on_cases: told how many cases have ended.
@@ -125,11 +124,11 @@ def certify(
     cases, or a folder to go on with is of another VUT, of other versions, or of other settings.
     """
     lattices = lattices_of(settings, radius)
-    asked = _asked(settings, radius, lattices, net)
+    asked = _asked(settings, radius, lattices, plan)
     if resume:
         files = _again(folder, asked)
     else:
-        files = dict(settings.vut_factory.files or {})
+        files = dict(plan.vut.files or {})
         with new_folder(folder) as new:
             (new / CERTIFICATE).write_bytes(_text(asked | {"files": files, "found": None}))
     places = _places(folder, asked, lattices)
@@ -174,10 +173,13 @@ def lattices_of(settings: CampaignSettings, radius: float) -> dict[int, Covering
 
 
 def _asked(
-    settings: CampaignSettings, radius: float, lattices: Mapping[int, Covering], net: Corridor
+    settings: CampaignSettings,
+    radius: float,
+    lattices: Mapping[int, Covering],
+    plan: SimulationPlan,
 ) -> dict[str, Any]:
     """Return what a certificate is of: all that decides what is in it."""
-    record = record_of(settings, net)
+    record = record_of(settings, plan)
     levels = {
         str(level): {
             "coordinates": [asdict(d) for d in settings.scenario.dimensions(level)],
@@ -192,7 +194,6 @@ def _asked(
         "levels": levels,
         "block": BLOCK,
         "settings": {name: v for name, v in record.items() if name not in OF_A_SEARCH},
-        "sources_sha256": sources_sha256(),
     }
 
 

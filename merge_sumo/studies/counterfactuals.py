@@ -16,10 +16,11 @@ import numpy as np
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.levelk import DECISION_STEPS
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
+from merge_sumo.engine.evaluate import opened_simulator
 from merge_sumo.engine.kinematic_world import EquationWorld
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.pov_library import PovLibrary
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.engine.simulator import SimulationPlan, opened_simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.world import World
@@ -124,7 +125,7 @@ def drive_again(plan: SimulationPlan, failing: Sequence[Failure]) -> list[Avoida
         with opened_simulator(plan) as ground:
             return list(avoidances(Stage(plan, ground.world, ground.pov), failing))
     plan.check_software()
-    world = EquationWorld(CORRIDORS, plan.net, plan.scenario)
+    world = EquationWorld(CORRIDORS, plan.road, plan.scenario)
     with closing(PovLibrary(CORRIDORS * (world.vehicles - 1), plan.povs)) as povs:
         return list(avoidances(Stage(plan, world, povs), failing))
 
@@ -184,7 +185,7 @@ class Stage:
         """Take the plan, the world, and the POVs."""
         self._world, self._povs = world, _Mainline(povs)
         self._substitutes = _Substitutes(world.corridors, plan.scenario.max_steps)
-        self._criterion, self._lines = plan.criterion, centre_lines(plan.net)
+        self._criterion, self._lines = plan.criterion, centre_lines(plan.road)
 
     def takeover(self, failure: Trajectory, until: int) -> _Again:
         """Return the case in which a driver takes over at a step.

@@ -17,13 +17,12 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.analysis.exposure import Distribution, read_distribution
-from merge_sumo.campaigns.campaign import OnCase, workers_or_here
-from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.campaign import OnCase
 from merge_sumo.campaigns.run import Run
-from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
-from merge_sumo.engine.simulator import road_for, runs_on
+from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.studies.importance import (
     DEFENSIVE,
@@ -51,15 +50,14 @@ WRITTEN: Final = 500
 
 def failure_probability(
     run: Run,
+    settings: CampaignSettings,
+    plan: SimulationPlan,
     out: Path,
     *,
     cases: int = DEFAULT_CASES,
     distribution: Path | None = None,
     confidence: float = 0.95,
     seed: int = 0,
-    net: Corridor | None = None,
-    given: Mapping[str, object] | None = None,
-    trust: bool = False,
     workers: Workers | None = None,
     on_case: OnCase | None = None,
 ) -> Estimate:
@@ -68,9 +66,9 @@ def failure_probability(
     Writes the estimate with all that decides it to `out`, and the fresh outcomes, each with its
     weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
 
-    The controller that a folder names runs only where the folder was made here, or with `trust`.
-    What is `given` is taken in the place of what the folder names: policies that are elsewhere, how
-    a VUT is hosted. Cases run on `workers`, by default in this process; the estimate is the same.
+    The settings are those of the campaign, but for policies that are elsewhere and how a VUT is
+    hosted; the plan is theirs. Cases run on `workers`, by default in this process; the estimate is
+    the same.
 
     Raises `UserError` for a distribution or numbers that make no sense, a run whose net or policies
     are not those of today, or files that exist or cannot be written.
@@ -81,9 +79,7 @@ def failure_probability(
         raise UserError(f"--confidence is {confidence}: choose 0.5 or more, and below 1")
     if seed < 0:
         raise UserError(f"--seed is {seed}: it must be 0 or more")
-    settings = settings_of(run.folder, run.settings, given, trust=trust)
-    net = net or road_for(settings.scenario)
-    _same_system(run, record_of(settings, net))
+    _same_system(run, record_of(settings, plan))
     stated = read_distribution(distribution, settings.levels, settings.scenario)
     check_new_file(out)
     lines = out.with_suffix(LINES)
@@ -98,7 +94,7 @@ def failure_probability(
         chance[level] = expected_chance(history, stated.points(level, cells(history.dims)))
     mixture = DefensiveMixture(stated.levels, chance, settings.scenario)
     draws = mixture.draw(cases, np.random.default_rng([seed, STREAM]))
-    outcomes = _run(settings, net, stated, draws, lines, on_case, workers)
+    outcomes = _run(settings, plan, stated, draws, lines, on_case, workers)
     failed = np.array([outcome.failed for outcome in outcomes])
     judged = np.array([outcome.score is not None for outcome in outcomes])
     result = estimate(draws, failed, judged, mixture.bound, confidence)
@@ -107,7 +103,7 @@ def failure_probability(
         "distribution": stated.record(),
         "defensive_share": DEFENSIVE,
         "seed": seed,
-        "campaign": record_of(settings, net),
+        "campaign": record_of(settings, plan),
     }
     write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
     return result
@@ -124,7 +120,7 @@ def _same_system(run: Run, today: Mapping[str, Any]) -> None:
 
 def _run(
     settings: CampaignSettings,
-    net: Corridor,
+    plan: SimulationPlan,
     stated: Distribution,
     draws: Draws,
     lines: Path,
@@ -142,13 +138,12 @@ def _run(
     cases = [by_place[place] for place in range(len(by_place))]
     outcomes: list[Outcome] = []
     with workers_or_here(workers) as there:
-        run = runs_on(there, plan_of(settings, net, cases=len(cases)))
+        plan = plan.for_cases(len(cases))
+        open_simulators(plan, there)
         for first in range(0, len(cases), WRITTEN):
             ran = []
-            for place, done in run(cases[first : first + WRITTEN]):
-                index, case = first + place, cases[first + place]
-                margin = done.margin
-                outcome = Outcome(index, first // WRITTEN, case, done.measures, margin=margin)
+            for place, done in evaluate(plan, cases[first : first + WRITTEN], there):
+                outcome = done.outcome(first + place, first // WRITTEN)
                 ran.append(outcome)
                 if on_case is not None:
                     on_case(outcome)

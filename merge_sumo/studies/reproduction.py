@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import check_level
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.plan import SimulationPlan, versions
 from merge_sumo.engine.povs import Povs
-from merge_sumo.engine.simulator import SimulationPlan
-from merge_sumo.engine.versions import versions
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
@@ -41,7 +40,6 @@ from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import make_folder, replace_own, write_new
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool, to_unit
-from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import LEVELS, US23
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
@@ -224,7 +222,7 @@ def reproduce(
     """
     povs = povs or Povs()
     for level in LEVELS:
-        check_level(level, povs)
+        povs.check_level(level)
     make_folder(folder)
     work = _Work(scale, povs, workers, on_run)
     result = Reproduction(scale, {}, {}, versions())
@@ -247,7 +245,8 @@ class _Work:
 
     def plan(self, vut: str) -> SimulationPlan:
         """Return the plan for a VUT of the paper on its road, by its criterion."""
-        return resolve(vut, scenario=US23, criterion=Criterion(), povs=self.povs)
+        policies = str(self.povs.policies)
+        return resolve(CampaignSettings(vut=vut, levels=(0,), scenario=US23, policies=policies))
 
     def column(self, column: Column) -> ColumnResult:
         """Run one column of the table."""

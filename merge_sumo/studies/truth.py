@@ -8,17 +8,14 @@ import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from numbers import Integral
 from pathlib import Path
-from typing import Final, cast
+from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.campaign import workers_or_here
-from merge_sumo.campaigns.settings import check_level
-from merge_sumo.engine.simulator import SimulationPlan, road_for, run_cases
-from merge_sumo.engine.versions import versions
+from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
@@ -27,12 +24,10 @@ from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.signature import CACHE, signed, user_key, verified
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import OWN, Scenario
 from merge_sumo.values.score import FAILURE_SCORE
 from merge_sumo.vuts.files import Files, changed
-from merge_sumo.vuts.registry import runs_code
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
@@ -79,27 +74,6 @@ class Truth:
         return [group for group in groups if len(group) >= REAL_REGION * len(points)]
 
 
-DECIDES_OUTCOMES: Final = (
-    "values",
-    "road",
-    "sumo",
-    "drivers",
-    "vuts",
-    "engine",
-)
-"""Sources of this package that decide what becomes of a case."""
-
-
-def sources_sha256() -> str:
-    """Return the hash of the sources of this package that decide what becomes of a case."""
-    package = Path(__file__).resolve().parents[1]
-    sources = hashlib.sha256()
-    for part in DECIDES_OUTCOMES:
-        for source in sorted((package / part).rglob("*.py")):
-            sources.update(source.read_bytes())
-    return sources.hexdigest()
-
-
 OnCases = Callable[[int], None]
 """Told how many cases have just ended."""
 
@@ -118,11 +92,12 @@ def ground_truth(
 
     Memory grows by 40 bytes a case and no more, whatever the number of cases.
 
-    The cache's key is a hash of what was asked for and of what is ours to know: VUT, cases, seed,
-    criterion, net, policies, versions, and the sources that decide outcomes. What the VUT itself
-    loaded while it drove is kept with the truth, and a truth is only used while those files are the
-    same. It is signed: what somebody else has put into the cache is not believed. Cases run on
-    `workers`, by default in this process.
+    The cache's key is a hash of level, cases, seed and of what decides outcomes by the plan, with
+    the versions of the software: after a change in the sources of this package that gives it no
+    other version, the cache is to be removed. What the VUT itself loaded while it drove is kept
+    with the truth, and a truth is only used while those files are the same. It is signed: what
+    somebody else has put into the cache is not believed. Cases run on `workers`, by default in
+    this process.
 
     Raises `UserError` where nothing can be kept in the cache, or others can write it.
     """
@@ -130,27 +105,28 @@ def ground_truth(
     for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
         if not isinstance(number, Integral) or number < least:
             raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
-    plan = _at_level(plan, level)
-    path = _path(plan, level, count, seed, cache)
-    scenario = plan.scenario
-    found = read_truth(path, level, count, scenario)
+    plan.povs.check_level(level)
+    path = TruthKey(plan.key(level), level, count, seed).path(cache)
+    pool = Pool(levels=(level,), scenario=plan.scenario)
+    found = read_truth(path, level, count, plan.scenario)
     if found is not None:
         return found
     check_place(path.parent, CACHE)
     check_own(path)
     key = user_key()
-    points = np.random.default_rng([seed, level]).random((count, len(scenario.dimensions(level))))
+    dims = len(plan.scenario.dimensions(level))
+    points = np.random.default_rng([seed, level]).random((count, dims))
     scores = np.full(count, np.nan)
+    if level != OWN:  # no case meets it
+        plan = replace(plan, povs=replace(plan.povs, own=None))
     files = (plan.vut.files or {}) | plan.povs.files
-    with workers_or_here(workers) as there:
-        rows = cast("Sequence[FloatArray]", points)
-        scored = there.run(partial(_scores, plan, level), rows, lambda _: (np.nan, {}))
-        for ended, (place, (score, loaded)) in enumerate(scored, start=1):
-            scores[place] = score
-            for name, sha256 in loaded.items():
-                files.setdefault(name, sha256)
-            if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
-                on_cases((ended - 1) % PROGRESS_CASES + 1)
+    scored = evaluate(plan, CasesAt(pool, level, points), workers, _scores)
+    for ended, (place, (score, loaded)) in enumerate(scored, start=1):
+        scores[place] = score
+        for name, sha256 in loaded.items():
+            files.setdefault(name, sha256)
+        if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
+            on_cases((ended - 1) % PROGRESS_CASES + 1)
     truth = Truth(points, scores)
     arrays = io.BytesIO()
     np.savez(
@@ -169,65 +145,29 @@ def known_truth(
     plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
     """Return what `ground_truth` would find in the cache; None where it would have to run cases."""
-    path = _path(_at_level(plan, level), level, cases, seed, cache)
+    path = TruthKey(plan.key(level), level, cases, seed).path(cache)
     return read_truth(path, level, cases, plan.scenario)
 
 
-def _at_level(plan: SimulationPlan, level: int) -> SimulationPlan:
-    """Return a plan without the drivers that no case of a level meets."""
-    check_level(level, plan.povs)
-    return plan if level == OWN else replace(plan, povs=replace(plan.povs, own=None))
-
-
-def _path(plan: SimulationPlan, level: int, cases: int, seed: int, cache: Path | None) -> Path:
-    """Return the file of the cache for the truth of a plan."""
-    own, options = plan.povs.own, plan.vut.options
-    kept = TruthKey(
-        vut=plan.vut.spec,
-        level=level,
-        cases=cases,
-        seed=seed,
-        command=options.command,
-        deadline_s=options.deadline_s,
-        scenario=plan.scenario,
-        policies=plan.povs.sha256(),
-        pov=None if own is None else own.spec,
-        criterion=plan.criterion,
-    )
-    return kept.path(cache)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class TruthKey:
     """What a truth in the cache is of; nothing of the VUT is loaded to look for it.
 
-    Of the learned drivers the hashes count, and not where they are.
+    Attributes:
+        plan: what decides the outcomes: `SimulationPlan.key` for the level.
+        level: level of the POV.
+        cases: number of cases.
+        seed: seed of their points.
     """
 
-    vut: str
+    plan: Mapping[str, Any]
     level: int
     cases: int
     seed: int
-    command: str | None
-    deadline_s: float
-    scenario: Scenario
-    policies: Mapping[str, str]
-    pov: str | None
-    criterion: Criterion
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
-        # The same name may be another file in another folder.
-        code = runs_code(self.vut, self.command) or (self.pov and runs_code(self.pov, None))
-        here = str(Path.cwd()) if code else None
-        depends = {
-            **asdict(self),
-            "here": here,
-            "versions": versions(),
-            "sources": sources_sha256(),
-            "net": road_for(self.scenario).sha256,
-        }
-        key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:24]
+        key = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
         return (cache or cache_folder()) / f"truth-{key}.npz"
 
 
@@ -271,10 +211,8 @@ def _signed_content(path: Path, most_bytes: int) -> bytes | None:
         return None
 
 
-def _scores(
-    plan: SimulationPlan, level: int, points: Sequence[FloatArray]
-) -> Sequence[tuple[float, Files]]:
-    pool = Pool(levels=(level,), scenario=plan.scenario)
-    ran = run_cases(plan, pool.cases(np.asarray(points), level))
-    scores = [np.nan if done.score is None else done.score for done in ran]
-    return [(score, done.files | done.pov_files) for score, done in zip(scores, ran, strict=True)]
+def _scores(results: Sequence[CaseResult]) -> list[tuple[float, Files]]:
+    """Return the score of each case, NaN without a verdict, and the files that were loaded."""
+    outcomes = [result.outcome(0) for result in results]
+    scores = [np.nan if outcome.score is None else outcome.score for outcome in outcomes]
+    return [(s, r.files | r.pov_files) for s, r in zip(scores, results, strict=True)]

@@ -14,18 +14,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import partial
-from pathlib import Path
+from operator import itemgetter
 from typing import Any, Final
 
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import counted, judge
-from merge_sumo.campaigns.campaign import workers_or_here
-from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.repeats import cause
 from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
-from merge_sumo.engine.simulator import road_for, run_cases, runs_on
-from merge_sumo.engine.versions import versions
+from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
+from merge_sumo.engine.plan import SimulationPlan, versions
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.system.workers import Workers
@@ -483,19 +483,19 @@ def _run_again(
     checked = sorted(scored, key=lambda o: (o.score, o.index))[:CHECKED]
     cases = [o.case for o in (*checked, *telling)]
     settings = settings_of(run.folder, run.settings, given, trust=trust)
-    results = run_cases(plan_of(settings, net, cases=len(cases)), cases)
-    for before, now in zip(checked, results, strict=False):
+    plan = resolve(settings, net.path).for_cases(len(cases))
+    results = [result for _, result in sorted(evaluate(plan, cases), key=itemgetter(0))]
+    for before, result in zip(checked, results, strict=False):
+        now = result.outcome(before.index)
         if before.score is None or now.score is None or abs(before.score - now.score) > SAME_SCORE:
             return _RunAgain(
                 "could not be run: its VUT or its POV does not do again what case "
                 f"{before.index} records"
             )
     again = _RunAgain("was run again")
-    for other, now in zip(telling, results[len(checked) :], strict=True):
-        on_motion(other.index, now.trajectory)
-        again.outcomes[other.index] = Outcome(
-            other.index, 0, other.case, now.measures, margin=now.margin
-        )
+    for other, result in zip(telling, results[len(checked) :], strict=True):
+        on_motion(other.index, result.trajectory)
+        again.outcomes[other.index] = result.outcome(other.index)
     return again
 
 
@@ -617,9 +617,9 @@ def settings_today(
 def rerun(
     run: Run,
     settings: CampaignSettings,
+    plan: SimulationPlan,
     indices: Sequence[int] = (),
     *,
-    net: Path | None = None,
     workers: Workers | None = None,
     on_case: Callable[[int], None] = lambda _: None,
 ) -> Rerun:
@@ -628,8 +628,8 @@ def rerun(
     Args:
         run: the campaign.
         settings: how: `settings_today`.
+        plan: how they run: that of the settings, on the net of the campaign.
         indices: its cases; all of them when left out.
-        net: net for that; must be the one of the campaign.
         workers: where the cases run, by default in this process.
         on_case: told how many cases have just ended.
 
@@ -640,13 +640,13 @@ def rerun(
     before = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
     if not before:
         raise UserError(f"{run.folder} has no case yet")
-    road = road_for(settings.scenario, net)
+    road = plan.road
     if run.settings.get("net_sha256", road.sha256) != road.sha256:
         raise UserError(
             f"{run.folder} was run on another net than {road.path}: give that with --net"
         )
     levels = sorted({outcome.case.level for outcome in before})
-    today = record_of(settings, road)
+    today = record_of(settings, plan)
     for level in levels:
         if not same_pov(run.settings, today, level):
             raise UserError(
@@ -656,12 +656,11 @@ def rerun(
     # In another order than the campaign's, which a VUT that remembers would repeat.
     order, by_index = before[::-1], dict[int, Outcome]()
     with workers_or_here(workers) as processes:
-        run_all = runs_on(processes, plan_of(settings, road, cases=len(before)))
-        for place, now in run_all([outcome.case for outcome in order]):
+        plan = plan.for_cases(len(before))
+        open_simulators(plan, processes)
+        for place, now in evaluate(plan, [outcome.case for outcome in order], processes):
             old = order[place]
-            by_index[old.index] = Outcome(
-                old.index, old.batch, old.case, now.measures, margin=now.margin
-            )
+            by_index[old.index] = now.outcome(old.index, old.batch)
             on_case(1)
     after = [by_index[outcome.index] for outcome in before]
     cases = [

@@ -11,15 +11,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
-from merge_sumo.engine.simulator import SimulationPlan, Simulator
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.in_memory import is_here
-from merge_sumo.vuts.registry import VutFactory, waits_for_client
+from merge_sumo.vuts.registry import waits_for_client
 
 CORRIDORS: Final = 4
 CASES: Final = tuple(
@@ -48,9 +47,10 @@ class VutCheck:
     us_per_step_worst: float
 
 
-def check_vut(factory: VutFactory) -> VutCheck:
-    """Let a VUT drive a few cases, some of them again, and one from a stand."""
-    with _plan(factory, CORRIDORS).open() as ground:
+def check_vut(plan: SimulationPlan) -> VutCheck:
+    """Let the VUT of a plan drive a few cases, some of them again, and one from a stand."""
+    plan = plan.for_cases(CORRIDORS)
+    with Simulator(plan) as ground:
         timed = ground.vut = _Timed(ground.vut)
         first = _run(ground, CASES)
         problems, differing = _errors(CASES, first), list[_Difference]()
@@ -74,18 +74,13 @@ def check_vut(factory: VutFactory) -> VutCheck:
         problems += [
             f"After {d.when} it drives differently from t = {d.at_s:g} s on." for d in differing
         ]
-        problems.append(_why(factory, differing[0]))
+        problems.append(_why(plan, differing[0]))
     return VutCheck(
         problems=problems,
         notes=notes,
         us_per_step_median=statistics.median(timed.us_per_step),
         us_per_step_worst=max(timed.us_per_step),
     )
-
-
-def _plan(factory: VutFactory, corridors: int) -> SimulationPlan:
-    scenario = CASES[0].scenario
-    return resolve(factory, scenario=scenario, criterion=Criterion(), corridors=corridors)
 
 
 class _Timed(Driver):
@@ -178,18 +173,18 @@ def _differences(
     return []
 
 
-def _why(factory: VutFactory, found: _Difference) -> str:
+def _why(plan: SimulationPlan, found: _Difference) -> str:
     """Return why a VUT drives differently; a case that runs first, twice, tells it."""
-    options = factory.options
-    goes_on = waits_for_client(factory.spec, options.command)
-    if options.in_process or is_here(factory.spec) or goes_on:
+    options, spec = plan.vut.options, plan.vut.spec
+    goes_on = waits_for_client(spec, options.command)
+    if options.in_process or is_here(spec) or goes_on:
         return (
             "It draws random numbers, reads a clock, or keeps something from earlier episodes, "
             "perhaps in its module or its class."
         )
     motions = []
     for _ in range(2):
-        with _plan(factory, 1).open() as ground:
+        with Simulator(plan.for_cases(1)) as ground:
             motions.append(_run(ground, [found.case])[0].motion)
     if not np.array_equal(motions[0], motions[1]):
         return (

@@ -45,8 +45,6 @@ POOL_THREADS: Final = 4
 WORKER_THREADS: Final = 4
 """Those of a worker and of the process of a VUT, besides one for each core in NumPy."""
 DASK_TIMEOUT_S: Final = 30.0
-LOADED: Final = "merge_sumo.engine.simulator"
-"""What a local worker is there for: loaded before it is asked to, and by its name alone."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -105,10 +103,14 @@ class Workers:
 
         Raises what `function` raises, and `UserError` when the executor goes away.
         """
-        size = chunk or max(1, min(MAX_CHUNK, math.ceil(len(items) / self.count)))
+        size = chunk or self.chunk_size(len(items))
         chunks = (items[first : first + size] for first in range(0, len(items), size))
         for first, results in self.run_chunks(function, chunks, lost, ran_again=ran_again):
             yield from enumerate(results, start=first)
+
+    def chunk_size(self, items: int) -> int:
+        """Return how many of so many items a worker takes at a time."""
+        return max(1, min(MAX_CHUNK, math.ceil(items / self.count)))
 
     def run_chunks(
         self,
@@ -230,10 +232,13 @@ def workers_or_cores(workers: int | None) -> int:
     return workers or os.cpu_count() or 1
 
 
-def open_workers(workers: int | None = None, dask: str | None = None) -> Workers:
+def open_workers(
+    workers: int | None = None, dask: str | None = None, *, preload: str | None = None
+) -> Workers:
     """Return the workers of a cluster at the address `dask`, or else local ones.
 
-    One local worker is this process itself; more are processes of their own. None is one a core.
+    One local worker is this process itself; more are processes of their own, which import the
+    module `preload` as they start. None is one a core.
     """
     if dask is not None:
         return dask_workers(dask)
@@ -241,7 +246,7 @@ def open_workers(workers: int | None = None, dask: str | None = None) -> Workers
     if count == 1:
         return Workers(InProcess, 1)
     check_threads(POOL_THREADS + count * ((os.cpu_count() or 1) + WORKER_THREADS))
-    return Workers(lambda: LocalProcesses(count), count, recycle_after=RECYCLE_AFTER)
+    return Workers(lambda: LocalProcesses(count, preload), count, recycle_after=RECYCLE_AFTER)
 
 
 def dask_workers(address: str) -> Workers:
@@ -289,10 +294,11 @@ class LocalProcesses(ProcessPoolExecutor):
     They are spawned, because libsumo's simulation must not be forked.
     """
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int, preload: str | None = None) -> None:
         """Start a number of workers; they get ready while this process does."""
+        spawn = multiprocessing.get_context("spawn")
         with without_cwd():  # its locks have a process of their own
-            super().__init__(workers, multiprocessing.get_context("spawn"), _begin_worker)
+            super().__init__(workers, spawn, _begin_worker, (preload,))
         self.submit(int)  # with the first task they start
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -325,7 +331,7 @@ def end_worker() -> None:
         _endings.pop()()
 
 
-def _begin_worker() -> None:
+def _begin_worker(preload: str | None) -> None:
     """Set up a worker process."""
     forget_safe_path()
     from threadpoolctl import threadpool_limits
@@ -335,7 +341,8 @@ def _begin_worker() -> None:
     multiprocessing.util.Finalize(None, end_worker, exitpriority=100)
     # As many threads as workers keep all cores busy.
     threadpool_limits(1)
-    import_module(LOADED)
+    if preload is not None:
+        import_module(preload)
 
 
 def leave_signals_to_parent() -> None:

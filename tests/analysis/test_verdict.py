@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from calling import invoke
+from campaigning import resume_campaign, run_campaign
 from handmade import write_run
 from lxml import etree
 from typer.testing import Result
@@ -18,7 +19,6 @@ from typer.testing import Result
 import merge_sumo as ms
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
 from merge_sumo.analysis.verdict import Gate, judge, parse_gates
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.run import Run, failures, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError

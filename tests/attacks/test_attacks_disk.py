@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 from attacks import World, tell
+from campaigning import run_campaign
 from conftest import require
 from plans import plan_for
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError

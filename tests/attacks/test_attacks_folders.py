@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 from attacks import tell
+from campaigning import resume_campaign, run_campaign
 
 from merge_sumo.campaigns import journal
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.ownership import note_run
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.settings import CampaignSettings

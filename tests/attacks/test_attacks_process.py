@@ -11,10 +11,10 @@ from collections import Counter
 
 import pytest
 from attacks import World, tell
+from campaigning import run_campaign
 from test_workers import cluster, workers_at
 
 import merge_sumo as ms
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.system.workers import dask_workers

@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from campaigning import run_campaign
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import (
     OUTCOMES,
     SETTINGS,
@@ -203,10 +204,9 @@ class TestACampaign:
         assert Run(folder).whole_batches() in (0, 4)
 
     def test_as_it_was_written_is_read(self, run):
-        road = road_of()
         values = settings_of(run.folder, run.settings)
         assert isinstance(values, CampaignSettings)
-        assert json.loads(json.dumps(record_of(values, road))) == run.settings
+        assert json.loads(json.dumps(record_of(values, resolve(values)))) == run.settings
 
 
 class TestPolicies:

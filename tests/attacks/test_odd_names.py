@@ -10,14 +10,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from campaigning import run_campaign
 from conftest import some
 from handmade import write_run
 from plans import plan_for
 
 from merge_sumo.campaigns import campaign as conductor
-from merge_sumo.campaigns.campaign import export_case, run_campaign
+from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.progress import Bars
 from merge_sumo.reports.report import write_report
@@ -168,7 +170,7 @@ class TestSumo:
     ):
         (tmp_path / name).mkdir()
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
-        with plan_for("design1", corridors=1).open():
+        with Simulator(plan_for("design1", corridors=1)):
             pass
         assert list((tmp_path / name).iterdir()) == []
 
@@ -181,12 +183,12 @@ class TestSumo:
         (tmp_path / name).mkdir()
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
         with pytest.raises(UserError, match="set TMPDIR to one without"):
-            plan_for("design1", corridors=1).open()
+            Simulator(plan_for("design1", corridors=1))
 
     def test_says_so_where_there_is_no_folder_for_temporary_files(self, tmp_path, monkeypatch):
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))
         with pytest.raises(UserError, match="set TMPDIR to a folder"):
-            plan_for("design1", corridors=1).open()
+            Simulator(plan_for("design1", corridors=1))
 
 
 SIZES = [3990, 4000, *range(4004, 4016), 4030, 4060, 4090, 4095, 4096]
@@ -200,7 +202,7 @@ def test_a_path_works_or_is_too_long_before_the_first_case(tmp_path, monkeypatch
     left = size - len(os.fsencode(folder)) - 2
     folder = folder / ("r" * (left // 2)) / ("r" * (left - left // 2))
     assert len(os.fsencode(folder)) == size
-    monkeypatch.setattr(conductor, "runs_on", lambda *_: 1 / 0)
+    monkeypatch.setattr(conductor, "open_simulators", lambda *_: 1 / 0)
     settings = CampaignSettings(vut="design1", levels=(0,), cases=99_999)
     with pytest.raises((UserError, ZeroDivisionError)) as error:
         run_campaign(settings, folder)

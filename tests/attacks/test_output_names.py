@@ -12,6 +12,7 @@ from unicodedata import category
 
 import numpy as np
 import pytest
+from campaigning import resume_campaign
 from handmade import write_run
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
@@ -19,9 +20,11 @@ from typer.testing import CliRunner
 import merge_sumo as ms
 from merge_sumo import cli
 from merge_sumo.campaigns import campaign as conductor
-from merge_sumo.campaigns.campaign import SCENARIOS, case_name, resume_campaign
+from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures, read_settings
+from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.reports.report import REPORT, write_report
@@ -146,7 +149,7 @@ def no_cases(monkeypatch) -> None:
             yield from ()
 
     stop = Stop()
-    monkeypatch.setattr(conductor, "runs_on", lambda *_: stop)
+    monkeypatch.setattr(conductor, "open_simulators", lambda *_: stop)
     monkeypatch.setattr(reproduction._Work, "column", stop)
 
 
@@ -297,7 +300,7 @@ class TestANameOfNothing:
             folders.check_new(Path(name))
 
     def test_is_refused_before_the_vut_is_opened(self, world, guarded, monkeypatch):
-        monkeypatch.setattr(conductor, "runs_on", lambda *_: 1 / 0)
+        monkeypatch.setattr(conductor, "open_simulators", lambda *_: 1 / 0)
         for name in NAMELESS:
             with pytest.raises(UserError, match="--out is"):
                 ms.campaign("design1", level=0, cases=2, out=name)
@@ -404,7 +407,7 @@ def moved_behind_a_link(path: Path, elsewhere: Path) -> None:
 class TestAReceivedFolder:
     @pytest.mark.parametrize("name", [SETTINGS, OUTCOMES, TRAJECTORIES, SCENARIOS])
     def test_with_a_link_is_not_gone_on_with(self, received, tmp_path, name, monkeypatch):
-        monkeypatch.setattr(conductor, "runs_on", lambda *_: 1 / 0)
+        monkeypatch.setattr(conductor, "open_simulators", lambda *_: 1 / 0)
         cut_to_one_batch(received)
         moved_behind_a_link(received / name, tmp_path / "ours")
         before = tree(tmp_path)
@@ -416,7 +419,7 @@ class TestAReceivedFolder:
     def test_with_a_link_among_its_trajectories_is_not_gone_on_with(
         self, received, tmp_path, monkeypatch, target
     ):
-        monkeypatch.setattr(conductor, "runs_on", lambda *_: 1 / 0)
+        monkeypatch.setattr(conductor, "open_simulators", lambda *_: 1 / 0)
         cut_to_one_batch(received)
         (received / TRAJECTORIES / "00002.npz").unlink()
         (received / TRAJECTORIES / "00002.npz").symlink_to(target)
@@ -468,8 +471,10 @@ class TestAReceivedFolder:
         monkeypatch.setattr(probability, "_run", lambda *_: 1 / 0)
         (received / name).symlink_to("../ours/new")
         before = tree(tmp_path)
+        run, out = Run(received), received / probability.RESULT
+        plan = resolve(today := settings_of(received, run.settings))
         with pytest.raises(UserError, match=f"{name} exists"):
-            probability.failure_probability(Run(received), received / probability.RESULT, cases=4)
+            probability.failure_probability(run, today, plan, out, cases=4)
         assert tree(tmp_path) == before
 
     def test_keeps_a_folder_of_somebodys_in_the_place_of_a_scenario(self, received, tmp_path):

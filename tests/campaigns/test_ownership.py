@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from campaigning import resume_campaign, run_campaign
 from conftest import some
 
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.run import CHECKSUM, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings

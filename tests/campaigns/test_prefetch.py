@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from campaigning import resume_campaign, run_campaign
 from test_journal import contents, episode
 
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.prefetch import Ahead, proposals
+from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
@@ -92,18 +92,13 @@ def test_who_learns_is_not_foreseen(name):
 def test_batches_that_ended_together_are_kept_together():
     workers = Workers(InProcess, 1)
 
-    class Stub:
-        def __init__(self):
-            self.workers = workers
+    def run(chunks):
+        return workers.run_chunks(lambda items: [f"ran {item}" for item in items], chunks, str)
 
-        def chunks(self, chunks):
-            return workers.run_chunks(lambda items: [f"ran {item}" for item in items], chunks, str)
-
-    run: Any = Stub()
     batches: list[Any] = [[f"case {batch}.{place}" for place in range(20)] for batch in range(5)]
-    with Ahead(run, iter(batches)) as ahead:
-        ran: Any = ([done for _, done in ahead(batch)] for batch in batches)
-        together: list[Any] = list(ahead.together(ran))
+    with Prefetch(run, 1, iter(batches)) as prefetch:
+        ran: Any = ([done for _, done in prefetch.run(batch)] for batch in batches)
+        together: list[Any] = list(prefetch.together(ran))
     assert [batch for group in together for batch in group] == [
         [f"ran {case}" for case in batch] for batch in batches
     ]

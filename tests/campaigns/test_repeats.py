@@ -6,12 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
+from campaigning import resume_campaign, run_campaign
 from conftest import some
 from typer.testing import CliRunner
 
 import merge_sumo as ms
 from merge_sumo import cli
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.repeats import (
     REPEATS,
     Repeat,
@@ -22,7 +23,6 @@ from merge_sumo.campaigns.repeats import (
 )
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.studies.certificate import certify
@@ -171,7 +171,7 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, n
     checked = CliRunner().invoke(cli.app, ["check-vut", spec])
     assert checked.exit_code == 1
     assert "It keeps something from earlier episodes" in checked.stdout
-    again = rerun(run, settings_today(run, trust=True))
+    again = rerun(run, today := settings_today(run, trust=True), resolve(today))
     assert again.unrepeated
     assert "no file of the VUT has changed" in str(again)
 
@@ -195,10 +195,10 @@ def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path)
 
 def test_a_certificate_of_what_remembers_is_none(vut, tmp_path):
     settings = CampaignSettings(vut=vut(IN_ITS_CLASS), levels=(0,))
-    net = road_for(settings.scenario)
+    plan = resolve(settings)
     with open_workers(1) as there:
-        run = runs_points_on(there, settings, net, tmp_path)
-        done = certify(settings, 0.08, tmp_path / "certificate", net, run)
+        run = runs_points_on(there, settings, plan, tmp_path)
+        done = certify(settings, 0.08, tmp_path / "certificate", plan, run)
     assert done.levels[0].otherwise > 0
     assert not done.certain
     assert "nothing is certain" in done.sentence

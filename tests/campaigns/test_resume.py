@@ -16,16 +16,17 @@ from pathlib import Path
 
 import pytest
 from calling import contents
+from campaigning import resume_campaign, run_campaign
 from conftest import some
 from processes import wait_for
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.campaign import SCENARIOS, resume_campaign, run_campaign
+from merge_sumo.campaigns.campaign import SCENARIOS
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.versions import differences
+from merge_sumo.engine.plan import differences
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system import folders, interrupt
@@ -139,7 +140,7 @@ class TestResuming:
     def test_tells_what_ran_before_apart(self, folder):
         before: list = []
         after: list = []
-        resume_campaign(folder, None, after.append, on_before=before.append)
+        resume_campaign(folder, on_case=after.append, on_before=before.append)
         assert [len(before), len(after)] == [2 * BATCH, 28 - 2 * BATCH]
 
     def test_of_a_finished_campaign_changes_nothing(self, whole):

@@ -7,8 +7,8 @@ import math
 from typing import Any
 
 import pytest
+from campaigning import run_campaign
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import PATIENCE, StoppingRule, covered_balls, gained
 from merge_sumo.errors import UserError

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import typer
+from campaigning import run_campaign
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -29,6 +29,7 @@ from merge_sumo.drivers.safety_models import (
     ttc_s,
 )
 from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S, US23, Scenario
@@ -323,7 +324,7 @@ def test_only_the_blind_driver_collides_where_both_are_due_at_the_same_time(name
     due_s = level0_time_to(one(182), one(18))[0]
     speeds = np.arange(25.0, 35.5, 2.0)
     cases = [Case(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v) for v in speeds.tolist()]
-    with plan_for(name, corridors=6).open() as ground:
+    with Simulator(plan_for(name, corridors=6)) as ground:
         gaps = [abs(ran.x_pov_m[-1] - ran.x_vut_m[-1]) for _, ran in ground.run(cases)]
         assert len(gaps) == len(cases)
     collides = [gap < 6.0 for gap in gaps]

@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from campaigning import run_campaign
 from conftest import some
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError

@@ -14,6 +14,7 @@ from plans import plan_for
 from test_score import CASE, ending
 
 from merge_sumo.drivers.following import keep_behind_vut
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import Criterion
@@ -90,7 +91,7 @@ def run(vut, scenario):
     """Return the trajectories of the cases in a scenario."""
     cases = [replace(case, scenario=scenario) for case in CASES]
     factory = vut_factory(vut, VutOptions(in_process=True))
-    with plan_for(factory, scenario=scenario, corridors=5).open() as ground:
+    with Simulator(plan_for(factory, scenario=scenario, corridors=5)) as ground:
         return dict(ground.run(cases))
 
 

@@ -14,17 +14,18 @@ from typing import Any
 import numpy as np
 import pytest
 import safetensors.numpy
+from campaigning import resume_campaign, run_campaign
 from numpy.typing import NDArray
 from plans import key_of, plan_for
 
 import merge_sumo as ms
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES
 from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_of
+from merge_sumo.engine.evaluate import open_simulators
 from merge_sumo.engine.povs import Povs
-from merge_sumo.engine.simulator import runs_on
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.workers import open_workers
@@ -363,7 +364,7 @@ class TestAFolder:
         plan = plan_for("design1", corridors=2, povs=Povs(policies=folder))
         shutil.rmtree(folder)
         with open_workers(1) as workers, pytest.raises(UserError, match="put the same files there"):
-            runs_on(workers, plan)
+            open_simulators(plan, workers)
 
     def test_of_the_name_of_a_scenario_is_its_shipped_one(self, tmp_path, same, monkeypatch):
         shipped = Path(shutil.copytree(same, tmp_path / "shipped"))
@@ -374,7 +375,8 @@ class TestAFolder:
         for name in ("us23", "without", "..", ".", "", "/", "../shipped/my-ring", "my-ring/"):
             assert policies_of(Scenario(name=name)) == shipped
         ring = CampaignSettings(vut="level1", levels=(1,), scenario=Scenario(name="my-ring"))
-        assert ring.povs.policies == shipped / "my-ring"
-        assert ring.vut_factory.options.policies == shipped / "my-ring"
-        assert CampaignSettings(vut="level1", levels=(1,)).povs.policies == shipped
+        plan = resolve(ring)
+        assert plan.povs.policies == shipped / "my-ring"
+        assert plan.vut.options.policies == shipped / "my-ring"
+        assert resolve(CampaignSettings(vut="level1", levels=(1,))).povs.policies == shipped
         assert US23.name == "us23"

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from campaigning import resume_campaign, run_campaign
 from conftest import some
 from misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS
 from plans import plan_for
@@ -21,12 +22,12 @@ from processes import none_left
 from vut_contract import cases_of, factory
 
 import merge_sumo as ms
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.engine.pov_adapter import PovAdapter
 from merge_sumo.engine.povs import Povs, own_pov
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
@@ -96,7 +97,9 @@ def run(
     """Return what became of every case against a POV of one's own."""
     povs = Povs(own=None if spec is None else own_pov(spec, VutOptions(**options)))
     scenario = cases[0].scenario
-    with plan_for(factory(vut), scenario=scenario, povs=povs, corridors=corridors).open() as ground:
+    with Simulator(
+        plan_for(factory(vut), scenario=scenario, povs=povs, corridors=corridors)
+    ) as ground:
         found = dict(ground.run(cases))
     return [found[place] for place in range(len(cases))]
 
@@ -196,7 +199,7 @@ class TestAPov:
         spec = pov(YIELDS)
         hosted = run(spec, own(cases_of(6)), vut=spec)
         povs = Povs(own=own_pov(spec, VutOptions(in_process=True)))
-        with plan_for(factory(spec, in_process=True), povs=povs, corridors=4).open() as ground:
+        with Simulator(plan_for(factory(spec, in_process=True), povs=povs, corridors=4)) as ground:
             found = dict(ground.run(own(cases_of(6))))
         assert same(hosted, [found[k] for k in range(6)])
         assert any(trajectory.a_pov_mps2.min() == -1.0 for trajectory in hosted)

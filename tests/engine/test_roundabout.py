@@ -17,11 +17,11 @@ import make_scenarios
 import numpy as np
 import pytest
 from calling import invoke
+from campaigning import run_campaign
 from lxml import etree
 from plans import plan_for
 
 from merge_sumo.analysis.diagnosis import Kind, diagnose
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -36,7 +36,7 @@ from merge_sumo.drivers.policies import (
     scenario_of,
 )
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.engine.simulator import Simulator, road_for
 from merge_sumo.reports.report import write_report
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.sumo.world import World
@@ -201,7 +201,7 @@ class TestItsVut:
     )
     def test_fails_only_against_drivers_who_react(self, level, count, bounds, kinds):
         cases = uniform_cases(count, level, seed=1)
-        with plan_for("roundabout", scenario=ROUNDABOUT).open() as ground:
+        with Simulator(plan_for("roundabout", scenario=ROUNDABOUT)) as ground:
             failing = [
                 trajectory for _, trajectory in ground.run(cases) if measure(trajectory).is_close
             ]

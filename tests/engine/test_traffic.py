@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from campaigning import run_campaign
 from plans import plan_for
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.engine.simulator import Simulator, road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.binding import load_libsumo
@@ -43,7 +43,7 @@ def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) ->
 
 def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
     factory = vut_factory(vut, VutOptions(**options))
-    with plan_for(factory, scenario=cases[0].scenario, corridors=corridors).open() as ground:
+    with Simulator(plan_for(factory, scenario=cases[0].scenario, corridors=corridors)) as ground:
         ran = dict(ground.run(cases))
     return [ran[place] for place in range(len(cases))]
 

@@ -13,13 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from campaigning import run_campaign
 from conftest import require, some
 from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.analysis import diagnosis
 from merge_sumo.analysis.coordinates import WRITTEN
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.reports import report

@@ -13,10 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from campaigning import run_campaign
 from conftest import some
 from test_browser import browser, shown  # noqa: F401 (a fixture)
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.reports.motion import verdict_of

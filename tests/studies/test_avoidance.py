@@ -11,17 +11,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from campaigning import run_campaign
 from plans import plan_for
 
 import merge_sumo as ms
-from merge_sumo.campaigns.campaign import run_campaign
-from merge_sumo.campaigns.plan import plan_of
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
+from merge_sumo.engine.evaluate import opened_simulator
 from merge_sumo.engine.povs import Povs, own_pov
-from merge_sumo.engine.simulator import opened_simulator, road_for
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
@@ -34,7 +34,7 @@ from merge_sumo.studies.avoidance import (
 )
 from merge_sumo.studies.counterfactuals import Avoidance, Stage, avoidances, drive_again
 from merge_sumo.system.workers import InProcess, Workers, open_workers
-from merge_sumo.values.scenario import OWN, US23
+from merge_sumo.values.scenario import OWN
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import vut_factory
 
@@ -43,7 +43,7 @@ LONG = pytest.mark.long
 
 def avoidance_of(run, workers=None, **other):
     settings = settings_of(run.folder, run.settings, trust=True)
-    return avoidance(run, settings, road_for(US23), workers=workers, **other)
+    return avoidance(run, resolve(settings), workers=workers, **other)
 
 
 @pytest.fixture(scope="module")
@@ -142,11 +142,10 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_le
     if "follow_up_s" in settings:
         scenario = replace(scenario, follow_up_s=settings.pop("follow_up_s"))
     settings = CampaignSettings(vut=vut, scenario=scenario, batch=20, seed=1, **settings)
-    net = road_for(scenario)
-    run = run_campaign(settings, tmp_path / "run", net)
+    run = run_campaign(settings, tmp_path / "run")
     failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
     assert len(failing) >= at_least
-    plan = plan_of(settings, net, vut=vut_factory("careful"))
+    plan = replace(resolve(settings), vut=vut_factory("careful"))
     with opened_simulator(plan) as ground:
         in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
     assert drive_again(plan, failing) == in_sumo

@@ -15,24 +15,26 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies import certificate
-from merge_sumo.studies.certificate import CERTIFICATE, certify, lattices_of
+from merge_sumo.studies.certificate import CERTIFICATE, lattices_of
 from merge_sumo.studies.certificate_runs import CheckedCase
 from merge_sumo.studies.lattice import Covering, covering
 from merge_sumo.system.signature import signed, user_key, verified
-from merge_sumo.values.scenario import US23
 
-ROAD = road_for(US23)
 LOW, HIGH = np.array([-340.0, 25.0, 0.0]), np.array([-180.0, 35.0, math.pi / 2])
 """The pool of the paper, written down again: nothing here asks the lattice or the pool."""
 
 
 def settings(*levels, vut="design2"):
     return CampaignSettings(vut=vut, levels=levels)
+
+
+def certify(settings, radius, folder, run, **other):
+    return certificate.certify(settings, radius, folder, resolve(settings), run, **other)
 
 
 def planted(centres=(), radius=0.1, untold=lambda unit: False):
@@ -140,7 +142,7 @@ class TestPlantedBalls:
     def found(self, folder, level, dims, radius, seed):
         """Return how many of 1,000 balls, slightly larger than certified, hold a failure."""
         centres = places(dims, 1000, seed)
-        done = certify(settings(level), radius, folder, ROAD, planted(centres, 1.01 * radius))
+        done = certify(settings(level), radius, folder, planted(centres, 1.01 * radius))
         assert not done.certain
         apart = cKDTree(failing(folder, level)).query(centres)[0]
         return int((apart <= 1.01 * radius).sum())
@@ -160,15 +162,15 @@ class TestPlantedBalls:
         p, h = 1.0 / max(lattice.steps), 1.0 / min(lattice.steps)
         hole = np.array([[p * round(0.5 / p / 2) * 2, 2 * h + lattice.radius]])
         ball = planted(hole, 0.99 * lattice.radius)
-        assert certify(settings(0), 0.1, tmp_path / "c", ROAD, ball).certain
+        assert certify(settings(0), 0.1, tmp_path / "c", ball).certain
         assert not certify(
-            settings(0), 0.1, tmp_path / "d", ROAD, planted(hole, 1.01 * lattice.radius)
+            settings(0), 0.1, tmp_path / "d", planted(hole, 1.01 * lattice.radius)
         ).certain
 
 
 class TestACertificate:
     def test_says_what_is_certain_and_in_what_units(self, tmp_path):
-        done = certify(settings(0, 2), 0.1, tmp_path / "c", ROAD, planted())
+        done = certify(settings(0, 2), 0.1, tmp_path / "c", planted())
         assert done.certain
         assert done.sentence == (
             "design2 v level 0/2, 611 cases: no ball of radius 10 % of the axes (16 m, 1 m/s, "
@@ -177,14 +179,14 @@ class TestACertificate:
         assert check_certificate.check(tmp_path / "c")[1] == []
 
     def test_names_the_failures(self, tmp_path):
-        done = certify(settings(0), 0.1, tmp_path / "c", ROAD, planted(np.zeros((1, 2)), 0.01))
+        done = certify(settings(0), 0.1, tmp_path / "c", planted(np.zeros((1, 2)), 0.01))
         assert "52 cases: 1 fail: every ball of radius 10 %" in done.sentence
         assert done.levels[0].worst == [{"x_pov0_m": -340.0, "v_pov0_mps": 25.0, "score": -600.0}]
         assert check_certificate.check(tmp_path / "c")[1] == []
 
     def test_is_none_where_a_case_gave_no_verdict(self, tmp_path):
         silent = planted(untold=lambda unit: unit[0] == 0.0)
-        done = certify(settings(0), 0.1, tmp_path / "c", ROAD, silent)
+        done = certify(settings(0), 0.1, tmp_path / "c", silent)
         assert not done.certain
         assert "none fails; 4 gave no verdict" in done.sentence
         assert check_certificate.check(tmp_path / "c")[1] == []
@@ -199,7 +201,7 @@ class TestACertificate:
                 drifts = len(runs) > 1 and place < 3
                 yield place, done._replace(score=done.score + 1e-12 * drifts)
 
-        done = certify(settings(0), 0.1, tmp_path / "c", ROAD, moody)
+        done = certify(settings(0), 0.1, tmp_path / "c", moody)
         assert runs == [52, 13]
         assert not done.certain
         assert done.sentence == (
@@ -208,13 +210,13 @@ class TestACertificate:
         )
         assert check_certificate.check(tmp_path / "c")[1] == []
         # Whoever goes on with it asks again.
-        again = certify(settings(0), 0.1, tmp_path / "c", ROAD, steady, resume=True)
+        again = certify(settings(0), 0.1, tmp_path / "c", steady, resume=True)
         assert again.levels[0].otherwise == 0
 
     def test_is_the_same_to_the_last_byte_however_often_it_was_stopped(self, tmp_path, monkeypatch):
         monkeypatch.setattr(certificate, "BLOCK", 70)
         run = planted(untold=lambda unit: unit[0] < 0.3)
-        certify(settings(1, 2), 0.1, tmp_path / "whole", ROAD, run)
+        certify(settings(1, 2), 0.1, tmp_path / "whole", run)
         left: list[int] = [3]
         told: list = []
 
@@ -228,7 +230,7 @@ class TestACertificate:
             told.clear()
             try:
                 certify(
-                    *(settings(1, 2), 0.1, tmp_path / "stopped", ROAD, run),
+                    *(settings(1, 2), 0.1, tmp_path / "stopped", run),
                     resume=again > 0,
                     check=stop,
                     on_cases=told.append,
@@ -247,26 +249,26 @@ class TestACertificate:
 
     def test_runs_a_spoilt_block_again(self, tmp_path):
         folder = tmp_path / "c"
-        certify(settings(0), 0.1, folder, ROAD, planted())
+        certify(settings(0), 0.1, folder, planted())
         block = folder / "level-0" / "00000.npz"
         before = block.read_bytes()
         block.write_bytes(before[:-50])
-        certify(settings(0), 0.1, folder, ROAD, planted(), resume=True)
+        certify(settings(0), 0.1, folder, planted(), resume=True)
         assert block.read_bytes() == before
 
     def test_goes_on_with_its_own_settings_only(self, tmp_path):
         folder = tmp_path / "c"
-        certify(settings(0), 0.1, folder, ROAD, planted())
+        certify(settings(0), 0.1, folder, planted())
         for other, radius, said in (
             (settings(0), 0.2, "radius differs: .* was begun with 0.1, now it is 0.2"),
             (settings(0, vut="design1"), 0.1, "settings.vut differs"),
         ):
             with pytest.raises(UserError, match=said):
-                certify(other, radius, folder, ROAD, planted(), resume=True)
+                certify(other, radius, folder, planted(), resume=True)
         with pytest.raises(UserError, match="exists"):
-            certify(settings(0), 0.1, folder, ROAD, planted())
+            certify(settings(0), 0.1, folder, planted())
         with pytest.raises(UserError, match="no certificate to go on with"):
-            certify(settings(0), 0.1, tmp_path, ROAD, planted(), resume=True)
+            certify(settings(0), 0.1, tmp_path, planted(), resume=True)
 
 
 class TestBlocksThatSomebodyPlanted:
@@ -274,14 +276,14 @@ class TestBlocksThatSomebodyPlanted:
 
     @pytest.fixture
     def begun(self, tmp_path):
-        certify(settings(0), 0.1, tmp_path / "c", ROAD, planted(np.zeros((1, 2)), 0.2))
+        certify(settings(0), 0.1, tmp_path / "c", planted(np.zeros((1, 2)), 0.2))
         return tmp_path / "c"
 
     def go_on(self, folder) -> int:
         """Go on with a certificate; return how many cases ran that are not run twice anyway."""
         counted: list[int] = []
         run = planted(np.zeros((1, 2)), 0.2)
-        certify(settings(0), 0.1, folder, ROAD, run, resume=True, on_cases=counted.append)
+        certify(settings(0), 0.1, folder, run, resume=True, on_cases=counted.append)
         return sum(counted[1:])
 
     def test_those_of_this_user_do_not_run_again(self, begun):
@@ -325,7 +327,7 @@ class TestWhoChecksOne:
 
     @pytest.fixture
     def folder(self, tmp_path):
-        certify(settings(0), 0.1, tmp_path / "c", ROAD, planted(np.zeros((1, 2)), 0.01))
+        certify(settings(0), 0.1, tmp_path / "c", planted(np.zeros((1, 2)), 0.01))
         return tmp_path / "c"
 
     def rewrite(self, folder, change):

@@ -7,14 +7,16 @@ import math
 
 import numpy as np
 import pytest
+from campaigning import run_campaign
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest, norm, truncnorm
 
 from merge_sumo.analysis.exposure import read_distribution
-from merge_sumo.campaigns.campaign import run_campaign
-from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.errors import UserError
+from merge_sumo.studies import probability
 from merge_sumo.studies.importance import (
     CELLS,
     DEFENSIVE,
@@ -24,7 +26,6 @@ from merge_sumo.studies.importance import (
     estimate,
     mean_at_least,
 )
-from merge_sumo.studies.probability import failure_probability
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import V_POV0, dimensions
 from merge_sumo.values.scenario import US23
@@ -266,6 +267,11 @@ class TestADistribution:
     def test_that_is_not_there_is_refused(self, tmp_path):
         with pytest.raises(UserError, match="cannot read"):
             read_distribution(tmp_path / "nowhere.json", LEVELS)
+
+
+def failure_probability(run, out, **other):
+    settings = settings_of(run.folder, run.settings)
+    return probability.failure_probability(run, settings, resolve(settings), out, **other)
 
 
 class TestOfACampaign:

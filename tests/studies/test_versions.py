@@ -9,11 +9,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+from campaigning import run_campaign
 from lxml import html
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
@@ -108,7 +109,7 @@ class TestTheSameVut:
 
 class TestRecordsOnly:
     def test_run_nothing_again(self, run, other_seed, monkeypatch):
-        monkeypatch.setattr("merge_sumo.studies.versions.plan_of", None)
+        monkeypatch.setattr("merge_sumo.studies.versions.resolve", None)
         compared = compare_runs(run, other_seed, rerun=False)
         found = compared.levels[0]
         assert found.changes[Change.NOT_RUN_AGAIN] == len(compared.cases)
@@ -295,7 +296,7 @@ def folder(run, tmp_path) -> Path:
 
 class TestRerunOfTheSameVut:
     def test_gives_every_verdict_and_score_again(self, run):
-        found = rerun(run, settings_today(run))
+        found = rerun(run, today := settings_today(run), resolve(today))
         assert [o.measures for o in found.after] == [o.measures for o in run.outcomes]
         assert found.changed == []
         assert found.compared.worse(0.0) == []

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.drivers.policies import policies_of, policies_sha256
+from merge_sumo.engine.plan import MAX_CORRIDORS, SimulationPlan, plan_key, versions
 from merge_sumo.engine.povs import Povs
-from merge_sumo.engine.simulator import MAX_CORRIDORS, SimulationPlan
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.studies.truth import TruthKey
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import VutFactory
 
 PAPERS = Criterion()
@@ -24,21 +25,29 @@ def plan_for(
     povs: Povs | None = None,
     corridors: int = MAX_CORRIDORS,
 ) -> SimulationPlan:
-    return resolve(vut, scenario=scenario, criterion=criterion, povs=povs, corridors=corridors)
+    povs = povs or Povs(policies=policies_of(scenario))
+    options = VutOptions(policies=povs.policies)
+    return SimulationPlan(
+        scenario=scenario,
+        road=road_for(scenario),
+        vut=vut if isinstance(vut, VutFactory) else VutFactory(vut, options),
+        povs=povs,
+        criterion=criterion,
+        corridors=corridors,
+    )
 
 
-def key_of(**changes: Any) -> TruthKey:
-    """Return what a truth of design1 at level 0 is kept under, with some of it changed."""
+def key_of(*, level: int = 0, cases: int = 300, seed: int = 0, **changes: Any) -> TruthKey:
+    """Return what a truth of design1 is kept under, with some of it changed."""
     values: dict[str, Any] = {
         "vut": "design1",
-        "level": 0,
-        "cases": 300,
-        "seed": 0,
-        "command": None,
+        "vut_command": None,
         "deadline_s": 5.0,
-        "scenario": US23,
-        "policies": policies_sha256(policies_of(US23)),
         "pov": None,
+        "policies_sha256": policies_sha256(policies_of(US23)),
+        "road_sha256": road_for(US23).sha256,
+        "scenario": US23,
         "criterion": PAPERS,
+        "versions": versions(),
     }
-    return TruthKey(**values | changes)
+    return TruthKey(plan_key(**values | changes), level, cases, seed)

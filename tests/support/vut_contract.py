@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from plans import plan_for
 
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import VutOptions
@@ -30,7 +31,7 @@ def factory(spec: object, **options: Any) -> VutFactory:
 def run_cases(vut: VutFactory, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
     """Return what became of every case, in order; every case must come back exactly once."""
     found: dict[int, Trajectory] = {}
-    with plan_for(vut, corridors=corridors).open() as ground:
+    with Simulator(plan_for(vut, corridors=corridors)) as ground:
         for index, trajectory in ground.run(cases):
             assert index not in found
             found[index] = trajectory

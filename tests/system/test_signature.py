@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from campaigning import resume_campaign, run_campaign
 from plans import plan_for
 
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth

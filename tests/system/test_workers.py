@@ -16,14 +16,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from campaigning import run_campaign
 from plans import plan_for
 from processes import wait_for
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.simulator import lost_case, run_cases, runs_on
-from merge_sumo.engine.versions import software
+from merge_sumo.engine.evaluate import _lost, open_simulators, run_cases
+from merge_sumo.engine.plan import versions
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import (
     InProcess,
@@ -144,7 +144,7 @@ class TestAWorkerThatDies:
         plan = plan_for("design1", corridors=4)
         with open_workers(2) as workers:
             work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
-            ran = dict(workers.run(work, cases, lost_case, chunk=1))
+            ran = dict(workers.run(work, cases, _lost, chunk=1))
         ends = [ran[place].measures.end for place in range(4)]
         assert ends[2] is End.SIM_ERROR
         assert "worker process died 2 times" in ran[2].measures.error
@@ -232,10 +232,10 @@ class TestACampaign:
             run_campaign(settings, tmp_path / name)
 
     def test_is_refused_by_workers_with_other_software(self):
-        other = {**software(), "libsumo": "1.0"}
-        plan = replace(plan_for("design1", corridors=2), software=other)
+        other = {**versions(), "libsumo": "1.0"}
+        plan = replace(plan_for("design1", corridors=2), versions=other)
         with open_workers(1) as workers, pytest.raises(UserError, match="a worker has libsumo"):
-            runs_on(workers, plan)
+            open_simulators(plan, workers)
 
 
 def test_an_ending_is_called_once():

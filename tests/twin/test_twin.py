@@ -11,16 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from campaigning import resume_campaign, run_campaign
 from conftest import some
 from plans import plan_for
 
 from merge_sumo.analysis.predictions import off_m, prediction_in_words, surprises
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.policies import policies_of
+from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.engine.povs import Povs
-from merge_sumo.engine.simulator import road_for, run_cases
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.scenario_file import named_scenario

@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from campaigning import resume_campaign, run_campaign
 from hypothesis import given
 from hypothesis import strategies as st
 from plans import key_of, plan_for
 from test_score import CASE, ending
 
 from merge_sumo.analysis.verdict import judge
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.engine.simulator import road_for
@@ -490,7 +491,9 @@ class TestCampaigns:
             Run(tmp_path)
 
     def test_are_kept_where_recorded_cases_run_again(self, harsh):
-        again = rerun(harsh, settings_of(harsh.folder, harsh.settings), (0, 1, 2))
+        again = rerun(
+            harsh, today := settings_of(harsh.folder, harsh.settings), resolve(today), (0, 1, 2)
+        )
         assert [o.margin for o in again.after] == [o.margin for o in harsh.outcomes[:3]]
         assert not again.changed
 

@@ -8,10 +8,10 @@ from dataclasses import asdict, fields, replace
 import numpy as np
 import pytest
 from calling import invoke
+from campaigning import run_campaign
 from foreign_nets import FOREIGN
 from merges import SMALLER
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
 from merge_sumo.campaigns.settings import CampaignSettings

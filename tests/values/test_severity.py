@@ -14,7 +14,7 @@ from conftest import some
 from plans import plan_for
 from shapely import Polygon
 
-from merge_sumo.engine.simulator import run_cases
+from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.registry import make_sampler
@@ -103,7 +103,7 @@ def test_agrees_with_polygons_and_steps(tested):
     for ran in run_cases(plan, cases):
         measures = ran.measures
         assert (measures.impact_speed_mps is None) == (measures.severity != "contact")
-        shared_m2 = overlap_before_m(plan.net, ran.trajectory)
+        shared_m2 = overlap_before_m(plan.road, ran.trajectory)
         if shared_m2 == 0.0 or shared_m2 > 1e-3:
             assert (measures.before_clearance_m or 1.0) * (1.0 - 2.0 * (shared_m2 > 0.0)) > 0.0
         if not measures.end.is_tested:

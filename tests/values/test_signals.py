@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from campaigning import run_campaign
 from typer.testing import CliRunner
 
 import merge_sumo as ms
 from merge_sumo import cli
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from campaigning import resume_campaign, run_campaign
 from misbehaviours import STUBBORN
 from processes import none_left, wait_for
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from campaigning import run_campaign
 from conftest import some
 from processes import at_most_cpu_s
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
-from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.errors import UserError
-from merge_sumo.road.merge import road_of
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import MAX_STEPS
 from merge_sumo.values.trajectory import End
@@ -318,7 +318,8 @@ def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
     hashes = []
     for source in (FUNCTION, FUNCTION + "# changed"):
         settings = CampaignSettings(vut=vut(source), levels=(0,), cases=2, batch=2)
-        (sha256,) = record_of(settings, road_of())["vut_files"].values()
+        (sha256,) = record_of(settings, resolve(settings))["vut_files"].values()
         hashes.append(sha256)
     assert hashes[0] != hashes[1]
-    assert record_of(CampaignSettings(vut="level0", levels=(0,)), road_of())["vut_files"] is None
+    built_in = CampaignSettings(vut="level0", levels=(0,))
+    assert record_of(built_in, resolve(built_in))["vut_files"] is None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from campaigning import run_campaign
 from vut_contract import cases_of, factory, run_cases
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.run import failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError

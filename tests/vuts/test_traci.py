@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import traci
+from campaigning import run_campaign
 from conftest import require, some
 from raw_traci import GET_LANE, MISDEEDS, STEP, Client, GoneError, command, text
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
-from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError

@@ -1,0 +1,239 @@
+"""From a plan and cases to results: in this process, on workers, or on a cluster.
+
+Whatever runs cases does it here. A worker keeps its simulator open from one chunk to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from threading import RLock
+from typing import Any, Final, TypeVar, overload
+
+import numpy as np
+
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.simulator import Simulator
+from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.system.blame import MAX_DEATHS
+from merge_sumo.system.pickling import quickly_pickled
+from merge_sumo.system.workers import InProcess, Workers, open_workers, when_worker_ends
+from merge_sumo.values.case import Case, FloatArray, Pool
+from merge_sumo.values.prediction import Prediction
+from merge_sumo.values.score import Measures, Outcome, measure, measure_all
+from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.files import Files, hashed
+
+R = TypeVar("R")
+
+
+@quickly_pickled
+@dataclass(frozen=True, slots=True)
+class CaseResult:
+    """What became of one case, and the files that had decided on it by then.
+
+    Attributes:
+        measures: verdict and measures.
+        trajectory: what happened.
+        files: those of the user's that the VUT has loaded, with their hashes.
+        pov_files: those that a POV of the user's own has loaded.
+        margin: that of the plan's criterion; None where it needs none.
+        again: whether it ran again, because a process had died or had been stopped.
+    """
+
+    measures: Measures
+    trajectory: Trajectory
+    files: Files = field(default_factory=dict)
+    pov_files: Files = field(default_factory=dict)
+    margin: float | None = None
+    again: bool = False
+
+    def outcome(self, index: int, batch: int = 0, prediction: Prediction | None = None) -> Outcome:
+        """Return the outcome of the case with its place in a campaign."""
+        case, margin = self.trajectory.case, self.margin
+        return Outcome(index, batch, case, self.measures, prediction, margin)
+
+
+class CasesAt(Sequence[Case]):
+    """Cases by their points in the unit cube, made when they run: they travel as numbers."""
+
+    def __init__(self, pool: Pool, level: int, points: FloatArray) -> None:
+        """Take points, (n, d), of a level of a pool."""
+        self.pool, self.level, self.points = pool, level, points
+
+    def __len__(self) -> int:
+        """Return the number of cases."""
+        return len(self.points)
+
+    @overload
+    def __getitem__(self, place: int) -> Case: ...
+    @overload
+    def __getitem__(self, place: slice) -> CasesAt: ...
+    def __getitem__(self, place: int | slice) -> Case | CasesAt:
+        """Return a case, or some of them."""
+        if isinstance(place, slice):
+            return CasesAt(self.pool, self.level, self.points[place])
+        return self.pool.cases(self.points[place][None], self.level)[0]
+
+    def __iter__(self) -> Iterator[Case]:
+        """Make the cases."""
+        return iter(self.pool.cases(self.points, self.level))
+
+
+Keep = Callable[[Sequence[CaseResult]], Sequence[R]]
+"""What is kept of the results of a chunk; it runs where they are, and only that travels."""
+
+
+@overload
+def evaluate(
+    plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None = None
+) -> Generator[tuple[int, CaseResult], None, None]: ...
+@overload
+def evaluate(
+    plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None, keep: Keep[R]
+) -> Generator[tuple[int, R], None, None]: ...
+def evaluate(
+    plan: SimulationPlan,
+    cases: Sequence[Case],
+    workers: Workers | None = None,
+    keep: Keep[Any] | None = None,
+) -> Generator[tuple[int, Any], None, None]:
+    """Run cases; yield (place in `cases`, result) as chunks of them end.
+
+    Args:
+        plan: how they run.
+        cases: cases of the plan's scenario.
+        workers: where they run; None opens this process for them alone.
+        keep: gives what is kept of the results of a chunk, by default all; to be found by name.
+
+    Raises `UserError` where the plan cannot be carried out.
+    """
+    with workers_or_here(workers) as available:
+        size = available.chunk_size(len(cases))
+        chunks = (cases[first : first + size] for first in range(0, len(cases), size))
+        for first, results in evaluate_chunks(plan, chunks, available, keep):
+            yield from enumerate(results, start=first)
+
+
+def evaluate_chunks(
+    plan: SimulationPlan,
+    chunks: Iterable[Sequence[Case]],
+    workers: Workers,
+    keep: Keep[Any] | None = None,
+) -> Generator[tuple[int, Sequence[Any]], None, None]:
+    """Run chunks of cases as workers want them; yield (place of the first case, results)."""
+    if keep is None:
+        return workers.run_chunks(partial(run_cases, plan), chunks, _lost, ran_again=_again)
+    return workers.run_chunks(
+        partial(_run_and_keep, plan, keep), chunks, lambda case: keep([_lost(case)])[0]
+    )
+
+
+def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
+    """Open the simulator of a plan in every worker; `UserError` where that cannot be.
+
+    A worker takes as long to start as to run hundreds of cases, so all of them start at once.
+    """
+
+    def died(_: None) -> None:
+        own = plan.povs.own
+        pov = "" if own is None else f" or the POV {own.spec}"
+        raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
+
+    everywhere = [None] * min(workers.count, plan.corridors)
+    for _ in workers.run(partial(_open_simulator, plan), everywhere, died, chunk=1):
+        pass
+
+
+def evaluation_workers(workers: int | None = None, dask: str | None = None) -> Workers:
+    """Return workers that load what it takes to run cases as they start: see `open_workers`."""
+    return open_workers(workers, dask, preload=__name__)
+
+
+@contextmanager
+def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
+    """Give the workers, which stay open, or this process as the only one."""
+    if workers is not None:
+        yield workers
+        return
+    with open_workers(1) as here:
+        yield here
+
+
+THIS_PROCESS: Final = Workers(InProcess, 1)
+"""This process, which keeps its simulator between evaluations: for a loop within a worker."""
+
+
+def run_cases(plan: SimulationPlan, cases: Iterable[Case]) -> list[CaseResult]:
+    """Run cases in the simulator that this process keeps; return the results in their order."""
+    cases = list(cases)
+    with opened_simulator(plan) as simulator:
+        ran_again: set[int] = set()
+        ran = dict(simulator.run(cases, ran_again))
+        files = hashed(simulator.vut.files()), hashed(simulator.pov.files())
+    trajectories = [ran[place] for place in range(len(cases))]
+    measured = measure_all(trajectories, centre_lines(plan.road))
+    return [
+        CaseResult(
+            *(measures, trajectory, *files, plan.criterion.margin(trajectory, measures)),
+            place in ran_again,
+        )
+        for place, (measures, trajectory) in enumerate(zip(measured, trajectories, strict=True))
+    ]
+
+
+def _run_and_keep(plan: SimulationPlan, keep: Keep[R], cases: Iterable[Case]) -> Sequence[R]:
+    return keep(run_cases(plan, cases))
+
+
+def _open_simulator(plan: SimulationPlan, nothing: Sequence[None]) -> Sequence[None]:
+    with opened_simulator(plan):
+        return nothing
+
+
+_kept: tuple[tuple[object, ...], Simulator] | None = None
+"""The simulator of this process, with the key of its plan: it stays open between chunks."""
+_one_at_a_time = RLock()
+"""libsumo holds one simulation per process, and some clusters give a process several threads."""
+
+
+@contextmanager
+def opened_simulator(plan: SimulationPlan) -> Iterator[Simulator]:
+    """Give the simulator of this process, which stays open for the next chunk of the same plan."""
+    global _kept  # noqa: PLW0603 (one SUMO per process)
+    key = plan.key(), plan.vut, plan.povs, plan.corridors
+    with _one_at_a_time:
+        try:
+            if _kept is None or _kept[0] != key:
+                close_simulator()
+                plan.check_software()
+                _kept = key, Simulator(plan)
+                when_worker_ends(close_simulator)
+            yield _kept[1]
+        except BaseException:
+            close_simulator()  # it stands in the middle of episodes
+            raise
+
+
+def close_simulator() -> None:
+    """Close the simulator that this process keeps, if any."""
+    global _kept
+    with _one_at_a_time:
+        if _kept is not None:
+            simulator, _kept = _kept[1], None
+            simulator.close()
+
+
+def _lost(case: Case) -> CaseResult:
+    """Return what is recorded of a case that ended every worker that ran it."""
+    start = [[(x, v, 0.0) for x, v in case.starts()]]
+    reason = f"its worker process died {MAX_DEATHS} times"
+    trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, reason)
+    return CaseResult(measure(trajectory), trajectory)
+
+
+def _again(result: CaseResult) -> CaseResult:
+    return replace(result, again=True)

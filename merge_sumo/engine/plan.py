@@ -1,0 +1,145 @@
+"""The plan of a simulation: everything that decides what becomes of a case."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.engine.povs import Povs
+from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.scenario import OWN, Scenario
+from merge_sumo.vuts.registry import VutFactory, runs_code
+
+MAX_CORRIDORS: Final = 32
+"""Episodes that one process runs at a time."""
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the software that decide the outcome of a case."""
+    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SimulationPlan:
+    """What it takes to run cases in any process; it travels to workers with every chunk.
+
+    Attributes:
+        scenario: the scenario, with its follow-up behind M.
+        road: the road on which it takes place.
+        vut: makes the VUT.
+        povs: the drivers of the POV at each level.
+        criterion: what counts as a failure.
+        corridors: the most episodes at a time; decides no outcome.
+        versions: those of the software that gives the outcomes; by default of this process.
+        policies_sha256: hashes of the learned drivers; by default of those that this process finds.
+    """
+
+    scenario: Scenario
+    road: Corridor
+    vut: VutFactory
+    povs: Povs
+    criterion: Criterion
+    corridors: int = MAX_CORRIDORS
+    versions: Mapping[str, str] = field(default_factory=versions)
+    policies_sha256: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Note the learned drivers, unless they are given."""
+        if not self.policies_sha256:
+            object.__setattr__(self, "policies_sha256", self.povs.sha256())
+
+    def key(self, level: int = OWN) -> dict[str, Any]:
+        """Return what decides the outcomes of cases at a level: see `plan_key`."""
+        own = self.povs.own if level == OWN else None
+        return plan_key(
+            vut=self.vut.spec,
+            vut_command=self.vut.options.command,
+            deadline_s=self.vut.options.deadline_s,
+            pov=None if own is None else own.spec,
+            policies_sha256=self.policies_sha256,
+            road_sha256=self.road.sha256,
+            scenario=self.scenario,
+            criterion=self.criterion,
+            versions=self.versions,
+        )
+
+    def workers(self, requested: int | None) -> int:
+        """Return the number of processes that run cases: as many as VUT and POV can serve.
+
+        Raises `UserError` where more are requested than that.
+        """
+        most, own = self.vut.workers(requested), self.povs.own
+        return most if own is None else min(most, own.workers(requested))
+
+    def for_cases(self, cases: int) -> SimulationPlan:
+        """Return the plan with no more corridors than there are cases to run at a time."""
+        return replace(self, corridors=min(self.corridors, cases))
+
+    def with_log(self, log: Path) -> SimulationPlan:
+        """Return the plan with what a user's drivers print added to a file."""
+        return replace(self, vut=self.vut.with_log(log), povs=self.povs.with_log(log))
+
+    def check_software(self) -> None:
+        """Raise `UserError` where the software of this process would give other outcomes."""
+        for name, (expected, present) in differences(dict(self.versions), versions()).items():
+            raise UserError(
+                f"a worker has {name} {present}, and this process {expected}: install the same "
+                "there"
+            )
+        for name in differences(dict(self.policies_sha256), self.povs.sha256()):
+            raise UserError(
+                f"a worker has another policy {name} in {self.povs.policies} than this process, or "
+                "none: put the same files there"
+            )
+
+
+def plan_key(
+    *,
+    vut: str,
+    vut_command: str | None,
+    deadline_s: float,
+    pov: str | None,
+    policies_sha256: Mapping[str, str],
+    road_sha256: str,
+    scenario: Scenario,
+    criterion: Criterion,
+    versions: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return what decides the outcomes of cases, as plain values that JSON can hold.
+
+    The files of a VUT are left out, as they are known in full only after it drove: what is kept
+    under a key has their hashes beside it. Instead the working folder counts where a user's code
+    runs, because the same name may be another file in another folder.
+    """
+    code = runs_code(vut, vut_command) or (pov is not None and runs_code(pov, None))
+    return {
+        "vut": vut,
+        "vut_command": vut_command,
+        "deadline_s": deadline_s,
+        "pov": pov,
+        "folder": str(Path.cwd()) if code else None,
+        "policies_sha256": dict(policies_sha256),
+        "road_sha256": road_sha256,
+        "scenario": asdict(scenario),
+        "criterion": asdict(criterion),
+        "versions": dict(versions),
+    }
+
+
+def differences(was: Any, now: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
+    """Return by name where two records differ, with both values; None for one that is missing."""
+    if isinstance(was, dict) and isinstance(now, dict):
+        differing: dict[str, tuple[Any, Any]] = {}
+        for key in now | was:
+            inner = f"{name}.{key}" if name else key
+            differing |= differences(was.get(key), now.get(key), inner)
+        return differing
+    was, now = (list(value) if isinstance(value, tuple) else value for value in (was, now))
+    return {} if was == now else {name: (was, now)}

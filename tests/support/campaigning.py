@@ -1,0 +1,30 @@
+"""Campaigns for tests: settings or a folder in, the run out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from merge_sumo.campaigns import campaign
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import Run, read_settings
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+
+
+def run_campaign(
+    settings: CampaignSettings, folder: Path, *, net: Path | None = None, **other: Any
+) -> Run:
+    return campaign.run_campaign(settings, resolve(settings, net), folder, **other)
+
+
+def resume_campaign(
+    folder: Path,
+    given: Mapping[str, object] | None = None,
+    *,
+    net: Path | None = None,
+    trust: bool = False,
+    **other: Any,
+) -> Run:
+    settings = settings_of(folder, read_settings(folder), given, trust=trust)
+    return campaign.resume_campaign(settings, resolve(settings, net), folder, **other)
