@@ -21,8 +21,8 @@ from campaigning import run_campaign
 from foreign_nets import corridor_of
 
 from merge_sumo import cli
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run
 from merge_sumo.engine import evaluate
 from merge_sumo.road.corridor import Corridor
 

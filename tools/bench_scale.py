@@ -38,11 +38,10 @@ import numpy as np
 from bench_record import add_record_option, append_record
 
 from merge_sumo.campaigns.campaign import conduct, run_campaign
-from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.prefetch import Prefetch, proposals
-from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, to_line
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES, Journal, Run, failures, read_outcomes, to_line
 from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate, run_cases
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler

@@ -65,12 +65,12 @@ from merge_sumo.campaigns.one_case import (
     settings_and_case,
 )
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import SETTINGS, Run, read_settings
 from merge_sumo.campaigns.scenario_suggestion import about, suggested, unseen
 from merge_sumo.campaigns.settings import (
     CampaignSettings,
     settings_of,
 )
+from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers

@@ -28,7 +28,7 @@ from merge_sumo.analysis.verdict import (
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
-from merge_sumo.campaigns.run import SETTINGS, Run, failures
+from merge_sumo.campaigns.store import SETTINGS, Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.studies.avoidance import in_a_sentence, read_avoidance

@@ -8,12 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.ownership import FILES
 from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.repeats import repeat, write_repeats
-from merge_sumo.campaigns.run import RAN_AGAIN, SETTINGS, Run, spread_failures
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
+from merge_sumo.campaigns.store import RAN_AGAIN, SETTINGS, Journal, Run, spread_failures
 from merge_sumo.campaigns.transfer import lessons
 from merge_sumo.engine.evaluate import (
     CaseResult,

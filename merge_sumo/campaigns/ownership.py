@@ -9,12 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.run import SETTINGS
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.trust import Code, doubt, note_own
 from merge_sumo.vuts.registry import file_named, runs_code
 
+RECORD: Final = "campaign.json"
+"""File of a campaign's folder that names its code, with all other settings."""
 FILES: Final = ("vut_files", "pov_files")
 """Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
 
@@ -30,7 +31,7 @@ def note_run(folder: Path, at: Path, record: Mapping[str, Any], *, begun: bool) 
     """
     vut, command, pov = _named(record)
     if runs_code(vut, command) or (pov is not None and runs_code(pov, None)):
-        note_own(folder, at, SETTINGS, _code(record), begun=begun)
+        note_own(folder, at, RECORD, _code(record), begun=begun)
 
 
 def check_own_code(folder: Path, recorded: Mapping[str, Any], given: Mapping[str, object]) -> None:
@@ -40,7 +41,7 @@ def check_own_code(folder: Path, recorded: Mapping[str, Any], given: Mapping[str
     for spec, started, named in ((vut, command, vut_given), (pov, None, "pov" in given)):
         if spec is None or named or not runs_code(spec, started):
             continue
-        why = doubt(folder, SETTINGS, _code(recorded))
+        why = doubt(folder, RECORD, _code(recorded))
         if why is not None:
             raise UserError(
                 f"{folder} {why}, and to go on is to run the controller that it names, "

@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import chain, islice
 from typing import Final, Self
 
-from merge_sumo.campaigns.journal import Batch
+from merge_sumo.campaigns.store import Batch
 from merge_sumo.engine.evaluate import CaseResult
 from merge_sumo.engine.plan import MAX_CORRIDORS
 from merge_sumo.samplers.base import Sampler

@@ -20,8 +20,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import CaseResult
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import replace_own

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.campaigns.ownership import check_own_code
-from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.stopping import StoppingRule
+from merge_sumo.campaigns.store import SETTINGS, scenario_of
 from merge_sumo.campaigns.transfer import hashes, lessons
 from merge_sumo.drivers.policies import policies_in
 from merge_sumo.engine.plan import SimulationPlan

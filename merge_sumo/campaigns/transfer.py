@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import FloatArray

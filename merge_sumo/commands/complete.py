@@ -131,7 +131,7 @@ def networks(incomplete: str) -> Completions:
 
 def runs(incomplete: str) -> Completions:
     """Return the folders of campaigns in `runs`, the newest first, and other folders."""
-    from merge_sumo.campaigns.run import SETTINGS
+    from merge_sumo.campaigns.store import SETTINGS
 
     found = []
     for settings in Path(RUNS).glob(f"*/{SETTINGS}"):

@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Final
 
 from merge_sumo.analysis.verdict import in_counts
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.store import failures
 from merge_sumo.reports.progress import clock_text, rate_text
 from merge_sumo.studies.avoidance import MOST
 from merge_sumo.system.printable import printable

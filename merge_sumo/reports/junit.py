@@ -21,7 +21,7 @@ from merge_sumo.analysis.verdict import (
     Verdict,
     message_of,
 )
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.values.scenario import level_name

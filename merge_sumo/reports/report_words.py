@@ -16,7 +16,7 @@ from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.analysis.verdict import counted, in_words
 from merge_sumo.campaigns import repeats
-from merge_sumo.campaigns.run import SETTINGS, TRAJECTORIES, Run
+from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.reports.headline import Rule, after_words, avoidable_words, before_words, headline
 from merge_sumo.reports.report_levels import Level, levels_of

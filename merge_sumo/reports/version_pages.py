@@ -17,7 +17,7 @@ import numpy as np
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.diagnosis import Kind
 from merge_sumo.analysis.verdict import counted, in_words
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import policy_hash
 from merge_sumo.reports.static_map import map_of

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.analysis.predictions import has_predictions
 from merge_sumo.analysis.surface import Grid, nodes
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.povs import Povs
 from merge_sumo.engine.simulator import road_for

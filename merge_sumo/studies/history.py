@@ -27,7 +27,7 @@ from merge_sumo.analysis.diagnosis import Kind, diagnose
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import severities_of
 from merge_sumo.analysis.verdict import Verdict, in_words, judge
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.studies.avoidance import read_avoidance
 from merge_sumo.studies.counterfactuals import Avoidance

@@ -18,8 +18,8 @@ import numpy as np
 
 from merge_sumo.analysis.exposure import Distribution, read_distribution
 from merge_sumo.campaigns.campaign import OnCase
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError

@@ -21,8 +21,8 @@ from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import counted, judge
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.repeats import cause
-from merge_sumo.campaigns.run import SETTINGS, Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
+from merge_sumo.campaigns.store import SETTINGS, Run, failures
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan, versions
 from merge_sumo.engine.simulator import road_for

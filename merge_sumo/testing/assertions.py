@@ -10,7 +10,7 @@ from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.verdict import NOTHING_TESTED
 from merge_sumo.api.keywords import Setup
 from merge_sumo.api.results import CampaignRun
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.store import failures
 from merge_sumo.reports.motion import verdict_of
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.system.printable import printable, quoted

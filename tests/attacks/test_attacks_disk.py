@@ -19,8 +19,8 @@ from campaigning import run_campaign
 from conftest import require
 from plans import plan_for
 
-from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.folders import TEMPORARY

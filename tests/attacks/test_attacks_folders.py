@@ -17,10 +17,10 @@ import pytest
 from attacks import tell
 from campaigning import resume_campaign, run_campaign
 
-from merge_sumo.campaigns import journal
+from merge_sumo.campaigns import store
 from merge_sumo.campaigns.ownership import note_run
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import REPORT
 from merge_sumo.studies import probability
@@ -110,7 +110,7 @@ class TestACampaign:
             other_account(put_link_for_new, str(common), str(private))
             note_run(*arguments, **named)
 
-        monkeypatch.setattr(journal, "note_run", swap)
+        monkeypatch.setattr(store, "note_run", swap)
         settings = CampaignSettings(**SETTINGS_OF, cases=2, batch=2)
         with pytest.raises(UserError):
             run_campaign(settings, common / "run")

@@ -15,8 +15,8 @@ from campaigning import run_campaign
 from test_workers import cluster, workers_at
 
 import merge_sumo as ms
-from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES
 from merge_sumo.system.workers import dask_workers
 
 __all__ = ["cluster", "workers_at"]

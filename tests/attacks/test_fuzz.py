@@ -26,7 +26,8 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import (
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
+from merge_sumo.campaigns.store import (
     OUTCOMES,
     SETTINGS,
     TRAJECTORIES,
@@ -35,7 +36,6 @@ from merge_sumo.campaigns.run import (
     read_settings,
     to_line,
 )
-from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
@@ -318,7 +318,7 @@ ATHERIS = """
 import sys, atheris
 with atheris.instrument_imports(include=["merge_sumo", "json"]):
     from merge_sumo.errors import UserError
-    from merge_sumo.campaigns.run import read_outcomes, to_line
+    from merge_sumo.campaigns.store import read_outcomes, to_line
 
 def one(data):
     try:

@@ -17,8 +17,8 @@ from plans import plan_for
 
 from merge_sumo.campaigns import campaign as conductor
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.progress import Bars

@@ -18,8 +18,8 @@ from campaigning import resume_campaign, run_campaign
 from conftest import some
 
 from merge_sumo.campaigns.ownership import check_own_code
-from merge_sumo.campaigns.run import CHECKSUM, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import CHECKSUM, SETTINGS, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.resources import cache_folder

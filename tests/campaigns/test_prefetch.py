@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 from campaigning import resume_campaign, run_campaign
-from test_journal import contents, episode
+from test_store import contents, episode
 
-from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Journal
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.system.workers import InProcess, Workers

@@ -21,8 +21,8 @@ from merge_sumo.campaigns.repeats import (
     spread_places,
     unrepeatable,
 )
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.studies.certificate import certify

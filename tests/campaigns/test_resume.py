@@ -23,9 +23,16 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.campaign import SCENARIOS
-from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import (
+    CHECKSUM,
+    OUTCOMES,
+    SETTINGS,
+    TRAJECTORIES,
+    Journal,
+    Run,
+    read_settings,
+)
 from merge_sumo.engine.plan import differences
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
@@ -258,7 +265,7 @@ class TestTwoProcessesOnOneFolder:
 
     def test_leave_no_lock_behind_when_one_is_killed(self, folder):
         script = (
-            "import os, sys, pathlib; from merge_sumo.campaigns.journal import Journal;"
+            "import os, sys, pathlib; from merge_sumo.campaigns.store import Journal;"
             "kept = Journal.reopen(pathlib.Path(sys.argv[1])); os.kill(os.getpid(), 9)"
         )
         killed = subprocess.run([sys.executable, "-c", script, str(folder)], check=False)

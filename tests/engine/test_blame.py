@@ -13,8 +13,8 @@ import pytest
 from campaigning import run_campaign
 from conftest import some
 
-from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.system import pulse
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame

@@ -22,8 +22,8 @@ from processes import none_left
 from vut_contract import cases_of, factory
 
 import merge_sumo as ms
-from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import CHECKSUM, OUTCOMES, SETTINGS, Run
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.engine.pov_adapter import PovAdapter
 from merge_sumo.engine.povs import Povs, own_pov

@@ -22,9 +22,9 @@ from lxml import etree
 from plans import plan_for
 
 from merge_sumo.analysis.diagnosis import Kind, diagnose
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.policies import (

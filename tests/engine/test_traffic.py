@@ -12,8 +12,8 @@ import pytest
 from campaigning import run_campaign
 from plans import plan_for
 
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
 from merge_sumo.engine.simulator import Simulator, road_for
 from merge_sumo.errors import UserError

@@ -20,8 +20,8 @@ from handmade import write_run
 
 from merge_sumo.analysis import diagnosis
 from merge_sumo.analysis.coordinates import WRITTEN
-from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.campaign_progress import CampaignProgress

@@ -12,7 +12,7 @@ from lxml import html
 from rich.console import Console
 
 from merge_sumo.analysis.summary import summarise
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.store import failures
 from merge_sumo.reports import campaign_panel, running_page
 from merge_sumo.reports.campaign_panel import CampaignPanel
 from merge_sumo.reports.campaign_progress import (

@@ -20,7 +20,7 @@ from lxml import html
 from merge_sumo.analysis.summary import summarise
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.analysis.verdict import judge
-from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report_data
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.headline import Rule, headline

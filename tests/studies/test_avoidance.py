@@ -16,8 +16,8 @@ from plans import plan_for
 
 import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.engine.evaluate import opened_simulator

@@ -16,8 +16,7 @@ import pytest
 from handmade import drive, write_run
 
 import merge_sumo as ms
-from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.store import Journal, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.version_pages import axis_end, history_page
 from merge_sumo.studies.history import RegionChange, history_of

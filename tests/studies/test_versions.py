@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports import version_pages
 from merge_sumo.reports.version_pages import OVER_TIME, comparison_page

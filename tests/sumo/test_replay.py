@@ -17,7 +17,7 @@ import pytest
 from lxml import etree
 
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.store import failures
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
 from merge_sumo.sumo import replay as replay_module

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.store import Journal, Run
 from merge_sumo.engine.plan import versions
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.scenario import A_MIN_MPS2, DT_S, POV, US23, VUT, Scenario

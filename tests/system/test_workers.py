@@ -20,8 +20,8 @@ from campaigning import run_campaign
 from plans import plan_for
 from processes import wait_for
 
-from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES
 from merge_sumo.engine.evaluate import _lost, open_simulators, run_cases
 from merge_sumo.engine.plan import versions
 from merge_sumo.errors import UserError

@@ -16,8 +16,8 @@ from conftest import some
 from plans import plan_for
 
 from merge_sumo.analysis.predictions import off_m, prediction_in_words, surprises
-from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.engine.povs import Povs

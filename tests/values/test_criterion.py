@@ -16,8 +16,8 @@ from test_score import CASE, ending
 
 from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines

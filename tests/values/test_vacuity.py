@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from merge_sumo.analysis.plausibility import doubts
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.criteria import CRITERIA

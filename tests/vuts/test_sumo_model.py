@@ -7,8 +7,8 @@ import pytest
 from campaigning import run_campaign
 from vut_contract import cases_of, factory, run_cases
 
-from merge_sumo.campaigns.run import failures
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import failures
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.world import World

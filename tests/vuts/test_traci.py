@@ -356,7 +356,7 @@ def test_the_speeds_that_follow_from_a_command_are_those_of_sumo(command, argume
 
 
 def measures_of(folder: Path) -> list[dict]:
-    from merge_sumo.campaigns.run import Run
+    from merge_sumo.campaigns.store import Run
 
     return [outcome.to_record() for outcome in Run(folder).outcomes]
 

@@ -17,8 +17,7 @@ from calling import contents
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import Run, failures, read_outcomes, to_line
+from merge_sumo.campaigns.store import Journal, Run, failures, read_outcomes, to_line
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines

@@ -1,41 +1,51 @@
-"""What a campaign remembers, as it is read: a folder with settings, outcomes and trajectories.
+"""What a campaign remembers: a folder that one process writes, and anybody reads.
 
-campaign.json             every resolved setting, versions, hashes
+campaign.json             every resolved setting, versions, hashes, and the hash of itself
 outcomes.jsonl            one line per case, in order, synced after every batch
 trajectories/00007.npz    the motion of every case of a batch, and the hash of its lines
 
-What is not as it was written (`journal.py`) is found by its hashes. Where these are missing, as in
-folders of older versions, what is there is read as it is.
+`Run` reads and `Journal` writes whole batches. A bit that flips on a disk or on a way is found by
+the hashes, and in arrays by the checksums of the zip archive. Folders of older versions, without
+hashes, are read as they are.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
+import os
 import re
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.campaigns.ownership import RECORD, note_run
 from merge_sumo.errors import UserError
+from merge_sumo.system.anchors import Anchor
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
-from merge_sumo.system.printable import printable
+from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_folder
+from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import convert, decode
+from merge_sumo.system.trust import begun_here
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.signals import SignalRuns, Signals, from_runs
+from merge_sumo.values.signals import SignalRuns, Signals, from_runs, to_record
 from merge_sumo.values.trajectory import Trajectory
 
-SETTINGS: Final = "campaign.json"
+SETTINGS: Final = RECORD
 OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
 NAME_CHARACTERS: Final = 300
@@ -47,6 +57,9 @@ RAN_AGAIN: Final = "ran_again"
 """Key of `campaign.json`: how many cases ran again because a process had died or was stopped."""
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json`: the hash of all other keys with their values."""
+Batch = list[tuple[Outcome, Trajectory]]
+MOST_SYNCS: Final = 8
+"""Files that are synced at the same time."""
 
 
 class Run:
@@ -351,3 +364,172 @@ def _check_lines(folder: Path, text: bytes, outcomes: list[Outcome]) -> None:
 def settings_sha256(settings: dict[str, Any]) -> str:
     """Return the hash of settings: what `CHECKSUM` says of them."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+
+
+class Journal:
+    """Writes a campaign's folder, as the only process that does; to be used in `with`.
+
+    The folder appears whole or not at all, and what was appended once stays.
+    """
+
+    def __init__(self, folder: Path, place: Anchor, outcomes: io.FileIO, *, begun: bool) -> None:
+        """Take the folder by name and as it is held, and its open outcomes.
+
+        Use `create` or `reopen`. `begun` is whether this user began the campaign there.
+        """
+        self.folder = folder
+        self._place = place
+        self._begun = begun
+        self._outcomes = outcomes
+        self._threads = ThreadPoolExecutor(MOST_SYNCS)
+        _lock(outcomes, folder)
+
+    @classmethod
+    def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
+        """Create the folder with its settings; `UserError` when it exists or cannot be written."""
+        with new_folder(folder) as new, ExitStack() as undo:
+            (new / TRAJECTORIES).mkdir()
+            _write(new / SETTINGS, _settings_text(settings))
+            place = Anchor(new)
+            undo.callback(place.close)
+            journal = cls(folder, place, (new / OUTCOMES).open("wb", buffering=0), begun=True)
+            note_run(new, folder, settings, begun=True)  # before a kill can leave the folder alone
+            sync_folder(new)
+            undo.pop_all()
+        return journal
+
+    @classmethod
+    def reopen(cls, folder: Path) -> tuple[Self, Run, int]:
+        """Return the journal of a campaign to go on with, what it holds, and what was dropped.
+
+        Dropped are outcomes, whole or torn, of a batch that was not written to its end: they are
+        run again. Raises `UserError` when another process writes the folder, when a link in it
+        leads elsewhere, or as `Run` does.
+        """
+        check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
+        check_own(*(folder / TRAJECTORIES).glob("*"))
+        undo = ExitStack()
+        try:
+            place = Anchor(folder)
+            undo.callback(place.close)
+            outcomes = (place.path / OUTCOMES).open("r+b", buffering=0)
+            undo.callback(outcomes.close)
+        except OSError as error:
+            undo.close()
+            if error.errno in (errno.ENOENT, errno.ENOTDIR):
+                raise UserError(
+                    f"{folder} is not a campaign to go on with: it has no {OUTCOMES}"
+                ) from error
+            raise UserError(f"cannot write {folder}: {error.strerror}") from error
+        try:
+            journal = cls(folder, place, outcomes, begun=begun_here(folder, SETTINGS))
+            run = Run(folder)
+            whole = run.outcomes[: run.whole_batches()]
+            dropped = len(run.outcomes) - len(whole) + run.torn
+            run.outcomes = whole
+            if dropped:
+                outcomes.seek(0)
+                length = sum(len(line) for line, _ in zip(outcomes, whole, strict=False))
+                outcomes.truncate(length)
+                os.fsync(outcomes.fileno())
+        except OSError as error:
+            undo.close()
+            raise UserError(f"cannot write {folder}: {error.strerror}") from error
+        except BaseException:
+            undo.close()
+            raise
+        return journal, run, dropped
+
+    def append(self, *batches: Batch) -> None:
+        """Write the outcomes of batches and their trajectories, and sync them to the disk.
+
+        The trajectories go first, so that every outcome on disk has its trajectory there. Raises
+        `UserError` when they cannot be written; what was there before stays. A disk syncs several
+        batches at once in little more time than one.
+        """
+        paths = [batch_file(self._place.path, batch[0][0].batch) for batch in batches]
+        lines, arrays = zip(*map(_encoded, batches), strict=True)
+        try:
+            end = self._outcomes.seek(0, os.SEEK_END)
+            list(self._threads.map(_write, paths, arrays))
+            sync_folder(self._place.path / TRAJECTORIES)
+            try:
+                _write_all(self._outcomes, b"".join(lines))
+            except OSError:
+                self._outcomes.truncate(end)
+                raise
+        except OSError as error:
+            raise UserError(
+                f"cannot write {self.folder}: {error.strerror}; what ran before is kept: go on "
+                f"with `merge-sumo campaign --resume {quoted(self.folder)}`"
+            ) from error
+
+    def rewrite_settings(self, settings: dict[str, Any]) -> None:
+        """Put other settings in the place of those that were there, all or nothing."""
+        replace_own(self.folder / SETTINGS, _settings_text(settings), place=self._place.path)
+        self.note_own(settings)
+
+    def note_own(self, settings: dict[str, Any]) -> None:
+        """Remember that this user runs the code that the settings name, from this folder."""
+        note_run(self.folder, self.folder, settings, begun=self._begun)
+
+    def __enter__(self) -> Self:
+        """Return the journal."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the folder; another process may write it."""
+        self._threads.shutdown()
+        self._outcomes.close()
+        self._place.close()
+
+
+def _encoded(batch: Batch) -> tuple[bytes, bytes]:
+    """Return the lines of a batch, and the file of its trajectories."""
+    outcomes, trajectories = zip(*batch, strict=True)
+    lines = "".join(map(to_line, outcomes)).encode()
+    signals = {str(o.index): to_record(t.signals) for o, t in batch if t.signals}
+    text = json.dumps(signals, allow_nan=False).encode()
+    kept: dict[str, Any] = {"signals": np.frombuffer(text, np.uint8)} if signals else {}
+    arrays = io.BytesIO()
+    np.savez(
+        arrays,
+        **kept,
+        index=np.array([o.index for o in outcomes]),
+        rows=np.array([len(t.motion) for t in trajectories]),
+        motion=np.concatenate([t.motion.reshape(len(t.motion), -1) for t in trajectories]),
+        lines_sha256=hashlib.sha256(lines).hexdigest(),
+    )
+    return lines, arrays.getvalue()
+
+
+def _settings_text(settings: dict[str, Any]) -> bytes:
+    record = {**settings, CHECKSUM: settings_sha256(settings)}
+    return (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
+
+
+def _lock(outcomes: io.FileIO, folder: Path) -> None:
+    """Refuse when another process holds the lock; it goes with the process, however that ends."""
+    if sys.platform == "win32":  # no flock there
+        return
+    import fcntl
+
+    try:
+        fcntl.flock(outcomes, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        outcomes.close()
+        raise UserError(f"another process writes {folder}: wait until it has ended") from error
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file and sync it to the disk."""
+    with path.open("wb", buffering=0) as file:
+        _write_all(file, content)
+
+
+def _write_all(file: io.FileIO, content: bytes) -> None:
+    # Unbuffered: after an error, nothing is left that closing the file would write after all.
+    rest = memoryview(content)
+    while rest:
+        rest = rest[file.write(rest) :]
+    os.fsync(file.fileno())
