@@ -31,7 +31,7 @@ def _version(
 
 
 def _check_here() -> None:
-    """Raise `UserError` where the working folder is gone: names of files mean nothing there."""
+    """Raise `UserError` where the working folder is gone: relative paths mean nothing then."""
     try:
         Path.cwd()
     except OSError as error:

@@ -25,7 +25,7 @@ class Hosting(TypedDict, total=False):
         vut_command: command that starts the controller of `vut="traci"`.
         deadline_s: time in s that a VUT may take for a step before the case is a VUT_ERROR.
         vut_memory_gib: memory in GiB that the process of a VUT of your own may take.
-        in_process: run such a VUT in this process, where a debugger reaches it.
+        in_process: run such a VUT in this process, within reach of a debugger.
     """
 
     policies: Path | str | None
@@ -111,8 +111,8 @@ def check_keywords(function: str, given: Mapping[str, Any], known: Any) -> None:
 
 def scenario_of(scenario: Scenario | Path | str, follow_up_s: float | None = None) -> Scenario:
     """Return the scenario that a person names, with a follow-up of this duration in s if given."""
-    found = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
-    return found if follow_up_s is None else replace(found, follow_up_s=follow_up_s)
+    named = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
+    return named if follow_up_s is None else replace(named, follow_up_s=follow_up_s)
 
 
 def recordable(given: Mapping[str, Any]) -> dict[str, Any]:

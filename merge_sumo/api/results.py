@@ -61,10 +61,9 @@ class Table(list[dict[str, Any]]):
     """Rows of cases, as in `outcomes.jsonl`: a list that `pandas.DataFrame` takes as it is."""
 
     def __init__(self, outcomes: Iterable[Outcome]) -> None:
-        """Take the rows of outcomes, in their order."""
-        taken = list(outcomes)
-        super().__init__(outcome.to_record() for outcome in taken)
-        scenario = taken[0].case.scenario if taken else US23
+        rows = list(outcomes)
+        super().__init__(outcome.to_record() for outcome in rows)
+        scenario = rows[0].case.scenario if rows else US23
         self._columns = (*PLACE, *(c.field for c in coordinates(scenario)), *VERDICT)
 
     def _repr_html_(self) -> str:
@@ -85,10 +84,12 @@ def _cell(value: object) -> str:
 
 
 class CampaignRun(Result):
-    """A campaign that was run, as its folder holds it."""
+    """A campaign that was run: its folder, read, and the gates that apply to it.
+
+    Raises `UserError` for a folder that is no campaign.
+    """
 
     def __init__(self, folder: Path | str | Run, gates: Iterable[str] = ()) -> None:
-        """Open the folder of a campaign, to which gates may apply; `UserError` when it is none."""
         self._gates = parse_gates(gates)
         self._run = folder if isinstance(folder, Run) else Run(Path(folder))
         if not isinstance(self._run.settings.get("levels"), list):
@@ -169,7 +170,7 @@ class CampaignRun(Result):
         return may_end and len(self._run.outcomes) < self.settings["cases"]
 
     def trajectory(self, index: int) -> Trajectory:
-        """Return the motion of a case; `UserError` when there is none."""
+        """Return the motion of a case; `UserError` for an index without a case."""
         return self._run.trajectory(index)
 
     @property
@@ -203,7 +204,7 @@ class CampaignRun(Result):
         }
 
     def lines(self) -> list[str]:
-        """Return the verdict, the levels, and where report and worst case are."""
+        """Return the verdict, the levels, and the paths of report and worst case."""
         run, levels = self._run, self.summary.levels
         optional = [
             self._converged_line() if self.converged else None,
@@ -274,7 +275,6 @@ class CaseRun(Result):
     """One case that was run."""
 
     def __init__(self, ended: Ended) -> None:
-        """Take the outcome and the motion of the case."""
         self.outcome, self.trajectory = ended.outcome, ended.trajectory
 
     @property
@@ -402,7 +402,7 @@ class Benchmark(Result):
     Attributes:
         samplers: `SamplerSummary` by name: medians and quartiles over the seeds.
         truths: the truth by level.
-        dense: the dense truth by level, where one is known.
+        dense: the dense truth of the levels that have one.
         limit_fmc: coverage of all that truth and searches found, or of the dense truths.
         oracle_fmc: coverage of an oracle by number of cases.
         cases: cases of each search.
@@ -508,20 +508,20 @@ class CertificateResult(Result):
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
         one = self.certificate
-        levels = {level: asdict(found) for level, found in one.levels.items()}
+        levels = {level: asdict(result) for level, result in one.levels.items()}
         summary = {"certain": one.certain, "sentence": one.sentence, "radius": one.radius}
         return {**summary, "levels": levels, "file": str(self.file)}
 
     def lines(self) -> list[str]:
         """Return the sentence, and the worst failures by level."""
         lines = [self.certificate.sentence]
-        for level, found in self.certificate.levels.items():
-            if found.failures or found.untold:
+        for level, result in self.certificate.levels.items():
+            if result.failures or result.untold:
                 lines.append(
-                    f"  level {level_name(level)}: {found.failures:,} failures and "
-                    f"{found.untold:,} without a verdict in {found.cases:,} cases"
+                    f"  level {level_name(level)}: {result.failures:,} failures and "
+                    f"{result.untold:,} without a verdict in {result.cases:,} cases"
                 )
-            for case in found.worst[:NAMED]:
+            for case in result.worst[:NAMED]:
                 values = ", ".join(f"{name} {value:.4g}" for name, value in case.items())
                 lines.append(f"    {values}")
         return [*lines, f"certificate: {self.file}"]
@@ -594,12 +594,11 @@ class CheckResult(Result):
 
     def lines(self) -> list[str]:
         """Return what is wrong in sentences, and the cost of a step."""
-        found = self.found
         return [
-            *(found.problems or ["nothing wrong"]),
-            *(f"note: {sentence}" for sentence in found.notes),
-            f"a step costs {found.us_per_step_median:.0f} us (median), "
-            f"{found.us_per_step_worst:.0f} us at worst",
+            *(self.found.problems or ["nothing wrong"]),
+            *(f"note: {sentence}" for sentence in self.found.notes),
+            f"a step costs {self.found.us_per_step_median:.0f} us (median), "
+            f"{self.found.us_per_step_worst:.0f} us at worst",
         ]
 
 

@@ -268,7 +268,7 @@ def replay(
 ) -> None:
     """Replay a scenario in SUMO and check every position and speed against its record.
 
-    A case of a campaign is exported first, where it is not yet. Says "identical" (exit code 0) or
+    A case of a campaign is exported first. Says "identical" (exit code 0) or
     "diverged at t = ..." (exit code 1).
 
     Example:  merge-sumo replay scenarios/stalemate --gui
@@ -384,7 +384,7 @@ def history(
         "history.html"
     ),
 ) -> None:
-    """Show several versions of a VUT in one page: what was found, what got fixed, what broke.
+    """Show several versions of a VUT in one page: failures, and what got fixed or broke.
 
     Everything is read from the records: no case runs again, and no VUT. A region in which the
     earlier version failed counts as fixed when the later one tested cases there and none failed;

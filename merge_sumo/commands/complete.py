@@ -133,13 +133,13 @@ def runs(incomplete: str) -> Completions:
     """Return the folders of campaigns in `runs`, the newest first, and other folders."""
     from merge_sumo.campaigns.store import SETTINGS
 
-    found = []
+    by_time = []
     for settings in Path(RUNS).glob(f"*/{SETTINGS}"):
         try:
-            found.append((settings.stat().st_mtime, str(settings.parent)))
+            by_time.append((settings.stat().st_mtime, str(settings.parent)))
         except OSError:
             continue
-    newest = [(folder, "campaign") for _, folder in sorted(found, reverse=True)[:MOST_RUNS]]
+    newest = [(folder, "campaign") for _, folder in sorted(by_time, reverse=True)[:MOST_RUNS]]
     known = {f"{folder}/" for folder, _ in newest}
     others = [entry for entry in _files(incomplete, ()) if entry[0] not in known]
     return _beginning(incomplete, [*newest, *others])

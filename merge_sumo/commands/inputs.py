@@ -34,10 +34,10 @@ def check_vut(
     given: Given,
     vut: Annotated[
         str,
-        typer.Argument(help="What you would write after --vut.", autocompletion=complete.vuts),
+        typer.Argument(help="Vehicle under test, as after --vut.", autocompletion=complete.vuts),
     ],
 ) -> None:
-    """Let a VUT drive a few cases and say what is wrong with it, and what a step of it costs.
+    """Let a VUT drive a few cases, and print what is wrong with it and the cost of a step.
 
     Says "nothing wrong" (exit code 0), or what is wrong in sentences (exit code 1).
 
@@ -74,7 +74,7 @@ def new_scenario(
     mainline: Annotated[str, typer.Option(help='Edges of the mainline, past M: "e1 e2".')],
     ramp: Annotated[str, typer.Option(help='Edges of the ramp, past M: "r1 e2".')],
 ) -> None:
-    """Write a scenario for a merge in a net of your own: what was found, and a suggested pool.
+    """Write a scenario for a merge in a net of your own, with a suggested pool.
 
     A picture of the road is written beside it, as SVG.
 
@@ -95,7 +95,7 @@ def check_scenario(
         ),
     ],
 ) -> None:
-    """Say whether a scenario can be hosted, and whether the learned drivers know it.
+    """Check that a scenario can be hosted, and that the learned drivers were trained on it.
 
     Example:  merge-sumo scenario check us23
     """
@@ -128,14 +128,17 @@ def train(
         typer.Option(help="Folder to write.", show_default="the shipped policies, for us23 only"),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Train nothing: measure regret of what is there.")
+        bool,
+        typer.Option(
+            "--check", help="Train nothing: measure the regret of the networks in the folder."
+        ),
     ] = False,
     cases: Annotated[int, typer.Option(help="Random cases of a check.")] = 300,
 ) -> None:
     """Train the learned drivers in SUMO, level by level, and measure their regret.
 
-    The regret is what a driver loses to its best response, as a share of what that gains over
-    level-0 behaviour. An interrupted training goes on with what is not finished.
+    The regret is the loss of a driver against its best response, as a share of the gain of the best
+    response over level-0 behaviour. An interrupted training continues.
 
     Example:  merge-sumo train --out my-policies --seed 1
     """

@@ -119,13 +119,13 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "follow_up": _option(
         float | None,
         None,
-        "How long both drive on behind M: what happens there is measured.",
+        "Time for which both drive on after M, with measures of its own.",
         metavar="SECONDS",
         show_default="the scenario's, 0",
     ),
-    "x": _option(float | None, None, "Where the POV starts, in m: M is 0.", "--x"),
-    "v": _option(float | None, None, "How fast it starts, in m/s.", "--v"),
-    "psi": _option(float | None, None, "Its social value orientation in rad, at level 2."),
+    "x": _option(float | None, None, "Initial position of the POV in m; M is 0.", "--x"),
+    "v": _option(float | None, None, "Initial speed of the POV in m/s.", "--v"),
+    "psi": _option(float | None, None, "Social value orientation of the POV in rad, at level 2."),
     "v_vut0": _option(
         float | None,
         None,
@@ -180,7 +180,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "require": _option(
         str | None,
         None,
-        "What is to hold over time, instead of --fail-when, in signal temporal logic: "
+        "Requirement over time, instead of --fail-when, in signal temporal logic: "
         "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
         metavar="STL",
     ),
@@ -218,8 +218,8 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "in_process": _option(
         bool,
         False,
-        "Run a VUT of your own in this process, where a debugger reaches it, instead of in one of "
-        "its own that it may ruin.",
+        "Run a VUT of your own in this process, within reach of a debugger, instead of in one of "
+        "its own.",
         "--in-process",
     ),
 }

@@ -27,8 +27,8 @@ def truth(
 ) -> None:
     """Find the ground truth of a VUT at each level, by uniform cases on all cores.
 
-    It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of what it
-    depends on, and used again while all files that the VUT has loaded are the same.
+    It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of all inputs,
+    and used again while all files that the VUT has loaded are the same.
 
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
     """
@@ -72,8 +72,8 @@ def compare(
     With all levels, each run shares its cases out over them, and coverage is summed over them.
     The truth of the paper's size misses places that searches find, so coverage is also shown as a
     share of a limit: the coverage of 1,000,000 uniform cases, or of all that truth and searches
-    found together, whichever is more. Such a dense truth is kept as any truth is, and used where it
-    is there; to make it takes minutes, and --dense does.
+    found together, whichever is more. Such a dense truth takes minutes: --dense makes it, and as it
+    is kept, later comparisons use it.
 
     Example:  merge-sumo compare --vut design1 --level 0 --samplers uniform,gpr --seeds 3
     """
@@ -112,10 +112,10 @@ def certify(
 ) -> None:
     """Certify that no ball of a radius in the pool fails throughout, or find one that may.
 
-    Tests a lattice that covers the pool: in every ball of that radius, in coordinates of the unit
-    cube, there is a case of it. Where none of them fails, no such ball fails throughout: certain,
-    as the simulation is deterministic; that the VUT is, some cases that run twice are to show. A
-    failing region that is thinner than the balls may be between the cases.
+    Tests a lattice that covers the pool: every ball of that radius, in coordinates of the unit
+    cube, contains one of its cases. Where none of them fails, no such ball fails throughout. This
+    is certain, as the simulation is deterministic; some cases run twice to show that the VUT is,
+    too. A failing region that is thinner than the balls may lie between the cases.
     `tools/check_certificate.py` checks the folder, and shares nothing with it.
 
     Exit code 0 when it is certain, 1 when a case fails, gives no verdict or ends otherwise the
@@ -169,9 +169,9 @@ def probability(
 ) -> None:
     """Estimate how likely a VUT is to fail, with an interval that is valid.
 
-    The cases of the campaign were chosen to fail: they only say where fresh cases are worth most.
-    These are drawn independently, run in SUMO, and weighted; the interval is by betting, and holds
-    for any number of cases.
+    The cases of the campaign were chosen to fail: they only shape the distribution from which fresh
+    cases are drawn. These are independent, run in SUMO, and weighted; the interval is by betting,
+    and holds for any number of cases.
 
     Example:  merge-sumo probability runs/design2 --cases 4000
     """

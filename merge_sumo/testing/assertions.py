@@ -1,4 +1,4 @@
-"""Assertions on a controller: a campaign that raises `AssertionError` where it finds something."""
+"""Assertions on a controller: a campaign that raises `AssertionError` for a failure."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Final, Unpack
 from merge_sumo import api
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.verdict import NOTHING_TESTED
-from merge_sumo.api.keywords import Setup
+from merge_sumo.api.keywords import Settings
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.store import failures
 from merge_sumo.reports.motion import verdict_of
-from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
@@ -25,25 +24,17 @@ DEFAULT_CASES: Final = 200
 def assert_no_failures(
     vut: AnyVut,
     *,
-    level: int | str = "all",
-    sampler: str = DEFAULT_SAMPLER,
-    cases: int = DEFAULT_CASES,
-    seed: int = 0,
     out: Path | str | None = None,
     workers: int = 1,
-    **setup: Unpack[Setup],
+    **settings: Unpack[Settings],
 ) -> CampaignRun:
     """Test a VUT in a campaign, and raise `AssertionError` where a case fails or ends in an error.
 
     Args:
         vut: vehicle under test: a spec, a class, a function, or an object.
-        level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
-        sampler: name of what chooses the cases.
-        cases: number of cases.
-        seed: same seed, same cases, same result.
         out: new folder to write; `runs/<vut>-<date>` by default.
         workers: processes that run cases; the outcomes are the same.
-        setup: how a case is run and judged, as of `merge_sumo.campaign`: `fail_when` says what
+        settings: as of `merge_sumo.campaign`, with 200 `cases` by default; `fail_when` says what
             counts as a failure.
 
     Returns:
@@ -51,44 +42,35 @@ def assert_no_failures(
 
     Raises:
         AssertionError: where a case fails, ends in an error, or no case reaches the merge point.
-            The message names what was found, the worst case, the report, and the command that
+            The message names the counts, the worst case, the report, and the command that
             replays the case.
         UserError: for values that make no campaign.
     """
     __tracebackhide__ = True
-    run = api.campaign(
-        vut,
-        level=level,
-        sampler=sampler,
-        cases=cases,
-        seed=seed,
-        out=out,
-        workers=workers,
-        progress=False,
-        **setup,
-    )
-    message = _message(run, seed)
+    settings.setdefault("cases", DEFAULT_CASES)
+    run = api.campaign(vut, out=out, workers=workers, progress=False, **settings)
+    message = _message(run, settings.get("seed", 0))
     if message is not None:
         raise AssertionError(message)
     return run
 
 
 def _message(run: CampaignRun, seed: int) -> str | None:
-    """Return what an assertion says of a campaign; None where there is nothing to say."""
+    """Return the message of an assertion; None for a campaign without failures and errors."""
     outcomes = run.run.outcomes
     failed = failures(outcomes)
     wrong = [*failed, *(outcome for outcome in outcomes if outcome.measures.end.is_error)]
     if run.verdict.tested and not wrong:
         return None
-    said = [f"{run.run.vut}: {run.verdict.counts}, with seed {seed}"]
+    lines = [f"{run.run.vut}: {run.verdict.counts}, with seed {seed}"]
     if not run.run.criterion.is_papers:
-        said.append(f"  a case fails when {run.run.criterion.words}")
-    said += run.verdict.trouble_lines()
+        lines.append(f"  a case fails when {run.run.criterion.words}")
+    lines += run.verdict.trouble_lines()
     if not run.verdict.tested:
-        said.append(f"  {NOTHING_TESTED}")
+        lines.append(f"  {NOTHING_TESTED}")
     if wrong:
-        said += _worst(run, wrong[0], "worst case" if failed else "first error")
-    return "\n".join(map(printable, [*said, f"  report: {run.report_file}"]))
+        lines += _worst(run, wrong[0], "worst case" if failed else "first error")
+    return "\n".join(map(printable, [*lines, f"  report: {run.report_file}"]))
 
 
 def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
