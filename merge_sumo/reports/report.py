@@ -11,7 +11,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,13 +19,17 @@ from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
-from merge_sumo.reports.report_words import page_words
+from merge_sumo.reports.report_sections import (
+    head_words,
+    page_template,
+    sections_of,
+    shared_words,
+)
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.scenario import level_name
 
 if TYPE_CHECKING:
-    from jinja2 import Template
+    pass
 
 REPORT: Final = "report.html"
 GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
@@ -81,32 +84,23 @@ def report_page(
         (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
         for name in ("report.css", "report.js")
     )
-    facts = ReportModel(run, summary, workers, on_part)
-    words = page_words(facts)
-    facts.part_ended()
-    data = json.dumps(page_data(facts), allow_nan=False, separators=(",", ":"))
+    model = ReportModel(run, summary, workers, on_part)
+    words = shared_words(model)
+    sections = sections_of(model, words)
+    model.part_ended()
+    data = json.dumps(page_data(model), allow_nan=False, separators=(",", ":"))
     # No "<" in the JSON: nothing in it can end its element.
     data = data.replace("<", "\\u003c")
-    facts.part_ended()
-    return _template().render(
-        **words,
+    model.part_ended()
+    return page_template().render(
+        {**words, **head_words(model)},
+        sections=sections,
         style=Markup(style),  # noqa: S704 (our own file)
         script=Markup(script),  # noqa: S704 (our own file)
         style_hash=policy_hash(style),
         script_hash=policy_hash(script),
         data=Markup(data),  # noqa: S704 (JSON without "<")
-        level_name=level_name,
     )
-
-
-@cache
-def _template() -> Template:
-    """Return the template, which is compiled once."""
-    from jinja2 import Environment, PackageLoader
-
-    loader = PackageLoader("merge_sumo.reports")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
-    return environment.get_template("report.html.jinja")
 
 
 def policy_hash(source: str) -> str:

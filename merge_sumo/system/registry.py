@@ -71,6 +71,11 @@ class Registry(Mapping[str, T], Generic[T]):
         self._registered[name] = self._checked(name, item, "this process")
         return item
 
+    @property
+    def ours(self) -> frozenset[str]:
+        """The names of this package."""
+        return frozenset(self._ours)
+
     def __iter__(self) -> Iterator[str]:
         """Iterate over the names; nothing is imported."""
         return iter(dict.fromkeys((*self._ours, *self._registered, *self._entries())))

@@ -303,8 +303,7 @@ MEASURES: Final[Registry[Measure]] = Registry(
 @cache
 def further_measures() -> dict[str, Measure]:
     """Return the measures that installed packages bring, by name; for a process they stay."""
-    ours = {measure.name for measure in OURS}
-    return {name: MEASURES[name] for name in MEASURES if name not in ours}
+    return {name: MEASURES[name] for name in MEASURES if name not in MEASURES.ours}
 
 
 def further_of(

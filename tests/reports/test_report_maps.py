@@ -15,7 +15,7 @@ from handmade import write_run
 from merge_sumo.analysis.coordinates import coordinates, described
 from merge_sumo.reports.report_maps import PAIR_NODES, explained, maps_of, pairs_of
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.report_words import page_words
+from merge_sumo.reports.report_sections import SECTIONS, shared_words
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.truth import Truth
 from merge_sumo.values.case import Case
@@ -141,7 +141,9 @@ class TestWords:
     @classmethod
     def words(cls, tmp_path_factory):
         folder = tmp_path_factory.mktemp("traffic") / "run"
-        return page_words(ReportModel(write_run(folder, 40, error=None, scenario=TRAFFIC)))
+        model = ReportModel(write_run(folder, 40, error=None, scenario=TRAFFIC))
+        sections = (SECTIONS[name].words(model) for name in ("numbers", "words"))
+        return shared_words(model) | next(sections) | next(sections)
 
     def test_name_the_pairs_and_what_they_explain(self, words):
         zero, _, two = words["levels"]
@@ -164,7 +166,7 @@ class TestWords:
 
     def test_have_a_slider_for_a_third_coordinate(self, tmp_path):
         run = write_run(tmp_path / "run", 10, levels=(0, 2), error=None, scenario=RANGED)
-        zero, two = page_words(ReportModel(run))["levels"]
+        zero, two = shared_words(ReportModel(run))["levels"]
         assert (zero.third.name, zero.third.low, zero.third.high) == ("v_VUT0", 14.0, 22.0)
         assert two.third is None
         assert len(two.pairs) == 6

@@ -1,0 +1,316 @@
+"""The sections of the report: each is a template, and a function from a run to its words.
+
+The head of the page and several sections share words: those of `shared_words`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Set
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from markupsafe import Markup
+
+from merge_sumo.analysis.diagnosis import (
+    BRAKED_MPS,
+    MEANING,
+)
+from merge_sumo.analysis.plausibility import notes_on
+from merge_sumo.analysis.predictions import prediction_in_words
+from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
+from merge_sumo.analysis.verdict import counted, in_words
+from merge_sumo.campaigns import repeats
+from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
+from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.errors import UserError
+from merge_sumo.reports.headline import Rule, after_words, avoidable_words, before_words, headline
+from merge_sumo.reports.report_levels import levels_of
+from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
+from merge_sumo.studies.avoidance import in_a_sentence
+from merge_sumo.studies.truth import TRUTH_CASES
+from merge_sumo.system.printable import printable
+from merge_sumo.system.registry import Registry
+from merge_sumo.values.fmc import radius_for
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.severity import meanings
+from merge_sumo.vuts.output import LOG, end_of
+
+if TYPE_CHECKING:
+    from jinja2 import Environment, Template
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportSection:
+    """A section of the report.
+
+    Attributes:
+        template: source of a Jinja template, with values escaped: a whole `<section>`. Scripts and
+            styles of its own do not run: the policy of the page names those of the page alone.
+        words: returns what the template needs beside `shared_words`; None leaves the section out.
+    """
+
+    template: str
+    words: Callable[[ReportModel], Mapping[str, Any] | None] = lambda _: {}
+
+    def html(self, model: ReportModel, shared: Mapping[str, Any]) -> Markup | None:
+        """Return the section of a run; None where it is left out."""
+        words = self.words(model)
+        if words is None:
+            return None
+        rendered = _compiled(self.template).render({**shared, **words})
+        return Markup(rendered)  # noqa: S704 (the template has escaped its values)
+
+
+def shared_words(model: ReportModel) -> dict[str, Any]:
+    """Return what the head of the page and several sections need."""
+    run, summary = model.run, model.summary
+    levels, fmc_axis = levels_of(model)
+    return {
+        "vut": run.vut,
+        "counts": model.verdict.counts,
+        "troubles": model.troubles(),
+        "summary": summary,
+        "settings": {name: _shown(value) for name, value in run.settings.items() if value},
+        "scenario": run.scenario,
+        "traffic": run.scenario.vehicles > 2,
+        "coordinates": model.coordinates,
+        "levels": levels,
+        "fmc_axis": fmc_axis,
+        "any_truth": any(level.truth is not None for level in levels),
+        "counted": summary.cases - len(model.shown),
+        "predicted": prediction_in_words(run.outcomes),
+        "avoidance": _avoidance(model),
+        "level_name": level_name,
+    }
+
+
+def head_words(model: ReportModel) -> dict[str, Any]:
+    """Return the result in sentences, and what a reader is to know of the page as a whole."""
+    run, wanted = model.run, model.run.settings.get("cases")
+    rule = Rule(run.criterion, run.scenario.dx_crash_m)
+    result = headline(model.verdict, model.summary, model.worst, model.kinds, rule)
+    lost = [str(o.index) for o in model.shown if o.index not in model.motion]
+    if len(lost) > LISTED:
+        lost = [*lost[:LISTED], counted(len(lost) - LISTED, "other")]
+    return {
+        "headline": " ".join(filter(None, (result, run.ran_again_in_words))),
+        "unrepeatable": repeats.unrepeatable(model.repeats),
+        "careful": in_a_sentence(model.avoidance.values()),
+        "lost": in_words(lost) if lost else "",
+        "notes": notes_on(run.outcomes, run.criterion),
+        "torn": run.torn or (isinstance(wanted, int) and model.summary.cases < wanted),
+    }
+
+
+def _untested(model: ReportModel) -> dict[str, Any] | None:
+    return {"more_troubles": model.verdict.troubles[LISTED:]} if model.troubles() else None
+
+
+def _numbers(model: ReportModel) -> dict[str, Any]:
+    outcomes, crash_m = model.run.outcomes, model.run.scenario.dx_crash_m
+    return {
+        "found": model.verdict,
+        "truth_cases": " or ".join(
+            f"{count:,}" for count in sorted({TRUTH_CASES[level] for level in model.levels})
+        ),
+        "plausible_chance": f"{PLAUSIBLE:.0%}",
+        "fewest_failures": FEWEST_FAILURES,
+        "radii": _radii({len(model.run.scenario.dimensions(level)) for level in model.levels}),
+        "avoidable": avoidable_words(model.worst, crash_m),
+        "after": after_words(outcomes, crash_m),
+        "before": before_words(outcomes),
+        "batches": len({o.batch for o in outcomes}),
+        "recorded": _recorded(model.run),
+        "driven": _duration(sum(o.measures.t_end_s for o in outcomes)),
+    }
+
+
+def _maps(model: ReportModel) -> dict[str, Any]:
+    scenario = model.run.scenario
+    return {
+        "severities": meanings(scenario.dx_crash_m),
+        "covered": any(len(scenario.dimensions(level)) <= 3 for level in model.levels),
+    }
+
+
+def _in_words(model: ReportModel) -> dict[str, Any] | None:
+    kinds = _kinds(model)
+    if not model.boxes and not kinds:
+        return None
+    described = Counter(box.level for box in model.boxes for _ in range(box.failures))
+    left = {n: model.summary.levels[n].failures - described[n] for n in model.levels}
+    return {
+        "sentences": [box.sentence for box in model.boxes],
+        "scattered": ", ".join(
+            f"{counted(count, 'failure')} at level {level_name(level)}"
+            for level, count in left.items()
+            if count > 0
+        ),
+        "kinds": kinds,
+        "braked": f"{BRAKED_MPS:g}",
+    }
+
+
+def _cases(model: ReportModel) -> dict[str, Any]:
+    tables = [
+        (f"{trouble.count} {trouble.end}: {trouble.message}", model.examples_of(trouble))
+        for trouble in model.troubles()
+    ]
+    tables += [
+        ("Ten worst failures, one of each region first", model.spread),
+        ("Ten cases nearest to a failure", model.near[:LISTED]),
+    ]
+    if model.surprises:
+        tables.append(("Ten largest errors of the twin's predictions", model.surprises))
+    other_net = model.run.settings.get("net_sha256") != model.road.sha256
+    return {"tables": tables, "other_net": other_net}
+
+
+def _printed(model: ReportModel) -> dict[str, Any] | None:
+    printed = end_of(model.run.folder / LOG)
+    return {"printed": printed} if printed else None
+
+
+def _how(model: ReportModel) -> dict[str, Any]:
+    criterion = model.run.criterion
+    return {
+        "flat_settings": list(_flat(model.run.settings)),
+        "criterion": None if criterion.is_papers else criterion.words,
+    }
+
+
+def _radii(dims_of_levels: Set[int]) -> str:
+    """Return what to know of the radius where there are more than three coordinates."""
+    more = sorted(dims for dims in dims_of_levels if dims > 3)
+    if not more:
+        return ""
+    parts = [f"{radius_for(dims):.2f} for {dims} coordinates" for dims in more]
+    return (
+        f"It is {in_words(parts)}: there a ball is as large as in three. Then the volume is "
+        "integrated by quasi-Monte Carlo, to within some tenths of a percent."
+    )
+
+
+def _kinds(model: ReportModel) -> list[dict[str, Any]]:
+    found = Counter(model.kinds.values())
+    avoidable = Counter(model.kinds[o.index] for o in model.worst if _avoidable_kind(model, o))
+    return [
+        {
+            "name": kind.value,
+            "meaning": MEANING[kind],
+            "count": count,
+            "avoidable": avoidable[kind],
+        }
+        for kind, count in found.most_common()
+    ]
+
+
+def _avoidance(model: ReportModel) -> list[tuple[str, str]]:
+    """Return by driver how many failures it avoids; nothing where that is not known."""
+    known = list(model.avoidance.values())
+    if not known:
+        return []
+    counts = {name: sum(name in one.avoided_by for one in known) for name in REFERENCES}
+    counts["careful, in the POV's place"] = sum(one.pov_careful for one in known)
+    return [(name, f"{count} of {len(known)}") for name, count in counts.items()]
+
+
+def _avoidable_kind(model: ReportModel, outcome: Outcome) -> bool:
+    return outcome.index in model.kinds and bool(outcome.measures.avoidable)
+
+
+def _recorded(run: Run) -> str | None:
+    """Return when a run was recorded and how long it took, by the times of its files."""
+    files = [run.folder / SETTINGS, *(run.folder / TRAJECTORIES).glob("*.npz")]
+    times = [file.stat().st_mtime for file in files if file.is_file()]
+    if len(times) < 2:
+        return None
+    began, took_s = datetime.fromtimestamp(min(times), UTC), max(times) - min(times)
+    took = f"{took_s:.0f} s" if took_s < 100.0 else _duration(took_s)
+    return f"{began:%Y-%m-%d %H:%M} UTC, in {took} (by the times of its files)"
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60.0)
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{seconds / 60.0:.1f} min"
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Any:
+    """Yield (name, value) of settings, nested ones with their path."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name} ")
+        else:
+            yield _shown(f"{prefix}{name}"), _shown(value)
+
+
+def _shown(value: object) -> str:
+    """Return a setting as a text that is fit to be shown; it may be a stranger's."""
+    text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return printable(text[:ERROR_CHARACTERS])
+
+
+@cache
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader
+
+    loader = PackageLoader("merge_sumo.reports")
+    return Environment(loader=loader, autoescape=True, trim_blocks=True)
+
+
+@cache
+def _compiled(source: str) -> Template:
+    return _environment().from_string(source)
+
+
+def page_template() -> Template:
+    """Return the template of the page, around its sections."""
+    return _environment().get_template("report.html.jinja")
+
+
+def _own(name: str) -> str:
+    """Return the source of a template of this package."""
+    path = Path(__file__).parent / "templates" / "sections" / f"{name}.html.jinja"
+    return path.read_text(encoding="utf-8")
+
+
+SECTIONS: Final[Registry[ReportSection]] = Registry(
+    "merge_sumo.report_sections",
+    "report section",
+    {
+        "untested": ReportSection(template=_own("untested"), words=_untested),
+        "numbers": ReportSection(template=_own("numbers"), words=_numbers),
+        "where": ReportSection(template=_own("where"), words=_maps),
+        "words": ReportSection(template=_own("words"), words=_in_words),
+        "cases": ReportSection(template=_own("cases"), words=_cases),
+        "all": ReportSection(template=_own("all")),
+        "search": ReportSection(template=_own("search")),
+        "printed": ReportSection(template=_own("printed"), words=_printed),
+        "how": ReportSection(template=_own("how"), words=_how),
+    },
+    accepts=lambda item: isinstance(item, ReportSection),
+    contract="a merge_sumo.reports.report_sections.ReportSection",
+)
+"""The sections of the page, in their order; those of installed packages come last."""
+
+
+def sections_of(model: ReportModel, shared: Mapping[str, Any]) -> list[Markup]:
+    """Return the sections of a run as HTML; `UserError` where one of another package fails."""
+    sections = []
+    for name, section in SECTIONS.items():
+        try:
+            html = section.html(model, shared)
+        except Exception as error:
+            if name in SECTIONS.ours:
+                raise
+            raise UserError(
+                f"the report section {name!r} failed: {type(error).__name__}: {error}"
+            ) from error
+        if html is not None:
+            sections.append(html)
+    return sections
