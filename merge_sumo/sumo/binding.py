@@ -63,10 +63,10 @@ def load_libsumo() -> Any:
         raise UserError("libsumo is not installed: run `pip install libsumo==1.28.0`") from error
     except ImportError as error:
         raise _library_missing("libsumo", str(error)) from error
-    found = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
-    if found != SUMO_VERSION:
+    version = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
+    if version != SUMO_VERSION:
         raise UserError(
-            f"libsumo is of SUMO {found}, and merge-sumo needs {SUMO_VERSION}: run `pip install "
+            f"libsumo is of SUMO {version}, and merge-sumo needs {SUMO_VERSION}: run `pip install "
             f"--force-reinstall --no-deps libsumo=={SUMO_VERSION} eclipse-sumo=={SUMO_VERSION}`, "
             "and keep packages that bring another SUMO (older libtraci) out of this environment"
         )

@@ -1,7 +1,7 @@
-"""A SUMO in a process of its own, which nobody reaches but this process: it has no port.
+"""A SUMO in a process of its own, which this process alone reaches: it has no port.
 
-The two talk in JSON over a pair of sockets that no one else has. What is said to the child may hand
-over a connection; what the child says is read as data.
+The two exchange JSON over a pair of sockets of their own. A message to the child may hand over a
+connection; messages of the child are read as data.
 """
 
 from __future__ import annotations
@@ -32,7 +32,11 @@ _LENGTH: Final = struct.Struct("!I")
 
 
 class ChildDiedError(Exception):
-    """The process is gone; the text says how it ended, `killed` whether SIGKILL ended it."""
+    """The process is gone; the text says how it ended.
+
+    Attributes:
+        killed: whether SIGKILL ended it.
+    """
 
     def __init__(self, how: str, *, killed: bool = False) -> None:
         """Take how it ended."""
@@ -148,22 +152,27 @@ class SumoChild:
         patience_s: float | None = None,
         connection: socket.socket | None = None,
     ) -> dict[str, Any]:
-        """Return what the child answers; raises `ChildDiedError`, and TimeoutError for nothing.
+        """Return the answer to a message.
 
-        `connection` is handed over; the message says that it is.
+        Args:
+            message: what the child is to do.
+            patience_s: time that it has.
+            connection: is handed over behind the message, which says so.
+
+        Raises:
+            ChildDiedError: when the process is gone.
+            TimeoutError: when it does not answer in time.
         """
         try:
             self.channel.send(message)
             if connection is not None:
                 self.channel.give(connection, self.process.pid)
-            return self.channel.receive(patience_s)
-        except TimeoutError:
-            raise
-        except (OSError, EOFError, ValueError) as error:
+        except OSError as error:
             raise self._death() from error
+        return self.receive(patience_s)
 
-    def receive(self, patience_s: float) -> dict[str, Any]:
-        """Return what the child says unasked; raises as `ask` does."""
+    def receive(self, patience_s: float | None) -> dict[str, Any]:
+        """Return the next message of the child; raises as `ask` does."""
         try:
             return self.channel.receive(patience_s)
         except TimeoutError:

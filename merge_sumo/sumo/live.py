@@ -52,7 +52,7 @@ OPENS_S: Final = 60.0
 
 
 def check_display() -> None:
-    """Raise `UserError` where no window can open."""
+    """Raise `UserError` when there is no display."""
     if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise UserError(
             "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
@@ -177,23 +177,23 @@ class Window:
         """Give the cars the colours that they have in a replay."""
         vehicle = self.vehicle
         for name in vehicle.getIDList():
-            colour = [round(255 * float(part)) for part in COLOURS[_who(name)].split(",")]
+            colour = [round(255 * float(part)) for part in COLOURS[_car(name)].split(",")]
             vehicle.setColor(name, (*colour, 255))
 
     def _look(self) -> None:
         """Write the speeds beside the cars, and let the view follow the VUT.
 
-        It is in the middle, and the others are in the picture.
+        The VUT is in the middle, and the other cars are in the picture.
         """
         vehicle, places, vut = self.vehicle, {}, ""
         for name in vehicle.getIDList():
-            places[_who(name)] = vehicle.getPosition(name)
-            vut = name if _who(name) == VEHICLES[VUT] else vut
+            places[_car(name)] = vehicle.getPosition(name)
+            vut = name if _car(name) == VEHICLES[VUT] else vut
         x, y = places[VEHICLES[VUT]]
         for name in vehicle.getIDList():
-            who = _who(name)
-            text = f"{who.upper()} {vehicle.getSpeed(name):.1f} m/s"
-            ahead = x >= places[VEHICLES[POV]][0] if who == VEHICLES[VUT] else places[who][0] > x
+            car = _car(name)
+            text = f"{car.upper()} {vehicle.getSpeed(name):.1f} m/s"
+            ahead = x >= places[VEHICLES[POV]][0] if car == VEHICLES[VUT] else places[car][0] > x
             vehicle.setParameter(name, LABEL, beside(text, ahead=ahead))
         wide, high = WINDOW
         half_m = max(
@@ -269,7 +269,8 @@ def _serve(channel: Channel, libsumo: Any) -> None:
             channel.send({"value": None if message["call"] == "start" else value})
 
 
-def _who(name: str) -> str:
+def _car(name: str) -> str:
+    """Return the name of a vehicle without its corridor."""
     return name.partition(".")[0]
 
 

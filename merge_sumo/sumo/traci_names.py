@@ -54,7 +54,7 @@ def named() -> dict[tuple[int, int], Named]:
     """Return all commands on variables, by the numbers of both."""
     traci = load_traci()
     domain_of = traci.domain.Domain
-    found: dict[tuple[int, int], list[str]] = {}
+    functions: dict[tuple[int, int], list[str]] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # some functions are deprecated
         for name, domain in sorted(vars(traci).items()):
@@ -66,10 +66,10 @@ def named() -> dict[tuple[int, int], Named]:
                 for function, call in inspect.getmembers(mine, inspect.ismethod):
                     sent = None if function.startswith("_") else _sent(mine, call)
                     if sent is not None:
-                        found.setdefault(sent, []).append(f"{name}.{function}")
+                        functions.setdefault(sent, []).append(f"{name}.{function}")
             finally:
                 mine._connection = before
-    return {key: Named(*key, tuple(functions)) for key, functions in found.items()}
+    return {key: Named(*key, tuple(names)) for key, names in functions.items()}
 
 
 def _sent(domain: Any, call: Any) -> tuple[int, int] | None:

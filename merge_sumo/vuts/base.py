@@ -27,7 +27,7 @@ from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT
 from merge_sumo.values.signals import Left, as_signals
 from merge_sumo.values.trajectory import as_reason
-from merge_sumo.vuts.blame_cell import NOBODY, asked
+from merge_sumo.vuts.blame_cell import NO_CORRIDOR, current_call
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -84,6 +84,24 @@ class Vut:
     vut_type: Mapping[str, str] | None = None
     files: tuple[Path, ...] = ()
     named_only: bool = False
+
+
+def split_options(argument: str, spec: str) -> tuple[str, dict[str, str]]:
+    """Return what stands before "?", and the options NAME=VALUE behind it, joined by "&".
+
+    Raises:
+        UserError: for what is no option, and for one that is given twice.
+    """
+    before, _, text = argument.partition("?")
+    options: dict[str, str] = {}
+    for part in filter(None, text.split("&")):
+        name, equals, value = part.partition("=")
+        if not (name and equals and value):
+            raise UserError(f"--vut {spec}: {part!r} is not an option: write NAME=VALUE")
+        if name in options:
+            raise UserError(f"--vut {spec}: the option {name} is there twice")
+        options[name] = value
+    return before, options
 
 
 class Car(NamedTuple):
@@ -202,7 +220,7 @@ class Deadline:
 
     def __exit__(self, *_: object) -> None:
         """Stop the timer."""
-        asked.note(NOBODY)
+        current_call.note(NO_CORRIDOR)
         if self._restore is not None:
             self._restore()
             self._restore = None
@@ -215,7 +233,7 @@ class Deadline:
 
     def call(self, corridor: int, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return function(*arguments), asked for a corridor; `DeadlineExceeded` if late."""
-        asked.note(corridor)
+        current_call.note(corridor)
         if self._restore is not None:
             # Anew for each call: a ring before its deadline would cut short what waits in C.
             first_s = RING_AFTER * self.deadline_s
@@ -234,7 +252,7 @@ class Deadline:
 
         Raises the error again where it is no VUT's: a person wants to stop.
         """
-        if isinstance(error, (Stopped, KeyboardInterrupt)) and not asked.shared:
+        if isinstance(error, (Stopped, KeyboardInterrupt)) and not current_call.shared:
             raise error
         if isinstance(error, DeadlineExceeded):
             return self.deadline_exceeded

@@ -1,27 +1,30 @@
-"""Which corridor's controller is being asked, for whoever watches the process of a VUT."""
+"""The corridor whose controller is being called, for the process that watches that of a VUT."""
 
 from __future__ import annotations
 
 import struct
 from typing import Any, Final
 
-NOBODY: Final = -1
-EVERYBODY: Final = -2
-"""Whom a batched VUT is asked for."""
+NO_CORRIDOR: Final = -1
+ALL_CORRIDORS: Final = -2
+"""A batched VUT is called for all at once."""
 
 
 class BlameCell:
-    """Which corridor's controller is being asked, in memory that outlives the process.
+    """The corridor whose controller is being called, in memory that outlives the process.
 
-    Whoever watches the process reads from it whose doing it was that the process died or hangs.
+    The process that watches reads from it which controller was at work when the process died or
+    hung.
+
+    Attributes:
+        shared: whether another process reads it: then this process is there for a VUT alone.
     """
 
     FORMAT: Final = struct.Struct("<Qq")
 
     def __init__(self) -> None:
-        """Note it where nobody else reads it."""
+        """Note it in memory of this process alone."""
         self.shared = False
-        """Whether somebody does: then this process is there for a VUT alone."""
         self._memory: Any = bytearray(self.FORMAT.size)
         self._count = 0
 
@@ -31,15 +34,15 @@ class BlameCell:
 
     @classmethod
     def read(cls, memory: Any) -> tuple[int, int]:
-        """Return from such a buffer how often something was noted, and what was last."""
+        """Return from such a buffer the number of notes so far, and the last one."""
         count, corridor = cls.FORMAT.unpack_from(memory)
         return count, corridor
 
     def note(self, corridor: int) -> None:
-        """Note a corridor, `NOBODY` or `EVERYBODY`."""
+        """Note a corridor, `NO_CORRIDOR` or `ALL_CORRIDORS`."""
         self._count += 1
         self.FORMAT.pack_into(self._memory, 0, self._count, corridor)
 
 
-asked: Final = BlameCell()
+current_call: Final = BlameCell()
 """Of this process."""

@@ -13,12 +13,12 @@ Files = dict[str, str | None]
 
 def hashed(paths: Iterable[Path]) -> Files:
     """Return the files with their hashes."""
-    here = Path.cwd().resolve()
-    found: Files = {}
+    folder = Path.cwd().resolve()
+    files: Files = {}
     for path in sorted({path.resolve() for path in paths}):
-        name = path.relative_to(here) if path.is_relative_to(here) else path
-        found[name.as_posix()] = sha256_of(path)
-    return found
+        name = path.relative_to(folder) if path.is_relative_to(folder) else path
+        files[name.as_posix()] = sha256_of(path)
+    return files
 
 
 def changed(files: Files) -> list[str]:

@@ -12,9 +12,8 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions
-from merge_sumo.vuts.blame_cell import asked
-from merge_sumo.vuts.options import split_options
+from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, split_options
+from merge_sumo.vuts.blame_cell import current_call
 
 INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 OUTPUT: Final = "acceleration_mps2"
@@ -94,8 +93,8 @@ class Unit:
         """Return a variable that is one 64-bit float; `UserError` when it is not."""
         variable = variables.get(name)
         if variable is None:
-            there = ", ".join(sorted(variables)[:12])
-            raise UserError(f"{self._path} has no variable {name!r}; it has {there}")
+            names = ", ".join(sorted(variables)[:12])
+            raise UserError(f"{self._path} has no variable {name!r}; it has {names}")
         if variable.type not in _FLOATS:
             raise UserError(
                 f"the variable {name!r} of {self._path} is a {variable.type}: it must be a Real "
@@ -154,7 +153,7 @@ class FmuVut(PerCorridor):
 
     def renew(self, corridor: int) -> None:
         """Replace the instance of a corridor."""
-        asked.note(corridor)
+        current_call.note(corridor)
         _free(self._instances[corridor])
         self._instances[corridor] = None
         self._instances[corridor] = self._unit.instance(f"vut{corridor}")

@@ -110,8 +110,10 @@ def drivers_of(
             continue
         name = spec.partition(":")[2]
         if travels(spec):
-            where = "the processes of the workers" if count > 1 else "this process"
-            why = f"{name} is an object, so it drives in {where}, which what it does wrong may end"
+            process = "the processes of the workers" if count > 1 else "this process"
+            why = (
+                f"{name} is an object, so it drives in {process}, which what it does wrong may end"
+            )
         else:
             alone = ", and without workers," if count > 1 else ""
             workers = 1
@@ -150,12 +152,12 @@ def _importable(target: Any) -> str | None:
     module, name = getattr(target, "__module__", None), getattr(target, "__qualname__", "")
     if module in (None, *MAINS) or "<" in name:
         return None
-    found: Any = sys.modules.get(str(module))
-    if getattr(found, "__spec__", None) is None or getattr(found, "__file__", None) is None:
+    imported: Any = sys.modules.get(str(module))
+    if any(getattr(imported, own, None) is None for own in ("__spec__", "__file__")):
         return None
     for part in name.split("."):
-        found = getattr(found, part, None)
-    return f"{module}:{name}" if found is target else None
+        imported = getattr(imported, part, None)
+    return f"{module}:{name}" if imported is target else None
 
 
 def _files(vut: Any) -> tuple[Path, ...]:

@@ -13,8 +13,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, US23
-from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions
-from merge_sumo.vuts.options import split_options
+from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, split_options
 
 PERIOD: Final = "decision_period_s"
 """Metadata of a network, or option: it decides this often and holds its acceleration."""

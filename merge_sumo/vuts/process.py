@@ -64,11 +64,6 @@ class Program:
         """Id of its process, which is that of its session."""
         return self._process.pid
 
-    @property
-    def running(self) -> bool:
-        """Whether it has not ended."""
-        return self._process.poll() is None
-
     def ended(self, patience_s: float) -> str:
         """Return how it ended and the last line that it printed; "" when it still runs."""
         try:

@@ -33,7 +33,7 @@ from merge_sumo.vuts.base import (
     seen_at_start,
     text_of,
 )
-from merge_sumo.vuts.blame_cell import EVERYBODY, NOBODY, asked
+from merge_sumo.vuts.blame_cell import ALL_CORRIDORS, NO_CORRIDOR, current_call
 from merge_sumo.vuts.signatures import check_call, check_methods, fits
 
 GROUP: Final = "merge_sumo.vuts"
@@ -202,7 +202,9 @@ class BatchedVut(Driver):
         self._raised = None
         try:
             with self._deadline as deadline:
-                answer = np.asarray(deadline.call(EVERYBODY, self._object.act_batch, _batch(scene)))
+                answer = np.asarray(
+                    deadline.call(ALL_CORRIDORS, self._object.act_batch, _batch(scene))
+                )
             if answer.shape != (self.corridors,) or answer.dtype.kind not in "fiu":
                 raise WrongAnswerError(
                     f"answered shape {answer.shape} of {answer.dtype} instead of "
@@ -255,7 +257,7 @@ def _batch(scene: Scene) -> SeenBatch:
 
 
 def _made(target: type, spec: str, *arguments: int) -> Any:
-    asked.note(NOBODY)  # it goes on: each object may take its time
+    current_call.note(NO_CORRIDOR)  # it goes on: each object may take its time
     try:
         return target(*arguments)
     except (Exception, SystemExit) as error:
@@ -287,7 +289,7 @@ def _close(vut: Any, deadline_s: float) -> None:
     try:
         with deadline:
             if _has(vut, "close"):
-                deadline.call(NOBODY, vut.close)
+                deadline.call(NO_CORRIDOR, vut.close)
     except BaseException as error:
         sys.stderr.write(f"closing the VUT: {deadline.reason(error)}\n")
 

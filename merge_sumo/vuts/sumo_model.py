@@ -17,8 +17,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VUT
-from merge_sumo.vuts.base import Vut, VutOptions
-from merge_sumo.vuts.options import split_options
+from merge_sumo.vuts.base import Vut, VutOptions, split_options
 
 SHARED_OPTIONS: Final = {
     *("maxSpeed", "accel", "decel", "emergencyDecel"),

@@ -25,8 +25,9 @@ import pytest
 import traci
 from campaigning import run_campaign
 from conftest import require, some
+from controllers import RAW_CLIENT, assert_drives_as_level0, free_port, program, raw_client
 from raw_traci import GET_LANE, MISDEEDS, STEP, Client, GoneError, command, text
-from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+from vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene
@@ -41,18 +42,12 @@ from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.traci.vut import TraciVut
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
-SUPPORT = Path(__file__).parents[1] / "support"
 CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
     encoding="utf-8"
 )
 (CONTROLLER,) = re.findall(r"```python\n(import sys, traci.*?)```", PAGE, flags=re.DOTALL)
 """The tutorial's controller; its law is that of level 0."""
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 class Played:
@@ -374,12 +369,10 @@ def assert_same_to_1e9(one: list[dict], other: list[dict]) -> None:
 
 @pytest.mark.parametrize("count", [40, pytest.param(400, marks=pytest.mark.long)])
 def test_the_same_law_by_traci_and_in_process_gives_the_same_measures(tmp_path, count):
-    (tmp_path / "controller.py").write_text(CONTROLLER)
-    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
-    command = f"{sys.executable} {tmp_path / 'controller.py'} {{port}}"
+    command = program(tmp_path, CONTROLLER)
     shared = {"levels": (0,), "sampler": "uniform", "cases": count, "batch": 20, "seed": 4}
     by_traci = CampaignSettings(vut="traci", vut_command=command, **shared)
-    in_process = CampaignSettings(vut=f"{tmp_path / 'law.py'}:Level0", **shared)
+    in_process = CampaignSettings(vut="level0", **shared)
     run_campaign(by_traci, tmp_path / "traci")
     run_campaign(in_process, tmp_path / "python")
     found = measures_of(tmp_path / "traci")
@@ -453,14 +446,8 @@ def cpp_client(tmp_path_factory) -> Path:
     return folder / "client"
 
 
-def test_a_controller_in_cpp_on_libtraci_drives_like_the_same_law_in_process(cpp_client, tmp_path):
-    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
-    cases = cases_of(20)
-    by_cpp = run_cases(factory("traci", command=f"{cpp_client} {{port}}"), cases)
-    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
-    for one, other in zip(by_cpp, by_python, strict=True):
-        assert one.error is None
-        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+def test_a_controller_in_cpp_on_libtraci_drives_like_the_same_law_in_process(cpp_client):
+    assert_drives_as_level0(factory("traci", command=f"{cpp_client} {{port}}"), cases_of(20))
 
 
 LIBTRACI = CONTROLLER.replace("import sys, traci", "import sys\nimport libtraci as traci").replace(
@@ -489,24 +476,14 @@ def test_a_controller_on_the_package_libtraci_drives_like_the_same_law_in_proces
     )
     if interpreter is None:
         pytest.skip("libtraci is not here: set LIBTRACI_PYTHON to a Python that has it")
-    (tmp_path / "client.py").write_text(LIBTRACI)
-    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
-    cases = cases_of(20)
-    command = f"{interpreter} {tmp_path / 'client.py'} {{port}}"
-    by_libtraci = run_cases(factory("traci", command=command), cases)
-    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
-    for one, other in zip(by_libtraci, by_python, strict=True):
-        assert one.error is None
-        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+    command = program(tmp_path, LIBTRACI).replace(sys.executable, interpreter)
+    assert_drives_as_level0(factory("traci", command=command), cases_of(20))
 
 
 def test_traci_start_with_our_port_connects_to_us_and_not_to_the_sumo_it_starts(tmp_path):
-    program = tmp_path / "starts.py"
     head = 'import sys, traci\ntraci.start(["sumo", "-n", "no.net.xml"], port=int(sys.argv[1]))'
-    program.write_text(CONTROLLER.replace("import sys, traci\ntraci.init(int(sys.argv[1]))", head))
-    trajectories = run_cases(
-        factory("traci", command=f"{sys.executable} {program} {{port}}"), cases_of(2)
-    )
+    source = CONTROLLER.replace("import sys, traci\ntraci.init(int(sys.argv[1]))", head)
+    trajectories = run_cases(factory("traci", command=program(tmp_path, source)), cases_of(2))
     assert [t.error for t in trajectories] == [None, None]
 
 
@@ -525,17 +502,9 @@ for _ in range({episodes}):
 def test_a_program_may_connect_for_every_episode_and_is_started_again_when_it_has_ended(
     tmp_path, episodes
 ):
-    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
-    program = tmp_path / "episodes.py"
     head = f"open({str(tmp_path / 'started')!r}, 'a').write('.')\n"
-    program.write_text(head + EPISODES.format(episodes=episodes))
-    cases = cases_of(4)
-    command = f"{sys.executable} {program} {{port}}"
-    by_traci = run_cases(factory("traci", command=command), cases)
-    by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
-    for one, other in zip(by_traci, by_python, strict=True):
-        assert one.error is None
-        assert one.motion == pytest.approx(other.motion, abs=1e-9)
+    command, cases = program(tmp_path, head + EPISODES.format(episodes=episodes)), cases_of(4)
+    assert_drives_as_level0(factory("traci", command=command), cases)
     assert len((tmp_path / "started").read_text()) == -(-len(cases) // episodes)
 
 
@@ -556,17 +525,6 @@ def children() -> set[str]:
     return found
 
 
-ENDS = """
-from raw_traci import Client
-Client(int(sys.argv[1])).drive(4)
-sys.exit({words!r})
-"""
-
-
-def program(misdeed: str) -> str:
-    return f"{sys.executable} {SUPPORT / 'raw_traci.py'} {{port}} '{misdeed}'"
-
-
 @pytest.mark.parametrize(
     ("misdeed", "reason"),
     [
@@ -584,7 +542,7 @@ def program(misdeed: str) -> str:
 )
 def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(misdeed, reason):
     before = descriptors()
-    vut = factory("traci", command=program(misdeed), deadline_s=0.5)
+    vut = factory("traci", command=raw_client(misdeed), deadline_s=0.5)
     trajectories = run_cases(vut, cases_of(2))
     for trajectory in trajectories:
         assert trajectory.end is End.VUT_ERROR
@@ -617,13 +575,8 @@ def test_a_command_that_never_connects_is_told_how():
 
 def test_the_reason_of_an_end_is_not_that_of_a_sumo_which_the_controller_started(tmp_path):
     words = "KeyError: 64\nError: Could not access configuration 'm.sumocfg'.\nQuitting (on error)."
-    ends = tmp_path / "ends.py"
-    ends.write_text(
-        f"import sys\nsys.path.insert(0, {str(SUPPORT)!r})\n" + ENDS.format(words=words)
-    )
-    (trajectory,) = run_cases(
-        factory("traci", command=f"{sys.executable} {ends} {{port}}"), cases_of(1)
-    )
+    command = program(tmp_path, f"{RAW_CLIENT}client.drive(4)\nsys.exit({words!r})\n")
+    (trajectory,) = run_cases(factory("traci", command=command), cases_of(1))
     assert trajectory.error.endswith("the controller ended with exit code 1: KeyError: 64")
 
 
@@ -650,6 +603,11 @@ def test_the_server_listens_on_the_loopback_interface_only():
 
     played = Played(client, steps=1)
     assert played.result == [f"0100007F:{played.port:04X}"]
+
+
+def assert_has_verdict_or_reason(trajectory) -> None:
+    assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
+    assert trajectory.error is None or trajectory.error.startswith("the controller ")
 
 
 class Monkey:
@@ -692,8 +650,7 @@ def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count)
             vut = factory(f"traci:{port}", deadline_s=deadline_s, connect_s=5.0)
             trajectories = run_cases(vut, cases[: min(len(cases), count - misdeeds)])
             for trajectory in trajectories:
-                assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
-                assert trajectory.error != ""
+                assert_has_verdict_or_reason(trajectory)
             ran += len(trajectories)
             misdeeds += sum(t.end is End.VUT_ERROR for t in trajectories)
     finally:
@@ -779,8 +736,7 @@ def test_of_mutated_messages_of_a_session_every_case_has_its_verdict_or_its_reas
         while len(monkey.done) < count:
             vut = factory(f"traci:{port}", deadline_s=0.1, connect_s=5.0)
             for trajectory in run_cases(vut, cases):
-                assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
-                assert trajectory.error is None or trajectory.error.startswith("the controller ")
+                assert_has_verdict_or_reason(trajectory)
                 ran += 1
     finally:
         monkey.stop()
@@ -904,7 +860,7 @@ def test_a_storm_of_connections_ends_with_a_verdict_or_a_reason_for_every_case(s
         for trajectory in run_cases(
             factory(f"traci:{port}", deadline_s=0.2, connect_s=5.0), cases_of(50)
         ):
-            assert (trajectory.error is None) == (trajectory.end is not End.VUT_ERROR)
+            assert_has_verdict_or_reason(trajectory)
     finally:
         stopped.set()
         storming.join()

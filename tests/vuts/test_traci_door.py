@@ -18,9 +18,18 @@ from pathlib import Path
 import pytest
 import traci
 from conftest import require, some
+from controllers import (
+    RAW_CLIENT,
+    STOCK_CLIENT,
+    SUPPORT,
+    assert_drives_as_level0,
+    free_port,
+    program,
+    raw_client,
+)
 from processes import none_left, ports_of
 from raw_traci import Client, GoneError
-from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+from vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.errors import UserError
 from merge_sumo.system import landlock
@@ -29,13 +38,11 @@ from merge_sumo.vuts.process import TOKEN_VARIABLE
 from merge_sumo.vuts.traci import door
 from merge_sumo.vuts.traci.door import TOKEN_KEY, descends, owner_of
 
-SUPPORT = Path(__file__).parents[1] / "support"
 RAW = SUPPORT / "raw_traci.py"
-OURS = f"{sys.executable} {RAW} {{port}}"
+OURS = raw_client()
 CAMPAIGN = sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", "traci"
 GIVES = (
-    "import sys, traci\n"
-    "traci.init(int(sys.argv[1]), numRetries=600)\n"
+    f"{STOCK_CLIENT}"
     f"traci.simulation.setParameter('', '{TOKEN_KEY}', sys.argv[2])\n"
     "while traci.simulation.getMinExpectedNumber() > 0:\n"
     "    traci.simulationStep()\n"
@@ -44,11 +51,6 @@ GIVES = (
     "traci.close()\n"
 )
 """A stock client that gives a token first; its law is that of level 0."""
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 @contextmanager
@@ -111,43 +113,23 @@ def guess(client: Client) -> None:
 class TestAProgram:
     @pytest.mark.parametrize("name", some(STRANGERS, "drives", "guesses a token"))
     def test_is_served_whoever_of_the_same_user_connects_besides(self, name, tmp_path):
-        port = free_port()
-        (tmp_path / "law.py").write_text(LEVEL0_CLASS)
-        log = tmp_path / "controller.log"
-        cases = cases_of(2)
+        port, log = free_port(), tmp_path / "controller.log"
         with strangers(port, STRANGERS[name]) as served:
-            by_traci = run_cases(factory(f"traci:{port}", command=OURS, log=log), cases)
-        by_python = run_cases(factory(f"{tmp_path / 'law.py'}:Level0"), cases)
-        for one, other in zip(by_traci, by_python, strict=True):
-            assert one.error is None
-            assert one.motion == pytest.approx(other.motion, abs=1e-9)
+            vut = factory(f"traci:{port}", command=OURS, log=log)
+            assert_drives_as_level0(vut, cases_of(2))
         assert not any(served)
         if name == "drives":
             assert "a process that --vut-command did not start connected" in log.read_text()
 
-    def test_may_have_a_child_that_connects(self):
-        command = f"sh -c '{sys.executable} {RAW} {{port}} & wait'"
-        (trajectory,) = run_cases(factory("traci", command=command), cases_of(1))
-        assert trajectory.error is None
-
-    def test_may_have_a_child_in_a_session_of_its_own(self):
-        command = f"sh -c 'setsid {sys.executable} {RAW} {{port}} & wait'"
+    @pytest.mark.parametrize("in_a_session", ["", "setsid "], ids=["of ours", "of its own"])
+    def test_may_have_a_child_that_connects(self, in_a_session):
+        command = f"sh -c '{in_a_session}{OURS}& wait'"
         (trajectory,) = run_cases(factory("traci", command=command), cases_of(1))
         assert trajectory.error is None
 
     def test_that_ends_while_its_client_goes_on_is_an_error_of_every_case(self, tmp_path):
-        program = tmp_path / "leaves.py"
-        program.write_text(
-            "import os, sys, time\n"
-            f"sys.path.insert(0, {str(SUPPORT)!r})\n"
-            "from raw_traci import Client\n"
-            "client = Client(int(sys.argv[1]))\n"
-            "client.step()\n"
-            "if os.fork():\n"
-            "    os._exit(0)\n"
-            "client.drive(10_000)\n"
-        )
-        command = f"{sys.executable} {program} {{port}}"
+        leaves = "client.step()\nif os.fork():\n    os._exit(0)\nclient.drive(10_000)\n"
+        command = program(tmp_path, RAW_CLIENT + leaves)
         with none_left():
             trajectories = run_cases(factory("traci", command=command), cases_of(3))
         for trajectory in trajectories:
@@ -180,16 +162,11 @@ class TestAProgram:
 
     @pytest.mark.parametrize("campaign", ["that ends", "that is late"])
     def test_that_we_end_leaves_no_traceback(self, campaign, tmp_path):
-        log, program = tmp_path / "controller.log", tmp_path / "for_ever.py"
+        log = tmp_path / "controller.log"
         late = "    if 'vut' in traci.vehicle.getIDList(): time.sleep(600)\n"
-        program.write_text(
-            "import sys, time, traci\n"
-            "traci.init(int(sys.argv[1]))\n"
-            "print('begun', flush=True)\n"
-            "while True:\n"
-            "    traci.simulationStep()\n" + (late if campaign == "that is late" else "")
-        )
-        command = f"{sys.executable} {program} {{port}}"
+        for_ever = "print('begun', flush=True)\nwhile True:\n    traci.simulationStep()\n"
+        source = STOCK_CLIENT + for_ever + (late if campaign == "that is late" else "")
+        command = program(tmp_path, source)
         vut = factory("traci", command=command, log=log, deadline_s=1.0)
         (trajectory,) = run_cases(vut, cases_of(1))
         assert (trajectory.error is None) == (campaign == "that ends")
@@ -294,10 +271,8 @@ class TestAnotherUser:
 def test_the_sumo_that_a_controller_asks_has_no_port(tmp_path):
     """Of all sockets by TCP or UDP, its process has the client's connection alone."""
     port, seen, stopped = free_port(), list[list[str]](), threading.Event()
-    asks = tmp_path / "asks.py"
-    asks.write_text(
-        "import sys, time, traci\n"
-        "traci.init(int(sys.argv[1]))\n"
+    asks = (
+        f"{STOCK_CLIENT}"
         "while traci.simulation.getMinExpectedNumber() > 0:\n"
         "    traci.simulationStep()\n"
         "    if 'vut' in traci.vehicle.getIDList():\n"
@@ -316,8 +291,8 @@ def test_the_sumo_that_a_controller_asks_has_no_port(tmp_path):
     thread = threading.Thread(target=look)
     thread.start()
     try:
-        command = f"{sys.executable} {asks} {{port}}"
-        (trajectory,) = run_cases(factory(f"traci:{port}", command=command), cases_of(1))
+        vut = factory(f"traci:{port}", command=program(tmp_path, asks))
+        (trajectory,) = run_cases(vut, cases_of(1))
     finally:
         stopped.set()
         thread.join()
@@ -441,13 +416,8 @@ def test_a_sumo_that_is_ended_once_is_nobodys_fault(tmp_path, signal, times, err
                 os.kill(process, signal)
                 ended.append(process)
 
-    slow = tmp_path / "slow.py"
-    slow.write_text(
-        "import sys, time\n"
-        f"sys.path.insert(0, {str(SUPPORT)!r})\n"
-        "from raw_traci import Client\n"
-        "client = Client(int(sys.argv[1]))\n"
-        "client.drive(10)\n"
+    slow = (
+        f"{RAW_CLIENT}client.drive(10)\n"
         f"open({str(tmp_path / 'drives')!r}, 'w').close()\n"
         "while True:\n"
         "    client.drive(1)\n"
@@ -456,8 +426,8 @@ def test_a_sumo_that_is_ended_once_is_nobodys_fault(tmp_path, signal, times, err
     thread = threading.Thread(target=end)
     thread.start()
     try:
-        command = f"{sys.executable} {slow} {{port}}"
-        trajectories = run_cases(factory("traci", command=command), cases_of(3))
+        vut = factory("traci", command=program(tmp_path, slow))
+        trajectories = run_cases(vut, cases_of(3))
     finally:
         ended.extend([0] * times)
         thread.join()
@@ -467,11 +437,8 @@ def test_a_sumo_that_is_ended_once_is_nobodys_fault(tmp_path, signal, times, err
 
 def test_who_serves_is_locked_and_keeps_no_file_of_its_own(tmp_path):
     require(landlock.version() > 0, "the kernel has no Landlock")
-    asks = tmp_path / "asks.py"
-    asks.write_text(
-        "import sys, traci\n"
-        "traci.init(int(sys.argv[1]))\n"
-        "traci.simulationStep()\n"
+    asks = (
+        f"{STOCK_CLIENT}traci.simulationStep()\n"
         "try:\n"
         f"    traci.simulation.saveState({str(tmp_path / 'state.xml')!r})\n"
         "except traci.TraCIException as error:\n"
@@ -480,28 +447,20 @@ def test_who_serves_is_locked_and_keeps_no_file_of_its_own(tmp_path):
         "    traci.simulationStep()\n"
     )
     log = tmp_path / "controller.log"
-    (trajectory,) = run_cases(
-        factory("traci", command=f"{sys.executable} {asks} {{port}}", log=log), cases_of(1)
-    )
+    vut = factory("traci", command=program(tmp_path, asks), log=log)
+    (trajectory,) = run_cases(vut, cases_of(1))
     assert trajectory.error is None
     assert "does not carry out simulation.saveState" in log.read_text()
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["asks.py", "controller.log"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["controller.log", "controller.py"]
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", pytest.param("SIGINT", marks=pytest.mark.long)])
 def test_a_campaign_that_is_stopped_while_a_controller_thinks_ends_at_once(name, tmp_path):
     """And not when the controller's deadline of ten minutes has passed; nothing is left."""
-    thinks, begun = tmp_path / "thinks.py", tmp_path / "begun"
-    thinks.write_text(
-        "import sys, time\n"
-        f"sys.path.insert(0, {str(SUPPORT)!r})\n"
-        "from raw_traci import Client\n"
-        "Client(int(sys.argv[1])).drive(4)\n"
-        f"open({str(begun)!r}, 'w').close()\n"
-        "time.sleep(600)\n"
-    )
+    begun = tmp_path / "begun"
+    thinks = f"client.drive(4)\nopen({str(begun)!r}, 'w').close()\ntime.sleep(600)\n"
     asked = ("--cases", "5", "--deadline", "600", "--out", str(tmp_path / "run"))
-    command = f"{sys.executable} {thinks} {{port}}"
+    command = program(tmp_path, RAW_CLIENT + thinks)
     with none_left():
         campaign = subprocess.Popen(
             [*CAMPAIGN, "--vut-command", command, *asked],

@@ -38,8 +38,8 @@ class LoadedFiles:
         modules: list[Any] = [m for n, m in list(sys.modules.items()) if n not in self._before]
         imported = [str(getattr(module, "__file__", None) or "") for module in modules]
         sources = {os.path.realpath(file) for file in imported if file}
-        found = sources | self._read - self._written
-        return {path for path in found if self._theirs(path) and Path(path).is_file()}
+        paths = sources | self._read - self._written
+        return {path for path in paths if self._theirs(path) and Path(path).is_file()}
 
     def _theirs(self, path: str) -> bool:
         # Compiled modules stand for their sources, which are in `sys.modules`; what packages are
@@ -59,13 +59,13 @@ class LoadedFiles:
         if not isinstance(path, str | bytes):
             return  # a descriptor, opened before
         try:
-            where = os.path.realpath(os.fsdecode(path))
+            real_path = os.path.realpath(os.fsdecode(path))
         except (OSError, ValueError):  # the name is none; the VUT shall hear it from `open`
             return
         reads = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR) == 0
         if isinstance(mode, str):
             reads = not set(mode) & set("wax+")
-        (self._read if reads else self._written).add(where)
+        (self._read if reads else self._written).add(real_path)
 
 
 def _not_theirs() -> set[str]:

@@ -1,8 +1,8 @@
 """A user's VUT in a process of its own, so that it can take down nothing but itself.
 
 Each step is a question to that process and its answer. When the process dies, or answers nothing
-for longer than the deadline, it is killed and started again: whose doing it was is in memory that
-both share, and the episodes of the other corridors begin anew.
+for longer than the deadline, it is killed and started again: the corridor at fault is in memory
+that both share, and the episodes of the other corridors begin anew.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import select
 import signal
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -60,47 +59,34 @@ def hosted_vut(finder: str, spec: str, options: VutOptions) -> Vut:
     Raises:
         UserError: for a VUT that cannot be opened.
     """
-    facts = _facts(finder, spec, options)
+    facts, stamps = _facts(finder, spec, options)
 
     def make(corridors: int, _world: World | None) -> Driver:
         return HostedVut(corridors, finder, spec, options)
 
     return Vut(
         make=make,
-        max_corridors=facts.max_corridors,
-        max_workers=facts.max_workers,
-        files=tuple(Path(file) for file, _ in facts.stamps),
+        max_corridors=facts["max_corridors"],
+        max_workers=facts["max_workers"],
+        files=tuple(map(Path, stamps)),
     )
 
 
-Stamp = tuple[int, int]
+Stamps = dict[str, tuple[int, int] | None]
+"""Time of the last change, ns, and size of files by their paths; None for a lost file."""
+
+_known: dict[tuple[str, str, float], tuple[Mapping[str, Any], Stamps]] = {}
+"""Facts by spec, working folder and memory: no process is started where no file has changed."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Facts:
-    """What a VUT said of itself, and the state of its files then."""
-
-    max_corridors: int | None
-    max_workers: int | None
-    stamps: tuple[tuple[str, Stamp | None], ...]
-
-
-_known: dict[tuple[str, str, float], _Facts] = {}
-"""By spec, working folder and memory: a process is not started again where no file has changed."""
-
-
-def _facts(finder: str, spec: str, options: VutOptions) -> _Facts:
+def _facts(finder: str, spec: str, options: VutOptions) -> tuple[Mapping[str, Any], Stamps]:
+    """Return the facts of a VUT, and the state of its files."""
     key = spec, str(Path.cwd()), options.memory_gib
-    known = _known.get(key)
-    if known is None or any(_stamp(file) != stamp for file, stamp in known.stamps):
+    if key not in _known or _stamps(_known[key][1]) != _known[key][1]:
         host = _first(lambda: Host(finder, spec, options))
-        try:
-            said = host.said
-        finally:
-            host.kill()
-        stamps = tuple((file, _stamp(file)) for file in said["files"])
-        known = _known[key] = _Facts(said["max_corridors"], said["max_workers"], stamps)
-    return known
+        host.kill()
+        _known[key] = host.facts, _stamps(host.facts["files"])
+    return _known[key]
 
 
 def _first(opened: Callable[[], Host]) -> Host:
@@ -111,12 +97,13 @@ def _first(opened: Callable[[], Host]) -> Host:
         return opened()
 
 
-def _stamp(file: str) -> Stamp | None:
-    try:
-        found = Path(file).stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_size
+def _stamps(files: Iterable[str]) -> Stamps:
+    stamps: Stamps = dict.fromkeys(files)
+    for file in stamps:
+        with suppress(OSError):
+            status = Path(file).stat()
+            stamps[file] = status.st_mtime_ns, status.st_size
+    return stamps
 
 
 class HostDiedError(Exception):
@@ -124,9 +111,9 @@ class HostDiedError(Exception):
 
     Attributes:
         reason: how that happened.
-        corridor: whose controller was being asked; None where nobody knows.
+        corridor: that of the controller that was being called; None where it is unknown.
         hung: whether it was killed because it hung.
-        killed: whether somebody else killed it, or it itself.
+        killed: whether SIGKILL ended it, from outside or from within.
     """
 
     def __init__(
@@ -144,7 +131,9 @@ class OpeningDiedError(UserError):
 class Host:
     """The process of a VUT, with the VUT opened in it.
 
-    `said` is what the VUT said of itself: "max_corridors", "max_workers" and "files".
+    Attributes:
+        alive: whether it can be asked; a process that once gave no answer is killed.
+        facts: "max_corridors", "max_workers" and "files" of the VUT.
     """
 
     def __init__(self, finder: str, spec: str, options: VutOptions) -> None:
@@ -152,25 +141,19 @@ class Host:
         self._options = options
         self._number = 0
         self.alive = True
-        """Whether it can be asked; a process that once gave no answer is killed."""
         self._buffer = bytearray()
         self._start()
+        question = {"finder": finder, "spec": spec, "deadline_s": options.deadline_s}
+        content = self._open(spec, About.OPEN, question)
         try:
-            told = {"finder": finder, "spec": spec, "deadline_s": options.deadline_s}
-            self.said: Mapping[str, Any] = wire.from_json(
-                self._opened(spec, About.OPEN, wire.to_json(told)), dict
-            )
-        except BaseException:
+            self.facts: Mapping[str, Any] = wire.from_json(content, dict)
+        except WireError:
             self.kill()
             raise
 
     def make(self, spec: str, corridors: int) -> None:
         """Have the VUT's driver made; `UserError` when that cannot be."""
-        try:
-            self._opened(spec, About.MAKE, wire.to_json(corridors))
-        except BaseException:
-            self.kill()
-            raise
+        self._open(spec, About.MAKE, corridors)
 
     def ask(self, about: About, content: bytes = b"", *, patience_s: float | None = None) -> Frame:
         """Ask and return the answer; raises `HostDiedError` when there is none.
@@ -193,7 +176,7 @@ class Host:
             corridor = self._corridor()
             self.kill()
             raise HostDiedError(how_it_ended(None), corridor) from None
-        except BaseException:  # a person stops: nobody waits for the answer any more
+        except BaseException:  # a person stops: the answer is awaited no more
             self.kill()
             raise
 
@@ -232,7 +215,7 @@ class Host:
             settings = {
                 "memory_gib": self._options.memory_gib,
                 "lifeline": their_lifeline,
-                "asked": memory.fileno(),
+                "blame_cell": memory.fileno(),
             }
             try:
                 self._process = subprocess.Popen(
@@ -253,7 +236,7 @@ class Host:
             finally:
                 for descriptor in (their_in, their_out, their_lifeline):
                     os.close(descriptor)
-            self._asked = mmap.mmap(memory.fileno(), BlameCell.FORMAT.size)
+            self._blame_cell = mmap.mmap(memory.fileno(), BlameCell.FORMAT.size)
         # A question fits into the pipe, unless the process has stopped to listen.
         os.set_blocking(self._to, False)
         assert self._process.stderr is not None, "piped"  # noqa: S101
@@ -261,8 +244,9 @@ class Host:
         self._poll = select.poll()
         self._poll.register(self._from, select.POLLIN)
 
-    def _opened(self, spec: str, about: About, content: bytes) -> bytes:
+    def _open(self, spec: str, about: About, question: Any) -> bytes:
         """Ask for a VUT to be opened or made; `UserError` when that cannot be."""
+        content = wire.to_json(question)
         try:
             answer = self.ask(about, content, patience_s=self._options.connect_s)
         except HostDiedError as died:
@@ -272,18 +256,19 @@ class Host:
                 f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
             ) from died
         if answer.about is About.REFUSED:
+            self.kill()
             raise UserError(wire.from_json(answer.content, str))
         return answer.content
 
     def _answer(self, patience_s: float) -> Frame:
-        noted, clock = BlameCell.read(self._asked)[0], AwakeClock(2.0 * LOOK_S)
+        notes, clock = BlameCell.read(self._blame_cell)[0], AwakeClock(2.0 * LOOK_S)
         while True:
             answer = wire.take(self._buffer)
             if answer is not None and answer.number == self._number:
                 return answer
-            now = BlameCell.read(self._asked)[0]
-            if now != noted:
-                noted = now
+            now = BlameCell.read(self._blame_cell)[0]
+            if now != notes:
+                notes = now
                 clock.restart()
             elif clock.elapsed_s() > patience_s:
                 corridor = self._corridor()
@@ -312,7 +297,7 @@ class Host:
         return HostDiedError(how_it_ended(code), corridor, killed=code == -signal.SIGKILL)
 
     def _corridor(self) -> int | None:
-        corridor = BlameCell.read(self._asked)[1]
+        corridor = BlameCell.read(self._blame_cell)[1]
         return corridor if corridor >= 0 else None
 
 
@@ -359,21 +344,21 @@ class HostedVut(Driver):
         try:
             answer = self._host.ask(About.ACT, content)
             if answer.about is About.LOST:
-                told = wire.from_json(answer.content, dict)
-                raise VutLostError(told["reason"], told["corridor"], final=told["final"])
+                lost = wire.from_json(answer.content, dict)
+                raise VutLostError(lost["reason"], lost["corridor"], final=lost["final"])
             if answer.about is not About.DONE:
                 # Not its driver, but what surrounds it failed: the VUT has changed that.
                 self._host.kill()
                 raise VutLostError(str(wire.from_json(answer.content, str)), final=True)
-            said = wire.unpack_answers(answer.content, self.corridors)
-            self._reasons, self._signals = said.reasons, said.signals
+            answers = wire.unpack_answers(answer.content, self.corridors)
+            self._reasons, self._signals = answers.reasons, answers.signals
         except HostDiedError as died:
             own, how = self._own(died.corridor), {"final": died.hung, "killed": died.killed}
             raise VutLostError(died.reason, own, **how) from None
         except (WireError, KeyError, ValueError, AttributeError):
             self._host.kill()
             raise VutLostError(how_it_ended(None)) from None
-        return said.a_mps2
+        return answers.a_mps2
 
     def signals(self) -> Mapping[int, Left]:
         """Return what the VUT left with its last answers."""
@@ -397,7 +382,7 @@ class HostedVut(Driver):
 
     def _started(self) -> Host:
         host = Host(self._finder, self._spec, self._options)
-        self._files |= {Path(file) for file in host.said["files"]}
+        self._files |= {Path(file) for file in host.facts["files"]}
         host.make(self._spec, self.corridors)
         return host
 

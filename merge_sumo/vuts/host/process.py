@@ -21,7 +21,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.lifeline import end_with
 from merge_sumo.system.spawning import named
 from merge_sumo.vuts.base import Vut, VutOptions, text_of
-from merge_sumo.vuts.blame_cell import BlameCell, asked
+from merge_sumo.vuts.blame_cell import BlameCell, current_call
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.file_audit import LoadedFiles
 from merge_sumo.vuts.host.wire import About, Frame
@@ -34,7 +34,7 @@ def main(settings: Mapping[str, Any]) -> None:
     _hear_signals()
     _limit(settings["memory_gib"])
     end_with(settings["lifeline"])
-    asked.share(mmap.mmap(settings["asked"], BlameCell.FORMAT.size))
+    current_call.share(mmap.mmap(settings["blame_cell"], BlameCell.FORMAT.size))
     _Hosting(channel).serve()
 
 
@@ -55,12 +55,12 @@ class _Channel:
 
     def receive(self) -> Frame | None:
         """Return the next question; None when the other process is gone."""
-        while (found := wire.take(self._buffer)) is None:
+        while (question := wire.take(self._buffer)) is None:
             part = os.read(self._in, 1 << 16)
             if not part:
                 return None
             self._buffer += part
-        return found
+        return question
 
     def send(self, number: int, about: About, content: bytes = b"") -> None:
         """Answer."""
@@ -88,11 +88,11 @@ class _Hosting:
             except UserError as error:
                 about, content = About.REFUSED, wire.to_json(str(error))
             except VutLostError as lost:
-                told = {"reason": lost.reason, "corridor": lost.corridor, "final": lost.final}
-                about, content = About.LOST, wire.to_json(told)
+                why = {"reason": lost.reason, "corridor": lost.corridor, "final": lost.final}
+                about, content = About.LOST, wire.to_json(why)
             except Exception as error:
-                said = f"{type(error).__name__}: {text_of(error)}"
-                about, content = About.REFUSED, wire.to_json(said)
+                sentence = f"{type(error).__name__}: {text_of(error)}"
+                about, content = About.REFUSED, wire.to_json(sentence)
             self._channel.send(question.number, about, content)
             if question.about is About.CLOSE:
                 return
@@ -112,11 +112,11 @@ class _Hosting:
             return About.DONE, b""
         return About.DONE, self._act(self._driver, question.content)
 
-    def _open(self, told: dict[str, Any]) -> dict[str, Any]:
-        find_vut = named(told["finder"])
-        options = VutOptions(deadline_s=told["deadline_s"], in_process=True)
+    def _open(self, request: dict[str, Any]) -> dict[str, Any]:
+        find_vut = named(request["finder"])
+        options = VutOptions(deadline_s=request["deadline_s"], in_process=True)
         self._loaded = LoadedFiles()
-        vut: Vut = find_vut(told["spec"], options)
+        vut: Vut = find_vut(request["spec"], options)
         self._vut = vut
         return {
             "max_corridors": vut.max_corridors,

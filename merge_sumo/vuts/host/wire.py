@@ -151,8 +151,8 @@ def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     at = _HEAD.size
     begun = []
     for _ in range(count):
-        corridor, x_pov0_m, v_pov0_mps, v_vut0_mps, *told = _BEGIN.unpack_from(content, at)
-        ahead_s, behind_s, *of_scenario = told
+        corridor, x_pov0_m, v_pov0_mps, v_vut0_mps, *more = _BEGIN.unpack_from(content, at)
+        ahead_s, behind_s, *of_scenario = more
         in_traffic = vehicles > 2
         case = Case(
             level=0,

@@ -1,0 +1,47 @@
+"""Controllers as text, commands that start them, and what they must do."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+from vut_contract import factory, run_cases
+
+from merge_sumo.values.case import Case
+from merge_sumo.vuts.registry import VutFactory
+
+SUPPORT = Path(__file__).parent
+RAW_CLIENT = f"""import os, sys, time
+sys.path.insert(0, {str(SUPPORT)!r})
+from raw_traci import Client
+client = Client(int(sys.argv[1]))
+"""
+"""Begins a program that drives by our own client."""
+STOCK_CLIENT = "import sys, time, traci\ntraci.init(int(sys.argv[1]), numRetries=600)\n"
+"""Begins a program that drives by SUMO's own client."""
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def program(folder: Path, source: str, name: str = "controller.py") -> str:
+    """Write a Python program into a folder; return the command that starts it with the port."""
+    (folder / name).write_text(source, encoding="utf-8")
+    return f"{sys.executable} {folder / name} {{port}}"
+
+
+def raw_client(misdeed: str = "") -> str:
+    """Return the command of our own client, which drives as level 0, or does something wrong."""
+    return f"{sys.executable} {SUPPORT / 'raw_traci.py'} {{port}} {misdeed and repr(misdeed)}"
+
+
+def assert_drives_as_level0(vut: VutFactory, cases: list[Case], within: float = 1e-9) -> None:
+    """Assert that a VUT drives by the law of level 0, and makes no error."""
+    level0 = run_cases(factory("level0"), cases)
+    for one, other in zip(run_cases(vut, cases), level0, strict=True):
+        assert one.error is None
+        assert one.motion == pytest.approx(other.motion, abs=within, rel=0)
