@@ -1,1 +1,1 @@
-"""Vehicles under test: what a user brings, and how it is asked."""
+"""Vehicles under test: what a user brings, and how it is called."""

@@ -1,4 +1,4 @@
-"""What all kinds of VUT share: what they see, the deadline, and one controller per corridor."""
+"""What all kinds of VUT share: options, observation, deadline, and one controller per corridor."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from merge_sumo.vuts.blame_cell import NO_CORRIDOR, current_call
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class VutOptions:
-    """How a VUT is hosted; `UserError` for values that make no sense.
+    """How a VUT is hosted; `UserError` for values out of their range.
 
     Attributes:
         command: command line of a controller that is a program of its own, else None.
         deadline_s: time for one step, and for one reset.
         connect_s: time for a program to start and connect.
-        in_process: whether a user's code runs in this process instead of one of its own: there a
-            debugger reaches it, and what it does wrong may take this process with it.
+        in_process: whether a user's code runs in this process instead of one of its own: a debugger
+            reaches it then, and its faults may end this process.
         memory_gib: memory that the process of a user's code may take.
         log: file to which what a controller prints is added; None is standard error.
         policies: folder of the networks of the learned VUTs; None for the shipped ones.
@@ -70,12 +70,12 @@ class Vut:
     """A VUT that is ready to be made.
 
     Attributes:
-        make: makes the driver for a number of corridors in a world.
+        make: returns the driver for a number of corridors in a world; None for no world.
         max_corridors: corridors that one driver can serve; None for any number.
         max_workers: processes that can each have such a driver at a time; None for any number.
         vut_type: attributes of the SUMO vType with which SUMO itself drives; None if it does not.
         files: files of the user's that it is made of, as far as they are known.
-        named_only: whether it may be made of more than `files`, which nobody can know.
+        named_only: whether it may be made of unknown files besides `files`.
     """
 
     make: Callable[[int, World | None], Driver]
@@ -117,9 +117,9 @@ class Car(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a VUT sees at a step: time and state, and nothing about who drives the POV.
+    """What a VUT sees at a step: time and state, and nothing of the POV's driver.
 
-    A controller in the POV's seat (`--pov`) is shown itself as the VUT, and the VUT as the POV.
+    A controller that drives a POV (`--pov`) sees itself as the VUT, and the VUT as the POV.
 
     In traffic the car that the VUT will meet counts as POV: the one that would be nearest to M when
     the VUT is there, if the car kept its speed and the VUT drove the scenario's level-0 profile
@@ -192,11 +192,12 @@ RING_AFTER: Final = 1.02
 
 @dataclass(slots=True)
 class Deadline:
-    """Ends calls to a VUT that take longer than the deadline, and keeps standard output ours.
+    """Ends calls to a VUT that take longer than the deadline.
 
-    While it is entered, a timer rings in the main thread and interrupts a call that is too late.
-    It cannot interrupt native code, nor work in another thread or where there is no such timer
-    (Windows): there a call that is too late is found out when it returns.
+    While it is entered, a timer rings in the main thread and interrupts a call that is too late,
+    and standard output of the VUT is standard error. Native code is not interrupted; neither is a
+    call in another thread or on a system without such timers (Windows): it counts as too late when
+    it returns.
     """
 
     deadline_s: float
@@ -232,7 +233,7 @@ class Deadline:
             raise DeadlineExceeded
 
     def call(self, corridor: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return function(*arguments), asked for a corridor; `DeadlineExceeded` if late."""
+        """Return function(*arguments), called for a corridor; `DeadlineExceeded` if late."""
         current_call.note(corridor)
         if self._restore is not None:
             # Anew for each call: a ring before its deadline would cut short what waits in C.
@@ -248,9 +249,10 @@ class Deadline:
         return answer
 
     def reason(self, error: BaseException) -> str:
-        """Return what a call did wrong, with the place where it happened.
+        """Return what a call did wrong, with file and line.
 
-        Raises the error again where it is no VUT's: a person wants to stop.
+        Raises:
+            BaseException: the error itself, where it is no VUT's: a person wants to stop.
         """
         if isinstance(error, (Stopped, KeyboardInterrupt)) and not current_call.shared:
             raise error
@@ -268,13 +270,13 @@ class Deadline:
 
 
 MOST_CHARACTERS: Final = 300
-"""Of what a VUT says of itself."""
+"""Of a text of a VUT's."""
 
 
 def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
-    """Return what a thing of a VUT says of itself, in a line; it may raise instead, or lie.
+    """Return the text of an object of a VUT's in one line, even where making it raises.
 
-    A text that is a VUT's own kind of string is taken as the characters that it has.
+    A text of a subclass of `str` is taken as the characters that it has.
     """
     try:
         return as_reason(str.__str__(as_text(thing)))[:MOST_CHARACTERS]
@@ -293,13 +295,15 @@ def _place(error: BaseException) -> str:
 
 
 class PerCorridor(Driver):
-    """Asks a controller of its own in each corridor, so that corridors share no state.
+    """Calls a controller of its own in each corridor, so that corridors share no state.
 
     What a controller does wrong is the reason of its corridor alone; it is then made anew.
+
+    Attributes:
+        renewal: begins the reason where that fails.
     """
 
     renewal = "made anew"
-    """Begins the reason where that fails."""
 
     def __init__(self, corridors: int, deadline_s: float) -> None:
         """Prepare for a number of corridors; a subclass makes the controllers."""
@@ -315,7 +319,7 @@ class PerCorridor(Driver):
 
     @abstractmethod
     def reset(self, corridor: int, seen: Seen) -> None:
-        """Tell the controller of a corridor that an episode begins."""
+        """Begin an episode for the controller of a corridor."""
 
     @abstractmethod
     def answer(self, corridor: int, seen: Seen) -> float:
@@ -324,16 +328,16 @@ class PerCorridor(Driver):
     def begin(self, corridor: int, case: Case) -> None:
         """Reset the controller of a corridor; an error is kept as the reason of its answer."""
         self._reasons[corridor] = None
-        doing = self.renewal
+        activity = self.renewal
         try:
             with self._deadline as deadline:
                 if self._renew_first[corridor]:
                     deadline.call(corridor, self.renew, corridor)
                     self._renew_first[corridor] = False
-                doing = "reset"
+                activity = "reset"
                 deadline.call(corridor, self.reset, corridor, seen_at_start(case))
         except BaseException as error:
-            self._fault(corridor, f"{doing}: {self._deadline.reason(error)}")
+            self._fault(corridor, f"{activity}: {self._deadline.reason(error)}")
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
@@ -393,5 +397,5 @@ def as_number(answer: Any) -> float:
         return float(answer)
     if isinstance(answer, np.ndarray) and answer.shape == () and answer.dtype.kind in "fiu":
         return float(answer)
-    said = text_of(answer, repr)[:60]
-    raise WrongAnswerError(f"answered {said} ({type(answer).__name__}) instead of a number")
+    text = text_of(answer, repr)[:60]
+    raise WrongAnswerError(f"answered {text} ({type(answer).__name__}) instead of a number")

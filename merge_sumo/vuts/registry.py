@@ -149,12 +149,16 @@ def built_in_vuts(policies: Path | None = None) -> dict[str, Callable[[int], Dri
 
 @dataclass(frozen=True)
 class VutFactory:
-    """Makes the driver that `spec` names; made of plain values, so that a process can be told it.
+    """Makes the driver that `spec` names; plain values, which travel to other processes.
 
-    `files` are the user's files that the VUT is made of, with their hashes, as far as they are
-    known before it drives; they are found unless they are given.
+    Attributes:
+        spec: names the VUT, as after `--vut`.
+        options: how it is hosted.
+        files: the user's files that the VUT is made of, with their hashes, as far as they are
+            known before it drives; looked up unless they are given.
 
-    Raises `UserError` for a spec that names no VUT, or one that cannot be loaded.
+    Raises:
+        UserError: for a spec that names no VUT, or one that cannot be loaded.
     """
 
     spec: str
@@ -162,7 +166,7 @@ class VutFactory:
     files: Files | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
-        """Find the VUT."""
+        """Look the files up."""
         if self.files is None:
             object.__setattr__(self, "files", hashed(self.vut.files))
 
@@ -175,22 +179,24 @@ class VutFactory:
         """Return what makes the same VUT, with what it prints added to a file."""
         return VutFactory(self.spec, replace(self.options, log=log), self.files)
 
-    def workers(self, asked: int | None) -> int:
-        """Return in how many processes it is tested: as many as asked, or one a core.
+    def workers(self, requested: int | None) -> int:
+        """Return in how many processes it is tested: the requested ones, or one a core for None.
 
-        Raises `UserError` when more are asked for than it can serve, or less than one.
+        Raises:
+            UserError: when more are requested than it can serve, or less than one.
         """
-        count, most = workers_or_cores(asked), self.vut.max_workers
+        count, most = workers_or_cores(requested), self.vut.max_workers
         if most is None or count <= most:
             return count
-        if asked is None:
+        if requested is None:
             return most
-        raise UserError(f"--workers is {asked}: {self.spec} serves at most {most} at a time")
+        raise UserError(f"--workers is {requested}: {self.spec} serves at most {most} at a time")
 
     def __call__(self, corridors: int, world: World | None = None) -> Driver:
         """Return a driver for corridors 0 to `corridors` - 1 of a world.
 
-        Raises `UserError` where the VUT is not made of the same files as when it was found.
+        Raises:
+            UserError: where the files of the VUT have changed since this was made.
         """
         then, now = self.files or {}, hashed(self.vut.files)
         if set(then.values()) != set(now.values()):
@@ -201,9 +207,9 @@ class VutFactory:
         return self.vut.make(corridors, world)
 
     def __reduce__(self) -> tuple[Callable[..., VutFactory], tuple[Any, ...]]:
-        """Travel as plain values; the VUT is found again on arrival.
+        """Travel as plain values; the VUT is looked up again on arrival.
 
-        An object that nobody else can find goes along.
+        An object of this process goes along.
         """
         return (_arrived, (self.spec, self.options, self.files, object_of(self.spec)))
 

@@ -34,7 +34,6 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.trajectory import End
@@ -318,36 +317,6 @@ class TestAStockClient:
             stock(once)(port)
 
         assert Played(client, episodes=2, steps=5).reasons == [None, None]
-
-
-@pytest.mark.parametrize(
-    ("command", "arguments", "steps"),
-    [
-        ("setSpeed", (18.15,), 3),
-        ("slowDown", (17.0, 0.5), 5),
-        ("slowDown", (19.0, 1.0), 10),
-        ("slowDown", (17.95, 0.0), 1),
-        ("setAcceleration", (1.0, 0.6), 6),
-        ("setAcceleration", (-3.0, 0.1), 1),
-    ],
-)
-def test_the_speeds_that_follow_from_a_command_are_those_of_sumo(command, arguments, steps):
-    with World(1) as world:
-        world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
-        vehicle = world._libsumo.vehicle
-        vehicle.setSpeed("vut.0", -1.0)
-        getattr(vehicle, command)("vut.0", *arguments)
-        expected = []
-        for _ in range(steps):
-            world.advance()
-            expected.append(vehicle.getSpeed("vut.0"))
-
-    def drive(c):
-        c.simulationStep()
-        getattr(c.vehicle, command)("vut", *arguments)
-        c.simulationStep(c.simulation.getTime() + steps * DT_S + 0.05)
-
-    assert Played(stock(drive), steps=steps).speeds == pytest.approx(expected, abs=1e-9)
 
 
 def measures_of(folder: Path) -> list[dict]:

@@ -42,6 +42,7 @@ SCRIPTS: dict[str, list[tuple]] = {
     ],
     "slowing down within a limit": [(0, V, "setDecel", 2.5), (0, V, "slowDown", 16.0, 1.5)],
     "slowing down beyond a limit": [(0, V, "setDecel", 0.5), (0, V, "slowDown", 17.0, 1.5)],
+    "slowing down at once": [(0, V, "slowDown", 17.95, 0.0), (1, V, "setSpeed", 18.1)],
     "speeding up beyond a limit": [(0, V, "setAccel", 0.5), (0, V, "slowDown", 20.0, 1.5)],
     "an acceleration beyond a limit": [
         (0, V, "setAccel", 0.5),
@@ -240,13 +241,20 @@ class TestWhatSumoDecides:
         assert 0.0 < drive.x_m[0] - US23.pov_length_m - drive.x_m[1] < 5.0
 
 
-def test_what_can_change_nothing_here_is_noted_once(drive):
+@pytest.mark.parametrize(
+    ("function", "values", "name"),
+    [
+        ("changeLane", (0, 1.0), "vehicle.changeLane or vehicle.changeLaneRelative"),
+        ("setLaneChangeMode", (0,), "vehicle.setLaneChangeMode"),
+        ("updateBestLanes", (), "vehicle.updateBestLanes"),
+        ("rerouteTraveltime", (False,), "vehicle.rerouteTraveltime"),
+    ],
+)
+def test_what_can_change_nothing_here_is_noted_once(drive, function, values, name):
     drive.begin()
     for _ in range(2):
-        drive.ours.vehicle.changeLane("vut", 0, 1.0)
-    assert drive.session.notes == [
-        "vehicle.changeLane or vehicle.changeLaneRelative is accepted and changes nothing here"
-    ]
+        getattr(drive.ours.vehicle, function)("vut", *values)
+    assert drive.session.notes == [f"{name} is accepted and changes nothing here"]
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -266,6 +274,7 @@ def test_a_speed_that_is_no_number_is_a_fault(drive, function, value):
         ("vehicle", "moveTo", ("vut", "main_out_0", 5.0), "as the scenario says"),
         ("vehicle", "remove", ("vut",), "as the scenario says"),
         ("vehicle", "setRoute", ("vut", ["ramp"]), "the route is the scenario's"),
+        ("vehicle", "changeTarget", ("vut", "main_in"), "the route is the scenario's"),
         ("vehicle", "setActionStepLength", ("vut", 1.0), "the VUT acts in every step of 0.1 s"),
         ("vehicle", "setLength", ("vut", 1.0), "what the vehicles are is the scenario's"),
         ("vehicle", "setTau", ("pov", 1.0), "the vehicle 'pov' is not the controller's to command"),
