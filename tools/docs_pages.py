@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 ROOT = Path(__file__).resolve().parent.parent
 SHOWN = (
@@ -91,6 +91,31 @@ GENERATED: dict[str, Callable[[], str]] = {
 }
 
 
+def vut_kinds_table() -> str:
+    """Return the registered kinds of VUT as a table."""
+    from merge_sumo.vuts.registry import KINDS, PYTHON
+
+    kinds = [kind for kind in (PYTHON, *KINDS.values()) if kind.form]
+    rows = [f"| `{kind.form}` | {kind.what} | `{kind.example}` |" for kind in kinds]
+    return "\n".join(("| form | kind | example |", "|---|---|---|", *rows))
+
+
+def samplers_table() -> str:
+    """Return the registered samplers as a table."""
+    from merge_sumo.samplers.registry import SAMPLERS
+
+    rows = [f"| `{name}` | {sampler.about} |" for name, sampler in SAMPLERS.items()]
+    return "\n".join(("| `--sampler` | method |", "|---|---|", *rows))
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "kinds of VUT": vut_kinds_table,
+    "samplers": samplers_table,
+}
+"""Tables from registries, which stand in a page as `<!-- table: NAME -->`."""
+TABLE: Final = re.compile(r"<!-- table: ([\w ]+) -->")
+
+
 def on_files(files: Any, config: Any) -> Any:
     """Add to the files of the site what docs/ does not hold (MkDocs calls this)."""
     from mkdocs.structure.files import File
@@ -103,10 +128,11 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Return a page whose links out of and into docs/ hold in the site (MkDocs calls this).
+    """Return a page as the site shows it, with tables and its own links (MkDocs calls this).
 
-    They are written as they hold in a checkout.
+    Links out of and into docs/ are written as they hold in a checkout.
     """
+    markdown = TABLE.sub(lambda table: TABLES[table[1]](), markdown)
     up = "../" * page.file.src_uri.count("/")
     if page.file.src_uri in SHOWN:
         return markdown.replace(f"]({up}docs/", f"]({up}")

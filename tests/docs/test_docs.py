@@ -7,7 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from docs_pages import GENERATED, ROOT, SHOWN, on_page_markdown
+from docs_pages import GENERATED, ROOT, SHOWN, TABLE, TABLES, on_page_markdown
+
+from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.vuts.registry import KINDS
 
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 PAGES = [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", *(ROOT / page for page in SHOWN)]
@@ -64,3 +67,13 @@ def test_attacks_name_tests_that_exist():
     names = set(re.findall(r"\btests/[\w/]+\.py\b", rows))
     assert names
     assert [name for name in sorted(names) if not (ROOT / name).is_file()] == []
+
+
+def test_tables_of_the_site_have_a_row_for_each_registered_object():
+    shown = {name for page in PAGES for name in TABLE.findall(page.read_text(encoding="utf-8"))}
+    assert shown == set(TABLES)
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="reference/vuts.md"))
+    text = on_page_markdown("<!-- table: kinds of VUT -->\n\n<!-- table: samplers -->", page)
+    assert "<!--" not in text
+    kinds = [name for name, kind in KINDS.items() if kind.form]
+    assert all(f"| `{name}" in text for name in (*SAMPLERS, *kinds))
