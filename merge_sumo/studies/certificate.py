@@ -1,46 +1,56 @@
-"""What is certainly absent: a covering lattice of the pool, tested to its last case.
+"""A certificate of absence: a covering lattice of the pool, tested to its last case.
 
-A search says where it found failures, and nothing of where it did not look. A certificate says: in
-every ball of a radius, in coordinates of the unit cube and with its centre in the pool, there is a
-case that was run and did not fail. So no such ball fails throughout; and as the simulation is
+A search reports the failures that it found, and little about the rest of the pool. A certificate
+says: in every ball of a radius, in coordinates of the unit cube and with its centre in the pool, a
+case was run and did not fail. So no such ball fails throughout; and as the simulation is
 deterministic, that is certain and no estimate. A VUT may not be: some cases run twice, and where
-one does not end as before, nothing is certain. What a certificate does not say: that there is no
-failure at all. A region that is thinner than the balls may lie between the cases.
+one does not end as before, nothing is certain. A certificate does not prove that no failure exists:
+a region that is thinner than the balls may lie between the cases.
 
-certificate.json       what was tested, by what, on which lattice; in the end what was found, hashes
-level-2/00007.npz      a block of the cases of a level, as they were run, and what became of them
+certificate.json       what was tested, by what, on which lattice; in the end the result, hashes
+level-2/00007.npz      a block of the cases of a level, as they were run, and their verdicts
 
-A third party checks such a folder with `tools/check_certificate.py`, which shares nothing with the
-lattice's code (`covering.py`).
+A third party checks such a folder with `tools/check_certificate.py`, which shares nothing with this
+file.
+
+It is no campaign with a sampler that walks the lattice: a campaign keeps an outcome of 0.8 kB and a
+motion of 4 kB per case, and all outcomes in memory (60 cases at level 0 and 1, measured), which at
+three million cases is 15 GB of files. A certificate keeps 34 bytes per case, holds one block in
+memory, believes only blocks that this user has signed, and resumes to the same bytes.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import math
+import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.campaigns.repeats import spread_places
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate
 from merge_sumo.engine.plan import SimulationPlan, differences
 from merge_sumo.errors import UserError
-from merge_sumo.studies.certificate_blocks import Blocks, block_key
-from merge_sumo.studies.certificate_runs import CheckedCase, RunPoints
-from merge_sumo.studies.lattice import Covering, covering
 from merge_sumo.studies.truth import OnCases
-from merge_sumo.system.arrays import regular
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
 from merge_sumo.system.printable import two_digits
 from merge_sumo.system.records import convert, decode
+from merge_sumo.system.signature import signed, user_key, verified
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import Dimension, level_name
 from merge_sumo.vuts.files import Files, changed
+from merge_sumo.vuts.output import LOG
 
 CERTIFICATE: Final = "certificate.json"
 BLOCK: Final = 2000
@@ -55,11 +65,289 @@ OF_A_SEARCH: Final = (
 )
 """Settings of a campaign that decide nothing here."""
 UNITS: Final = {"_mps": "m/s", "_m": "m", "_rad": "rad", "_s": "s"}
+SLACK: Final = 1e-9
+"""Share of the radius that is left for rounding."""
+MOST_POINTS: Final = 3_000_000
+"""The most cases of a level; level 2 at the default radius has 360,809, some 200 s of CPU time."""
+
+
+# The lattice.
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What a level of a certificate shows.
+class CoveringLattice:
+    """A lattice of the unit square or cube, of which every ball of a radius contains a point.
+
+    The points are those of a grid whose indices are all even or all odd: in two dimensions a
+    centred rectangular lattice, hexagonal except for a stretch of less than a step; in three the
+    body-centred cubic one. These cover space with the fewest points of all lattices (Kershner,
+    1939; Bambah, 1954).
+
+    Cases outside the pool cannot be run, and need not be. With n steps along an axis, both faces of
+    the cube stand on the grid. A mirror in the face 0 takes index i to -i, one in the face 1 takes
+    it to 2 n - i; both keep it even or odd, so the lattice is its own image. Fold space into the
+    cube by these mirrors: no two places get farther apart, places in the cube stay, and lattice
+    points become lattice points in the cube. So let c be in the cube, and p the nearest point of
+    the infinite lattice, at most the covering radius away: p folded is a point of the lattice in
+    the cube that is no farther from c. The points in the closed cube alone cover it.
+
+    Attributes:
+        steps: of the grid along each axis, 1 / steps apart; in three dimensions all the same.
+
+    Raises:
+        UserError: for steps that make no such lattice.
+    """
+
+    steps: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        same = len(self.steps) == 2 or len(set(self.steps)) == 1
+        if len(self.steps) not in (2, 3) or min(self.steps) < 1 or not same:
+            raise UserError(f"there is no covering lattice with steps {self.steps}")
+
+    @property
+    def radius(self) -> float:
+        """The covering radius: no place of the cube is farther from a point.
+
+        In the plane the nearest points are corners of triangles with two sides of squared length
+        p^2 + h^2 and a base of 2 p, p <= h the distances of the grid: they are acute, so the place
+        that is farthest from their corners is the centre of their circle, (p^2 + h^2) / (2 h). In
+        space it is the corner of the truncated octahedron around a point, sqrt(5) / 4 times the
+        edge of the cube, which is two steps long.
+        """
+        p, h = sorted(1.0 / n for n in self.steps[:2])
+        return (p * p + h * h) / (2.0 * h) if len(self.steps) == 2 else math.sqrt(5.0) / 2.0 * p
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return sum(math.prod(self._shape(odd)) for odd in (0, 1))
+
+    def points(self, first: int, end: int) -> FloatArray:
+        """Return points `first` to `end` - 1, (n, d), those up to the last one."""
+        numbers, evens = np.arange(first, min(end, len(self))), math.prod(self._shape(0))
+        parts = [
+            np.stack(np.unravel_index(part, self._shape(odd)), axis=-1) * 2 + odd
+            for odd, part in ((0, numbers[numbers < evens]), (1, numbers[numbers >= evens] - evens))
+        ]
+        points: FloatArray = np.concatenate(parts) / np.array(self.steps, dtype=np.float64)
+        return points
+
+    def _shape(self, odd: int) -> tuple[int, ...]:
+        """Return the number of even, or odd, indices from 0 to the steps of each axis."""
+        return tuple((n + 1) // 2 if odd else n // 2 + 1 for n in self.steps)
+
+
+def covering(radius: float, dimensions: int) -> CoveringLattice:
+    """Return the lattice with the fewest points that covers the unit square or cube.
+
+    Raises:
+        UserError: for a radius that is none, or that takes more than `MOST_POINTS`, and for more
+            than three dimensions.
+    """
+    if dimensions not in (2, 3):
+        raise UserError(
+            f"the pool has {dimensions} coordinates: a covering lattice is known to be the best in "
+            "two and three, and takes too many cases in more; narrow the scenario"
+        )
+    if not 0.0 < radius <= 0.5:
+        raise UserError(f"--radius is {radius}: it is a share of the axes, above 0 and up to 0.5")
+    points: float = 0.8 * (0.5 / radius) ** dimensions  # fewer than any lattice needs
+    if points <= MOST_POINTS:
+        reach = radius * (1.0 - SLACK)
+        if dimensions == 3:
+            lattice = CoveringLattice((math.ceil(math.sqrt(5.0) / 2.0 / reach),) * 3)
+        else:
+            # From the steps of one axis follow those of the other: h^2 - 2 r h + p^2 <= 0.
+            fewest = math.ceil(1.0 / reach)
+            choices = [
+                (n, reach + math.sqrt(max(reach * reach - 1.0 / (n * n), 0.0)))
+                for n in range(fewest, 2 * fewest + 1)
+            ]
+            lattice = min(
+                (CoveringLattice((n, math.ceil(1.0 / highest))) for n, highest in choices), key=len
+            )
+        points = len(lattice)
+        if points <= MOST_POINTS:
+            return lattice
+    raise UserError(
+        f"--radius is {radius}: it takes {points:.2g} cases and more at a level, of which "
+        f"{MOST_POINTS:,} are the most; choose a larger one"
+    )
+
+
+def lattices_of(settings: CampaignSettings, radius: float) -> dict[int, CoveringLattice]:
+    """Return the lattice of each level; `UserError` where it has none."""
+    return {
+        level: covering(radius, len(settings.scenario.dimensions(level)))
+        for level in settings.levels
+    }
+
+
+# Cases: points of the unit cube in, verdicts out.
+
+
+class CheckedCase(NamedTuple):
+    """The verdict on a case.
+
+    Attributes:
+        case: its coordinates as they were run.
+        score: NaN without a verdict.
+        failed: whether it failed.
+        told: whether it has a verdict: the VUT reached the merge point, or failed.
+        files: those that VUT and POV have loaded.
+    """
+
+    case: tuple[float, ...]
+    score: float
+    failed: bool
+    told: bool
+    files: Files
+
+
+RunPoints = Callable[[int, FloatArray], Iterable[tuple[int, CheckedCase]]]
+"""Runs the cases at points, (n, d), of a level's unit cube; gives (place, result) in any order."""
+
+
+def runs_points_on(
+    workers: Workers, settings: CampaignSettings, plan: SimulationPlan, folder: Path
+) -> RunPoints:
+    """Return what runs points on workers; what a controller prints goes to the folder's log."""
+    plan = plan.with_log(folder.resolve() / LOG)
+
+    def run(level: int, points: FloatArray) -> Iterable[tuple[int, CheckedCase]]:
+        return evaluate(plan, CasesAt(settings.pool, level, points), workers, _checked)
+
+    return run
+
+
+def _checked(results: Sequence[CaseResult]) -> list[CheckedCase]:
+    # One dictionary for a chunk: it travels once.
+    files = results[0].files | results[0].pov_files
+    checked = []
+    for outcome in (result.outcome(0) for result in results):
+        case, score = outcome.case, math.nan if outcome.score is None else outcome.score
+        values = tuple(getattr(case, d.field) for d in case.scenario.dimensions(case.level))
+        checked.append(CheckedCase(values, score, outcome.failed, outcome.is_tested, files))
+    return checked
+
+
+# Blocks: files of cases and verdicts, signed by the user who ran them.
+
+
+TYPES: Final = {"case": "<f8", "score": "<f8", "failed": "|b1", "told": "|b1"}
+"""Arrays of a block and their types."""
+
+
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """The lattice of a level in blocks, and their files.
+
+    A block that this user has not signed is not believed when a certificate goes on: its cases run
+    again. For readers without our code, the signature is behind the .npz archive.
+
+    Attributes:
+        folder: where the files are.
+        lattice: the points.
+        of: what tells this level of this certificate from any other.
+        key: what the files are signed with.
+    """
+
+    folder: Path
+    lattice: CoveringLattice
+    of: str
+    key: bytes
+
+    @property
+    def count(self) -> int:
+        """Number of blocks."""
+        return -(-len(self.lattice) // BLOCK)
+
+    def size(self, number: int) -> int:
+        """Return the number of cases in a block."""
+        return min(BLOCK, len(self.lattice) - number * BLOCK)
+
+    def points(self, number: int) -> FloatArray:
+        """Return the points of a block, (n, d)."""
+        return self.lattice.points(number * BLOCK, (number + 1) * BLOCK)
+
+    def file(self, number: int) -> Path:
+        """Return the path of a block."""
+        return self.folder / f"{number:05d}.npz"
+
+    def write(self, number: int, results: Sequence[CheckedCase]) -> None:
+        """Write a block; `UserError` where that cannot be."""
+        arrays = io.BytesIO()
+        columns = {
+            name: np.array([getattr(result, name) for result in results], dtype=dtype)
+            for name, dtype in TYPES.items()
+        }
+        np.savez(arrays, **columns)  # type: ignore[arg-type]
+        replace_own(self.file(number), signed(arrays.getvalue(), self._named(number), self.key))
+
+    def read(self, number: int) -> dict[str, NDArray[Any]] | None:
+        """Return a block; None where it is missing, or is not what we wrote."""
+        try:
+            content = regular(self.file(number)).read_bytes()
+            inner = verified(content, self._named(number), self.key)
+            if inner is None:
+                return None
+            block = read_arrays(io.BytesIO(inner), *TYPES)
+        except UNREADABLE_NPZ:
+            return None
+        size = self.size(number)
+        shapes = dict.fromkeys(TYPES, (size,)) | {"case": (size, len(self.lattice.steps))}
+        fits = all(
+            block[name].shape == shapes[name] and block[name].dtype == dtype
+            for name, dtype in TYPES.items()
+        )
+        return block if fits else None
+
+    def run_missing(
+        self, run: Callable[[FloatArray], Iterable[tuple[int, CheckedCase]]], missing: Sequence[int]
+    ) -> Iterable[tuple[int, list[CheckedCase]]]:
+        """Run blocks and yield (number, results) of each as its last case ends."""
+        if not missing:
+            return
+        starts = np.cumsum([0, *(self.size(number) for number in missing)])
+        open_blocks: dict[int, dict[int, CheckedCase]] = {}
+        for place, result in run(np.concatenate([self.points(number) for number in missing])):
+            nth = int(np.searchsorted(starts, place, side="right")) - 1
+            block = open_blocks.setdefault(nth, {})
+            block[place - int(starts[nth])] = result
+            if len(block) == self.size(missing[nth]):
+                del open_blocks[nth]
+                yield missing[nth], [block[k] for k in range(len(block))]
+
+    def run_twice(
+        self, run: Callable[[FloatArray], Iterable[tuple[int, CheckedCase]]]
+    ) -> list[bool]:
+        """Run some cases once more, in reverse order; return which end as before.
+
+        The first ones, which ran when the VUT was new, are among them.
+        """
+        numbers = spread_places(len(self.lattice), min(TWICE, -(-len(self.lattice) // 4)))
+        points = np.concatenate([self.lattice.points(number, number + 1) for number in numbers])
+        same = [False] * len(numbers)
+        for nth, result in run(points):
+            number, row = divmod(numbers[nth], BLOCK)
+            block = self.read(number)
+            same[nth] = block is not None and all(
+                np.array_equal(getattr(result, name), block[name][row], equal_nan=True)
+                for name in TYPES
+            )
+        return same
+
+    def _named(self, number: int) -> str:
+        return f"block {number} of {self.of}"
+
+
+# The certificate.
+
+
+@dataclass(frozen=True, slots=True)
+class LevelResult:
+    """The result of a level.
 
     Attributes:
         cases: how many were run.
@@ -85,13 +373,13 @@ class Certificate:
     """A certificate that is complete."""
 
     radius: float
-    levels: dict[int, Found]
+    levels: dict[int, LevelResult]
     sentence: str
 
     @property
     def certain(self) -> bool:
         """Whether no ball of the radius fails throughout."""
-        return not any(f.failures or f.untold or f.otherwise for f in self.levels.values())
+        return not any(of.failures or of.untold or of.otherwise for of in self.levels.values())
 
 
 def certify(
@@ -102,10 +390,10 @@ def certify(
     run: RunPoints,
     *,
     resume: bool = False,
-    on_cases: OnCases | None = None,
+    on_cases: OnCases = lambda _: None,
     check: Callable[[], None] = lambda: None,
 ) -> Certificate:
-    """Test a covering lattice of the pool, write it into a folder, and return what it shows.
+    """Test a covering lattice of the pool, write it into a folder, and return the result.
 
     Same settings, same versions: the same bytes, whatever the workers and however often it was
     stopped.
@@ -120,66 +408,63 @@ def certify(
         on_cases: told how many cases have ended.
         check: called after every block; may raise to stop there.
 
-    Raises `UserError` where the pool has more than three coordinates, the radius takes too many
-    cases, or a folder to go on with is of another VUT, of other versions, or of other settings.
+    Raises:
+        UserError: where the pool has more than three coordinates, the radius takes too many cases,
+            or a folder to go on with is of another VUT, of other versions, or of other settings.
     """
     lattices = lattices_of(settings, radius)
-    asked = _asked(settings, radius, lattices, plan)
+    subject = _subject(settings, radius, lattices, plan)
+
+    def text(files: Files, found: dict[str, Any] | None) -> bytes:
+        record = subject | {"files": files, "found": found}
+        sha256 = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+        return (json.dumps({**record, "sha256": sha256}, indent=2, allow_nan=False) + "\n").encode()
+
     if resume:
-        files = _again(folder, asked)
+        files = _files_to_go_on(folder, subject)
     else:
         files = dict(plan.vut.files or {})
         with new_folder(folder) as new:
-            (new / CERTIFICATE).write_bytes(_text(asked | {"files": files, "found": None}))
-    places = _places(folder, asked, lattices)
-    for level, lattice in lattices.items():
-        place = places[level]
-        check_own(place.folder)
-        make_place(place.folder)
-        missing = [n for n in range(_count(lattice)) if place.read(n, _size(lattice, n)) is None]
-        if on_cases is not None:
-            on_cases(len(lattice) - sum(_size(lattice, n) for n in missing))
+            (new / CERTIFICATE).write_bytes(text(files, None))
+    levels = _blocks(folder, subject, lattices)
+    for level, blocks in levels.items():
+        check_own(blocks.folder)
+        make_place(blocks.folder)
+        missing = [number for number in range(blocks.count) if blocks.read(number) is None]
+        on_cases(len(blocks.lattice) - sum(map(blocks.size, missing)))
         known = len(files)
-        for number, block in _tested(lattice, missing, partial(run, level), files, on_cases):
+        for number, results in blocks.run_missing(partial(run, level), missing):
+            on_cases(len(results))
+            for result in results:
+                for name, sha256 in result.files.items():
+                    files.setdefault(name, sha256)
             if len(files) > known:
                 known = len(files)
-                replace_own(folder / CERTIFICATE, _text(asked | {"files": files, "found": None}))
-            place.write(number, block)
+                replace_own(folder / CERTIFICATE, text(files, None))
+            blocks.write(number, results)
             check()
     found = {}
-    for level, lattice in lattices.items():
-        place, dims = places[level], settings.scenario.dimensions(level)
-        twice = _twice(place, lattice, partial(run, level))
-        found[level] = _found(place, lattice, dims, twice)
+    for level, blocks in levels.items():
+        same = blocks.run_twice(partial(run, level))
+        found[level] = _level_result(blocks, settings.scenario.dimensions(level), same)
         check()
-    said = _sentence(radius, found, settings)
-    done = Certificate(radius, found, said)
+    done = Certificate(radius, found, _sentence(radius, found, settings))
     result = {
         "certain": done.certain,
-        "sentence": said,
+        "sentence": done.sentence,
         "levels": {str(level): asdict(of_level) for level, of_level in found.items()},
     }
-    files = dict(sorted(files.items()))
-    replace_own(folder / CERTIFICATE, _text(asked | {"files": files, "found": result}))
+    replace_own(folder / CERTIFICATE, text(dict(sorted(files.items())), result))
     return done
 
 
-def lattices_of(settings: CampaignSettings, radius: float) -> dict[int, Covering]:
-    """Return the lattice of each level; `UserError` where there is none."""
-    return {
-        level: covering(radius, len(settings.scenario.dimensions(level)))
-        for level in settings.levels
-    }
-
-
-def _asked(
+def _subject(
     settings: CampaignSettings,
     radius: float,
-    lattices: Mapping[int, Covering],
+    lattices: Mapping[int, CoveringLattice],
     plan: SimulationPlan,
 ) -> dict[str, Any]:
     """Return what a certificate is of: all that decides what is in it."""
-    record = record_of(settings, plan)
     levels = {
         str(level): {
             "coordinates": [asdict(d) for d in settings.scenario.dimensions(level)],
@@ -189,6 +474,7 @@ def _asked(
         }
         for level, lattice in lattices.items()
     }
+    record = record_of(settings, plan)
     return {
         "radius": radius,
         "levels": levels,
@@ -197,13 +483,12 @@ def _asked(
     }
 
 
-def _again(folder: Path, asked: Mapping[str, Any]) -> Files:
+def _files_to_go_on(folder: Path, subject: Mapping[str, Any]) -> Files:
     """Return the files of the VUT in a folder to go on with; `UserError` where it is another's."""
     path = folder / CERTIFICATE
     check_own(path)
     try:
         record = decode(regular(path).read_bytes(), dict[str, Any])
-        was = {name: record.get(name) for name in asked}
         files: Files = convert(record.get("files"), dict[str, str | None])
     except OSError as error:
         raise UserError(
@@ -211,8 +496,8 @@ def _again(folder: Path, asked: Mapping[str, Any]) -> Files:
         ) from error
     except UserError as error:
         raise UserError(f"{path} is not as it was written: {error}") from error
-    now = json.loads(json.dumps(asked))
-    for name, (before, today) in differences(was, now).items():
+    begun = {name: record.get(name) for name in subject}
+    for name, (before, today) in differences(begun, json.loads(json.dumps(subject))).items():
         raise UserError(
             f"{name} differs: {folder} was begun with {before}, now it is {today}; make it the "
             "same, or begin anew"
@@ -222,83 +507,61 @@ def _again(folder: Path, asked: Mapping[str, Any]) -> Files:
     return files
 
 
-def _tested(
-    lattice: Covering,
-    missing: Sequence[int],
-    run: Callable[[FloatArray], Iterable[tuple[int, CheckedCase]]],
-    files: Files,
-    on_cases: OnCases | None,
-) -> Iterable[tuple[int, list[CheckedCase]]]:
-    """Yield blocks, (number, results), as their last cases end; add to the files of the VUT."""
-    if not missing:
-        return
-    points = np.concatenate([_points(lattice, number) for number in missing])
-    starts = np.cumsum([0, *(_size(lattice, number) for number in missing)])
-    open_blocks: dict[int, dict[int, CheckedCase]] = {}
-    for place, done in run(points):
-        nth = int(np.searchsorted(starts, place, side="right")) - 1
-        block = open_blocks.setdefault(nth, {})
-        block[place - int(starts[nth])] = done
-        for name, sha256 in done.files.items():
-            files.setdefault(name, sha256)
-        if len(block) == starts[nth + 1] - starts[nth]:
-            del open_blocks[nth]
-            if on_cases is not None:
-                on_cases(len(block))
-            yield missing[nth], [block[k] for k in range(len(block))]
+def _blocks(
+    folder: Path, subject: Mapping[str, Any], lattices: Mapping[int, CoveringLattice]
+) -> dict[int, Blocks]:
+    """Return the blocks of each level, signed by this user for this certificate alone."""
+    sha256 = hashlib.sha256(json.dumps(subject, sort_keys=True).encode()).hexdigest()
+    try:
+        key = user_key()
+    except UserError:
+        key = secrets.token_bytes(32)  # nobody has it later on: nothing is believed
+    blocks = {}
+    for level, lattice in lattices.items():
+        name = level_name(level)
+        of = f"level {name} of the certificate {sha256}"
+        blocks[level] = Blocks(folder / f"level-{name}", lattice, of, key)
+    return blocks
 
 
-def _twice(
-    place: Blocks, lattice: Covering, run: Callable[[FloatArray], Iterable[tuple[int, CheckedCase]]]
-) -> list[bool]:
-    """Run some cases of a level once more, in reverse order; return which end as before.
-
-    The first ones, which ran when the VUT was new, are among them.
-    """
-    count = min(TWICE, -(-len(lattice) // 4))
-    numbers = spread_places(len(lattice), count)
-    points = np.concatenate([lattice.points(number, number + 1) for number in numbers])
-    same = [False] * count
-    for nth, done in run(points):
-        block, row = divmod(numbers[nth], BLOCK)
-        was = place.read(block, _size(lattice, block))
-        verdict = np.array([*done.case, done.score, done.failed, done.told])
-        same[nth] = was is not None and np.array_equal(
-            verdict,
-            [*was["case"][row], was["score"][row], was["failed"][row], was["told"][row]],
-            equal_nan=True,
-        )
-    return same
-
-
-def _found(
-    place: Blocks, lattice: Covering, dims: Sequence[Dimension], twice: Sequence[bool]
-) -> Found:
-    """Read the blocks of a level, one after the other."""
+def _level_result(blocks: Blocks, dims: Sequence[Dimension], same: Sequence[bool]) -> LevelResult:
+    """Read the blocks of a level, one after the other; `same`: which ended twice the same way."""
     sha256, failures, untold = hashlib.sha256(), 0, 0
     worst: list[tuple[float, list[float]]] = []
-    for number in range(_count(lattice)):
-        block = place.read(number, _size(lattice, number))
+    for number in range(blocks.count):
+        block = blocks.read(number)
         if block is None:
-            raise UserError(f"{place.file(number)} is not as it was written: resume")
-        for name in ("case", "score", "failed", "told"):
+            raise UserError(f"{blocks.file(number)} is not as it was written: resume")
+        for name in TYPES:
             sha256.update(block[name].tobytes())
         failed = block["failed"]
         failures += int(failed.sum())
         untold += int((~block["told"]).sum())
-        # Who fails without a score comes last.
+        # A failure without a score comes last.
         scores = np.nan_to_num(block["score"][failed], nan=0.0).tolist()
         worst += zip(scores, block["case"][failed].tolist(), strict=True)
         worst = sorted(worst)[:WORST]
     names = [d.field for d in dims]
     named = [dict(zip(names, case, strict=True)) | {"score": score} for score, case in worst]
-    digest, otherwise = sha256.hexdigest(), twice.count(False)
-    return Found(len(lattice), failures, untold, len(twice), otherwise, digest, named)
+    return LevelResult(
+        len(blocks.lattice),
+        failures,
+        untold,
+        len(same),
+        same.count(False),
+        sha256.hexdigest(),
+        named,
+    )
 
 
-def _sentence(radius: float, found: Mapping[int, Found], settings: CampaignSettings) -> str:
+def _sentence(radius: float, found: Mapping[int, LevelResult], settings: CampaignSettings) -> str:
+    """Return the result of all levels in a sentence."""
     most = max((settings.scenario.dimensions(level) for level in found), key=len)
-    parts = [f"{two_digits(radius * (d.high - d.low))} {_unit(d)}" for d in most]
+    units = [next(unit for end, unit in UNITS.items() if d.field.endswith(end)) for d in most]
+    parts = [
+        f"{two_digits(radius * (d.high - d.low))} {unit}"
+        for d, unit in zip(most, units, strict=True)
+    ]
     ball = f"ball of radius {100.0 * radius:g} % of the axes ({', '.join(parts)})"
     cases, failures, untold, twice, otherwise = (
         sum(getattr(of_level, name) for of_level in found.values())
@@ -308,57 +571,20 @@ def _sentence(radius: float, found: Mapping[int, Found], settings: CampaignSetti
     tested = f"{settings.vut} v level {levels}, {cases:,} cases"
     if not settings.criterion.is_papers:
         tested += f" that may fail by {settings.criterion.in_short}"
-    said = f"no {ball} fails throughout: certain, the simulation is deterministic"
     if otherwise:
-        said = (
-            f"{failures or 'none'} fail, and nothing is certain: {otherwise} of {twice} that were "
-            "run twice did not end as before"
+        return (
+            f"{tested}: {failures or 'none'} fail, and nothing is certain: {otherwise} of {twice} "
+            "that were run twice did not end as before"
         )
-    elif failures:
-        said = f"{failures:,} fail: every {ball} that fails throughout holds one of them"
+    if failures:
+        result = f"{failures:,} fail: every {ball} that fails throughout holds one of them"
     elif untold:
-        said = "none fails"
-    if untold and not otherwise:
-        said += (
-            f"; {untold:,} gave no verdict, and no {ball if not failures else 'ball'} is certain "
+        result = "none fails"
+    else:
+        result = f"no {ball} fails throughout: certain, the simulation is deterministic"
+    if untold:
+        result += (
+            f"; {untold:,} gave no verdict, and no {'ball' if failures else ball} is certain "
             "in which there are no others"
         )
-    return f"{tested}: {said}"
-
-
-def _unit(dimension: Dimension) -> str:
-    return next(unit for end, unit in UNITS.items() if dimension.field.endswith(end))
-
-
-def _text(record: dict[str, Any]) -> bytes:
-    sha256 = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
-    return (json.dumps({**record, "sha256": sha256}, indent=2, allow_nan=False) + "\n").encode()
-
-
-def _places(
-    folder: Path, asked: Mapping[str, Any], lattices: Mapping[int, Covering]
-) -> dict[int, Blocks]:
-    """Return where the blocks of each level are, and what they are signed as."""
-    of = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
-    key = block_key()
-    return {
-        level: Blocks(
-            folder / f"level-{level_name(level)}",
-            len(lattice.steps),
-            f"level {level_name(level)} of the certificate {of}",
-            key,
-        )
-        for level, lattice in lattices.items()
-    }
-
-
-def _count(lattice: Covering) -> int:
-    return -(-len(lattice) // BLOCK)
-
-
-def _points(lattice: Covering, number: int) -> FloatArray:
-    return lattice.points(number * BLOCK, (number + 1) * BLOCK)
-
-
-def _size(lattice: Covering, number: int) -> int:
-    return min(BLOCK, len(lattice) - number * BLOCK)
+    return f"{tested}: {result}"

@@ -25,8 +25,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
-from merge_sumo.studies.certificate import certify
-from merge_sumo.studies.certificate_runs import runs_points_on
+from merge_sumo.studies.certificate import certify, runs_points_on
 from merge_sumo.studies.versions import rerun, settings_today
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.trajectory import End

@@ -20,9 +20,13 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies import certificate
-from merge_sumo.studies.certificate import CERTIFICATE, lattices_of
-from merge_sumo.studies.certificate_runs import CheckedCase
-from merge_sumo.studies.lattice import Covering, covering
+from merge_sumo.studies.certificate import (
+    CERTIFICATE,
+    CheckedCase,
+    CoveringLattice,
+    covering,
+    lattices_of,
+)
 from merge_sumo.system.signature import signed, user_key, verified
 
 LOW, HIGH = np.array([-340.0, 25.0, 0.0]), np.array([-180.0, 35.0, math.pi / 2])
@@ -82,10 +86,10 @@ def places(dims, count, seed):
 class TestTheLattice:
     def test_has_the_points_whose_indices_are_all_even_or_all_odd(self):
         wanted = [(0, 0), (0, 1), (0.5, 0), (0.5, 1), (1, 0), (1, 1), (0.25, 0.5), (0.75, 0.5)]
-        assert [tuple(p) for p in Covering((4, 2)).points(0, 99).tolist()] == wanted
+        assert [tuple(p) for p in CoveringLattice((4, 2)).points(0, 99).tolist()] == wanted
 
     def test_is_body_centred_in_three_dimensions(self):
-        found = Covering((2, 2, 2))
+        found = CoveringLattice((2, 2, 2))
         corners = list(itertools.product((0.0, 1.0), repeat=3))
         assert [tuple(p) for p in found.points(0, 99).tolist()] == [*corners, (0.5, 0.5, 0.5)]
         # A cube of edge 1: the farthest places are (1/2, 1/4, 0) and its images.
@@ -93,7 +97,7 @@ class TestTheLattice:
 
     @pytest.mark.parametrize("steps", [(7, 4), (5, 5, 5)])
     def test_is_the_same_in_pieces(self, steps):
-        found = Covering(steps)
+        found = CoveringLattice(steps)
         whole = found.points(0, len(found))
         pieces = [found.points(first, first + 3) for first in range(0, len(found), 3)]
         assert np.array_equal(np.concatenate(pieces), whole)
