@@ -102,16 +102,11 @@ def imports_a_variable(source: str) -> bool:
     )
 
 
-LOADED_BY_WORKERS = {"merge_sumo.engine.simulator"}
-"""Named in `system/workers.py`, which is to be told it instead."""
-
-
 def import_graph() -> dict[str, set[str]]:
     """Return the files of the package that each imports, by their dotted names."""
     modules = {module_of(file): file for file in FILES}
     return {
-        module: {name for name in imports_of(file) if name in modules}
-        - {module, *(LOADED_BY_WORKERS if module == "merge_sumo.system.workers" else ())}
+        module: {name for name in imports_of(file) if name in modules} - {module}
         for module, file in modules.items()
     }
 
@@ -263,8 +258,7 @@ class TestImports:
                 continue
             allowed = {*LAYERS[: LAYERS.index(room) + 1], ""}
             ours = imports_any(imports_of(file), {"merge_sumo"})
-            wrong = {name for name in ours if layer_of(name) not in allowed}
-            if wrong - LOADED_BY_WORKERS:
+            if wrong := {name for name in ours if layer_of(name) not in allowed}:
                 above[module_of(file)] = wrong
         assert above == {}
 

@@ -44,7 +44,6 @@ class VutKind:
             own.
         own_code: whether to test it is to run code that is neither of this package nor of SUMO.
         by_command: whether it is a program that `--vut-command` starts; without, a person does.
-        in_memory: whether it is an object of this process.
         file_of: returns the file that an argument names; "" for none.
         no_pov: why it cannot drive a POV; "" where it can.
     """
@@ -56,7 +55,6 @@ class VutKind:
     hosted: bool = False
     own_code: bool = True
     by_command: bool = False
-    in_memory: bool = False
     file_of: Callable[[str], str] = lambda _: ""
     no_pov: str = ""
 
@@ -127,7 +125,7 @@ KINDS: Final[Registry[VutKind]] = Registry(
             hosted=True,
             file_of=_file_before_options,
         ),
-        HERE: VutKind(prepare=here_vut, in_memory=True),
+        HERE: VutKind(prepare=here_vut),
     },
     accepts=lambda item: isinstance(item, VutKind),
     contract="a merge_sumo.vuts.registry.VutKind",
