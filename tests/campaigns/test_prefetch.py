@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from calling import contents
 from campaigning import resume_campaign, run_campaign
-from test_store import contents, episode
+from test_store import episode
 
 from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.settings import CampaignSettings
