@@ -81,8 +81,10 @@ def measures_page() -> str:
         about = f"{measure.about}.".replace("|", r"\|")
         worse = f"{measure.worse}er values" if measure.worse else ""
         rows += f"| `{name}` | {measure.unit} | {about} | {worse} |\n"
-    head = "| name | unit | what it is | worse |\n|---|---|---|---|\n"
-    return f"# Measures\n\n{inspect.cleandoc(Measures.__doc__ or '')}\n\n{head}{rows}"
+    head = "| name | unit | definition | worse |\n|---|---|---|---|\n"
+    # Further paragraphs of the docstring are about the code.
+    about = "\n\n".join(inspect.cleandoc(Measures.__doc__ or "").split("\n\n")[:2])
+    return f"# Measures\n\n{about}\n\n{head}{rows}"
 
 
 GENERATED: dict[str, Callable[[], str]] = {
