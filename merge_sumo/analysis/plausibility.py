@@ -18,8 +18,7 @@ from merge_sumo.values.expression import (
 )
 from merge_sumo.values.scenario import DT_S
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.soundness import KMH_PER_MPS
-from merge_sumo.values.vacuity import comparisons_in, text_of
+from merge_sumo.values.vacuity import KMH_PER_MPS, comparisons_in, text_of
 
 CLIPPED_SHARE: Final = 0.01
 """Share of the steps from which on it is said that accelerations were clipped."""

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Final, NamedTuple
 
 from merge_sumo.road.corridor import Approach, Corridor, LanePath, Piece
@@ -159,20 +159,31 @@ def _meeting(
             return _Meeting(one, other, drop=None, place=place)
         if place + 1 == len(tail) or mainline[place + 1].keys() & ramp[place + 1].keys():
             continue
-        lanes = {lane.id: lane for lane in net.lanes(edge)}
-        for ending, going in ((ramp, mainline), (mainline, ramp)):
-            for last in (lanes[name] for name in ending[place]):
-                for beside in (lanes[name] for name in going[place]):
-                    onward = net.links(beside, tail[place + 1])
-                    ends = not net.links(last, tail[place + 1])
-                    if ends and onward and abs(last.index - beside.index) == 1:
-                        drop = _drop(net, last, onward[0])
-                        one, other = (onward[0], drop) if ending is ramp else (drop, onward[0])
-                        return _Meeting(one, other, drop=drop, place=place + 1)
+        links = _lane_drop(net, mainline[place], ramp[place], tail[place : place + 2])
+        if links is not None:
+            return _Meeting(*links, place=place + 1)
     raise net.broken(
         f"mainline and ramp have no lane in common up to the end of edge {tail[-1]}; name the edge "
         "that follows on both"
     )
+
+
+def _lane_drop(
+    net: NetFile, mainline: _Layer, ramp: _Layer, edges: _Edges
+) -> tuple[Link, Link, Link] | None:
+    """Return the links of both paths where a lane of one ends beside a lane of the other.
+
+    The third one is the link, of these two, of the path whose lane ends. `edges` are the edge on
+    which it ends and the one that follows; None where no such lane ends.
+    """
+    lanes = {lane.id: lane for lane in net.lanes(edges[0])}
+    for ending, going in ((ramp, mainline), (mainline, ramp)):
+        for last, beside in product([lanes[id_] for id_ in ending], [lanes[id_] for id_ in going]):
+            onward = net.links(beside, edges[1])
+            if onward and not net.links(last, edges[1]) and abs(last.index - beside.index) == 1:
+                drop = _drop(net, last, onward[0])
+                return (onward[0], drop, drop) if ending is ramp else (drop, onward[0], drop)
+    return None
 
 
 def _drop(net: NetFile, last: Lane, beside: Link) -> Link:

@@ -21,13 +21,12 @@ from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.criteria import CRITERIA, PAPER
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
 from merge_sumo.values.measures import MEASURES, OURS
-from merge_sumo.values.ranges import Speeds
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
 from merge_sumo.values.severity import Severity
-from merge_sumo.values.soundness import domain_of, emptiness, idle_parts
 from merge_sumo.values.temporal import check_formula, formula_range, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.values.vacuity import Speeds, domain_of, emptiness, idle_parts
 
 SHORT: Final = 120
 """Characters of a condition in a headline."""
@@ -163,7 +162,9 @@ class Criterion:
         """
         spoken = frozenset[str]() if self.require else _names(self.words)
         seen = lines if spoken & OF_BODIES else None
-        measures = measure(trajectory, seen, way_out="last_avoidable_s" in spoken, further=spoken)
+        measures = measure(
+            trajectory, seen, avoidability="last_avoidable_s" in spoken, further=spoken
+        )
         return self._outcome(0, 0, trajectory, measures)
 
     def _outcome(

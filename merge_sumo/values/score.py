@@ -18,16 +18,16 @@ import numpy as np
 
 from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.records import convert, decode, record_type, to_plain
+from merge_sumo.values.avoidability import last_avoidable_s
 from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
-from merge_sumo.values.former import upgrade_from_0_1
 from merge_sumo.values.measures import OURS, Further, further_measures, further_of
 from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
+from merge_sumo.values.migration import upgrade_from_0_1
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario, Vehicle
 from merge_sumo.values.severity import Severity, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
-from merge_sumo.values.way_out import last_way_out_s
 
 FAILURE_SCORE: Final = -500.0
 """lambda: a case fails when its score is below."""
@@ -217,7 +217,7 @@ def measure(
     trajectory: Trajectory,
     lines: CentreLines | None = None,
     *,
-    way_out: bool = True,
+    avoidability: bool = True,
     further: Collection[str] | None = None,
 ) -> Measures:
     """Return the verdict and the measures of an episode.
@@ -225,11 +225,11 @@ def measure(
     Args:
         trajectory: what happened.
         lines: centre lines of the road; without them bodies are looked at from M on.
-        way_out: whether the last way out is searched for, which takes most of the time.
+        avoidability: whether `last_avoidable_s` is computed, which takes most of the time.
         further: names of the further measures that are taken; all by default.
     """
     before_m = math.inf if lines is None else closest_before_m([trajectory], lines)[0]
-    measures = _measure(trajectory, before_m, way_out=way_out)
+    measures = _measure(trajectory, before_m, avoidability=avoidability)
     return _with_further(measures, trajectory, lines, further)
 
 
@@ -237,7 +237,7 @@ def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[
     """Return the verdict and the measures of episodes, which takes less time than one by one."""
     before = closest_before_m(trajectories, lines)
     return [
-        _with_further(_measure(trajectory, before_m, way_out=True), trajectory, lines)
+        _with_further(_measure(trajectory, before_m, avoidability=True), trajectory, lines)
         for trajectory, before_m in zip(trajectories, before, strict=True)
     ]
 
@@ -252,7 +252,7 @@ def _with_further(
     return replace(measures, further=further) if further else measures
 
 
-def _measure(trajectory: Trajectory, before_m: float, *, way_out: bool) -> Measures:
+def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> Measures:
     nearest = trajectory.nearest
     pair = trajectory.facing(nearest)
     (x_pov, v_pov, _), (x_vut, v_vut, _) = pair.motion[-1].tolist()
@@ -264,8 +264,8 @@ def _measure(trajectory: Trajectory, before_m: float, *, way_out: bool) -> Measu
         ttc = time_to_collision(dx, dv)
         pet = _post_encroachment_time(pair)
         first = "VUT" if dx < 0 else "POV"
-        if close and way_out:
-            last_avoidable = last_way_out_s(trajectory)
+        if close and avoidability:
+            last_avoidable = last_avoidable_s(trajectory)
             avoidable = last_avoidable is not None
         if not close:
             gap = abs(dx) - trajectory.case.scenario.dx_crash_m

@@ -21,10 +21,9 @@ from merge_sumo.system.printable import printable
 from merge_sumo.system.suggestions import meant
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.expression import ALIKE_MEASURES, LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
-from merge_sumo.values.ranges import Range, Speeds
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S, Scenario
-from merge_sumo.values.soundness import robustness_range
 from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.values.vacuity import Range, Speeds, robustness_range
 
 SIGNALS: Final = (
     *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),

@@ -335,7 +335,7 @@ class TestTheVerdictAlone:
 
     def test_looks_for_a_way_out_where_the_criterion_speaks_of_it_alone(self, monkeypatch):
         asked = []
-        monkeypatch.setattr(score, "last_way_out_s", lambda _: asked.append(1))
+        monkeypatch.setattr(score, "last_avoidable_s", lambda _: asked.append(1))
         Criterion("ttc_s < 1.5").judged(ending(0.0))
         assert not asked
         Criterion("last_avoidable_s < 2").judged(ending(0.0))

@@ -33,11 +33,16 @@ from merge_sumo.values.criterion import (
     values_of,
 )
 from merge_sumo.values.expression import AllOf, AnyOf, Comparison, Condition, Equality, Negation
-from merge_sumo.values.ranges import Range, Speeds, measure_ranges
 from merge_sumo.values.scenario import DT_S, US23
-from merge_sumo.values.soundness import domain_of, robustness_range
 from merge_sumo.values.temporal import NEVER_S, SIGNALS, _robustness, _specification
-from merge_sumo.values.vacuity import Domain
+from merge_sumo.values.vacuity import (
+    Domain,
+    Range,
+    Speeds,
+    domain_of,
+    measure_ranges,
+    robustness_range,
+)
 
 SCENARIOS = ["us23", "roundabout", "us23-traffic"]
 
@@ -174,7 +179,7 @@ class TestAFormula:
         limits = {name: Range(-rng.random() * 9, rng.random() * 9) for name in SIGNALS}
         (formula,) = _specification(text).ast.specs
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("merge_sumo.values.soundness.signal_ranges", lambda *_: limits)
+            patch.setattr("merge_sumo.values.vacuity.signal_ranges", lambda *_: limits)
             said = robustness_range(formula, US23, Speeds.possible(US23), NEVER_S)
         for steps in (2, 5, 30):
             for _ in range(20):

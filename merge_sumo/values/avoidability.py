@@ -1,4 +1,4 @@
-"""Until when the VUT could have kept its distance at M: the last way out of a failure."""
+"""Until when the VUT could have avoided a conflict at M."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from merge_sumo.values.scenario import DT_S, VUT
 from merge_sumo.values.trajectory import Trajectory
 
 
-def last_way_out_s(trajectory: Trajectory) -> float | None:
-    """Return the last time, in s, from which the VUT had a way out; None without one.
+def last_avoidable_s(trajectory: Trajectory) -> float | None:
+    """Return the last time, in s, at which the VUT could still avoid a conflict; None without one.
 
     The POV never moves backwards, so of all ways to arrive at M the first and the last possible
     decide: the VUT passes in front at full acceleration, or waits at full braking. Both are
     rolled out from every step of the record at once. In traffic every car has to be avoided, and
-    ways through gaps between them are left out.
+    gaps between cars are left out.
     """
     cars, scenario = np.delete(trajectory.motion, VUT, axis=1), trajectory.case.scenario
     steps = np.arange(1, scenario.max_steps + 1)[:, None]
     beyond = steps * (cars[-1, :, 1] * DT_S) + cars[-1, :, 0]
     x_cars = np.concatenate([cars[:, :, 0], beyond])
     starts = np.arange(len(cars) - 1)
-    way_out = np.zeros(len(starts), dtype=bool)
+    avoidable = np.zeros(len(starts), dtype=bool)
     for acceleration in (scenario.a_max_mps2, scenario.a_min_mps2):
         x, v = trajectory.x_vut_m[:-1].copy(), trajectory.v_vut_mps[:-1].copy()
         driving = np.ones(len(starts), dtype=bool)
@@ -30,12 +30,12 @@ def last_way_out_s(trajectory: Trajectory) -> float | None:
             v = np.maximum(v + acceleration * DT_S, 0.0)
             arrived = driving & (x >= 0.0)
             dx = x_cars[starts[arrived] + ahead] - x[arrived, None]
-            way_out[arrived] |= (np.abs(dx) >= scenario.dx_crash_m).all(axis=1)
+            avoidable[arrived] |= (np.abs(dx) >= scenario.dx_crash_m).all(axis=1)
             driving &= ~arrived
             if not driving.any():
                 break
             if acceleration < 0.0 and not v[driving].any():
                 # These stop short of M and can wait there, if the POV moves on.
-                way_out[driving] |= bool((cars[-1, :, 1] > 0.0).all())
+                avoidable[driving] |= bool((cars[-1, :, 1] > 0.0).all())
                 break
-    return float(starts[way_out][-1] * DT_S) if way_out.any() else None
+    return float(starts[avoidable][-1] * DT_S) if avoidable.any() else None
