@@ -20,8 +20,7 @@ from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.studies.avoidance import avoidance
-from merge_sumo.studies.counterfactuals import CAREFUL, TAKES_OVER
+from merge_sumo.studies.counterfactuals import CAREFUL, TAKES_OVER, avoidance
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import LEVELS
 from merge_sumo.values.trajectory import End

@@ -95,8 +95,8 @@ from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenar
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies import benchmark, certificate, reproduction, versions, vut_check
 from merge_sumo.studies import probability as estimates
-from merge_sumo.studies.avoidance import note_avoidance
 from merge_sumo.studies.certificate import runs_points_on
+from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
 from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth

@@ -31,9 +31,9 @@ from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.store import SETTINGS, Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, verdict_of
-from merge_sumo.studies.avoidance import in_a_sentence, read_avoidance
 from merge_sumo.studies.benchmark import Quartiles, SamplerSummary
 from merge_sumo.studies.certificate import Certificate
+from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.importance import Estimate
 from merge_sumo.studies.reproduction import TABLE_JSON, TABLE_MARKDOWN
 from merge_sumo.studies.truth import DENSE_CASES, REAL_REGION, Truth

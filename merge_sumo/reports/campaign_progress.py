@@ -12,7 +12,7 @@ from typing import Final
 from merge_sumo.analysis.verdict import in_counts
 from merge_sumo.campaigns.store import failures
 from merge_sumo.reports.progress import clock_text, rate_text
-from merge_sumo.studies.avoidance import MOST
+from merge_sumo.studies.counterfactuals import MOST
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc

@@ -27,7 +27,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.report_maps import GRID
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
-from merge_sumo.studies.avoidance import read_avoidance
+from merge_sumo.studies.counterfactuals import read_avoidance
 from merge_sumo.studies.expectation import read_expectation
 from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey, read_truth
 from merge_sumo.system.workers import Workers

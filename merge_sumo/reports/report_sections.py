@@ -30,7 +30,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.headline import Rule, after_words, avoidable_words, before_words, headline
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
-from merge_sumo.studies.avoidance import in_a_sentence
+from merge_sumo.studies.counterfactuals import in_a_sentence
 from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.printable import printable
 from merge_sumo.system.registry import Registry

@@ -449,12 +449,12 @@ def certify(
         found[level] = _level_result(blocks, settings.scenario.dimensions(level), same)
         check()
     done = Certificate(radius, found, _sentence(radius, found, settings))
-    result = {
+    summary = {
         "certain": done.certain,
         "sentence": done.sentence,
         "levels": {str(level): asdict(of_level) for level, of_level in found.items()},
     }
-    replace_own(folder / CERTIFICATE, text(dict(sorted(files.items())), result))
+    replace_own(folder / CERTIFICATE, text(dict(sorted(files.items())), summary))
     return done
 
 

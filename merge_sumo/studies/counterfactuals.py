@@ -1,22 +1,40 @@
-"""Failures that are driven again: a reference driver in the VUT's place, or on the mainline.
+"""Counterfactuals: which drivers would have avoided a failure, in the very same case.
+
+The cases of the failures of a campaign run again, without the VUT and without running its code:
+
+- with each reference driver in the VUT's place, from the start;
+- with the FSM driver as one that takes over: up to some time the VUT does what it did, by its
+  recorded accelerations, and from then on the driver drives, with its delay still to come. Every
+  step is tried from the last one back, up to the first success: success is not monotone in time;
+- with a careful driver on the mainline in the POV's place, against what the VUT did.
 
 The drivers of the package need nothing of SUMO, so the episodes are those of eq. (4)
-(`equation_world.py`), many at a time. Where the POV is the tester's own they run in SUMO.
+(`engine/kinematic_world.py`), many at a time. Where the POV is the tester's own they run in SUMO.
+
+avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases;
+                        of very many, the worst
+
+The file of a folder which somebody sent is data as everything in it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import math
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.levelk import DECISION_STEPS
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
-from merge_sumo.engine.evaluate import opened_simulator
+from merge_sumo.engine.evaluate import opened_simulator, workers_or_here
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.pov_library import PovLibrary
@@ -24,23 +42,33 @@ from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.world import World
+from merge_sumo.system.folders import replace_own
+from merge_sumo.system.records import read_indexed
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S, EpisodeTime
-from merge_sumo.values.score import is_close
+from merge_sumo.values.score import Outcome, is_close
 from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.output import LOG
+from merge_sumo.vuts.registry import vut_factory
 
+AVOIDANCE: Final = "avoidance.jsonl"
 CAREFUL: Final = "careful"
 """The reference driver that the headline counts."""
 TAKES_OVER: Final = "fsm"
 """The reference driver that takes over. From the start it avoids what can be avoided; the careful
 driver brakes only 2 s before a collision, and would tell of itself more than of the VUT."""
+MOST: Final = 500
+"""Failures that run again, the worst: each takes some thirty episodes."""
+CHUNK: Final = 64
+"""Failures that a worker takes at a time: enough to keep all corridors busy."""
 BLOCK_STEPS: Final = 10
-"""Take-overs that are tried at a time, from the last one back."""
+"""Take-overs that are tried at a time, from the last one back. Chosen, not tuned."""
 CORRIDORS: Final = 256
-"""Episodes that run at a time without SUMO."""
+"""Episodes that run at a time without SUMO. Chosen, not tuned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +100,141 @@ class Avoidance:
         return CAREFUL in self.avoided_by
 
     @property
-    def by_who_takes_over(self) -> bool:
+    def by_takeover_driver(self) -> bool:
         """Whether the driver of `latest_takeover_s` avoids it from the start."""
         return TAKES_OVER in self.avoided_by
 
 
+# The file of a campaign.
+
+
+def note_avoidance(
+    run: Run,
+    plan: SimulationPlan,
+    *,
+    workers: Workers | None = None,
+    check: Callable[[], None] = lambda: None,
+    on_part: Callable[[int, int], None] = lambda _done, _total: None,
+) -> None:
+    """Find which drivers would have avoided the failures of a campaign, and write that.
+
+    The arguments are those of `avoidance`.
+    """
+    known = avoidance(run, plan, workers=workers, check=check, on_part=on_part)
+    if known:
+        write_avoidance(run.folder, known)
+
+
+def write_avoidance(folder: Path, avoidances: Iterable[Avoidance]) -> Path:
+    """Write avoidances into the folder of a campaign, in the place of an older one."""
+    path = folder / AVOIDANCE
+    lines = "".join(json.dumps(asdict(one), allow_nan=False) + "\n" for one in avoidances)
+    replace_own(path, lines.encode())
+    return path
+
+
+def read_avoidance(run: Run) -> dict[int, Avoidance]:
+    """Return by index what the folder of a campaign says of its failures.
+
+    Empty where it says nothing. Raises `UserError` for a line that is not of one of its failures.
+    """
+    failing = {outcome.index for outcome in run.outcomes if outcome.failed}
+    return read_indexed(run.folder / AVOIDANCE, Avoidance, failing, _upgrade_from_0_1)
+
+
+def _upgrade_from_0_1(record: dict[str, Any]) -> dict[str, Any]:
+    # Another driver took over in that release, so the time says nothing of this one.
+    if "careful_until_s" in record:
+        record["latest_takeover_s"] = None
+        del record["careful_until_s"]
+    return record
+
+
+def in_a_sentence(avoidances: Iterable[Avoidance]) -> str | None:
+    """Return how many failures careful drivers would have avoided; None where nothing is known."""
+    known = list(avoidances)
+    if not known:
+        return None
+    careful = sum(one.by_careful for one in known)
+    takeover = sum(one.by_takeover_driver for one in known)
+    pov = sum(one.pov_careful for one in known)
+    times = sorted(one.latest_takeover_s for one in known if one.latest_takeover_s is not None)
+    plural = "failure" if len(known) == 1 else "failures"
+    sentence = (
+        f"{careful} of {len(known)} {plural} would have been avoided by a careful and competent "
+        f"driver, {takeover} by the fuzzy safety model"
+    )
+    if times:
+        middle = times[math.floor((len(times) - 1) / 2)]
+        sentence += f" (which may take over until {middle:.1f} s, in the median)"
+    return f"{sentence}, and {pov} by a careful driver on the mainline."
+
+
+# The failures of a campaign.
+
+
+Failure = tuple[int, Trajectory]
+"""The index of a failing case, and its recorded motion."""
+
+
+def avoidance(
+    run: Run,
+    plan: SimulationPlan,
+    *,
+    workers: Workers | None = None,
+    check: Callable[[], None] = lambda: None,
+    on_part: Callable[[int, int], None] = lambda _done, _total: None,
+) -> list[Avoidance]:
+    """Return who would have avoided each failure of a campaign, in the order of its cases.
+
+    Of more than `MOST` failures, of the worst ones. Failures whose trajectory is lost, and those
+    that end a worker each time, are left out. The POVs are those of the plan; a POV of the
+    tester's own runs again.
+
+    Args:
+        run: the campaign.
+        plan: how it was run.
+        workers: where the episodes run, by default in this process.
+        check: called whenever a worker is done with some of them; may raise to stop there.
+        on_part: told how many failures are done, and how many there are, from 0 on.
+    """
+    worst = sorted(failures(run.outcomes)[:MOST], key=lambda outcome: outcome.index)
+    failing = [(o.index, motion) for o in worst if (motion := _trajectory(run, o)) is not None]
+    if not failing:
+        return []
+    # No code of the VUT: a driver of the package is in its place.
+    plan = replace(plan, vut=vut_factory(CAREFUL)).with_log(run.folder.resolve() / LOG)
+    avoided: list[Avoidance] = []
+    with workers_or_here(workers) as processes:
+        on_part(done := 0, len(failing))
+        size = min(CHUNK, math.ceil(len(failing) / processes.count))
+        chunks = (failing[first : first + size] for first in range(0, len(failing), size))
+        run_some = partial(run_counterfactuals, plan)
+        with closing(processes.run_chunks(run_some, chunks, _unknown)) as results:
+            for _, some in results:
+                avoided += [one for one in some if one is not None]
+                on_part(done := done + len(some), len(failing))
+                check()
+    return sorted(avoided, key=lambda one: one.index)
+
+
+def _trajectory(run: Run, outcome: Outcome) -> Trajectory | None:
+    try:
+        return run.trajectory(outcome.index)
+    except UserError:
+        return None
+
+
+def _unknown(_: Failure) -> None:
+    """Return nothing for a failure that ended every worker that ran it."""
+
+
+# The episodes.
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Again(Case):
-    """A case that is driven again.
+class _Counterfactual(Case):
+    """A failing case with another driver.
 
     Attributes:
         by: reference driver in the VUT's place.
@@ -112,12 +267,8 @@ class _Again(Case):
         return replace(trajectory, motion=motion, end=End.TIMEOUT if late else trajectory.end)
 
 
-Failure = tuple[int, Trajectory]
-"""The index of a failing case, and what happened in it."""
-
-
-def drive_again(plan: SimulationPlan, failing: Sequence[Failure]) -> list[Avoidance | None]:
-    """Return which drivers would have avoided failures, by driving them again in this process.
+def run_counterfactuals(plan: SimulationPlan, failing: Sequence[Failure]) -> list[Avoidance | None]:
+    """Return which drivers would have avoided failures, by running their cases in this process.
 
     Raises `UserError` where other software would give other outcomes.
     """
@@ -132,19 +283,19 @@ def drive_again(plan: SimulationPlan, failing: Sequence[Failure]) -> list[Avoida
 
 def avoidances(stage: Stage, failing: Sequence[Failure]) -> list[Avoidance]:
     """Return which drivers would have avoided failures."""
-    failures = [failure for _, failure in failing]
+    motions = [motion for _, motion in failing]
     # One driver after the other: a driver that is in no corridor costs nothing.
-    asked = [_again(f, by=name) for name in REFERENCES for f in failures]
-    asked += [_again(f, until=len(f.motion) - 1, careful_pov=True) for f in failures]
-    *by_name, pov_careful = np.reshape(stage.passed(asked), (-1, len(failures))).tolist()
-    latest = _latest_takeovers(stage, failures)
-    found: list[Avoidance] = []
-    for place, (index, _) in enumerate(failing):
+    cases = [_counterfactual(motion, by=name) for name in REFERENCES for motion in motions]
+    cases += [_counterfactual(m, until=len(m.motion) - 1, careful_pov=True) for m in motions]
+    *by_name, pov_careful = np.reshape(stage.passed(cases), (-1, len(motions))).tolist()
+    result: list[Avoidance] = []
+    for place, (step, (index, _)) in enumerate(
+        zip(_latest_takeovers(stage, motions), failing, strict=True)
+    ):
         names = [name for name, by in zip(REFERENCES, by_name, strict=True) if by[place]]
-        step = latest[place]
         time_s = None if step is None else round(step * DT_S, 1)
-        found.append(Avoidance(index, tuple(names), time_s, pov_careful[place]))
-    return found
+        result.append(Avoidance(index, tuple(names), time_s, pov_careful[place]))
+    return result
 
 
 def _latest_takeovers(stage: Stage, failures: Sequence[Trajectory]) -> list[int | None]:
@@ -156,13 +307,13 @@ def _latest_takeovers(stage: Stage, failures: Sequence[Trajectory]) -> list[int 
     latest: list[int | None] = [None] * len(failures)
     untried = {place: len(failure.motion) - 1 for place, failure in enumerate(failures)}
     while untried:
-        asked = [
+        takeovers = [
             (place, until)
             for place, end in untried.items()
             for until in range(max(end - BLOCK_STEPS, 0), end)
         ]
-        cases = [stage.takeover(failures[place], until) for place, until in asked]
-        for (place, until), passed in zip(asked, stage.passed(cases), strict=True):
+        cases = [stage.takeover(failures[place], until) for place, until in takeovers]
+        for (place, until), passed in zip(takeovers, stage.passed(cases), strict=True):
             if passed:
                 latest[place] = until  # in rising order
         untried = {
@@ -173,13 +324,13 @@ def _latest_takeovers(stage: Stage, failures: Sequence[Trajectory]) -> list[int 
     return latest
 
 
-def _again(failure: Trajectory, **other: Any) -> _Again:
+def _counterfactual(failure: Trajectory, **other: Any) -> _Counterfactual:
     same = {f.name: getattr(failure.case, f.name) for f in fields(Case)}
-    return _Again(**same, failure=failure, **other)
+    return _Counterfactual(**same, failure=failure, **other)
 
 
 class Stage:
-    """Where failures are driven again, with the drivers of the mainline."""
+    """The world and the drivers of the mainline with which the cases of failures run again."""
 
     def __init__(self, plan: SimulationPlan, world: World | EquationWorld, povs: Driver) -> None:
         """Take the plan, the world, and the POVs."""
@@ -187,16 +338,16 @@ class Stage:
         self._substitutes = _Substitutes(world.corridors, plan.scenario.max_steps)
         self._criterion, self._lines = plan.criterion, centre_lines(plan.road)
 
-    def takeover(self, failure: Trajectory, until: int) -> _Again:
+    def takeover(self, failure: Trajectory, until: int) -> _Counterfactual:
         """Return the case in which a driver takes over at a step.
 
         Without SUMO it begins where the learned POVs, which remember nothing else, last decided.
         """
         in_sumo = isinstance(self._world, World)
         first = 0 if in_sumo else until - until % DECISION_STEPS
-        return _again(failure, by=TAKES_OVER, first=first, until=until)
+        return _counterfactual(failure, by=TAKES_OVER, first=first, until=until)
 
-    def passed(self, cases: Sequence[_Again]) -> list[bool]:
+    def passed(self, cases: Sequence[_Counterfactual]) -> list[bool]:
         """Return whether each case is passed."""
         passed = [False] * len(cases)
         for place, trajectory in rollout(self._world, self._povs, self._substitutes, cases):
@@ -230,7 +381,7 @@ class _Substitutes(Driver):
         self._recorded = np.zeros((steps + 1, corridors))
 
     def begin(self, corridor: int, case: Case) -> None:
-        assert isinstance(case, _Again), "only failures are driven again"  # noqa: S101
+        assert isinstance(case, _Counterfactual), "only counterfactuals run here"  # noqa: S101
         self._by[corridor] = list(self._drivers).index(case.by)
         self._until[corridor] = case.until - case.first
         recorded_mps2 = case.recorded_mps2()
@@ -260,7 +411,7 @@ class _Mainline(Driver):
         self._is_careful = np.zeros(povs.corridors, dtype=np.bool_)
 
     def begin(self, corridor: int, case: Case) -> None:
-        self._is_careful[corridor] = isinstance(case, _Again) and case.careful_pov
+        self._is_careful[corridor] = isinstance(case, _Counterfactual) and case.careful_pov
         (self._careful if self._is_careful[corridor] else self._povs).begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:

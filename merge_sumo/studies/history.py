@@ -29,8 +29,7 @@ from merge_sumo.analysis.summary import severities_of
 from merge_sumo.analysis.verdict import Verdict, in_words, judge
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
-from merge_sumo.studies.avoidance import read_avoidance
-from merge_sumo.studies.counterfactuals import Avoidance
+from merge_sumo.studies.counterfactuals import Avoidance, read_avoidance
 from merge_sumo.studies.versions import check_comparable, levels_of
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import fmc, radius_for, regions

@@ -29,8 +29,7 @@ from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.running_page import running_page
 from merge_sumo.reports.version_pages import comparison_page, write_page
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.studies.avoidance import write_avoidance
-from merge_sumo.studies.counterfactuals import Avoidance
+from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.studies.versions import compare_runs
 from merge_sumo.values.scenario import POV
 

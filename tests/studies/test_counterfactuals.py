@@ -25,14 +25,17 @@ from merge_sumo.engine.povs import Povs, own_pov
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.studies.avoidance import (
+from merge_sumo.studies.counterfactuals import (
     AVOIDANCE,
+    Avoidance,
+    Stage,
     avoidance,
+    avoidances,
     in_a_sentence,
     read_avoidance,
+    run_counterfactuals,
     write_avoidance,
 )
-from merge_sumo.studies.counterfactuals import Avoidance, Stage, avoidances, drive_again
 from merge_sumo.system.workers import InProcess, Workers, open_workers
 from merge_sumo.values.scenario import OWN
 from merge_sumo.vuts.base import VutOptions
@@ -148,7 +151,7 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_le
     plan = replace(resolve(settings), vut=vut_factory("careful"))
     with opened_simulator(plan) as ground:
         in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
-    assert drive_again(plan, failing) == in_sumo
+    assert run_counterfactuals(plan, failing) == in_sumo
     assert len({one.latest_takeover_s for one in in_sumo}) > 3
 
 
@@ -160,7 +163,7 @@ def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
     for one in found[:4]:
         failure = run.trajectory(one.index)
         failing.append((one.index, replace(failure, case=replace(failure.case, level=OWN))))
-    assert drive_again(plan_for("careful", povs=povs), failing) == found[:4]
+    assert run_counterfactuals(plan_for("careful", povs=povs), failing) == found[:4]
 
 
 class TestWorkers:
