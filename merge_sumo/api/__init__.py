@@ -66,10 +66,7 @@ from merge_sumo.campaigns.one_case import (
 )
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.scenario_suggestion import about, suggested, unseen
-from merge_sumo.campaigns.settings import (
-    CampaignSettings,
-    settings_of,
-)
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
@@ -116,12 +113,7 @@ from merge_sumo.system.folders import (
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.workers import Workers, workers_or_cores
-from merge_sumo.values.scenario import (
-    LEVELS,
-    US23,
-    Scenario,
-    level_name,
-)
+from merge_sumo.values.scenario import LEVELS, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import Car, Seen
@@ -134,12 +126,11 @@ if TYPE_CHECKING:
     from merge_sumo.values.case import Case
 
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
-__all__ += ["RunComparison", "Seen"]
-__all__ += ["SeenBatch", "Settings", "Setup", "campaign", "certify", "check_scenario", "check_vut"]
-__all__ += ["compare", "compare_runs", "dated", "export", "export_policy", "history"]
-__all__ += ["new_scenario", "open_in_gui", "open_run", "probability", "replay", "report"]
-__all__ += ["reproduce", "rerun", "resume", "run_case", "scenarios", "train", "truth", "truths"]
-__all__ += ["vuts"]
+__all__ += ["RunComparison", "Seen", "SeenBatch", "Settings", "Setup", "campaign", "certify"]
+__all__ += ["check_scenario", "check_vut", "compare", "compare_runs", "dated", "export"]
+__all__ += ["export_policy", "history", "new_scenario", "open_in_gui", "open_run"]
+__all__ += ["probability", "replay", "report", "reproduce", "rerun", "resume", "run_case"]
+__all__ += ["scenarios", "train", "truth", "truths", "vuts"]
 
 AnyPath = Path | str
 AnyRun = CampaignRun | Path | str
@@ -235,18 +226,7 @@ def resume(
     """
     check_keywords("resume", given, Settings)
     folder = run.folder if isinstance(run, CampaignRun) else Path(run)
-    recorded = read_settings(folder)
-    named = {"vut": vut, **given}
-    named = {name: value for name, value in named.items() if value is not None}
-    drivers = {name: named.get(name, recorded.get(name)) for name in ("vut", "pov")}
-    spec, pov_spec, count = drivers_of(drivers["vut"] or "", drivers["pov"], workers)
-    specs = {"vut": spec, "pov": pov_spec}
-    fields = recordable(named | {name: specs[name] for name in specs if name in named})
-    settings = settings_of(folder, recorded, fields, trust=trust_vut)
-    if "level" in named:
-        policies = policies_folder(settings.policies, settings.scenario)
-        levels = parse_levels(str(named["level"]), policies, own=settings.pov is not None)
-        settings = replace(settings, levels=levels)
+    settings, count = _settings_again(folder, {"vut": vut, **given}, workers, trust=trust_vut)
     check_report(folder)
     plan = resolve(settings, _path(net))
     running = _Running(count, dask, on_case, check or _go_on, progress, gates, junit)
@@ -265,6 +245,27 @@ def resume(
         )
 
     return _concluded(settings, plan, folder, go_on, running)
+
+
+def _settings_again(
+    folder: Path, given: Mapping[str, Any], workers: int | None, *, trust: bool
+) -> tuple[CampaignSettings, int | None]:
+    """Return the settings of a campaign, as its folder records them or as they are given again.
+
+    With them comes the number of workers that the drivers allow.
+    """
+    recorded = read_settings(folder)
+    named = {name: value for name, value in given.items() if value is not None}
+    vut, pov = (named.get(name, recorded.get(name)) for name in ("vut", "pov"))
+    spec, pov_spec, count = drivers_of("" if vut is None else vut, pov, workers, stacklevel=4)
+    specs = {"vut": spec, "pov": pov_spec}
+    fields = recordable(named | {name: specs[name] for name in specs if name in named})
+    settings = settings_of(folder, recorded, fields, trust=trust)
+    if "level" in named:
+        policies = policies_folder(settings.policies, settings.scenario)
+        levels = parse_levels(str(named["level"]), policies, own=settings.pov is not None)
+        settings = replace(settings, levels=levels)
+    return settings, count
 
 
 @dataclass(frozen=True, slots=True)
@@ -768,7 +769,7 @@ def truths(
 
 @dataclass(frozen=True, slots=True)
 class _Study:
-    """A plan with the workers and the cache of a study of truths."""
+    """A plan, and what a study of truths and searches runs it with."""
 
     plan: SimulationPlan
     workers: Workers
@@ -795,6 +796,23 @@ class _Study:
             return {level: self.truth(level, DENSE_CASES) for level in levels}
         kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
         return {level: truth for level, truth in kept.items() if truth is not None}
+
+    def searches(
+        self, settings: CampaignSettings, samplers: Sequence[str], seeds: int
+    ) -> dict[str, list[benchmark.Search]]:
+        """Let each sampler search with each seed; return the searches by sampler."""
+        total = len(samplers) * seeds
+        with Counter(_title(settings), total, "runs", shown=self.progress) as counter:
+            return benchmark.search(
+                self.plan,
+                settings.levels,
+                samplers,
+                seeds=seeds,
+                cases=settings.cases,
+                batch=settings.batch,
+                workers=self.workers,
+                on_search=lambda name, _: counter.ended(1, name),
+            )
 
 
 @contextmanager
@@ -847,7 +865,7 @@ def compare(
     Raises `UserError` for values that make no comparison.
     """
     check_keywords("compare", setup, Setup)
-    picture = None if figure is None else Path(figure)
+    picture = _path(figure)
     if picture is not None:
         figures.check_figure(picture)
     names = list(dict.fromkeys(map(str.strip, SAMPLERS if samplers is None else samplers)))
@@ -859,23 +877,10 @@ def compare(
         replace(settings, sampler=name)
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")
-    levels = settings.levels
-    with (
-        _study(settings, count, dask, progress) as study,
-        Counter(_title(settings), len(names) * seeds, "runs", shown=progress) as counter,
-    ):
-        by_level = {number: study.truth(number, truth_cases) for number in levels}
-        dense_truths = study.dense_truths(levels, dense)
-        searches = benchmark.search(
-            study.plan,
-            levels,
-            names,
-            seeds=seeds,
-            cases=cases,
-            batch=batch,
-            workers=study.workers,
-            on_search=lambda name, _: counter.ended(1, name),
-        )
+    with _study(settings, count, dask, progress) as study:
+        by_level = {number: study.truth(number, truth_cases) for number in settings.levels}
+        dense_truths = study.dense_truths(settings.levels, dense)
+        searches = study.searches(settings, names, seeds)
     limit = benchmark.limit_fmc(chain.from_iterable(searches.values()), by_level, dense_truths)
     result = Benchmark(
         samplers={name: benchmark.compare(s, by_level, limit) for name, s in searches.items()},
@@ -1195,20 +1200,28 @@ def train(
                 on_progress=bars.progressed,
                 on_done=bars.done,
             )
+    manifest = _manifest_for(folder, names, scenario)
+    if check:
+        checks = {str(n): check_policy(n, folder, count=cases, scenario=played) for n in names}
+        return PolicyChecks(checks)
+    return PolicyChecks({str(n): PolicyCheck(**manifest[n]["check"]) for n in names})
+
+
+def _manifest_for(
+    folder: Path, names: Iterable[str], scenario: Scenario | AnyPath | None
+) -> Mapping[str, Any]:
+    """Return the manifest of a folder of networks; `UserError` for a missing one or scenario."""
     manifest = read_manifest(folder)
     missing = [name for name in names if name not in manifest]
     if missing:
         raise UserError(f"{folder} has no {missing[0]}: run `merge-sumo train` to make it")
-    trained_for = policies_scenario(manifest[names[0]])
+    trained_for = policies_scenario(manifest[next(iter(names))])
     if scenario is None and not plays_as(trained_for, US23):
         raise UserError(
             f"{folder} was trained for {trained_for.name}: say with --scenario in which one to "
             f"check it, or --scenario {US23.name}"
         )
-    if check:
-        checks = {str(n): check_policy(n, folder, count=cases, scenario=played) for n in names}
-        return PolicyChecks(checks)
-    return PolicyChecks({str(n): PolicyCheck(**manifest[n]["check"]) for n in names})
+    return manifest
 
 
 def export_policy(
