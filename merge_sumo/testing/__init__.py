@@ -1,6 +1,21 @@
 """What tests of others use: assertions on a controller, and contracts of what extends the tool."""
 
 from merge_sumo.testing.assertions import assert_no_failures
-from merge_sumo.testing.contracts import SamplerContract
+from merge_sumo.testing.contracts import (
+    CriterionContract,
+    ExportContract,
+    MeasureContract,
+    ReportSectionContract,
+    SamplerContract,
+    VutContract,
+)
 
-__all__ = ["SamplerContract", "assert_no_failures"]
+__all__ = [
+    "CriterionContract",
+    "ExportContract",
+    "MeasureContract",
+    "ReportSectionContract",
+    "SamplerContract",
+    "VutContract",
+    "assert_no_failures",
+]

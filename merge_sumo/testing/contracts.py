@@ -13,15 +13,30 @@ from __future__ import annotations
 
 import json
 import math
-from functools import lru_cache
+import tempfile
+from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo import api
+from merge_sumo.campaigns.store import Run
+from merge_sumo.errors import UserError
+from merge_sumo.reports.export_format import ExportFormat
+from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.reports.report_sections import ReportSection, shared_words
+from merge_sumo.road.merge import road_of
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.criteria import NamedCriterion
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.measures import Measure
+from merge_sumo.values.scenario import DT_S, US23, VUT
 from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.registry import vut_factory
 
 HALF_WIDTH: Final = 0.03
 """Of the band of failures in the unit square; about 7 % of the square."""
@@ -222,3 +237,176 @@ class SamplerContract:
         before = np.random.get_state(legacy=False)  # noqa: NPY002
         assert sampler.ask(9) == proposed
         assert repr(np.random.get_state(legacy=False)) == repr(before)  # noqa: NPY002
+
+
+def episode(case: Case) -> Trajectory:
+    """Return an episode without SUMO: every vehicle keeps its speed until the VUT is at M."""
+    starts = np.array(case.starts())  # (A, 2) of x and v
+    steps = int(np.ceil(-starts[VUT, 0] / (starts[VUT, 1] * DT_S)))
+    time_s = np.arange(steps + 1)[:, None] * DT_S
+    x_m, v_mps = starts[:, 0] + starts[:, 1] * time_s, np.tile(starts[:, 1], (steps + 1, 1))
+    return Trajectory(case, np.stack([x_m, v_mps, np.zeros_like(x_m)], axis=2), End.MERGED, None)
+
+
+class MeasureContract:
+    """What records, conditions and pages rely on in a measure: a pure function of an episode.
+
+    Attributes:
+        measure: the measure under test.
+        pool: cases of the episodes.
+    """
+
+    measure: Measure
+    pool: Pool = Pool(levels=(0,), v_vut0_mps=17.5)
+
+    def values(self) -> list[float | None]:
+        """Return the values of some episodes."""
+        assert self.measure.of is not None
+        cases = self.pool.cases(np.random.default_rng(0).random((10, 2)), self.pool.levels[0])
+        return [self.measure.of(episode(case), None) for case in cases]
+
+    def test_says_what_it_is(self) -> None:
+        """A name that a condition can use, and a sentence."""
+        assert self.measure.name.isidentifier()
+        assert self.measure.about
+        assert "\n" not in self.measure.about
+        assert not self.measure.about.endswith(".")
+        assert self.measure.missing is not None
+
+    def test_is_a_number_or_none_and_the_same_again(self) -> None:
+        """Not a number of an array, which a record does not hold."""
+        values = self.values()
+        assert all(value is None or type(value) is float for value in values)
+        assert values == self.values()
+
+    def test_leaves_the_episode_alone(self) -> None:
+        """Other measures look at it, too."""
+        assert self.measure.of is not None
+        (case,) = self.pool.cases(np.full((1, 2), 0.5), self.pool.levels[0])
+        trajectory = episode(case)
+        before = trajectory.motion.copy()
+        self.measure.of(trajectory, None)
+        assert np.array_equal(before, trajectory.motion)
+
+
+class CriterionContract:
+    """What a campaign relies on in a named criterion.
+
+    Attributes:
+        criterion: the criterion under test.
+    """
+
+    criterion: NamedCriterion
+
+    def test_some_cases_fail_and_others_do_not(self) -> None:
+        """`check` refuses a condition that no case meets, or every one."""
+        Criterion(self.criterion.condition).check(US23)
+        assert self.criterion.about
+
+
+@cache
+def campaign_of(vut: str = "level0") -> Run:
+    """Return a campaign in SUMO at level 0; its folder stays until the process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="merge-sumo-contract-")) / "run"
+    keywords: dict[str, Any] = {"level": 0, "sampler": "uniform", "cases": 20, "seed": 1}
+    return api.campaign(vut, out=folder, progress=False, **keywords).run
+
+
+class VutContract:
+    """What a campaign relies on in a VUT.
+
+    Attributes:
+        vut: what a person writes after `--vut`.
+    """
+
+    vut: str
+
+    def test_answers_in_every_step(self) -> None:
+        """No case ends in an error."""
+        ends = {outcome.measures.end for outcome in campaign_of(self.vut).outcomes}
+        assert not {end for end in ends if end.is_error}
+
+    def test_does_not_depend_on_other_corridors(self) -> None:
+        """A case alone has the outcome that it had among others."""
+        run = campaign_of(self.vut)
+        for index in (0, 7):
+            alone = api.run_case(self.vut, recorded=(run.folder, index))
+            assert alone.measures == run.outcome(index).measures
+
+    def test_is_found_again_by_its_name(self) -> None:
+        """A worker is told the name and makes it anew."""
+        first, second = (vut_factory(self.vut, VutOptions()) for _ in range(2))
+        assert first == second
+        assert first.files == second.files
+
+
+class ExportContract:
+    """What `merge-sumo export` relies on in a format.
+
+    Attributes:
+        export_format: the format under test.
+    """
+
+    export_format: ExportFormat
+
+    def written(self, folder: Path) -> Path:
+        """Return the path that the format says it has written below a folder."""
+        run, export_format = campaign_of(), self.export_format
+        if export_format.write_table is not None:
+            return export_format.write_table(run, [0, 3], folder)
+        assert export_format.write_case is not None
+        return export_format.write_case(run, 3, folder, road_of())
+
+    def test_writes_below_the_folder_that_it_is_told(self) -> None:
+        """The path that it returns can be opened."""
+        with tempfile.TemporaryDirectory() as scratch:
+            path = self.written(Path(scratch) / "new")
+            assert path.is_relative_to(Path(scratch) / "new")
+            assert path.stat().st_size
+
+    def test_writes_the_same_bytes_again(self) -> None:
+        """A case has one export."""
+        with tempfile.TemporaryDirectory() as scratch:
+            paths = [self.written(Path(scratch) / name) for name in ("a", "b")]
+            assert paths[0].read_bytes() == paths[1].read_bytes()
+
+    def test_replaces_nothing(self) -> None:
+        """What a person has written stays."""
+        with tempfile.TemporaryDirectory() as scratch:
+            path = self.written(Path(scratch) / "new")
+            before = path.read_bytes()
+            try:
+                self.written(Path(scratch) / "new")
+            except UserError:
+                assert path.read_bytes() == before
+            else:
+                raise AssertionError("an existing file is a UserError")
+
+
+class ReportSectionContract:
+    """What the page relies on in a section.
+
+    Attributes:
+        section: the section under test.
+    """
+
+    section: ReportSection
+
+    def html(self) -> str:
+        """Return the section of a campaign; "" where it is left out."""
+        model = ReportModel(campaign_of())
+        return self.section.html(model, shared_words(model)) or ""
+
+    def test_is_one_section_or_nothing(self) -> None:
+        """It begins and ends itself."""
+        html = self.html().strip()
+        assert not html or html.count("<section") == html.count("</section>") == 1
+
+    def test_loads_and_runs_nothing(self) -> None:
+        """The policy of the page would stop it."""
+        html = self.html().lower()
+        assert not [word for word in ("<script", "<style", " src=", "javascript:") if word in html]
+
+    def test_is_the_same_again(self) -> None:
+        """A report of the same run has the same bytes."""
+        assert self.html() == self.html()

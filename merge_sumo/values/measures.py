@@ -36,8 +36,8 @@ class Measure:
         missing: what a condition takes where an episode has no value: that of cars that never
             meet; None for a measure that is no number.
         worse: at which end of its values an episode is worse, if at one.
-        of: measures an episode on a road; None where it has no value, and for measures of this
-            package, which are fields of `Measures`.
+        of: measures an episode on a road, and returns None where that has no value; None for the
+            fields of `Measures`.
     """
 
     name: str
@@ -276,7 +276,7 @@ OURS: Final = (
         worse="high",
     ),
 )
-"""The fields of `Measures`, in the order in which an episode is listed."""
+"""The fields of `Measures`, in the order in which an episode is listed; further ones come last."""
 
 RESERVED: Final = frozenset({"index", "batch", "level", "margin", "foretold"})
 """Names of a record that are no measures."""
@@ -302,8 +302,8 @@ MEASURES: Final[Registry[Measure]] = Registry(
 
 @cache
 def further_measures() -> dict[str, Measure]:
-    """Return the measures that installed packages bring, by name; for a process they stay."""
-    return {name: MEASURES[name] for name in MEASURES if name not in MEASURES.ours}
+    """Return the measures with a function of their own, by name; for a process they stay."""
+    return {name: measure for name, measure in MEASURES.items() if measure.of is not None}
 
 
 def further_of(

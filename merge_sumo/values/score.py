@@ -43,7 +43,7 @@ TTC_SHARE: Final = 1.0 / 9.0
 """Part of P_safety that a short time to collision can cost; the gap has the rest."""
 
 
-MEASURED: Final = frozenset(measure.name for measure in OURS)
+MEASURED: Final = frozenset(measure.name for measure in OURS if measure.of is None)
 """Measures that are fields of `Measures`."""
 
 
@@ -57,7 +57,7 @@ class Measures:
     is nearest to the VUT at the end: it takes the POV's place. What bodies do (severity, clearance,
     bumper gap, braking after M, impact speed) is that of all cars.
 
-    `measures.py` says what each is; `further` holds those that installed packages bring.
+    `measures.py` says what each is; `further` holds those with a function of their own.
     """
 
     end: End

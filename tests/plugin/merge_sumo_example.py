@@ -1,0 +1,128 @@
+"""One of each extension of merge-sumo; `pyproject.toml` registers them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from merge_sumo.campaigns.store import Run
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.errors import UserError
+from merge_sumo.reports.export_format import ExportFormat
+from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.reports.report_sections import ReportSection
+from merge_sumo.samplers.base import LevelwiseSampler
+from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.sumo.world import World
+from merge_sumo.system.folders import check_new, make_place, new_file
+from merge_sumo.values.bodies import CentreLines
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.criteria import NamedCriterion
+from merge_sumo.values.measures import Measure
+from merge_sumo.values.scenario import POV, VUT
+from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.vuts.base import Vut, VutOptions
+from merge_sumo.vuts.registry import VutKind
+
+
+class MiddleSampler(LevelwiseSampler):
+    """Draws from a beta distribution around the middle of each coordinate."""
+
+    about = "prefers the middle of the pool"
+    colour = "#994F00"
+    learns = False
+
+    def propose(
+        self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
+    ) -> FloatArray:
+        """Return `n` points, (n, d)."""
+        return rng.beta(2.0, 2.0, size=(n, history.dims))
+
+
+def closest_m(trajectory: Trajectory, _lines: CentreLines | None) -> float:
+    """Return the least distance of the front bumpers of VUT and POV, in m along the lanes."""
+    x_m = trajectory.motion[:, :, 0]
+    return float(np.abs(x_m[:, POV] - x_m[:, VUT]).min())
+
+
+CLOSEST = Measure(
+    name="closest_m",
+    about="least distance of the front bumpers of VUT and POV up to M",
+    unit="m",
+    label="closest approach",
+    column="closest",
+    missing=math.inf,
+    worse="low",
+    of=closest_m,
+)
+NEAR = NamedCriterion("closest_m < 4", "front bumpers within 4 m at any time")
+
+
+class ConstantDriver(Driver):
+    """Drives with one acceleration in every step."""
+
+    def __init__(self, corridors: int, acceleration_mps2: float) -> None:
+        """Drive in a number of corridors."""
+        super().__init__(corridors)
+        self._acceleration_mps2 = acceleration_mps2
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the acceleration in each corridor, (K,)."""
+        return np.full(self.corridors, self._acceleration_mps2)
+
+
+def constant_vut(argument: str, _options: VutOptions) -> Vut:
+    """Return the VUT `constant:MPS2`; `UserError` where that is no number."""
+    try:
+        acceleration_mps2 = float(argument)
+    except ValueError as error:
+        raise UserError(f"--vut constant:{argument}: give an acceleration in m/s2") from error
+
+    def make(corridors: int, _world: World | None) -> Driver:
+        return ConstantDriver(corridors, acceleration_mps2)
+
+    return Vut(make=make)
+
+
+CONSTANT = VutKind(
+    form="constant:MPS2",
+    what="one acceleration in every step",
+    example="--vut constant:0.5",
+    prepare=constant_vut,
+)
+
+
+def write_endings(run: Run, indices: Sequence[int], folder: Path) -> Path:
+    """Write how cases ended as lines of JSON; return the path of the file."""
+    path = folder / "endings.jsonl"
+    check_new(path)
+    make_place(folder)
+    with new_file(path) as file:
+        for index in indices:
+            ending = {"case": index, "end": run.outcome(index).measures.end.value}
+            file.write(f"{json.dumps(ending)}\n".encode())
+    return path
+
+
+ENDINGS = ExportFormat(about="lines of JSON with the end of each case", write_table=write_endings)
+
+
+def closest_words(model: ReportModel) -> dict[str, Any] | None:
+    """Return the closest approach of a campaign; None where it was not measured."""
+    values = [outcome.measures.value("closest_m") for outcome in model.run.outcomes]
+    known = [value for value in values if value is not None]
+    return {"closest": min(known)} if known else None
+
+
+CLOSEST_APPROACH = ReportSection(
+    template=(
+        '<section aria-labelledby="closest"><h2 id="closest">Closest approach</h2>\n'
+        '<p>{{ vut }} came as near as {{ "%.1f" | format(closest) }} m to the POV.</p></section>'
+    ),
+    words=closest_words,
+)

@@ -1,0 +1,46 @@
+"""The example package keeps the contracts; so may the tests of any other."""
+
+from __future__ import annotations
+
+import pytest
+from merge_sumo_example import CLOSEST, CLOSEST_APPROACH, ENDINGS, NEAR, MiddleSampler
+
+from merge_sumo.testing import (
+    CriterionContract,
+    ExportContract,
+    MeasureContract,
+    ReportSectionContract,
+    SamplerContract,
+    VutContract,
+)
+from merge_sumo.vuts.registry import KINDS
+
+installed = pytest.mark.skipif(
+    "constant" not in KINDS, reason="the example package is not installed"
+)
+
+
+class TestMiddleSampler(SamplerContract):
+    sampler = MiddleSampler
+
+
+class TestClosest(MeasureContract):
+    measure = CLOSEST
+
+
+class TestEndings(ExportContract):
+    export_format = ENDINGS
+
+
+class TestClosestApproach(ReportSectionContract):
+    section = CLOSEST_APPROACH
+
+
+@installed
+class TestNear(CriterionContract):
+    criterion = NEAR
+
+
+@installed
+class TestConstant(VutContract):
+    vut = "constant:0.5"
