@@ -73,7 +73,7 @@ def decode(content: bytes | str, kind: Any = Any) -> Any:
         raise RecordError(_sentence(error, record, kind)) from error
     except RecursionError as error:
         raise RecordError("it is nested too deeply") from error
-    except ValueError as error:
+    except (msgspec.DecodeError, ValueError) as error:
         raise RecordError(f"it is no JSON ({error})") from error
 
 
