@@ -110,9 +110,27 @@ def samplers_table() -> str:
     return "\n".join(("| `--sampler` | method |", "|---|---|", *rows))
 
 
+def criteria_table() -> str:
+    """Return the registered criteria as a table."""
+    from merge_sumo.values.criteria import CRITERIA
+
+    rows = [f"| `{name}` | `{one.condition}` | {one.about} |" for name, one in CRITERIA.items()]
+    return "\n".join(("| `--fail-when` | condition | failure |", "|---|---|---|", *rows))
+
+
+def formats_table() -> str:
+    """Return the registered formats of export as a table."""
+    from merge_sumo.reports.formats import FORMATS
+
+    rows = [f"| `{name}` | {one.about} |" for name, one in FORMATS.items()]
+    return "\n".join(("| `--format` | written |", "|---|---|", *rows))
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "kinds of VUT": vut_kinds_table,
     "samplers": samplers_table,
+    "criteria": criteria_table,
+    "formats": formats_table,
 }
 """Tables from registries, which stand in a page as `<!-- table: NAME -->`."""
 TABLE: Final = re.compile(r"<!-- table: ([\w ]+) -->")

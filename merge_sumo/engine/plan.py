@@ -12,7 +12,9 @@ from typing import Any, Final
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.measures import MEASURES
 from merge_sumo.values.scenario import OWN, Scenario
 from merge_sumo.vuts.registry import VutFactory, runs_code
 
@@ -21,8 +23,12 @@ MAX_CORRIDORS: Final = 32
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the software that decide the outcome of a case."""
-    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn")
+    """Return the versions of the software that decide the outcome of a case.
+
+    Packages that bring measures or criteria are among it: records and verdicts depend on them.
+    """
+    extensions = sorted({*MEASURES.packages, *CRITERIA.packages})
+    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn", *extensions)
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 

@@ -76,6 +76,11 @@ class Registry(Mapping[str, T], Generic[T]):
         """The names of this package."""
         return frozenset(self._ours)
 
+    @property
+    def packages(self) -> list[str]:
+        """The installed packages that add to it, in the order of their names."""
+        return sorted({package for found in self._entries().values() for package in found})
+
     def __iter__(self) -> Iterator[str]:
         """Iterate over the names; nothing is imported."""
         return iter(dict.fromkeys((*self._ours, *self._registered, *self._entries())))

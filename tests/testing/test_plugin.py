@@ -79,6 +79,11 @@ def test_records_have_its_measure_after_those_of_the_package(folder):
     assert all((r["margin"] < 0.0) == (r["closest_m"] < 4.0) for r in records)
 
 
+def test_the_record_of_the_campaign_has_the_version_of_the_package(folder):
+    record = json.loads((folder / "campaign.json").read_text(encoding="utf-8"))
+    assert record["versions"]["merge-sumo-example"] == "1.0"
+
+
 def test_the_report_has_its_section_and_a_column_for_its_measure(folder):
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert '<h2 id="closest">Closest approach</h2>' in page
