@@ -9,9 +9,11 @@ The file of a folder which somebody sent is data as everything in it.
 from __future__ import annotations
 
 import json
-from typing import Any, Final
+import math
+from typing import Annotated, Final
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from merge_sumo.analysis.predictions import has_predictions
@@ -25,6 +27,7 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.studies.versions import levels_of
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
+from merge_sumo.system.records import Record, convert, decode
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.scenario import DX_CRASH_M, level_name
@@ -36,6 +39,10 @@ MOST_CASES: Final = 1000
 """Cases, the last ones, that the twin learns from, and nodes that it is asked at a time."""
 HIGHEST: Final = 255
 """What stands for a gap of 0 in the file."""
+
+
+class _Expectation(Record, frozen=True):
+    levels: dict[str, tuple[Annotated[int, Meta(ge=0, le=HIGHEST)], ...]]
 
 
 def note_expectation(run: Run) -> None:
@@ -75,14 +82,14 @@ def learned_twin(run: Run, levels: list[int]) -> Twin:
     povs = Povs(policies=policies_of(run.scenario))
     if povs.sha256() != run.settings.get("policies_sha256"):
         raise UserError("the run had other drivers than those that are here")
-    speed = run.settings.get("v_vut0_mps")
-    if type(speed) not in (int, float, type(None)):
-        raise UserError("the speed with which the VUT began is no number")
+    speed = None
+    if run.settings.get("v_vut0_mps") is not None:
+        speed = convert(run.settings["v_vut0_mps"], float)
     if speed is not None and not 0.0 <= speed <= run.scenario.v_start_max_mps:
         raise UserError(f"the VUT began with {speed} m/s, which no campaign of ours has")
     pool = Pool(
         levels=tuple(levels),
-        v_vut0_mps=None if speed is None else float(speed),
+        v_vut0_mps=speed,
         scenario=run.scenario,
     )
     lines = centre_lines(road_for(run.scenario))
@@ -111,21 +118,19 @@ def read_expectation(run: Run) -> dict[int, tuple[Grid, NDArray[np.uint8]]]:
     """
     path = run.folder / EXPECTED
     try:
-        levels = json.loads(regular(path).read_text(encoding="utf-8"))["levels"]
-        by_name = {level_name(level): level for level in levels_of(run)}
-        return {by_name[name]: _row(run, by_name[name], row) for name, row in levels.items()}
+        levels = decode(regular(path).read_bytes(), _Expectation).levels
+        return dict(_row(run, name, row) for name, row in levels.items())
     except FileNotFoundError:
         return {}
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"{path} is not as it was written") from error
+    except UserError as error:
+        raise UserError(f"{path} is not as it was written: {error}") from error
 
 
-def _row(run: Run, level: int, row: Any) -> tuple[Grid, NDArray[np.uint8]]:
-    grid = GRID[len(run.scenario.dimensions(level))]
-    if not isinstance(row, list) or len(row) != int(np.prod(grid)):
-        raise ValueError("not a node each")
-    if any(type(value) is not int or not 0 <= value <= HIGHEST for value in row):
-        raise ValueError("not from 0 to 255")
-    return grid, np.array(row, dtype=np.uint8)
+def _row(run: Run, name: str, row: tuple[int, ...]) -> tuple[int, tuple[Grid, NDArray[np.uint8]]]:
+    for level in levels_of(run):
+        grid = GRID.get(len(run.scenario.dimensions(level)))
+        if level_name(level) == name and grid is not None and len(row) == math.prod(grid):
+            return level, (grid, np.array(row, dtype=np.uint8))
+    raise UserError(f"the campaign has no level {name!r} of {len(row)} nodes")
