@@ -304,9 +304,18 @@ class Blocks:
         return block if fits else None
 
     def run_missing(
-        self, run: Callable[[FloatArray], Iterable[tuple[int, CheckedCase]]], missing: Sequence[int]
+        self, run: Callable[[FloatArray], Iterable[tuple[int, CheckedCase]]], on_cases: OnCases
     ) -> Iterable[tuple[int, list[CheckedCase]]]:
-        """Run blocks and yield (number, results) of each as its last case ends."""
+        """Run the blocks that are missing; yield (number, results) of each as its last case ends.
+
+        Args:
+            run: runs cases at points, (n, d), and gives (place, result).
+            on_cases: told how many cases are known, and then how many of a block have ended.
+        """
+        check_own(self.folder)
+        make_place(self.folder)
+        missing = [number for number in range(self.count) if self.read(number) is None]
+        on_cases(len(self.lattice) - sum(map(self.size, missing)))
         if not missing:
             return
         starts = np.cumsum([0, *(self.size(number) for number in missing)])
@@ -317,6 +326,7 @@ class Blocks:
             block[place - int(starts[nth])] = result
             if len(block) == self.size(missing[nth]):
                 del open_blocks[nth]
+                on_cases(len(block))
                 yield missing[nth], [block[k] for k in range(len(block))]
 
     def run_twice(
@@ -428,18 +438,13 @@ def certify(
             (new / CERTIFICATE).write_bytes(text(files, None))
     levels = _blocks(folder, subject, lattices)
     for level, blocks in levels.items():
-        check_own(blocks.folder)
-        make_place(blocks.folder)
-        missing = [number for number in range(blocks.count) if blocks.read(number) is None]
-        on_cases(len(blocks.lattice) - sum(map(blocks.size, missing)))
-        known = len(files)
-        for number, results in blocks.run_missing(partial(run, level), missing):
-            on_cases(len(results))
+        for number, results in blocks.run_missing(partial(run, level), on_cases):
+            known = len(files)
             for result in results:
                 for name, sha256 in result.files.items():
                     files.setdefault(name, sha256)
             if len(files) > known:
-                known = len(files)
+                # Before the block: what it rests on must be known where it is believed.
                 replace_own(folder / CERTIFICATE, text(files, None))
             blocks.write(number, results)
             check()

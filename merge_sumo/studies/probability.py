@@ -66,33 +66,38 @@ def failure_probability(
     Writes the estimate with all that decides it to `out`, and the fresh outcomes, each with its
     weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
 
-    The settings are those of the campaign, but for policies that are elsewhere and how a VUT is
-    hosted; the plan is theirs. Cases run on `workers`, by default in this process; the estimate is
-    the same.
+    Args:
+        run: the campaign.
+        settings: those of the campaign, except for policies that are elsewhere and how a VUT is
+            hosted.
+        plan: that of the settings.
+        out: new file, which ends in .json.
+        cases: fresh cases.
+        distribution: JSON file that states how often cases occur; uniform over the pool without.
+        confidence: chance that the interval holds the probability.
+        seed: of the draws.
+        workers: where cases run, by default in this process; the estimate is the same.
+        on_case: told each fresh outcome.
 
-    Raises `UserError` for a distribution or numbers that make no sense, a run whose net or policies
-    are not those of today, or files that exist or cannot be written.
+    Raises:
+        UserError: for a distribution or numbers that make no sense, a run whose net or policies are
+            not those of today, or files that exist or cannot be written.
     """
-    if cases < 1:
-        raise UserError(f"--cases is {cases}: it must be 1 or more")
-    if not 0.5 <= confidence < 1.0:
-        raise UserError(f"--confidence is {confidence}: choose 0.5 or more, and below 1")
-    if seed < 0:
-        raise UserError(f"--seed is {seed}: it must be 0 or more")
+    for name, number, fits, bounds in (
+        ("cases", cases, cases >= 1, "it must be 1 or more"),
+        ("confidence", confidence, 0.5 <= confidence < 1.0, "choose 0.5 or more, and below 1"),
+        ("seed", seed, seed >= 0, "it must be 0 or more"),
+    ):
+        if not fits:
+            raise UserError(f"--{name} is {number}: {bounds}")
     _same_system(run, record_of(settings, plan))
     stated = read_distribution(distribution, settings.levels, settings.scenario)
-    check_new_file(out)
     lines = out.with_suffix(LINES)
+    check_new_file(out)
     if lines == out:
         raise UserError(f"--out is {out}: end it in .json, as cases go to {LINES} beside it")
     check_new_file(lines)
-    told = make_sampler("uniform", settings.pool, 0)
-    told.tell(run.outcomes)
-    chance = {}
-    for level in stated.levels:
-        history = told.history(level)
-        chance[level] = expected_chance(history, stated.points(level, cells(history.dims)))
-    mixture = DefensiveMixture(stated.levels, chance, settings.scenario)
+    mixture = _mixture(run, settings, stated)
     draws = mixture.draw(cases, np.random.default_rng([seed, STREAM]))
     outcomes = _run(settings, plan, stated, draws, lines, on_case, workers)
     failed = np.array([outcome.failed for outcome in outcomes])
@@ -107,6 +112,17 @@ def failure_probability(
     }
     write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
     return result
+
+
+def _mixture(run: Run, settings: CampaignSettings, stated: Distribution) -> DefensiveMixture:
+    """Return the mixture that the outcomes of a campaign suggest."""
+    sampler = make_sampler("uniform", settings.pool, 0)
+    sampler.tell(run.outcomes)
+    chance = {}
+    for level in stated.levels:
+        history = sampler.history(level)
+        chance[level] = expected_chance(history, stated.points(level, cells(history.dims)))
+    return DefensiveMixture(stated.levels, chance, settings.scenario)
 
 
 def _same_system(run: Run, today: Mapping[str, Any]) -> None:
@@ -137,12 +153,12 @@ def _run(
         by_place.update(zip(places.tolist(), drawn, strict=True))
     cases = [by_place[place] for place in range(len(by_place))]
     outcomes: list[Outcome] = []
-    with workers_or_here(workers) as there:
+    with workers_or_here(workers) as processes:
         plan = plan.for_cases(len(cases))
-        open_simulators(plan, there)
+        open_simulators(plan, processes)
         for first in range(0, len(cases), WRITTEN):
             ran = []
-            for place, done in evaluate(plan, cases[first : first + WRITTEN], there):
+            for place, done in evaluate(plan, cases[first : first + WRITTEN], processes):
                 outcome = done.outcome(first + place, first // WRITTEN)
                 ran.append(outcome)
                 if on_case is not None:

@@ -96,10 +96,19 @@ def ground_truth(
     the versions of the software: after a change in the sources of this package that gives it no
     other version, the cache is to be removed. What the VUT itself loaded while it drove is kept
     with the truth, and a truth is only used while those files are the same. It is signed: what
-    somebody else has put into the cache is not believed. Cases run on `workers`, by default in
-    this process.
+    somebody else has put into the cache is not believed.
 
-    Raises `UserError` where nothing can be kept in the cache, or others can write it.
+    Args:
+        plan: how cases run.
+        level: POV level.
+        cases: uniform cases; by default those of the paper at the level.
+        seed: of their points.
+        workers: where they run, by default in this process.
+        cache: folder of truths, by default the user's.
+        on_cases: told how many cases have just ended.
+
+    Raises:
+        UserError: where nothing can be kept in the cache, or others can write it.
     """
     count = TRUTH_CASES[level] if cases is None else cases
     for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
@@ -107,15 +116,31 @@ def ground_truth(
             raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
     path = TruthKey(plan.key(level), level, count, seed).path(cache)
-    pool = Pool(levels=(level,), scenario=plan.scenario)
-    found = read_truth(path, level, count, plan.scenario)
-    if found is not None:
-        return found
+    known = read_truth(path, level, count, plan.scenario)
+    if known is not None:
+        return known
     check_place(path.parent, CACHE)
     check_own(path)
     key = user_key()
     dims = len(plan.scenario.dimensions(level))
     points = np.random.default_rng([seed, level]).random((count, dims))
+    truth, files = _run(plan, level, points, workers, on_cases)
+    arrays = io.BytesIO()
+    np.savez(arrays, points=truth.points, score=truth.score, files=json.dumps(files), of=path.stem)
+    make_place(path.parent, CACHE)
+    replace_own(path, signed(arrays.getvalue(), path.stem, key))
+    return truth
+
+
+def _run(
+    plan: SimulationPlan,
+    level: int,
+    points: FloatArray,
+    workers: Workers | None,
+    on_cases: OnCases | None,
+) -> tuple[Truth, Files]:
+    """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
+    pool, count = Pool(levels=(level,), scenario=plan.scenario), len(points)
     scores = np.full(count, np.nan)
     if level != OWN:  # no case meets it
         plan = replace(plan, povs=replace(plan.povs, own=None))
@@ -127,18 +152,7 @@ def ground_truth(
             files.setdefault(name, sha256)
         if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
             on_cases((ended - 1) % PROGRESS_CASES + 1)
-    truth = Truth(points, scores)
-    arrays = io.BytesIO()
-    np.savez(
-        arrays,
-        points=truth.points,
-        score=truth.score,
-        files=json.dumps(files),
-        of=path.stem,
-    )
-    make_place(path.parent, CACHE)
-    replace_own(path, signed(arrays.getvalue(), path.stem, key))
-    return truth
+    return Truth(points, scores), files
 
 
 def known_truth(
