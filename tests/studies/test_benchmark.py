@@ -64,7 +64,7 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
         {"level": 1},
         {"cases": 301},
         {"seed": 1},
-        {"command": "./controller"},
+        {"vut_command": "./controller"},
         {"deadline_s": 1.0},
     ],
 )
