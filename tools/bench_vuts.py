@@ -25,6 +25,8 @@ import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import traci
@@ -36,7 +38,7 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.world import SUMO_OPTIONS
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.onnx_export import export_onnx
 from merge_sumo.vuts.registry import vut_factory
@@ -179,8 +181,11 @@ def main() -> None:
 
         in_process = VutOptions(in_process=True)
 
+        # A TraCI controller is told the road and the scenario; no SUMO of ours runs here.
+        world: Any = SimpleNamespace(road=road_of(), scenario=US23)
+
         def driver(spec: str, corridors: int = 1, given: VutOptions | None = None) -> Driver:
-            return vut_factory(spec, given)(corridors)
+            return vut_factory(spec, given)(corridors, world)
 
         drivers = {
             "python": driver(f"{folder / 'law.py'}:Vut"),

@@ -12,7 +12,7 @@ from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.values.scenario import DT_S
 from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, split_options
 
 PERIOD: Final = "decision_period_s"
@@ -150,10 +150,10 @@ class OnnxVut(PerCorridor):
         super().__init__(corridors, deadline_s)
         self._network = network
         self._held = [0.0] * corridors
-        self._of_actions = [actions_mps2(US23)] * corridors
+        self._of_actions: list[FloatArray] = [np.empty(0)] * corridors
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take what the actions are in the scenario of the case."""
+        """Take the accelerations of the actions in the scenario of the case."""
         self._of_actions[corridor] = actions_mps2(case.scenario)
         super().begin(corridor, case)
 

@@ -25,13 +25,12 @@ import numpy as np
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.child import ChildDiedError, SumoChild
 from merge_sumo.sumo.shadow_sumo import write_files
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, US23, VEHICLES, VUT, Scenario
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.vuts.base import Vut, VutOptions
 from merge_sumo.vuts.process import TOKEN_VARIABLE, Program, split_command
 from merge_sumo.vuts.traci import server
@@ -39,24 +38,25 @@ from merge_sumo.vuts.traci.door import HOST, Door, Peer
 from merge_sumo.vuts.traci.server import FaultError
 
 DEFAULT_PORT: Final = 8813
-"""Where TraCI clients connect when they are not told otherwise."""
+"""Port of TraCI clients that are given no other."""
 START_S: Final = 60.0
 """Time that SUMO has to start, on whatever machine."""
 WORK_S: Final = 10.0
-"""Time that SUMO has for what a controller asks of it in a step, besides the deadline."""
+"""Time that SUMO has for the questions of a controller in a step, besides the deadline."""
 
 
 def traci_vut(argument: str, options: VutOptions) -> Vut:
     """Return the VUT of `traci` or `traci:PORT`; `UserError` for a port or command that is none."""
     if argument and not (argument.isdecimal() and 1 <= int(argument) <= 65535):
         raise UserError(f"--vut traci:{argument}: the port is a number from 1 to 65535")
-    # A command is told its port, so that any free one does and several can run at a time.
+    # A command gets its port as an argument: any free one will do, and several can run at a time.
     port = int(argument) if argument else (0 if options.command else DEFAULT_PORT)
     command = None if options.command is None else split_command(options.command)
 
     def make(corridors: int, world: World | None) -> Driver:
-        road, scenario = (road_of(), US23) if world is None else (world.road, world.scenario)
-        return TraciVut(corridors, road, scenario, port, command, options)
+        if world is None:
+            raise UserError("--vut traci drives in a SUMO world only")
+        return TraciVut(corridors, world.road, world.scenario, port, command, options)
 
     files = [Path(word) for word in command or () if Path(word).is_file()]
     return Vut(
@@ -173,7 +173,7 @@ class TraciVut(Driver):
         try:
             answer = self._shadow.ask(message, self._options.deadline_s + WORK_S)
         except ChildDiedError as died:
-            # Killed from outside, or by what the client asked: the case runs again, and tells.
+            # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
             raise VutLostError(
                 f"the SUMO that answers the controller {died}", killed=died.killed
@@ -195,7 +195,7 @@ class TraciVut(Driver):
         raise FaultError(text)
 
     def _peer(self) -> Peer:
-        """Return who is served."""
+        """Return the process whose connections are served."""
         if self._program is None:
             return Peer(None, os.environ.get(TOKEN_VARIABLE) or None)
         return Peer(self._program.process, self._program.token)
@@ -206,7 +206,7 @@ class TraciVut(Driver):
         A program that closed its connection may connect again, and has as long as for a step.
         """
         patience_s = self._patience_s
-        # Who did not come once is not waited for as long again.
+        # A client that did not come once is not waited for as long again.
         self._patience_s = min(patience_s, self._options.deadline_s)
         if self._door is None:
             self._door = Door(self._port, self._note)
@@ -256,7 +256,7 @@ class TraciVut(Driver):
         """Return the connection to serve; None when none comes, or the program has ended."""
         until, peer = monotonic() + patience_s, self._peer()
         while True:
-            # A program that ended will not connect any more: look every now and then.
+            # A program that ended will not connect any more, which is checked in between.
             connection = door.accept(peer, max(min(0.1, until - monotonic()), 0.001))
             if connection is not None:
                 return connection
@@ -276,7 +276,7 @@ class TraciVut(Driver):
             file.write(f"note: {sentence}\n")
 
     def _disconnect(self, *, grace: bool = False) -> None:
-        """Close the door, end the program and drop the client; nobody of it is left."""
+        """Close the door, end the program and drop the client."""
         if self._door is not None:
             self._door.close()
             self._door = None
@@ -310,13 +310,10 @@ class Shadow:
         self._child: SumoChild | None = None
         self._ready = False
         self.listens = False
-        """Whether it has answered all that it was asked: a person may stop us before."""
+        """Whether it has answered every message: a person may stop this process before."""
 
     def start(self) -> None:
-        """Have it started, if it does not run; `UserError` where SUMO cannot use the net.
-
-        It gets ready while the controller starts.
-        """
+        """Start it, if it does not run; it gets ready while the controller starts."""
         if self._child is not None:
             return
         with ExitStack() as opened:
@@ -328,11 +325,17 @@ class Shadow:
         self._child, self._ready = child, False
 
     def serve(self, connection: socket.socket, deadline_s: float) -> None:
-        """Hand a connection over to it; raises as `ask` does, and `UserError`."""
+        """Hand a connection over to it.
+
+        Raises:
+            UserError: where SUMO cannot use the net.
+            ChildDiedError: when the process has ended twice.
+            TimeoutError: when it does not answer.
+        """
         if not self._ready:
             try:
                 self._get_ready()
-            except ChildDiedError:  # whoever ended it, not the client: it has not been heard
+            except ChildDiedError:  # ended from outside: the client has not been heard yet
                 self.close()
                 self.start()
                 self._get_ready()
@@ -342,9 +345,9 @@ class Shadow:
 
     def _get_ready(self) -> None:
         assert self._child is not None, "started"  # noqa: S101
-        said = self._child.receive(START_S)
-        if "refused" in said:
-            why = self._child.said() or said["refused"]
+        message = self._child.receive(START_S)
+        if "refused" in message:
+            why = self._child.said() or message["refused"]
             raise UserError(f"SUMO cannot use the net {self._road.path}: {why}")
         self._ready = True
 
