@@ -25,6 +25,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine import evaluate
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.values.scenario import US23
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
 
@@ -60,7 +61,9 @@ def no_simulation_left() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def run(tmp_path_factory) -> Run:
     """Return a small finished campaign with failures: design1 against level 0."""
-    settings = CampaignSettings(vut="design1", levels=(0,), cases=60, batch=20, seed=1)
+    settings = CampaignSettings(
+        vut="design1", levels=(0,), cases=60, batch=20, seed=1, scenario=US23
+    )
     return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
 
 

@@ -27,7 +27,9 @@ import traci
 from bench_record import add_record_option, append_record
 
 from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.povs import Povs
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
@@ -48,7 +50,7 @@ VUT = "design1"
 
 def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     """Return the seconds that the host takes for cases, and the trajectories."""
-    pov = PovLibrary(world.corridors * (world.vehicles - 1))
+    pov = PovLibrary(world.corridors * (world.vehicles - 1), Povs(policies=policies_of(US23)))
     vut = vut_factory(VUT)(world.corridors)
     start = time.perf_counter()
     trajectories = [trajectory for _, trajectory in rollout(world, pov, vut, cases)]
@@ -117,7 +119,12 @@ def process_s(cases: list[Case]) -> list[float]:
             start = time.perf_counter()
             traci.start(command, numRetries=100)
             try:
-                _episode_by_traci(case, hosted_paths(road), PovLibrary(1), vut_factory(VUT)(1))
+                _episode_by_traci(
+                    case,
+                    hosted_paths(road),
+                    PovLibrary(1, Povs(policies=policies_of(US23))),
+                    vut_factory(VUT)(1),
+                )
             finally:
                 traci.close()
             seconds.append(time.perf_counter() - start)

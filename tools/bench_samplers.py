@@ -37,7 +37,7 @@ from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
-from merge_sumo.values.scenario import LEVELS
+from merge_sumo.values.scenario import LEVELS, US23
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
@@ -83,7 +83,7 @@ def search(
     name: str, level: int, seed: int, plan: SimulationPlan, truth: Truth
 ) -> tuple[list[float], int, float]:
     """Return FMC / truth at SHOWN, the real regions found, and the seconds of the sampler."""
-    pool = Pool(levels=(level,))
+    pool = Pool(levels=(level,), scenario=US23)
     games = None if name == WITHOUT else Twin(pool, plan.povs, seed)
     sampler = make_sampler("coverage" if name == WITHOUT else name, pool, seed, games)
     batch = None if sampler.predictor else BATCH
@@ -111,8 +111,8 @@ def search(
         found += [outcome.case for outcome, _ in ran if outcome.failed]
         ended += len(ran)
         if ended in SHOWN:
-            curve[ended] = fmc(to_unit(found, level))
-    points, whole = to_unit(found, level), fmc(truth.failures)
+            curve[ended] = fmc(to_unit(found, level, scenario=US23))
+    points, whole = to_unit(found, level, scenario=US23), fmc(truth.failures)
     regions = sum(
         bool((np.linalg.norm(points[:, None] - region, axis=2) <= RADIUS).any())
         for region in truth.real_regions()
@@ -144,7 +144,7 @@ def cells(figures: dict[str, float]) -> str:
 
 def outcome(index: int, case: Any) -> Outcome:
     """Return an outcome in closed form: a slanted band of failures."""
-    x, v = to_unit([case], case.level)[0, :2].tolist()
+    x, v = to_unit([case], case.level, scenario=US23)[0, :2].tolist()
     dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7)
     overlap_m = 6.0 - abs(dx_m)
     score = -560.0 - 75.0 * overlap_m if overlap_m > 0 else -450.0 * math.exp(overlap_m / 15.0)
@@ -156,13 +156,13 @@ def print_times(names: list[str]) -> dict[str, dict[int, float]]:
     """Print and return the seconds of one core for a batch after N cases at level 2."""
     sizes = (100, 200, 400, 1000, 2000, 5000)
     print(f"{'seconds for a batch after N =':30s}" + " ".join(f"{n:7d}" for n in sizes))
-    cases = make_sampler("uniform", Pool(levels=(2,)), 0).ask(sizes[-1])
+    cases = make_sampler("uniform", Pool(levels=(2,), scenario=US23), 0).ask(sizes[-1])
     outcomes = [outcome(index, case) for index, case in enumerate(cases)]
     figures: dict[str, dict[int, float]] = {}
     for name in names:
         seconds = figures[name] = {}
         for size in sizes:
-            sampler = make_sampler(name, Pool(levels=(2,)), 0)
+            sampler = make_sampler(name, Pool(levels=(2,), scenario=US23), 0)
             sampler.tell(outcomes[:size])
             start = time.process_time()
             sampler.ask(BATCH)
@@ -177,7 +177,7 @@ def print_trials(trials: Sequence[str], seeds: int, first: int) -> dict[str, dic
     print("FMC / truth" + " ".join(f"{f'N={n}':>7s}" for n in SHOWN) + " lowest   all regions")
     for trial in trials:
         vut = f"{Path(__file__).with_name('trial_vuts.py')}:{trial}"
-        plan = resolve(CampaignSettings(vut=vut, levels=LEVELS))
+        plan = resolve(CampaignSettings(vut=vut, levels=LEVELS, scenario=US23))
         for level in LEVELS:
             truth = ground_truth(plan, level)
             if len(truth.failures) < FEWEST_FAILURES:
@@ -222,7 +222,7 @@ def main() -> None:
 
 def print_searches(options: argparse.Namespace, names: list[str]) -> dict[str, dict[str, float]]:
     """Print and return what samplers, or `gpr` with other constants, find of one VUT's failures."""
-    settings = CampaignSettings(vut=options.vut, levels=(options.level,))
+    settings = CampaignSettings(vut=options.vut, levels=(options.level,), scenario=US23)
     plan = resolve(settings).for_cases(BATCH)
     truth = ground_truth(plan, options.level)
     print(f"{options.vut}, level {options.level}, FMC of the truth {fmc(truth.failures):.4f}")

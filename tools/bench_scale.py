@@ -49,6 +49,7 @@ from merge_sumo.studies.truth import _scores
 from merge_sumo.system.workers import LocalProcesses, Workers
 from merge_sumo.values.case import Case, Pool, from_unit, to_unit
 from merge_sumo.values.fmc import fmc, regions
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
 
 VUT = "design1"
@@ -93,10 +94,10 @@ def local(count: int) -> Workers:
 
 def truth(most: int) -> Iterator[dict[str, float]]:
     """Yield cost and memory for 100, 1,000, ... cases, all in the same worker process."""
-    plan = resolve(CampaignSettings(vut=VUT, levels=(0,)))
+    plan = resolve(CampaignSettings(vut=VUT, levels=(0,), scenario=US23))
     rng = np.random.default_rng(0)
     with local(1) as workers:
-        pool = Pool(levels=(0,))
+        pool = Pool(levels=(0,), scenario=US23)
         warm = CasesAt(pool, 0, rng.random((32, 2)))
         list(evaluate(plan, warm, workers, scores_and_memory))
         cases = 100
@@ -119,7 +120,7 @@ def truth(most: int) -> Iterator[dict[str, float]]:
 
 def two_workers() -> dict[str, list[float]]:
     """Return the rates on two workers over those on one, round by round."""
-    plan = resolve(CampaignSettings(vut=VUT, levels=(0,)))
+    plan = resolve(CampaignSettings(vut=VUT, levels=(0,), scenario=US23))
     points: Any = np.random.default_rng(1).random((PAIR_CASES, 2))
     found: dict[str, list[float]] = {"cases": [], "computing": [], "cases_per_s_on_one": []}
     with local(1) as one, local(2) as two:
@@ -127,7 +128,7 @@ def two_workers() -> dict[str, list[float]]:
         def seconds(workers: Workers) -> float:
             start = time.perf_counter()
             for first in range(0, PAIR_CASES, 500):  # chunks of 250 on two workers
-                some = CasesAt(Pool(levels=(0,)), 0, points[first : first + 500])
+                some = CasesAt(Pool(levels=(0,), scenario=US23), 0, points[first : first + 500])
                 list(evaluate(plan, some, workers, scores_and_memory))
             return time.perf_counter() - start
 
@@ -182,8 +183,8 @@ class Served:
 
 def parent(cases: int) -> float:
     """Return how many cases per second a campaign takes that workers have run."""
-    plan = resolve(CampaignSettings(vut=VUT, levels=(0,)))
-    pool = Pool(levels=(0,))
+    plan = resolve(CampaignSettings(vut=VUT, levels=(0,), scenario=US23))
+    pool = Pool(levels=(0,), scenario=US23)
     served: Any = Served(run_cases(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
     sampler, scout = (make_sampler("uniform", pool, 0) for _ in range(2))
     with (
@@ -200,7 +201,7 @@ def parent(cases: int) -> float:
 def history_of(count: int, seen: Sequence[Outcome]) -> list[Outcome]:
     """Return a history of that many outcomes: new places for what was measured once."""
     rng = np.random.default_rng(2)
-    cases = from_unit(rng.random((count, 2)), 0)
+    cases = from_unit(rng.random((count, 2)), 0, scenario=US23)
     outcomes = []
     for index, case in enumerate(cases):
         outcome = replace(seen[index % len(seen)], index=index, batch=index // BATCH, case=case)
@@ -210,7 +211,7 @@ def history_of(count: int, seen: Sequence[Outcome]) -> list[Outcome]:
 
 def sampler_s(name: str, history: Sequence[Outcome]) -> float:
     """Return the seconds for one batch after a history."""
-    sampler = make_sampler(name, Pool(levels=(0,)), 0)
+    sampler = make_sampler(name, Pool(levels=(0,), scenario=US23), 0)
     sampler.tell(history)
     return timed(partial(sampler.ask, BATCH))
 
@@ -228,12 +229,12 @@ def files(count: int, seen: Sequence[Outcome], folder: Path) -> dict[str, float]
     text = "".join(map(to_line, outcomes)).encode()
     run = Run(folder)
     run.outcomes = outcomes
-    points = to_unit((outcome.case for outcome in failures(outcomes)), 0)
+    points = to_unit((outcome.case for outcome in failures(outcomes)), 0, scenario=US23)
     found = {
         "cases": float(count),
         "failures": float(len(points)),
         "file_mb": len(text) / 1e6,
-        "read_s": timed(lambda: read_outcomes(text, OUTCOMES)),
+        "read_s": timed(lambda: read_outcomes(text, OUTCOMES, scenario=US23)),
         "fmc_s": timed(lambda: fmc(points)),
         "regions_s": timed(lambda: regions(points)),
         "report_s": timed(lambda: write_report(run)),
@@ -246,7 +247,9 @@ def of_campaigns(chosen: argparse.Namespace, tell: Callable[[str], None]) -> dic
     """Return what samplers and files take after more and more outcomes."""
     result: dict[str, Any] = {"samplers": {}, "files": []}
     with tempfile.TemporaryDirectory() as scratch:
-        settings = CampaignSettings(vut=VUT, levels=(0,), sampler="uniform", cases=400, batch=400)
+        settings = CampaignSettings(
+            vut=VUT, levels=(0,), sampler="uniform", cases=400, batch=400, scenario=US23
+        )
         run = run_campaign(settings, resolve(settings), Path(scratch) / "run")
         count = 100
         while count <= chosen.history and "samplers" in chosen.only:

@@ -45,7 +45,7 @@ from merge_sumo.vuts.registry import vut_factory
 
 STEPS = 80
 """Of an episode."""
-CASE = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0)
+CASE = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
 LAW = """
 class Vut:
     def act(self, seen):

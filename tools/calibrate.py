@@ -40,9 +40,9 @@ from merge_sumo.values.case import Case, FloatArray, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc, regions
 from merge_sumo.values.scenario import DT_S, US23, Scenario
 
-YIELDING = Case(level=1, x_pov0_m=-273.0, v_pov0_mps=33.0)
+YIELDING = Case(level=1, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 """The first example run of the paper."""
-STALEMATE = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6)
+STALEMATE = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
 """The second and the third."""
 
 
@@ -143,7 +143,9 @@ class Bench:
         dx, _ = gaps_at_m(cases, self.povs[level], vut)
         gap_m, crash_m = np.abs(dx), cases[0].scenario.dx_crash_m
         failed = gap_m < crash_m
-        points = to_unit((c for c, fails in zip(cases, failed, strict=True) if fails), level)
+        points = to_unit(
+            (c for c, fails in zip(cases, failed, strict=True) if fails), level, scenario=US23
+        )
         sizes = np.bincount(regions(points, apart)) if len(points) else np.zeros(0, np.int64)
         near = ((gap_m >= crash_m) & (gap_m < NEAR_MISS_M)).sum()
         return Picture(
@@ -278,7 +280,7 @@ def search_weights(options: argparse.Namespace) -> None:
                 check_cases=20,
             )
             names = ("pov1", "vut1", "pov2")
-            train_library(folder, names, options.seed, weights, settings)
+            train_library(folder, names, options.seed, weights, settings, scenario=US23)
             run1 = gaps_at_m([YIELDING], load_driver("pov1", 1, folder), Level0Vut(1))
             learned = load_driver("pov2", 1, folder), load_driver("vut1", 1, folder)
             run2 = gaps_at_m([STALEMATE], *learned)

@@ -33,6 +33,7 @@ from merge_sumo.campaigns.settings import settings_of as settings_in
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.system.workers import open_workers
+from merge_sumo.values.scenario import US23
 
 PLACES = ("moment", "sync", "torn", "worker")
 SAMPLERS = ("gpr", "coverage", "uniform")
@@ -49,7 +50,13 @@ PATIENCE_S = 600.0
 def settings_of(sampler: str) -> CampaignSettings:
     """Return a campaign in which every batch depends on those before it, or runs ahead of them."""
     return CampaignSettings(
-        vut="design1", levels=(0, 1), sampler=sampler, cases=CASES, batch=BATCH, seed=1
+        vut="design1",
+        levels=(0, 1),
+        sampler=sampler,
+        cases=CASES,
+        batch=BATCH,
+        seed=1,
+        scenario=US23,
     )
 
 

@@ -22,7 +22,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.studies.counterfactuals import CAREFUL, TAKES_OVER, avoidance
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import LEVELS
+from merge_sumo.values.scenario import LEVELS, US23
 from merge_sumo.values.trajectory import End
 
 MODELS = ("Krauss", "IDM", "EIDM", "ACC", "CACC")
@@ -44,7 +44,12 @@ def row(vut: str, cases: int, workers: int | None) -> str:
     with tempfile.TemporaryDirectory() as folder:
         for level in LEVELS:
             settings = CampaignSettings(
-                vut=vut, levels=(level,), sampler="uniform", cases=cases, batch=min(cases, 500)
+                vut=vut,
+                levels=(level,),
+                sampler="uniform",
+                cases=cases,
+                batch=min(cases, 500),
+                scenario=US23,
             )
             plan = resolve(settings)
             with open_workers(plan.workers(workers)) as there:

@@ -14,7 +14,7 @@ from msgspec import Meta
 from merge_sumo.errors import UserError
 from merge_sumo.system.records import Record, convert, decode, replaced, to_plain
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import US23, Dimension, Scenario
+from merge_sumo.values.scenario import Dimension, Scenario
 
 Weights = Annotated[
     tuple[Annotated[float, Meta(ge=0.0)], ...],
@@ -84,7 +84,7 @@ class Distribution:
 
     levels: dict[int, float]
     marginals: dict[str, Marginal]
-    scenario: Scenario = US23
+    scenario: Scenario
 
     def points(self, level: int, chances: FloatArray) -> FloatArray:
         """Return points of the unit cube, (n, d), at chances, (n, d): uniform ones are a sample."""
@@ -100,9 +100,7 @@ class Distribution:
         return {"levels": levels, **to_plain(self.marginals)}
 
 
-def read_distribution(
-    path: Path | None, levels: Sequence[int], scenario: Scenario = US23
-) -> Distribution:
+def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenario) -> Distribution:
     """Return the distribution that a JSON file states; without a file, uniform over the pool.
 
     The file has weights of levels and one entry for each coordinate; what is left out is uniform:

@@ -1065,7 +1065,7 @@ def vuts(policies: AnyPath | None = None) -> VutList:
 
     `policies` is the folder of learned drivers instead of the shipped ones.
     """
-    trained = read_manifest(policies_of() if policies is None else policies_in(policies))
+    trained = read_manifest(policies_of(US23) if policies is None else policies_in(policies))
     built_in = [name for name in built_in_vuts() if LEARNED.get(name, name) in (name, *trained)]
     kinds = [kind for kind in (PYTHON, *KINDS.values()) if kind.form]
     return VutList(built_in, list(installed_vuts()), kinds)

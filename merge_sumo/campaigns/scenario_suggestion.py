@@ -34,7 +34,7 @@ def suggested(road: Corridor, name: str) -> Scenario:
     v_vut0_mps = round(min(V_VUT0_MPS, limit_at(road.ramp, x_vut0_m)), 1)
     level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
     due_s = float(
-        level0_time_to(np.array(-x_vut0_m), np.array(v_vut0_mps), v_cruise_mps=level0_v_mps)
+        level0_time_to(np.array(-x_vut0_m), np.array(v_vut0_mps), US23.level0_a_mps2, level0_v_mps)
     )
     slow, fast = round(SLOWEST * limit_mps, 1), round(limit_mps, 1)
     low = max(-fast * due_s * (1.0 + MARGIN), -ROOM * road.mainline.before_m)

@@ -53,7 +53,7 @@ class CampaignSettings:
     policies: str | None = None
     pov: str | None = None
     learn_from: tuple[str, ...] = ()
-    scenario: Scenario = US23
+    scenario: Scenario
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
 
@@ -208,7 +208,7 @@ def settings_of(
     known = {
         spec.name: record[spec.name] for spec in fields(CampaignSettings) if spec.name in record
     }
-    if isinstance(known.get("scenario"), dict):
+    if not isinstance(known.get("scenario"), Scenario):
         known["scenario"] = scenario_of(record, folder / SETTINGS)
     if isinstance(known.get("policies"), str) and "policies" not in (given or {}):
         _check_still_there(folder, known["policies"])

@@ -235,7 +235,7 @@ def _criterion_of(settings: Mapping[str, Any], path: Path) -> Criterion:
     return Criterion(_FORMER_NAME.sub("bumper_gap_m", _FORMER.get(fail_when, fail_when)), require)
 
 
-def read_outcomes(text: bytes, name: str, scenario: Scenario = US23) -> tuple[list[Outcome], bool]:
+def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outcome], bool]:
     """Return the outcomes in the bytes of an `outcomes.jsonl`, and whether the last was torn.
 
     A last line without its end was being written when the campaign stopped: it is dropped. Any

@@ -11,8 +11,8 @@ from merge_sumo.values.scenario import DT_S, US23
 
 def level0_acceleration(
     v_vut_mps: FloatArray,
-    a_mps2: FloatArray | float = US23.level0_a_mps2,
-    v_cruise_mps: FloatArray | float = US23.level0_v_mps,
+    a_mps2: FloatArray | float,
+    v_cruise_mps: FloatArray | float,
 ) -> FloatArray:
     """Return the level-0 VUT's acceleration, m/s2: `a_mps2` until its speed, which it meets."""
     return np.minimum(np.maximum((v_cruise_mps - v_vut_mps) / DT_S, 0.0), a_mps2)
@@ -21,8 +21,8 @@ def level0_acceleration(
 def level0_time_to(
     distance_m: FloatArray,
     v_vut_mps: FloatArray,
-    a_mps2: FloatArray | float = US23.level0_a_mps2,
-    v_cruise_mps: FloatArray | float = US23.level0_v_mps,
+    a_mps2: FloatArray | float,
+    v_cruise_mps: FloatArray | float,
 ) -> FloatArray:
     """Return the seconds that a vehicle needs for a distance on the level-0 profile.
 

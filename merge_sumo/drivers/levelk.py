@@ -52,7 +52,8 @@ def features(
     x_vut_m: FloatArray,
     v_vut_mps: FloatArray,
     svo_rad: FloatArray | None = None,
-    scenario: Scenario = US23,
+    *,
+    scenario: Scenario,
 ) -> FloatArray:
     """Return what the network sees of n states, (n, 26), or (n, 28) with an orientation.
 
@@ -90,7 +91,7 @@ def prospects(
     v_pov_mps: FloatArray,
     x_vut_m: FloatArray,
     v_vut_mps: FloatArray,
-    scenario: Scenario = US23,
+    scenario: Scenario,
 ) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray, FloatArray]:
     """Return what may come of n states, every array of shape (n,).
 
@@ -228,7 +229,7 @@ class LevelKDriver(Driver):
             scene.x_vut_m[due],
             scene.v_vut_mps[due],
             self._svo_rad[due] if self.network.sees_svo else None,
-            scenario,
+            scenario=scenario,
         )
         values = self.network.values(inputs)
         self._held[due] = actions_mps2(scenario)[values.argmax(axis=1)]

@@ -33,7 +33,7 @@ MOST_BYTES: Final = 1 << 26
 """No network and no manifest is larger."""
 
 
-def policies_of(scenario: Scenario = US23) -> Path:
+def policies_of(scenario: Scenario) -> Path:
     """Return the shipped policies for a scenario: those of its name, else those of the paper's."""
     shipped = resource("policies")
     by_name = {manifest.parent.name: manifest.parent for manifest in shipped.glob(f"*/{MANIFEST}")}

@@ -19,12 +19,9 @@ from merge_sumo.values.scenario import OWN
 class PovLibrary(Driver):
     """Plays a POV of level 0, 1 or 2, or one of a person's own, corridor by corridor."""
 
-    def __init__(
-        self, corridors: int, povs: Povs | None = None, world: World | None = None
-    ) -> None:
-        """Prepare the drivers of all available levels, by default of the paper's scenario."""
+    def __init__(self, corridors: int, povs: Povs, world: World | None = None) -> None:
+        """Prepare the drivers of all available levels."""
         super().__init__(corridors)
-        povs = povs or Povs()
         self._drivers: dict[int, Driver] = {0: Level0Pov(corridors)}
         for level in set(povs.levels) & set(POLICIES):
             self._drivers[level] = load_driver(POLICIES[level], corridors, povs.policies)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -26,7 +26,7 @@ class Povs:
         own: makes the controller that drives at the level of a person's own; None without one.
     """
 
-    policies: Path = field(default_factory=policies_of)
+    policies: Path
     own: VutFactory | None = None
 
     @property

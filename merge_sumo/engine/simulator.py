@@ -34,7 +34,12 @@ class Simulator:
         with ExitStack() as opened:
             car_type = None if povs.own is None else povs.own.vut.vut_type
             vut_type = plan.vut.vut.vut_type
-            self.world = World(corridors, plan.road, vut_type, scenario, car_type, binding)
+            self.world = World(
+                *(corridors, plan.road, vut_type),
+                scenario=scenario,
+                car_type=car_type,
+                binding=binding,
+            )
             opened.callback(self.world.close)
             self.vut = plan.vut(corridors, self.world)
             opened.callback(self.vut.close)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.plan import SimulationPlan, versions
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
@@ -220,7 +221,7 @@ def reproduce(
     Raises:
         UserError: when the folder exists or cannot be written, or where a level has no POV.
     """
-    povs = povs or Povs()
+    povs = povs or Povs(policies=policies_of(US23))
     for level in LEVELS:
         povs.check_level(level)
     make_folder(folder)

@@ -22,10 +22,10 @@ from merge_sumo.vuts.registry import waits_for_client
 
 CORRIDORS: Final = 4
 CASES: Final = tuple(
-    Case(level=0, x_pov0_m=x, v_pov0_mps=v)
+    Case(level=0, x_pov0_m=x, v_pov0_mps=v, scenario=US23)
     for x, v in product((-340.0, -300.0, -260.0, -220.0), (25.0, 28.0, 31.0, 34.0))
 )
-FROM_STAND: Final = Case(level=0, x_pov0_m=-340.0, v_pov0_mps=25.0, v_vut0_mps=0.0)
+FROM_STAND: Final = replace(CASES[0], v_vut0_mps=0.0)
 LONG_BEGIN_US: Final = 20e3
 """A campaign of hundreds of cases feels it when an episode takes longer than this to begin."""
 

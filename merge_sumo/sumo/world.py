@@ -37,7 +37,7 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import load_libsumo, scratch_folder
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, US23, VEHICLES, VUT, Scenario
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
 SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
@@ -91,7 +91,8 @@ class World:
         corridors: int = 32,
         road: Corridor | None = None,
         vut_type: Mapping[str, str] | None = None,
-        scenario: Scenario = US23,
+        *,
+        scenario: Scenario,
         car_type: Mapping[str, str] | None = None,
         binding: Any = None,
     ) -> None:

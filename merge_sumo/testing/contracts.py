@@ -98,7 +98,7 @@ class SamplerContract:
     """
 
     sampler: type[Sampler]
-    pool: Pool = Pool(levels=(0, 1, 2), v_vut0_mps=17.5)
+    pool: Pool = Pool(levels=(0, 1, 2), v_vut0_mps=17.5, scenario=US23)
 
     def fresh(self, seed: int = 5) -> Sampler:
         """Return a sampler that was told nothing."""
@@ -257,7 +257,7 @@ class MeasureContract:
     """
 
     measure: Measure
-    pool: Pool = Pool(levels=(0,), v_vut0_mps=17.5)
+    pool: Pool = Pool(levels=(0,), v_vut0_mps=17.5, scenario=US23)
 
     def values(self) -> list[float | None]:
         """Return the values of some episodes."""

@@ -20,7 +20,7 @@ from merge_sumo.training.env import pool_starts
 from merge_sumo.training.game import Game, IntArray, greedy, of_two
 from merge_sumo.training.reward import Reward, RewardWeights, pov_reward
 from merge_sumo.values.case import Case, FloatArray, from_unit
-from merge_sumo.values.scenario import SVO, US23, Scenario
+from merge_sumo.values.scenario import SVO, Scenario
 from merge_sumo.values.trajectory import End, Trajectory
 
 CHECK_CASES: Final = 300
@@ -103,7 +103,7 @@ def _driver(maker: type[Driver] | QNetwork) -> Driver:
 
 
 def check_cases(
-    name: str, count: int = CHECK_CASES, seed: int = CHECK_SEED, scenario: Scenario = US23
+    name: str, count: int = CHECK_CASES, seed: int = CHECK_SEED, *, scenario: Scenario
 ) -> list[Case]:
     """Return random cases of the pool in which to check a network."""
     rng = np.random.default_rng(seed)
@@ -125,7 +125,8 @@ def check_policy(
     folder: Path | None = None,
     weights: RewardWeights | None = None,
     count: int = CHECK_CASES,
-    scenario: Scenario = US23,
+    *,
+    scenario: Scenario,
 ) -> PolicyCheck:
     """Return how near a network is to its best response over `count` cases of the pool."""
     opponent = opponents(name, folder)

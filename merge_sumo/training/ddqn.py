@@ -204,7 +204,7 @@ class _Collector:
         self.state = game.state()
 
     def _begin(self, which: np.ndarray) -> None:
-        starts = exploring_starts(len(which), self.rng, self.midway, self.game.scenario)
+        starts = exploring_starts(len(which), self.rng, self.midway, scenario=self.game.scenario)
         self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, len(which)) * self.sees_svo
         for corridor, start in zip(which.tolist(), starts, strict=True):
             self.game.begin(corridor, start)

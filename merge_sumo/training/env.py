@@ -137,7 +137,7 @@ class MergeGame:
         self.opponent.close()
 
 
-def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario = US23) -> FloatArray:
+def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
     """Return `n` starting states, (n, 4), uniform over the pool."""
     x_pov = rng.uniform(*scenario.x_pov0_m, n)
     v_pov = rng.uniform(*scenario.v_pov0_mps, n)
@@ -151,7 +151,7 @@ def _starting_speeds(n: int, rng: np.random.Generator, scenario: Scenario) -> Fl
 
 
 def exploring_starts(
-    n: int, rng: np.random.Generator, midway: float = 0.6, scenario: Scenario = US23
+    n: int, rng: np.random.Generator, midway: float = 0.6, *, scenario: Scenario
 ) -> FloatArray:
     """Return `n` starting states, (n, 4): a share from mid-way in a game, the rest of the pool.
 

@@ -157,4 +157,4 @@ def inputs_of(
     """Return what a network sees of states, (n, 4), and of psi, (n,), if it has one."""
     x_pov, v_pov, x_vut, v_vut = state.T
     psi = svo_rad if network.sees_svo else None
-    return features(x_pov, v_pov, x_vut, v_vut, psi, scenario)
+    return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=scenario)

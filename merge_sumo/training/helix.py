@@ -138,8 +138,8 @@ def train_library(
     seed: int = 0,
     weights: RewardWeights | None = None,
     settings: TrainingSettings | None = None,
-    scenario: Scenario = US23,
     *,
+    scenario: Scenario,
     on_progress: Callable[[TrainingProgress], None] | None = None,
     on_done: Callable[[str, PolicyCheck | None], None] | None = None,
 ) -> None:

@@ -133,7 +133,7 @@ def _label(
 ) -> tuple[_Labelled, float]:
     """Return states of this round with the worth of each action, and the mean return."""
     policy = greedy(network, game.scenario)
-    start = exploring_starts(s.starts, rng, s.midway, game.scenario)
+    start = exploring_starts(s.starts, rng, s.midway, scenario=game.scenario)
     svo_rad = rng.uniform(SVO.low, SVO.high, s.starts) * network.sees_svo
     tried = _try(game, network, start, svo_rad, rng, s)
     returns = game.action_returns(tried.state, tried.svo_rad, policy)

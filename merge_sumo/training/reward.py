@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, US23, Scenario
+from merge_sumo.values.scenario import DT_S, Scenario
 from merge_sumo.values.scenario_scale import Units
 
 FULL_GAP_M: Final = 45.0
@@ -82,7 +82,7 @@ class Reward:
     """
 
     weights: RewardWeights
-    scenario: Scenario = US23
+    scenario: Scenario
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:

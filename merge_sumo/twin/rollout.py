@@ -166,7 +166,7 @@ class TwinRollout:
             np.tile(x_vut_m, cars),
             np.tile(v_vut_mps, cars),
             np.tile(svo_rad, cars) if network.sees_svo else None,
-            self._scenario,
+            scenario=self._scenario,
         )
         chosen = network.values_at_once(seen).argmax(axis=1)
         actions: FloatArray = actions_mps2(self._scenario)[chosen].reshape(x_m.shape)

@@ -59,7 +59,7 @@ class Case:
     v_vut0_mps: float = V_VUT0_MPS
     headway_ahead_s: float | None = None
     headway_behind_s: float | None = None
-    scenario: Scenario = field(default=US23, repr=False)
+    scenario: Scenario = field(repr=False)
 
     def __post_init__(self) -> None:
         """Check that the numbers describe a scenario."""
@@ -120,11 +120,11 @@ class Pool:
     levels: tuple[int, ...]
     v_vut0_mps: float | None = None
     """None for the scenario's; where that is a range, it is a coordinate."""
-    scenario: Scenario = US23
+    scenario: Scenario
 
     def cases(self, points: FloatArray, level: int) -> list[Case]:
         """Return the cases at points, (n, d), of a level's unit cube."""
-        return from_unit(points, level, self.v_vut0_mps, self.scenario)
+        return from_unit(points, level, self.v_vut0_mps, scenario=self.scenario)
 
 
 def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> FloatArray:
@@ -144,7 +144,8 @@ def from_unit(
     points: FloatArray,
     level: int,
     v_vut0_mps: float | None = None,
-    scenario: Scenario = US23,
+    *,
+    scenario: Scenario,
 ) -> list[Case]:
     """Return the cases at points, (n, d), of the unit cube; the inverse of `to_unit`."""
     dims = scenario.dimensions(level)

@@ -25,7 +25,7 @@ from merge_sumo.values.measures import OURS, Further, further_measures, further_
 from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
 from merge_sumo.values.migration import upgrade_from_0_1
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, US23, VEHICLES, VUT, Scenario, Vehicle
+from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, VEHICLES, VUT, Scenario, Vehicle
 from merge_sumo.values.severity import Severity, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
@@ -165,7 +165,7 @@ class Outcome:
         return record
 
     @classmethod
-    def from_json(cls, line: bytes | str, scenario: Scenario = US23) -> Outcome:
+    def from_json(cls, line: bytes | str, scenario: Scenario) -> Outcome:
         """Return the outcome of a line of `outcomes.jsonl`; `UserError` where it is none."""
         case_names, measure_names, flat = record_fields(scenario)
         record = decode(line)

@@ -25,6 +25,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import check_junit, junit, write_junit
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import printable
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
 HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
@@ -299,7 +300,7 @@ class TestACampaignThatTestedNothing:
 def mixed(vuts, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("mixed") / "run"
     settings = CampaignSettings(
-        vut=vuts["mixed"], levels=(0,), sampler="uniform", cases=20, batch=10, seed=1
+        vut=vuts["mixed"], levels=(0,), sampler="uniform", cases=20, batch=10, seed=1, scenario=US23
     )
     found = judge(run_campaign(settings, folder).outcomes)
     assert min(found.errors, found.timeouts, found.tested) > 0
@@ -378,7 +379,13 @@ class TestACampaignOfFewCasesThatIsResumed:
             raise Stopped(signal.SIGINT)
 
         settings = CampaignSettings(
-            vut="design2", levels=(0,), sampler="annealing", cases=20, batch=10, seed=1
+            vut="design2",
+            levels=(0,),
+            sampler="annealing",
+            cases=20,
+            batch=10,
+            seed=1,
+            scenario=US23,
         )
         with pytest.raises(Stopped):
             run_campaign(settings, tmp_path / "run", check=check)
@@ -415,7 +422,7 @@ def folders(vuts, tmp_path_factory) -> dict[str, Path]:
     place = tmp_path_factory.mktemp("versions")
     for name, vut in {"good": "design2", **vuts}.items():
         settings = CampaignSettings(
-            vut=vut, levels=(0,), sampler="uniform", cases=20, batch=10, seed=1
+            vut=vut, levels=(0,), sampler="uniform", cases=20, batch=10, seed=1, scenario=US23
         )
         run_campaign(settings, place / name)
     return {path.name: path for path in place.iterdir()}
@@ -479,7 +486,13 @@ class TestTwoVersions:
 
     def test_that_are_the_same_with_other_seeds_are_not_worse(self, vuts, folders, tmp_path):
         settings = CampaignSettings(
-            vut=vuts["mixed"], levels=(0,), sampler="uniform", cases=24, batch=8, seed=5
+            vut=vuts["mixed"],
+            levels=(0,),
+            sampler="uniform",
+            cases=24,
+            batch=8,
+            seed=5,
+            scenario=US23,
         )
         run_campaign(settings, tmp_path / "run")
         for a, b in ((folders["mixed"], tmp_path / "run"), (tmp_path / "run", folders["mixed"])):
@@ -509,7 +522,7 @@ def test_what_prints_is_left_as_it_is():
 
 def test_a_resumed_campaign_that_was_broken_and_is_forced_on_is_judged_as_a_whole(vuts, tmp_path):
     settings = CampaignSettings(
-        vut=vuts["stops"], levels=(0,), sampler="uniform", cases=10, batch=5, seed=1
+        vut=vuts["stops"], levels=(0,), sampler="uniform", cases=10, batch=5, seed=1, scenario=US23
     )
     run_campaign(settings, tmp_path / "run")
     shutil.copytree(tmp_path / "run", tmp_path / "longer")

@@ -24,6 +24,7 @@ from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.folders import TEMPORARY
+from merge_sumo.values.scenario import US23
 
 CAMPAIGN = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "uniform", "-q")
 SMALL = (*CAMPAIGN, "--cases", "60", "--batch", "20", "--seed", "1")
@@ -226,7 +227,7 @@ class Vanishing:
 
 class TestAFolderThatVanishes:
     SETTINGS = CampaignSettings(
-        vut="design1", levels=(0,), sampler="uniform", cases=40, batch=20, seed=1
+        vut="design1", levels=(0,), sampler="uniform", cases=40, batch=20, seed=1, scenario=US23
     )
 
     def test_under_a_campaign_ends_it_in_a_sentence(self, tmp_path):

@@ -18,6 +18,7 @@ import merge_sumo as ms
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES
 from merge_sumo.system.workers import dask_workers
+from merge_sumo.values.scenario import US23
 
 __all__ = ["cluster", "workers_at"]
 
@@ -67,7 +68,9 @@ def test_campaigns_in_one_process_keep_nothing(vut, count, tmp_path):
 
 
 SETTINGS = {
-    name: CampaignSettings(vut="design1", levels=(0,), sampler=name, cases=40, batch=20, seed=4)
+    name: CampaignSettings(
+        vut="design1", levels=(0,), sampler=name, cases=40, batch=20, seed=4, scenario=US23
+    )
     for name in ("uniform", "gpr")
 }
 
@@ -141,7 +144,7 @@ def test_nothing_but_the_settings_decides_outcomes(sampler, cluster, tmp_path):
         found[name] = (world.root / "run" / OUTCOMES).read_bytes()
     address, _ = cluster
     settings = CampaignSettings(
-        vut="design2", levels=(0, 1, 2), sampler=sampler, cases=60, batch=20, seed=5
+        vut="design2", levels=(0, 1, 2), sampler=sampler, cases=60, batch=20, seed=5, scenario=US23
     )
     with dask_workers(address) as workers:
         run_campaign(settings, tmp_path / "dask", workers=workers)

@@ -43,6 +43,7 @@ from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.sumo import replay, replay_folder
 from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.system.resources import resource
+from merge_sumo.values.scenario import US23
 
 here = settings(
     max_examples=60,
@@ -109,7 +110,9 @@ def answer(read: Callable[[], T]) -> T | None:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Run:
     """Return a small campaign of which nothing was predicted: its report takes little time."""
-    settings = CampaignSettings(vut="design1", levels=(0,), sampler="uniform", cases=60, seed=4)
+    settings = CampaignSettings(
+        vut="design1", levels=(0,), sampler="uniform", cases=60, seed=4, scenario=US23
+    )
     return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
 
 
@@ -142,10 +145,12 @@ def some(*examples: bytes) -> st.SearchStrategy[bytes]:
 
 class TestOutcomes:
     def read(self, text: bytes) -> None:
-        found = answer(lambda: read_outcomes(text, OUTCOMES))
+        found = answer(lambda: read_outcomes(text, OUTCOMES, scenario=US23))
         if found is not None:
             outcomes, _ = found
-            again, torn = read_outcomes("".join(map(to_line, outcomes)).encode(), OUTCOMES)
+            again, torn = read_outcomes(
+                "".join(map(to_line, outcomes)).encode(), OUTCOMES, scenario=US23
+            )
             assert (again, torn) == (outcomes, False), "what was read can be written"
 
     @here

@@ -41,6 +41,7 @@ from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import Replay, open_gui, replay
 from merge_sumo.sumo.replay_folder import CASE, CONFIG, LABELS, NET, RECORD, TYPES, VIEW
 from merge_sumo.sumo.world import World
+from merge_sumo.values.scenario import US23
 
 HONEST = Path(__file__).resolve().parents[2] / "scenarios" / "no-reaction"
 LIMIT_S = 20.0
@@ -645,7 +646,7 @@ def test_a_hostile_net_does_nothing_on_its_way_to_a_world_and_to_opendrive(scene
     def use() -> str:
         road = road_of(path)
         assert_harmless(hosted_net(road, 2).decode())
-        with World(2, road) as world:
+        with World(2, road, scenario=US23) as world:
             world.advance()
         assert len(opendrive(road)) > 1000
         return IDENTICAL
@@ -714,7 +715,7 @@ class TestAnHonestNet:
         assert ended.code == 0, ended.reason
         path = tmp_path / "us23.net.xml"
         assert b"there#1" in cleaned(path.read_bytes())
-        with World(2, road_of(path)) as world:
+        with World(2, road_of(path), scenario=US23) as world:
             world.advance()
 
     @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ from merge_sumo.studies import probability, reproduction
 from merge_sumo.system import folders
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.training import helix
+from merge_sumo.values.scenario import US23
 
 NAMELESS = [
     *("", ".", "./", ".//", "./.", "..", "../", "../.", "./..", "../..", "../../."),
@@ -500,14 +501,14 @@ class TestAFolderOfPolicies:
     def test_that_holds_other_things_is_not_trained_into(self, tmp_path):
         (tmp_path / "pov1.training.jsonl").write_text("theirs")
         with pytest.raises(UserError, match="holds other things than policies"):
-            helix.train_library(tmp_path, ("pov1",))
+            helix.train_library(tmp_path, ("pov1",), scenario=US23)
         assert [path.name for path in tmp_path.iterdir()] == ["pov1.training.jsonl"]
 
     def test_whose_log_is_a_link_is_not_trained_into(self, tmp_path):
         (tmp_path / "manifest.json").write_text('{"networks": {}}')
         (tmp_path / "pov1.training.jsonl").symlink_to("elsewhere")
         with pytest.raises(UserError, match="it is a link"):
-            helix.train_library(tmp_path, ("pov1",))
+            helix.train_library(tmp_path, ("pov1",), scenario=US23)
         assert not (tmp_path / "elsewhere").exists()
 
     def test_that_was_begun_is_gone_on_with(self, tmp_path, monkeypatch):
@@ -519,7 +520,7 @@ class TestAFolderOfPolicies:
 
         monkeypatch.setattr(helix, "_train_beside", train)
         for _ in range(2):
-            helix.train_library(tmp_path / "new", ("pov1",))
+            helix.train_library(tmp_path / "new", ("pov1",), scenario=US23)
             (tmp_path / "new" / "pov1.training.jsonl").write_text("{}\n")
         assert asked == [tmp_path / "new"] * 4, "two levels, twice"
 

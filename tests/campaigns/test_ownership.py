@@ -24,6 +24,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.trust import RUNS, Code, doubt, note_own
+from merge_sumo.values.scenario import US23
 
 VUT = """
 import pathlib
@@ -79,7 +80,9 @@ def project(folder: Path, answer: float = 1.0, *, vut: str = "my_vut.py:Vut") ->
     made.change(answer)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        settings = CampaignSettings(vut=vut, levels=(0,), cases=12, batch=6, sampler="uniform")
+        settings = CampaignSettings(
+            vut=vut, levels=(0,), cases=12, batch=6, sampler="uniform", scenario=US23
+        )
         run_campaign(settings, Path("run"))
     assert made.ran()
     return made
@@ -189,7 +192,7 @@ class TestAReceivedFolder:
 
     @pytest.mark.parametrize("vut", ["level0", "design1", "sumo:IDM"])
     def test_runs_what_is_of_this_package_or_of_sumo(self, tmp_path, stranger, vut):
-        settings = CampaignSettings(vut=vut, levels=(0,), cases=2, batch=2)
+        settings = CampaignSettings(vut=vut, levels=(0,), cases=2, batch=2, scenario=US23)
         run = run_campaign(settings, tmp_path / "run")
         stranger()
         assert len(resume_campaign(run.folder).outcomes) == 2

@@ -10,6 +10,7 @@ import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
+from merge_sumo.values.scenario import US23
 from merge_sumo.vuts import registry
 from merge_sumo.vuts.host import hosted
 
@@ -49,13 +50,13 @@ def calls(monkeypatch):
 
 
 def test_settings_load_no_vut_and_start_no_process(spec, calls):
-    CampaignSettings(vut=spec, levels=(0,), cases=4)
-    CampaignSettings(vut="nowhere.py:f", levels=(0,), cases=4)
+    CampaignSettings(vut=spec, levels=(0,), cases=4, scenario=US23)
+    CampaignSettings(vut="nowhere.py:f", levels=(0,), cases=4, scenario=US23)
     assert not calls
 
 
 def test_a_plan_asks_a_vut_once_what_it_is(spec, calls):
-    plan = resolve(CampaignSettings(vut=spec, levels=(0,), cases=4))
+    plan = resolve(CampaignSettings(vut=spec, levels=(0,), cases=4, scenario=US23))
     assert calls == {"processes": 1, "found": 1}
     assert plan.workers(2) == 2
     plan.for_cases(4)
@@ -71,4 +72,4 @@ def test_a_campaign_starts_a_vut_to_ask_it_and_to_let_it_drive(spec, calls, tmp_
 
 def test_settings_of_a_vut_that_nobody_knows_have_no_plan():
     with pytest.raises(UserError, match="there is no VUT 'desgin2'"):
-        resolve(CampaignSettings(vut="desgin2", levels=(0,)))
+        resolve(CampaignSettings(vut="desgin2", levels=(0,), scenario=US23))

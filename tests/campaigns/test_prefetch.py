@@ -16,8 +16,11 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.system.workers import InProcess, Workers
 from merge_sumo.values.case import Pool
+from merge_sumo.values.scenario import US23
 
-SETTINGS = CampaignSettings(vut="design1", levels=(0,), sampler="uniform", cases=90, batch=20)
+SETTINGS = CampaignSettings(
+    vut="design1", levels=(0,), sampler="uniform", cases=90, batch=20, scenario=US23
+)
 
 
 def recorded(folder) -> dict[str, bytes]:
@@ -74,7 +77,7 @@ def test_batches_that_were_not_written_to_their_end_run_again(in_turn, tmp_path,
 
 
 def test_who_does_not_learn_is_foreseen_in_every_batch():
-    pool = Pool(levels=(0, 1, 2))
+    pool = Pool(levels=(0, 1, 2), scenario=US23)
     sampler, history = make_sampler("uniform", pool, 7), [episode(0)[0], episode(1)[0]]
     sampler.tell(history)
     ahead = list(proposals(make_sampler("uniform", pool, 7), history, 50, 20))
@@ -87,7 +90,7 @@ def test_who_does_not_learn_is_foreseen_in_every_batch():
 @pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "uniform"])
 def test_who_learns_is_not_foreseen(name):
     assert SAMPLERS[name].learns
-    assert not list(proposals(make_sampler(name, Pool(levels=(0,)), 0), (), 50, 20))
+    assert not list(proposals(make_sampler(name, Pool(levels=(0,), scenario=US23), 0), (), 50, 20))
 
 
 def test_batches_that_ended_together_are_kept_together():

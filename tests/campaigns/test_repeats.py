@@ -28,6 +28,7 @@ from merge_sumo.reports.report import write_report
 from merge_sumo.studies.certificate import certify, runs_points_on
 from merge_sumo.studies.versions import rerun, settings_today
 from merge_sumo.system.workers import open_workers
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
 SHY = """
@@ -193,7 +194,7 @@ def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path)
 
 
 def test_a_certificate_of_what_remembers_is_none(vut, tmp_path):
-    settings = CampaignSettings(vut=vut(IN_ITS_CLASS), levels=(0,))
+    settings = CampaignSettings(vut=vut(IN_ITS_CLASS), levels=(0,), scenario=US23)
     plan = resolve(settings)
     with open_workers(1) as there:
         run = runs_points_on(there, settings, plan, tmp_path)
@@ -216,16 +217,21 @@ def Vut(seen):
 
 
 def test_a_client_that_nobody_starts_is_not_waited_for_again(run):
-    settings = CampaignSettings(vut="traci", levels=(0,))
+    settings = CampaignSettings(vut="traci", levels=(0,), scenario=US23)
     assert chosen_again(run.outcomes, settings) == []
-    started = CampaignSettings(vut="traci", vut_command="python3 client.py {port}", levels=(0,))
+    started = CampaignSettings(
+        vut="traci", vut_command="python3 client.py {port}", levels=(0,), scenario=US23
+    )
     assert len(chosen_again(run.outcomes, started)) == 8
 
 
 def test_drivers_of_the_package_run_once(run, tmp_path):
     assert read_repeats(run) == []
     assert not (run.folder / REPEATS).exists()
-    assert chosen_again(run.outcomes, CampaignSettings(vut="design1", levels=(0,))) == []
+    assert (
+        chosen_again(run.outcomes, CampaignSettings(vut="design1", levels=(0,), scenario=US23))
+        == []
+    )
 
 
 def test_a_campaign_that_went_on_says_the_same_as_one_that_never_stopped(vut, tmp_path):

@@ -15,6 +15,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import Case, Pool
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
@@ -40,7 +41,7 @@ def outcomes(*failures_by_batch: int, safe: int = 1) -> list[Outcome]:
             failed = place < failures
             x = -340.0 + 16.0 * found if failed else -181.0
             found += failed
-            case = Case(level=0, x_pov0_m=x, v_pov0_mps=30.0)
+            case = Case(level=0, x_pov0_m=x, v_pov0_mps=30.0, scenario=US23)
             end, score = End.MERGED, -600.0 if failed else -1.0
             measures = bare_measures(end, score)
             ran.append(Outcome(len(ran), batch, case, measures))
@@ -49,7 +50,7 @@ def outcomes(*failures_by_batch: int, safe: int = 1) -> list[Outcome]:
 
 def rule(monkeypatch, *says: float, share: float = 0.1) -> StoppingRule:
     monkeypatch.setattr(Oracle, "says", says)
-    return StoppingRule(share, 20, lambda: Oracle(Pool(levels=(0,)), 0))
+    return StoppingRule(share, 20, lambda: Oracle(Pool(levels=(0,), scenario=US23), 0))
 
 
 class TestTheRule:
@@ -108,13 +109,23 @@ class TestWhatIsRefused:
     def test_a_share_that_is_none(self, share):
         with pytest.raises(UserError, match="--stop-after-converged is"):
             CampaignSettings(
-                vut="design1", levels=(0,), sampler="coverage", stop_after_converged=share
+                vut="design1",
+                levels=(0,),
+                sampler="coverage",
+                stop_after_converged=share,
+                scenario=US23,
             )
 
     @pytest.mark.parametrize("sampler", ["uniform", "annealing", "subset", "gpr"])
     def test_a_sampler_that_cannot_tell(self, sampler):
         with pytest.raises(UserError, match="choose --sampler coverage"):
-            CampaignSettings(vut="design1", levels=(0,), sampler=sampler, stop_after_converged=0.01)
+            CampaignSettings(
+                vut="design1",
+                levels=(0,),
+                sampler=sampler,
+                stop_after_converged=0.01,
+                scenario=US23,
+            )
 
 
 def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(tmp_path):

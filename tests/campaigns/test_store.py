@@ -48,6 +48,7 @@ def cases(draw) -> Case:
         v_pov0_mps=draw(st.floats(0.0, 45.0)),
         svo_rad=draw(svo),
         v_vut0_mps=draw(st.floats(0.0, 45.0)),
+        scenario=US23,
     )
 
 
@@ -87,7 +88,9 @@ any_outcome = st.builds(
 def episode(index: int, batch: int = 0, steps: int = 60) -> tuple[Outcome, Trajectory]:
     """Return an episode with numbers that no short decimal holds, and its outcome."""
     rng = np.random.default_rng(index)
-    case = Case(level=0, x_pov0_m=-200.0 - index / 3.0, v_pov0_mps=30.0 + 1.0 / (index + 3.0))
+    case = Case(
+        level=0, x_pov0_m=-200.0 - index / 3.0, v_pov0_mps=30.0 + 1.0 / (index + 3.0), scenario=US23
+    )
     motion = rng.normal(size=(steps + 1, 2, 3))
     motion[:, :, 0] = np.linspace(-180.0, -1.0, steps + 1)[:, None]
     motion[-1, :, 0] = rng.uniform(0.0, 2.0, 2)
@@ -110,9 +113,9 @@ class TestARecord:
     @examples
     @given(any_outcome)
     def test_survives_to_the_last_bit(self, outcome):
-        assert Outcome.from_json(json.dumps(outcome.to_record())) == outcome
+        assert Outcome.from_json(json.dumps(outcome.to_record()), scenario=US23) == outcome
         line = to_line(outcome)
-        again = Outcome.from_json(line)
+        again = Outcome.from_json(line, scenario=US23)
         assert again == outcome
         assert to_line(again) == line, "repr tells floats apart that == does not: -0.0 and 0.0"
 
@@ -132,7 +135,7 @@ class TestARecord:
 
     def test_has_no_orientation_below_level_2(self):
         outcome, _ = episode(0)
-        social = Case(level=2, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=0.25)
+        social = Case(level=2, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=0.25, scenario=US23)
         assert json.loads(to_line(outcome))["svo_rad"] is None
         assert json.loads(to_line(replace(outcome, case=social)))["svo_rad"] == 0.25
 
@@ -151,33 +154,36 @@ class TestARecord:
 
 class TestReading:
     def test_gives_the_outcomes_in_order(self):
-        outcomes, torn = read_outcomes(b"".join(lines_of(4)), "outcomes.jsonl")
+        outcomes, torn = read_outcomes(b"".join(lines_of(4)), "outcomes.jsonl", scenario=US23)
         assert outcomes == [episode(index)[0] for index in range(4)]
         assert not torn
 
     def test_of_nothing_gives_nothing(self):
-        assert read_outcomes(b"", "outcomes.jsonl") == ([], False)
+        assert read_outcomes(b"", "outcomes.jsonl", scenario=US23) == ([], False)
 
     def test_drops_a_last_line_that_is_torn_at_any_byte(self):
         whole, last = b"".join(lines_of(2)), lines_of(3)[2]
         before = [episode(0)[0], episode(1)[0]]
         for cut in range(1, len(last)):
-            assert read_outcomes(whole + last[:cut], "outcomes.jsonl") == (before, True)
-        assert len(read_outcomes(whole + last, "outcomes.jsonl")[0]) == 3
+            assert read_outcomes(whole + last[:cut], "outcomes.jsonl", scenario=US23) == (
+                before,
+                True,
+            )
+        assert len(read_outcomes(whole + last, "outcomes.jsonl", scenario=US23)[0]) == 3
 
     @pytest.mark.parametrize("cut", [0, 1, 2, 20, 200, -2])
     def test_names_a_line_in_the_middle_that_is_torn(self, cut):
         lines = lines_of(3)
         lines[1] = lines[1][:cut] + b"\n"
         with pytest.raises(UserError) as error:
-            read_outcomes(b"".join(lines), "outcomes.jsonl")
+            read_outcomes(b"".join(lines), "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 2", "outcomes.jsonl")
 
     def test_names_a_line_that_lost_its_end(self):
         lines = lines_of(3)
         lines[1] = lines[1].rstrip()
         with pytest.raises(UserError) as error:
-            read_outcomes(b"".join(lines), "outcomes.jsonl")
+            read_outcomes(b"".join(lines), "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 2")
 
     @pytest.mark.parametrize(
@@ -187,7 +193,9 @@ class TestReading:
     def test_names_the_first_line_that_is_not_in_its_place(self, order, line):
         lines = lines_of(3)
         with pytest.raises(UserError) as error:
-            read_outcomes(b"".join(lines[index] for index in order), "outcomes.jsonl")
+            read_outcomes(
+                b"".join(lines[index] for index in order), "outcomes.jsonl", scenario=US23
+            )
         assert_sentence(error, f"line {line} ")
 
     @pytest.mark.parametrize(
@@ -195,7 +203,7 @@ class TestReading:
     )
     def test_refuses_a_line_that_is_no_record(self, line):
         with pytest.raises(UserError) as error:
-            read_outcomes(lines_of(1)[0] + line + b"\n", "outcomes.jsonl")
+            read_outcomes(lines_of(1)[0] + line + b"\n", "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 2")
 
     @pytest.mark.parametrize("field", [*SPEC_FIELDS, "error"])
@@ -203,13 +211,13 @@ class TestReading:
         record = episode(0)[0].to_record()
         del record[field]
         with pytest.raises(UserError) as error:
-            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl")
+            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 1", field)
 
     def test_refuses_a_record_with_a_field_that_nobody_knows(self):
         record = {**episode(0)[0].to_record(), "scroe": -1.0}
         with pytest.raises(UserError) as error:
-            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl")
+            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 1", "scroe")
 
     @pytest.mark.parametrize(
@@ -241,7 +249,7 @@ class TestReading:
     def test_refuses_a_value_of_the_wrong_type(self, field, value):
         record = {**episode(0)[0].to_record(), field: value}
         with pytest.raises(UserError) as error:
-            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl")
+            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 1")
 
 

@@ -10,6 +10,7 @@ import make_scenarios
 import numpy as np
 import pytest
 from merges import HALF, LIKE_A_ROUNDABOUT, SMALLER
+from plans import POVS
 
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
@@ -30,7 +31,7 @@ from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.registry import vut_factory
 
-REWARD = Reward(RewardWeights())
+REWARD = Reward(RewardWeights(), scenario=US23)
 REGRET_BOUNDS = {
     "pov1": (0.01, 0.05),
     "vut1": (0.01, 0.05),
@@ -43,14 +44,14 @@ REGRET_BOUNDS = {
 
 def uniform_cases(level, count, seed=0):
     points = np.random.default_rng(seed).random((count, 3 if level == 2 else 2))
-    return from_unit(points, level)
+    return from_unit(points, level, scenario=US23)
 
 
 def played(vut, cases, corridors=32):
     """Return the measures of cases, in order, and the trajectories."""
-    with World(corridors) as world:
+    with World(corridors, scenario=US23) as world:
         driver = vut_factory(vut)(corridors)
-        got = dict(rollout(world, PovLibrary(corridors), driver, cases))
+        got = dict(rollout(world, PovLibrary(corridors, POVS), driver, cases))
     trajectories = [got[index] for index in range(len(cases))]
     return [measure(t) for t in trajectories], trajectories
 
@@ -60,7 +61,7 @@ def picture(vut, level, count):
     cases = uniform_cases(level, count, seed=1)
     measures, _ = played(vut, cases)
     failing = (c for c, m in zip(cases, measures, strict=True) if m.is_close)
-    points = to_unit(failing, level)
+    points = to_unit(failing, level, scenario=US23)
     return fmc(points), np.bincount(regions(points)) if len(points) else np.array([])
 
 
@@ -105,19 +106,21 @@ def test_features_are_finite_and_bounded_wherever_a_vut_may_take_a_driver():
     n = 20_000
     found = features(
         rng.uniform(-900, 1800, n), rng.uniform(0, 95, n), rng.uniform(-182, 20, n),
-        rng.uniform(0, 80, n), rng.uniform(0, math.pi / 2, n),
+        rng.uniform(0, 80, n), rng.uniform(0, math.pi / 2, n), scenario=US23
     )  # fmt: skip
     assert found.shape == (n, 28)
     assert np.isfinite(found).all()
     zero = np.zeros(1)
-    standing = features(zero - 200.0, zero, zero - 100.0, zero)
+    standing = features(zero - 200.0, zero, zero - 100.0, zero, scenario=US23)
     assert np.isfinite(standing).all()
 
 
 def papers_features(x_pov, v_pov, x_vut, v_vut):
     """Return what a network of the paper's scenario sees, with its numbers written out."""
     distance = np.maximum(-x_vut, 0.0)
-    t_level0 = np.minimum(level0_time_to(distance, v_vut), 20.0)
+    t_level0 = np.minimum(
+        level0_time_to(distance, v_vut, US23.level0_a_mps2, US23.level0_v_mps), 20.0
+    )
     t_constant = np.minimum(distance / np.maximum(v_vut, 0.5), 20.0)
     t_full = (np.sqrt(v_vut * v_vut + 4.0 * distance) - v_vut) / 2.0
     t_brake = np.minimum(t_level0, v_pov / 4.0)
@@ -153,13 +156,15 @@ def states(n):
 
 class TestOtherScenarios:
     def test_the_shipped_networks_see_the_paper_s_numbers_to_the_last_bit(self):
-        assert np.array_equal(features(*states(20_000).T), papers_features(*states(20_000).T))
+        assert np.array_equal(
+            features(*states(20_000).T, scenario=US23), papers_features(*states(20_000).T)
+        )
         assert actions_mps2(US23).tolist() == [-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0]
 
     def test_in_a_merge_of_half_the_size_they_see_the_same_and_act_half(self):
         x_pov, v_pov, x_vut, v_vut = (states(20_000) / 2).T
         half = features(x_pov, v_pov, x_vut, v_vut, scenario=HALF)
-        assert np.array_equal(half, features(*states(20_000).T))
+        assert np.array_equal(half, features(*states(20_000).T, scenario=US23))
         assert np.array_equal(actions_mps2(HALF), actions_mps2(US23) / 2)
 
     def test_a_driver_of_corridors_with_two_scenarios_acts_in_each_as_if_alone(self):
@@ -228,7 +233,7 @@ class TestTheExampleRuns:
 class TestRationality:
     @pytest.mark.parametrize("name", ["pov1", "vut1", "pov2"])
     def test_no_collision_in_10000_uniform_cases(self, name):
-        cases = checking.check_cases(name, 10_000, seed=5)
+        cases = checking.check_cases(name, 10_000, seed=5, scenario=US23)
         network, opponent = load_network(name), checking.opponents(name, None)
         pair = (network, opponent) if name.startswith("pov") else (opponent, network)
         returns = checking.returns_of(checking.play(cases, *pair), REWARD)
@@ -236,19 +241,19 @@ class TestRationality:
 
     @pytest.mark.parametrize("name", NETWORKS)
     def test_regret_over_300_cases_that_training_never_saw(self, name):
-        found = checking.check_policy(name)
+        found = checking.check_policy(name, scenario=US23)
         mean_bound, p99_bound = REGRET_BOUNDS[name]
         assert found.mean_regret <= mean_bound
         assert found.p99_regret <= p99_bound
         assert found.avoidable_collisions == 0
 
     def test_a_level0_driver_in_their_place_would_collide(self):
-        cases = checking.check_cases("pov1", 2000, seed=5)
+        cases = checking.check_cases("pov1", 2000, seed=5, scenario=US23)
         returns = checking.returns_of(checking.play(cases, Level0Pov, Level0Vut), REWARD)
         assert returns.collided.sum() > 20
 
     def test_a_prosocial_pov_gives_up_its_own_return_for_the_vuts(self):
-        cases = checking.check_cases("pov2", 4000, seed=6)
+        cases = checking.check_cases("pov2", 4000, seed=6, scenario=US23)
         pov2, vut1 = load_network("pov2"), load_network("vut1")
         vut_ego, pov_ego = [], []
         for svo_rad in (0.0, 0.375, 0.75, 1.125, 1.5):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plans import plan_for
+from plans import POVS, plan_for
 
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import level0_time_to
@@ -35,7 +35,7 @@ from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S, US23, Scenario
 from merge_sumo.values.trajectory import End, Trajectory
 
-CASE = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0)
+CASE = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=US23)
 TABLES = Path(__file__).parents[1] / "data" / "reference"
 OF_TABLE = {"CC": "careful", "FSM": "fsm", "Reg157": "reg157", "RSS": "rss"}
 
@@ -260,6 +260,7 @@ class TestTables:
                 x_pov0_m=float(row["x_pov0_m"]),
                 v_pov0_mps=float(row["v_pov0_mps"]),
                 svo_rad=float(row["svo_rad"]) if row["svo_rad"] else None,
+                scenario=US23,
             )
             for row in rows
         ]
@@ -291,7 +292,7 @@ class TestTables:
 def driven(name, cases):
     """Return when merges by eq. (4) end, dx at M, and the VUT's speed there, (n,) each."""
     n = len(cases)
-    vut, pov = REFERENCES[name](n), PovLibrary(n)
+    vut, pov = REFERENCES[name](n), PovLibrary(n, POVS)
     for corridor, case in enumerate(cases):
         vut.begin(corridor, case)
         pov.begin(corridor, case)
@@ -321,9 +322,11 @@ UNITS = (("x", "m"), ("v", "mps"), ("a", "mps2"))
 
 @pytest.mark.parametrize("name", ["level0", *REFERENCES])
 def test_only_the_blind_driver_collides_where_both_are_due_at_the_same_time(name):
-    due_s = level0_time_to(one(182), one(18))[0]
+    due_s = level0_time_to(one(182), one(18), US23.level0_a_mps2, US23.level0_v_mps)[0]
     speeds = np.arange(25.0, 35.5, 2.0)
-    cases = [Case(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v) for v in speeds.tolist()]
+    cases = [
+        Case(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v, scenario=US23) for v in speeds.tolist()
+    ]
     with Simulator(plan_for(name, corridors=6)) as ground:
         gaps = [abs(ran.x_pov_m[-1] - ran.x_vut_m[-1]) for _, ran in ground.run(cases)]
         assert len(gaps) == len(cases)

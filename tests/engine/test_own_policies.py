@@ -43,13 +43,13 @@ def home(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def same(home) -> Path:
     """Return a folder with the shipped policies."""
-    return Path(shutil.copytree(policies_of(), home / "same"))
+    return Path(shutil.copytree(policies_of(scenario=US23), home / "same"))
 
 
 @pytest.fixture(scope="module")
 def swapped(home) -> Path:
     """Return a folder in which the POV of level 1 is the shipped VUT, and the other way round."""
-    folder = Path(shutil.copytree(policies_of(), home / "swapped"))
+    folder = Path(shutil.copytree(policies_of(scenario=US23), home / "swapped"))
     one, other = folder / "pov1.safetensors", folder / "vut1.safetensors"
     first, second = one.read_bytes(), other.read_bytes()
     one.write_bytes(second)
@@ -63,7 +63,7 @@ def swapped(home) -> Path:
 @pytest.fixture(scope="module")
 def one(home) -> Path:
     """Return a folder in which only the POV of level 1 is trained."""
-    folder = Path(shutil.copytree(policies_of(), home / "one"))
+    folder = Path(shutil.copytree(policies_of(scenario=US23), home / "one"))
     write(folder, {"pov1": networks(folder)["pov1"]})
     return folder
 
@@ -265,7 +265,7 @@ class TestOtherCommands:
         assert code == 2
         assert f"no policy 'vut1' in {one}" in err
         pytest.importorskip("onnx")
-        for name, folder in (("vut1", swapped), ("pov1", policies_of())):
+        for name, folder in (("vut1", swapped), ("pov1", policies_of(scenario=US23))):
             assert call("policies", "export", name, "--out", name, "--policies", folder)[0] == 0
         assert Path("vut1").read_bytes().replace(b"vut1", b"pov1") == Path("pov1").read_bytes()
 
@@ -379,5 +379,8 @@ class TestAFolder:
         plan = resolve(ring)
         assert plan.povs.policies == shipped / "my-ring"
         assert plan.vut.options.policies == shipped / "my-ring"
-        assert resolve(CampaignSettings(vut="level1", levels=(1,))).povs.policies == shipped
+        assert (
+            resolve(CampaignSettings(vut="level1", levels=(1,), scenario=US23)).povs.policies
+            == shipped
+        )
         assert US23.name == "us23"

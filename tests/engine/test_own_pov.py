@@ -25,6 +25,7 @@ import merge_sumo as ms
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import CHECKSUM, OUTCOMES, SETTINGS, Run
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
+from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.pov_adapter import PovAdapter
 from merge_sumo.engine.povs import Povs, own_pov
 from merge_sumo.engine.simulator import Simulator
@@ -33,7 +34,7 @@ from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import Case, from_unit
-from merge_sumo.values.scenario import LEVELS, OWN, Scenario
+from merge_sumo.values.scenario import LEVELS, OWN, US23, Scenario
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions, seen_at_start
@@ -95,7 +96,10 @@ def run(
     spec: str | None, cases: list[Case], vut: str = "design2", corridors: int = 4, **options
 ) -> list[Trajectory]:
     """Return what became of every case against a POV of one's own."""
-    povs = Povs(own=None if spec is None else own_pov(spec, VutOptions(**options)))
+    povs = Povs(
+        policies=policies_of(US23),
+        own=None if spec is None else own_pov(spec, VutOptions(**options)),
+    )
     scenario = cases[0].scenario
     with Simulator(
         plan_for(factory(vut), scenario=scenario, povs=povs, corridors=corridors)
@@ -131,7 +135,7 @@ class TestTheSeat:
     def test_shows_the_car_of_the_mainline_as_vut_and_the_vut_as_pov(self):
         noting = Noting(2)
         seat = PovAdapter(noting)
-        case = Case(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, v_vut0_mps=17.0)
+        case = Case(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, v_vut0_mps=17.0, scenario=US23)
         seat.begin(1, case)
         assert noting.begun == [(1, (0.0, -182.0, 17.0, -273.0, 33.0))]
         active, step = np.array([False, True]), np.array([0, 7])
@@ -146,7 +150,9 @@ class TestTheSeat:
     @pytest.mark.parametrize("x_pov0_m", [-900.0, -1e-12, 0.0])
     def test_takes_a_case_from_wherever_the_pov_starts(self, x_pov0_m):
         noting = Noting(1)
-        PovAdapter(noting).begin(0, Case(level=OWN, x_pov0_m=x_pov0_m, v_pov0_mps=33.0))
+        PovAdapter(noting).begin(
+            0, Case(level=OWN, x_pov0_m=x_pov0_m, v_pov0_mps=33.0, scenario=US23)
+        )
         assert noting.begun[0][1].x_vut_m == pytest.approx(x_pov0_m, abs=1e-9)
 
     def test_in_traffic_shows_every_car_itself(self):
@@ -185,7 +191,7 @@ class TestAPov:
                 return 0.5
         """
         spec = pov(dedent(source))
-        case = Case(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0)
+        case = Case(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
         (motion,) = run(spec, [case], vut="level0")
         first, *_, last = Path("seen.txt").read_text().splitlines()
         state = "x_pov_m=-182.0, v_pov_mps=18.0, x_vut_m=-273.0, v_vut_mps=33.0"
@@ -198,7 +204,7 @@ class TestAPov:
     def test_may_be_the_very_file_that_is_the_vut(self):
         spec = pov(YIELDS)
         hosted = run(spec, own(cases_of(6)), vut=spec)
-        povs = Povs(own=own_pov(spec, VutOptions(in_process=True)))
+        povs = Povs(policies=policies_of(US23), own=own_pov(spec, VutOptions(in_process=True)))
         with Simulator(plan_for(factory(spec, in_process=True), povs=povs, corridors=4)) as ground:
             found = dict(ground.run(own(cases_of(6))))
         assert same(hosted, [found[k] for k in range(6)])
@@ -225,7 +231,9 @@ class TestAPov:
         pov(YIELDS)
         rng = np.random.default_rng(3)
         points = rng.random((12, 3))
-        others = [from_unit(points[:, : 2 + (level == 2)], level) for level in LEVELS]
+        others = [
+            from_unit(points[:, : 2 + (level == 2)], level, scenario=US23) for level in LEVELS
+        ]
         cases = [case for group in zip(*others, own(others[0]), strict=True) for case in group]
         mixed = run(spec, cases, vut="sumo:IDM", corridors=5)
         learned = [case for case in cases if case.level != OWN]
@@ -246,18 +254,20 @@ class TestSumosOwnPov:
     @pytest.mark.parametrize("model", ["IDM", *map(LONG, ("Krauss", "EIDM", "ACC", "CACC"))])
     def test_keeps_its_speed_where_nobody_is(self, model):
         # It starts so near to M that it is past it long before the VUT.
-        case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=31.0)
+        case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=31.0, scenario=US23)
         (motion,) = run(f"sumo:{model}", [case])
         assert motion.v_pov_mps == pytest.approx(31.0, abs=0.3)
 
     def test_goes_for_the_speed_that_it_is_told_within_the_limits(self):
-        case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=34.0)
+        case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=34.0, scenario=US23)
         (motion,) = run("sumo:IDM?maxSpeed=30", [case])
         assert motion.v_pov_mps[-1] == pytest.approx(30.0, abs=0.1)
         assert motion.a_pov_mps2.min() == pytest.approx(-4.0)
 
     def test_brakes_for_the_vut_where_level_0_does_not(self):
-        (motion,) = run("sumo:IDM", [Case(level=OWN, x_pov0_m=-280.0, v_pov0_mps=33.0)], "level0")
+        (motion,) = run(
+            "sumo:IDM", [Case(level=OWN, x_pov0_m=-280.0, v_pov0_mps=33.0, scenario=US23)], "level0"
+        )
         assert motion.a_pov_mps2.min() < -1.0
         assert measure(motion).end is End.MERGED
 

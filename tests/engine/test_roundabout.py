@@ -45,6 +45,7 @@ from merge_sumo.training.env import MergeGame
 from merge_sumo.training.reward import Reward, RewardWeights
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
 
@@ -136,7 +137,7 @@ class Haphazard(Driver):
 
 
 def test_random_episodes_follow_the_equations_of_motion_to_the_digit(road):
-    with World(32, road) as world:
+    with World(32, road, scenario=US23) as world:
         played = list(rollout(world, Haphazard(32, 1), Haphazard(32, 2), uniform_cases(200)))
     assert len(played) == 200
     for _, trajectory in played:
@@ -151,7 +152,7 @@ def test_random_episodes_follow_the_equations_of_motion_to_the_digit(road):
 class TestItsDrivers:
     def test_are_its_own_and_rational(self):
         folder = policies_of(ROUNDABOUT)
-        assert folder == policies_of() / "roundabout"
+        assert folder == policies_of(scenario=US23) / "roundabout"
         manifest = read_manifest(folder)
         assert tuple(manifest) == NETWORKS
         for name, entry in manifest.items():
@@ -205,7 +206,7 @@ class TestItsVut:
             failing = [
                 trajectory for _, trajectory in ground.run(cases) if measure(trajectory).is_close
             ]
-        points = to_unit((trajectory.case for trajectory in failing), level)
+        points = to_unit((trajectory.case for trajectory in failing), level, scenario=US23)
         assert bounds[0] <= (fmc(points) if failing else 0.0) <= bounds[1]
         assert {diagnose(trajectory, measure(trajectory)).kind for trajectory in failing} == kinds
 

@@ -54,7 +54,7 @@ class TestThePool:
         assert len(TRAFFIC.dimensions(level)) == dims
         points = np.random.default_rng(1).random((20, dims))
         cases = from_unit(points, level, scenario=TRAFFIC)
-        assert to_unit(cases, level) == pytest.approx(points, abs=1e-12)
+        assert to_unit(cases, level, scenario=US23) == pytest.approx(points, abs=1e-12)
 
     @pytest.mark.parametrize(("level", "dims"), [(0, 3), (1, 3), (2, 4)])
     def test_has_the_speed_of_the_vut_where_that_is_a_range(self, level, dims):
@@ -109,7 +109,9 @@ def test_the_safe_speed_is_that_of_sumos_original_krauss_model():
     attributes = {"carFollowModel": "KraussOrig1", "decel": "4", "tau": "1.3", "accel": "1000"}
     rng = np.random.default_rng(0)
     gaps, leaders = rng.uniform(0.5, 200.0, 200), rng.uniform(0.0, 45.0, 200)
-    with World(1, vut_type={**attributes, "minGap": "0", "maxSpeed": "200"}) as world:
+    with World(
+        1, vut_type={**attributes, "minGap": "0", "maxSpeed": "200"}, scenario=US23
+    ) as world:
         world.place(0, [(-340.0, 0.0), (-182.0, 18.0)])
         theirs = [
             libsumo.vehicle.getFollowSpeed("vut.0", 45.0, gap, leader, 4.0)
@@ -184,7 +186,7 @@ class TestWhatTheVutMeets:
         assert seen.others[0].x_m == -150.0
 
     def test_is_the_pov_where_there_is_no_other(self):
-        seen = seen_at_start(Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0))
+        seen = seen_at_start(Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23))
         assert seen.others == ((-300.0, 30.0),)
         assert len(seen) == 5
 

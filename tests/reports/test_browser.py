@@ -31,7 +31,7 @@ from merge_sumo.reports.version_pages import comparison_page, write_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.studies.versions import compare_runs
-from merge_sumo.values.scenario import POV
+from merge_sumo.values.scenario import POV, US23
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
@@ -821,7 +821,9 @@ class Vut:
 def test_signals_are_drawn_beside_the_motion_and_follow_its_slider(browser, tmp_path):
     (tmp_path / "my_vut.py").write_text(LEAVES, encoding="utf-8")
     vut = f"{tmp_path / 'my_vut.py'}:Vut"
-    settings = CampaignSettings(vut=vut, levels=(0,), cases=24, batch=24, sampler="uniform")
+    settings = CampaignSettings(
+        vut=vut, levels=(0,), cases=24, batch=24, sampler="uniform", scenario=US23
+    )
     run = run_campaign(settings, tmp_path / "run")
     with shown(browser, report.write_report(run)) as page:
         page.evaluate(f"location.hash = '#case-{ReportModel(run).shown[0].index}'")

@@ -363,7 +363,7 @@ class TestTheSurrogate:
         for level in (0, 1):
             surface = learn_surface(made.outcomes, level)
             told = [o for o in made.outcomes if o.case.level == level and o.measures.score]
-            chance = surface.chance(to_unit([o.case for o in told], level))
+            chance = surface.chance(to_unit([o.case for o in told], level, scenario=US23))
             failed = np.array([o.failed for o in told])
             assert chance[failed].min() > np.median(chance[~failed])
             assert chance[failed].mean() > 0.5

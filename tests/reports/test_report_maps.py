@@ -173,7 +173,7 @@ class TestWords:
 
 
 def test_a_case_is_described_by_its_coordinates():
-    plain = Case(level=2, x_pov0_m=-240.0, v_pov0_mps=30.0, svo_rad=0.5)
+    plain = Case(level=2, x_pov0_m=-240.0, v_pov0_mps=30.0, svo_rad=0.5, scenario=US23)
     assert described(plain) == "x_POV0 -240.0 m, v_POV0 30.00 m/s, psi 0.50 rad"
     queued = Case(
         level=0,

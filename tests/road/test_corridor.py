@@ -19,6 +19,7 @@ from foreign_nets import (
     plain,
     straight,
 )
+from plans import POVS
 
 from merge_sumo.engine.pov_library import PovLibrary
 from merge_sumo.engine.rollout import rollout
@@ -31,7 +32,7 @@ from merge_sumo.sumo.binding import load_libsumo, sumo_program
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.sumo.world import SPEED_MODE_COMMANDED, SimulationError, World
 from merge_sumo.values.case import from_unit
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, POV, VUT
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, POV, US23, VUT
 from merge_sumo.vuts.registry import vut_factory
 
 EXACT = 1e-9
@@ -85,7 +86,7 @@ class Commander:
 @pytest.mark.parametrize("name", ALL)
 def test_sumo_drives_300_random_episodes_by_eq_4_over_every_lane_of_the_paths(corridor, name):
     road = corridor(name)
-    with World(16, road) as world:
+    with World(16, road, scenario=US23) as world:
         commander = Commander(world)
         for k in range(16):
             commander.refill(k)
@@ -265,12 +266,12 @@ def test_a_straight_foreign_net_with_the_lengths_of_us23_gives_its_very_outcomes
     road = find_corridor(foreign_us23(tmp_path), ["-4711#0", "east&west"], ["1/2.0@x", "east&west"])
     assert (road.mainline.before_m, road.ramp.before_m) == (1000.0, 425.0)
     assert road.lane_point(-10.0, on_ramp=False)[2:] == pytest.approx((7000.0, -310.0, 0.0))
-    cases = from_unit(np.random.default_rng(4).random((100, 2)), level=0)
+    cases = from_unit(np.random.default_rng(4).random((100, 2)), level=0, scenario=US23)
     factory = vut_factory(vut)
     motions = []
     for where in (None, road):
-        with World(16, where, factory.vut.vut_type) as world:
-            ran = dict(rollout(world, PovLibrary(16), factory(16, world), cases))
+        with World(16, where, factory.vut.vut_type, scenario=US23) as world:
+            ran = dict(rollout(world, PovLibrary(16, POVS), factory(16, world), cases))
         motions.append([ran[place].motion for place in range(100)])
     for ours, theirs in zip(*motions, strict=True):
         assert np.array_equal(ours, theirs)
@@ -279,9 +280,9 @@ def test_a_straight_foreign_net_with_the_lengths_of_us23_gives_its_very_outcomes
 @pytest.mark.parametrize("name", ["priority", "lane drop"])
 def test_sumos_own_driver_is_put_where_eq_4_has_it(corridor, name):
     factory = vut_factory("sumo:Krauss")
-    cases = from_unit(np.random.default_rng(0).random((20, 2)), level=0)
-    with World(4, corridor(name), factory.vut.vut_type) as world:
-        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
+    cases = from_unit(np.random.default_rng(0).random((20, 2)), level=0, scenario=US23)
+    with World(4, corridor(name), factory.vut.vut_type, scenario=US23) as world:
+        ran = dict(rollout(world, PovLibrary(4, POVS), factory(4, world), cases))
     for trajectory in ran.values():
         assert trajectory.x_vut_m[-1] >= 0.0
         x, v, a = trajectory.motion[:, VUT].T
@@ -299,7 +300,7 @@ def test_a_world_says_when_sumo_does_not_drive_what_it_was_told(corridor):
         for _ in range(40):
             world.step(np.array([[0.0], [2.0]]))
 
-    with World(1, corridor("priority")) as world:
+    with World(1, corridor("priority"), scenario=US23) as world:
         world.place(0, [(-300.0, 30.0), (-100.0, 12.0)])
         drive(world)
         world.place(0, [(-300.0, 30.0), (-100.0, 12.0)])
@@ -313,7 +314,10 @@ def test_a_start_before_the_path_is_refused(corridor):
     road.check_room(mainline_m=340.0, ramp_m=182.0)
     with pytest.raises(UserError, match=r"ramp \(r0 r1 out\) begins 505.9 m before .* further up"):
         road.check_room(mainline_m=340.0, ramp_m=600.0)
-    with World(1, road) as world, pytest.raises(UserError, match=r"begins 505\.94 m before"):
+    with (
+        World(1, road, scenario=US23) as world,
+        pytest.raises(UserError, match=r"begins 505\.94 m before"),
+    ):
         world.place(0, [(-340.0, 30.0), (-600.0, 12.0)])
 
 
@@ -326,7 +330,7 @@ def test_idle_vehicles_of_a_short_ramp_stand_where_it_begins(tmp_path):
     )  # fmt: skip
     road = find_corridor(NetFile(net), ["in", "out"], ["r", "out"])
     assert road.ramp.before_m < 100.0
-    with World(2, road) as world:
+    with World(2, road, scenario=US23) as world:
         world.park(1)
         world.step(np.zeros((2, 2)))
         assert world.x_m[POV, 1] == pytest.approx(-182.0, abs=EXACT)

@@ -23,6 +23,7 @@ from conftest import some
 from foreign_nets import ALL, FOREIGN, OTHERS, SIX, corridor_of
 from handmade import write_run
 from lxml import etree
+from plans import POVS
 
 from merge_sumo.engine.pov_library import PovLibrary
 from merge_sumo.engine.rollout import rollout
@@ -48,7 +49,7 @@ from merge_sumo.sumo.replay_folder import (
 )
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, from_unit
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions
@@ -84,16 +85,16 @@ def folder(folder_of, tmp_path) -> Path:
 def driven(road, count: int) -> list[Trajectory]:
     """Return what SUMO drove in cases of level 0 on a road."""
     factory = vut_factory("design1")
-    cases = from_unit(np.random.default_rng(3).random((count, 2)), level=0)
-    with World(4, road) as world:
-        ran = dict(rollout(world, PovLibrary(4), factory(4, world), cases))
+    cases = from_unit(np.random.default_rng(3).random((count, 2)), level=0, scenario=US23)
+    with World(4, road, scenario=US23) as world:
+        ran = dict(rollout(world, PovLibrary(4, POVS), factory(4, world), cases))
     return [ran[index] for index in range(count)]
 
 
 def commanded(a_mps2: np.ndarray, road) -> Trajectory:
     """Return the motion of eq. (4) under accelerations, (steps, 2); no speed falls below 0."""
     far_m = (road.mainline.before_m, road.ramp.before_m)
-    case = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0)
+    case = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
     x, v = -np.minimum([-case.x_pov0_m, 182.0], far_m), np.array([case.v_pov0_mps, case.v_vut0_mps])
     rows = []
     for wanted in a_mps2:
@@ -420,13 +421,13 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
 
     client = threading.Thread(target=drive)
     client.start()
-    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
-    with World(1, road) as world:
+    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+    with World(1, road, scenario=US23) as world:
         vut = TraciVut(
             1, world.road, world.scenario, port, None, VutOptions(deadline_s=5.0, connect_s=10.0)
         )
         try:
-            ((_, trajectory),) = rollout(world, PovLibrary(1), vut, [case])
+            ((_, trajectory),) = rollout(world, PovLibrary(1, POVS), vut, [case])
         finally:
             vut.close()
             client.join()

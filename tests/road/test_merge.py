@@ -14,6 +14,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.sumo.world import World
+from merge_sumo.values.scenario import US23
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -160,7 +161,7 @@ class TestABrokenNet:
     def test_that_only_sumo_sees_through_is_refused_in_one_sentence(self, edit, tmp_path):
         path = tmp_path / "broken.net.xml"
         path.write_text(edit(default_net_path().read_text()))
-        with pytest.raises(UserError) as error, World(2, road_of(path)):
+        with pytest.raises(UserError) as error, World(2, road_of(path), scenario=US23):
             pass
         assert "\n" not in str(error.value)
         assert str(path) in str(error.value)

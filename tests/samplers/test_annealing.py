@@ -9,6 +9,7 @@ from merge_sumo.samplers.annealing import CHAINS, AnnealingSampler
 from merge_sumo.samplers.base import reflect
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import Pool
+from merge_sumo.values.scenario import US23
 
 FloatArray = np.ndarray
 
@@ -25,7 +26,7 @@ def history_of(points: FloatArray, score: FloatArray, batch: FloatArray) -> Leve
 
 
 def anneal(seed: int, batches: int, n: int = 20) -> LevelHistory:
-    sampler = AnnealingSampler(Pool(levels=(0,)), seed)
+    sampler = AnnealingSampler(Pool(levels=(0,), scenario=US23), seed)
     history = history_of(np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.int64))
     for batch in range(batches):
         rng = np.random.default_rng([seed, batch])

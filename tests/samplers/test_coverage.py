@@ -22,13 +22,14 @@ from merge_sumo.samplers.surrogate import Branches, Margin
 from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
 
 def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = True) -> Outcome:
     """Return what came of a case: a band of gaps below 6 m, unless this level never fails."""
-    x, v = to_unit([case], case.level)[0, :2].tolist()
+    x, v = to_unit([case], case.level, scenario=US23)[0, :2].tolist()
     dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7) if fails else 80.0
     overlap_m = 6.0 - abs(dx_m)
     end = End.MERGED
@@ -58,7 +59,7 @@ def play(
 
 
 def coverage_of(outcomes: list[Outcome], level: int) -> float:
-    return fmc(to_unit([o.case for o in outcomes if o.failed], level))
+    return fmc(to_unit([o.case for o in outcomes if o.failed], level, scenario=US23))
 
 
 class TestTheGround:
@@ -128,7 +129,10 @@ def test_covers_more_than_twice_of_what_uniform_covers(level, blind):
     uniform, ours = (
         statistics.median(
             coverage_of(
-                play(make_sampler(name, Pool(levels=(level,)), seed), 5, blind=blind), level
+                play(
+                    make_sampler(name, Pool(levels=(level,), scenario=US23), seed), 5, blind=blind
+                ),
+                level,
             )
             for seed in (1, 2, 3)
         )
@@ -151,7 +155,7 @@ def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
 
 
 def test_gives_more_cases_to_the_level_with_more_to_cover_but_starves_none():
-    sampler = make_sampler("coverage", Pool(levels=(0, 1, 2)), 4)
+    sampler = make_sampler("coverage", Pool(levels=(0, 1, 2), scenario=US23), 4)
     outcomes = play(sampler, 5, 30, level_that_fails=1)
     last = [o.case.level for o in outcomes if o.batch == 4]
     assert last.count(1) == 20, "5 of the half that is shared out evenly, and the other half"
@@ -159,19 +163,19 @@ def test_gives_more_cases_to_the_level_with_more_to_cover_but_starves_none():
 
 
 def test_expects_less_of_the_next_batch_the_more_it_has_covered():
-    sampler = CoverageSampler(Pool(levels=(0,)), 2)
+    sampler = CoverageSampler(Pool(levels=(0,), scenario=US23), 2)
     assert sampler.expected_gain(20) == math.inf
     play(sampler, 4)
     early = sampler.expected_gain(20)
-    play(later := CoverageSampler(Pool(levels=(0,)), 2), 14)
+    play(later := CoverageSampler(Pool(levels=(0,), scenario=US23), 2), 14)
     assert later.expected_gain(20) < 0.5 * early
 
 
 def test_learns_from_a_bounded_number_of_cases_in_a_long_campaign():
-    cases = make_sampler("uniform", Pool(levels=(0,)), 0).ask(1200)
-    sampler = make_sampler("coverage", Pool(levels=(0,)), 0)
+    cases = make_sampler("uniform", Pool(levels=(0,), scenario=US23), 0).ask(1200)
+    sampler = make_sampler("coverage", Pool(levels=(0,), scenario=US23), 0)
     sampler.tell([outcome(i, i // 40, case, blind=False) for i, case in enumerate(cases)])
-    points = to_unit(sampler.ask(10), 0)
+    points = to_unit(sampler.ask(10), 0, scenario=US23)
     assert points.shape == (10, 2)
 
 

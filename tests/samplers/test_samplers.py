@@ -20,9 +20,9 @@ from merge_sumo.values.trajectory import End
 
 TRAFFIC = replace(US23, headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 3.0))
 POOLS = {
-    "2-d": Pool(levels=(0,), v_vut0_mps=17.5),
-    "3-d": Pool(levels=(2,), v_vut0_mps=17.5),
-    "2-d and 3-d": Pool(levels=(0, 1, 2), v_vut0_mps=17.5),
+    "2-d": Pool(levels=(0,), v_vut0_mps=17.5, scenario=US23),
+    "3-d": Pool(levels=(2,), v_vut0_mps=17.5, scenario=US23),
+    "2-d and 3-d": Pool(levels=(0, 1, 2), v_vut0_mps=17.5, scenario=US23),
     "4-d": Pool(levels=(0,), v_vut0_mps=17.5, scenario=TRAFFIC),
     "4-d and 5-d": Pool(levels=(1, 2), v_vut0_mps=17.5, scenario=TRAFFIC),
     "6-d": Pool(levels=(2,), scenario=replace(TRAFFIC, v_vut0_mps=(14.0, 22.0))),
@@ -55,19 +55,19 @@ class TestTheRegistry:
 
     def test_names_the_samplers_that_there_are(self):
         with pytest.raises(UserError) as error:
-            make_sampler("grp", Pool(levels=(0,)), 0)
+            make_sampler("grp", Pool(levels=(0,), scenario=US23), 0)
         for word in ("'grp'", *SAMPLERS):
             assert word in str(error.value)
 
 
 def failures_found(name: str, levels: tuple[int, ...], seed: int, batches: int) -> int:
-    sampler = make_sampler(name, Pool(levels=levels), seed)
+    sampler = make_sampler(name, Pool(levels=levels, scenario=US23), seed)
     return sum(outcome.failed for outcome in play(sampler, batches, 20))
 
 
 def test_uniform_covers_the_pool_evenly():
-    cases = make_sampler("uniform", Pool(levels=(2,)), 3).ask(2000)
-    points = to_unit(cases, 2)
+    cases = make_sampler("uniform", Pool(levels=(2,), scenario=US23), 3).ask(2000)
+    points = to_unit(cases, 2, scenario=US23)
     assert points.shape == (2000, 3)
     assert np.abs(points.mean(axis=0) - 0.5).max() < 0.03
     assert points.min() < 0.005
@@ -85,15 +85,15 @@ def test_gpr_finds_more_failures_than_uniform_with_the_same_budget(levels):
 
 
 def test_gpr_spreads_its_batch_out():
-    sampler = make_sampler("gpr", Pool(levels=(0,)), 4)
+    sampler = make_sampler("gpr", Pool(levels=(0,), scenario=US23), 4)
     play(sampler, 4, 20)
-    points = to_unit(sampler.ask(20), 0)
+    points = to_unit(sampler.ask(20), 0, scenario=US23)
     apart = np.linalg.norm(points[:, None] - points[None], axis=2) + np.eye(20)
     assert np.median(apart.min(axis=0)) > 0.02
 
 
 def test_gpr_gives_more_cases_to_the_level_with_the_failures():
-    sampler = make_sampler("gpr", Pool(levels=(0, 1)), 4)
+    sampler = make_sampler("gpr", Pool(levels=(0, 1), scenario=US23), 4)
     cases = sampler.ask(20)
     # Level 0 never fails, all of level 1 does.
     verdicts = {0: bare_measures(End.MERGED, -5.0), 1: bare_measures(End.MERGED, -700.0)}

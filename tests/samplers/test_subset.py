@@ -15,6 +15,7 @@ from merge_sumo.samplers.subset import (
     replay,
 )
 from merge_sumo.values.case import Pool
+from merge_sumo.values.scenario import US23
 
 FloatArray = np.ndarray
 CORNER = 0.1
@@ -33,7 +34,7 @@ def history_of(points: FloatArray, batch: FloatArray) -> LevelHistory:
 
 
 def simulate(seed: int, batches: int, n: int = 20) -> LevelHistory:
-    sampler = SubsetSampler(Pool(levels=(0,)), seed)
+    sampler = SubsetSampler(Pool(levels=(0,), scenario=US23), seed)
     history = history_of(np.empty((0, 2)), np.empty(0, dtype=np.int64))
     for batch in range(batches):
         rng = np.random.default_rng([seed, batch])

@@ -23,6 +23,7 @@ from merge_sumo.system.workers import open_workers
 from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
@@ -169,11 +170,11 @@ def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float 
     curve = []
     for batch, points in enumerate(points_by_batch):
         for failed, point in [(False, (0.0, 0.0)), *((True, point) for point in points)]:
-            (case,) = from_unit(np.array([point]), 0)
+            (case,) = from_unit(np.array([point]), 0, scenario=US23)
             end, score = End.MERGED, -600.0 if failed else -1.0
             measures = bare_measures(end, score)
             outcomes.append(Outcome(len(outcomes), batch, case, measures))
-        curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0)))
+        curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0, scenario=US23)))
     return Search(outcomes, curve, sampler_s)
 
 

@@ -28,13 +28,14 @@ from merge_sumo.studies.certificate import (
     lattices_of,
 )
 from merge_sumo.system.signature import signed, user_key, verified
+from merge_sumo.values.scenario import US23
 
 LOW, HIGH = np.array([-340.0, 25.0, 0.0]), np.array([-180.0, 35.0, math.pi / 2])
 """The pool of the paper, written down again: nothing here asks the lattice or the pool."""
 
 
 def settings(*levels, vut="design2"):
-    return CampaignSettings(vut=vut, levels=levels)
+    return CampaignSettings(vut=vut, levels=levels, scenario=US23)
 
 
 def certify(settings, radius, folder, run, **other):

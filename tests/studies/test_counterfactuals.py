@@ -19,6 +19,7 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.engine.evaluate import opened_simulator
 from merge_sumo.engine.povs import Povs, own_pov
@@ -37,7 +38,7 @@ from merge_sumo.studies.counterfactuals import (
     write_avoidance,
 )
 from merge_sumo.system.workers import InProcess, Workers, open_workers
-from merge_sumo.values.scenario import OWN
+from merge_sumo.values.scenario import OWN, US23
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import vut_factory
 
@@ -158,7 +159,9 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_le
 def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
     path = tmp_path / "keeps.py"
     path.write_text("def keeps(seen):\n    return 0.0\n", encoding="utf-8")
-    povs = Povs(own=own_pov(f"{path}:keeps", VutOptions(in_process=True)))
+    povs = Povs(
+        policies=policies_of(US23), own=own_pov(f"{path}:keeps", VutOptions(in_process=True))
+    )
     failing = []
     for one in found[:4]:
         failure = run.trajectory(one.index)

@@ -36,7 +36,7 @@ def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> R
     journal = Journal.create(folder, record)
     ran = []
     for index, (x, v, became) in enumerate(points):
-        case = from_unit(np.array([[x, v]]), level)[0]
+        case = from_unit(np.array([[x, v]]), level, scenario=US23)[0]
         trajectory = drive(case, "answered nan" if became == "errs" else None)
         measures = measure(trajectory)
         if became != "errs":

@@ -31,7 +31,7 @@ from merge_sumo.values.case import V_POV0, dimensions
 from merge_sumo.values.scenario import US23
 
 LEVELS = (0, 1, 2)
-UNIFORM = read_distribution(None, LEVELS)
+UNIFORM = read_distribution(None, LEVELS, scenario=US23)
 
 
 def band(points, half_width):
@@ -180,7 +180,7 @@ class TestADistribution:
     def stated(self, tmp_path, text):
         path = tmp_path / "d.json"
         path.write_text(text if isinstance(text, str) else json.dumps(text))
-        return read_distribution(path, LEVELS)
+        return read_distribution(path, LEVELS, scenario=US23)
 
     def sample(self, distribution, level=2, n=4000):
         chances = np.random.default_rng(0).random((n, len(dimensions(level))))
@@ -266,7 +266,7 @@ class TestADistribution:
 
     def test_that_is_not_there_is_refused(self, tmp_path):
         with pytest.raises(UserError, match="cannot read"):
-            read_distribution(tmp_path / "nowhere.json", LEVELS)
+            read_distribution(tmp_path / "nowhere.json", LEVELS, scenario=US23)
 
 
 def failure_probability(run, out, **other):
@@ -276,7 +276,9 @@ def failure_probability(run, out, **other):
 
 class TestOfACampaign:
     def test_is_estimated_with_fresh_cases_and_kept(self, tmp_path):
-        settings = CampaignSettings(vut="design1", levels=(0,), cases=160, batch=20, seed=1)
+        settings = CampaignSettings(
+            vut="design1", levels=(0,), cases=160, batch=20, seed=1, scenario=US23
+        )
         run = run_campaign(settings, tmp_path / "run")
         out = tmp_path / "p.json"
         found = failure_probability(run, out, cases=600)

@@ -29,18 +29,23 @@ from merge_sumo.studies.versions import (
     rerun,
     settings_today,
 )
+from merge_sumo.values.scenario import US23
 
 
 @pytest.fixture(scope="module")
 def fixed(tmp_path_factory) -> Run:
     """Return a campaign of a VUT that does not fail at level 0: design2."""
-    settings = CampaignSettings(vut="design2", levels=(0,), cases=60, batch=20, seed=1)
+    settings = CampaignSettings(
+        vut="design2", levels=(0,), cases=60, batch=20, seed=1, scenario=US23
+    )
     return run_campaign(settings, tmp_path_factory.mktemp("fixed") / "run")
 
 
 @pytest.fixture(scope="module")
 def other_seed(tmp_path_factory) -> Run:
-    settings = CampaignSettings(vut="design1", levels=(0,), cases=60, batch=20, seed=2)
+    settings = CampaignSettings(
+        vut="design1", levels=(0,), cases=60, batch=20, seed=2, scenario=US23
+    )
     return run_campaign(settings, tmp_path_factory.mktemp("other") / "run")
 
 

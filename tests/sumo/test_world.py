@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import some
+from plans import POVS
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut
@@ -15,7 +16,7 @@ from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, from_unit
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, POV, VUT
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, POV, US23, VUT
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.registry import vut_factory
@@ -24,7 +25,7 @@ EXACT = 1e-9
 
 
 def random_cases(count: int, seed: int = 0) -> list[Case]:
-    return from_unit(np.random.default_rng(seed).random((count, 2)), level=0)
+    return from_unit(np.random.default_rng(seed).random((count, 2)), level=0, scenario=US23)
 
 
 class RandomDriver(Driver):
@@ -71,7 +72,7 @@ def assert_eq4(trajectory):
 @pytest.mark.parametrize("corridors", some([1, 32], 32))
 def test_sumo_moves_random_episodes_by_eq_4_at_every_step_with_refills(corridors):
     cases = random_cases(300)
-    with World(corridors) as world:
+    with World(corridors, scenario=US23) as world:
         trajectories = run_all(world, RandomDriver(corridors), RandomDriver(corridors), cases)
     lengths = {len(t.motion) for t in trajectories}
     assert len(lengths) > 5, "refills happen at different times"
@@ -82,8 +83,10 @@ def test_sumo_moves_random_episodes_by_eq_4_at_every_step_with_refills(corridors
 
 def test_a_vehicle_brakes_to_a_stand_stays_there_and_starts_again():
     case = random_cases(1)[0]
-    with World(2) as world:
-        (trajectory,) = run_all(world, PovLibrary(2), RandomDriver(2, brake_first_steps=60), [case])
+    with World(2, scenario=US23) as world:
+        (trajectory,) = run_all(
+            world, PovLibrary(2, POVS), RandomDriver(2, brake_first_steps=60), [case]
+        )
     stand = trajectory.v_vut_mps == 0.0
     assert stand.sum() >= 10
     assert not stand[-1]
@@ -95,9 +98,9 @@ def test_episodes_are_the_same_in_1_and_in_32_corridors():
     cases = random_cases(300, seed=1)
     outcomes = []
     for corridors in (1, 32):
-        with World(corridors) as world:
+        with World(corridors, scenario=US23) as world:
             vut = vut_factory("design2")(corridors)
-            outcomes.append(run_all(world, PovLibrary(corridors), vut, cases))
+            outcomes.append(run_all(world, PovLibrary(corridors, POVS), vut, cases))
     for one, many in zip(*outcomes, strict=True):
         assert np.array_equal(one.motion, many.motion)
         assert measure(one) == measure(many)
@@ -108,7 +111,7 @@ def test_sumo_holds_the_very_speeds_that_it_was_told(model):
     """They are not read back: to the last bit it would give the same numbers."""
     rng = np.random.default_rng(2)
     vut_type = None if model is None else vut_factory(model).vut.vut_type
-    with World(16, vut_type=vut_type) as world:
+    with World(16, vut_type=vut_type, scenario=US23) as world:
         for case in random_cases(200):
             world.place(int(rng.integers(16)), case.starts())
             for _ in range(3):
@@ -121,7 +124,7 @@ def test_sumo_holds_the_very_speeds_that_it_was_told(model):
 
 @pytest.mark.parametrize("speed_mps", [29.0, 31.0])
 def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps):
-    with World(1) as world:
+    with World(1, scenario=US23) as world:
         world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
         world.step(np.zeros((2, 1)))
         world._set_speed("pov.0", speed_mps)
@@ -130,7 +133,7 @@ def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps
 
 
 def test_sumo_reports_the_acceleration_that_was_commanded():
-    with World(3) as world:
+    with World(3, scenario=US23) as world:
         for k in range(3):
             world.place(k, [(-300.0, 30.0), (-182.0, 18.0)])
         command = np.array([[0.0, 1.0, -4.0], [2.0, -1.5, 0.0]])
@@ -139,7 +142,7 @@ def test_sumo_reports_the_acceleration_that_was_commanded():
 
 
 def test_a_constant_speed_pov_covers_33_m_in_a_second():
-    with World(1) as world:
+    with World(1, scenario=US23) as world:
         world.place(0, [(-273.0, 33.0), (-182.0, 18.0)])
         for _ in range(10):
             world.step(np.zeros((2, 1)))
@@ -148,7 +151,7 @@ def test_a_constant_speed_pov_covers_33_m_in_a_second():
 
 
 def test_lane_coordinates_go_on_behind_the_merge_point():
-    with World(1) as world:
+    with World(1, scenario=US23) as world:
         world.place(0, [(-1.0, 30.0), (-2.0, 25.0)])
         world.step(np.zeros((2, 1)))
         assert world.x_m[:, 0] == pytest.approx([2.0, 0.5], abs=EXACT)
@@ -166,8 +169,8 @@ def test_a_pov_that_accelerates_until_the_timeout_stays_on_the_road():
         def act(self, scene):
             return np.full(self.corridors, A_MIN_MPS2)
 
-    case = Case(level=0, x_pov0_m=-180.0, v_pov0_mps=35.0)
-    with World(1) as world:
+    case = Case(level=0, x_pov0_m=-180.0, v_pov0_mps=35.0, scenario=US23)
+    with World(1, scenario=US23) as world:
         (trajectory,) = run_all(world, Fastest(1), Stop(1), [case])
     assert trajectory.end is End.TIMEOUT
     assert len(trajectory.motion) == MAX_STEPS + 1
@@ -177,16 +180,16 @@ def test_a_pov_that_accelerates_until_the_timeout_stays_on_the_road():
 
 
 def test_the_episode_ends_at_the_first_step_at_which_the_vut_is_at_m():
-    with World(4) as world:
-        for trajectory in run_all(world, PovLibrary(4), Level0Vut(4), random_cases(20)):
+    with World(4, scenario=US23) as world:
+        for trajectory in run_all(world, PovLibrary(4, POVS), Level0Vut(4), random_cases(20)):
             assert trajectory.x_vut_m[-1] >= 0.0
             assert (trajectory.x_vut_m[:-1] < 0.0).all()
 
 
 def test_a_second_open_world_is_refused_and_the_first_goes_on():
-    with World(1) as world:
+    with World(1, scenario=US23) as world:
         with pytest.raises(UserError, match="one simulation per process"):
-            World(1)
+            World(1, scenario=US23)
         world.step(np.zeros((2, 1)))
 
 
@@ -211,8 +214,8 @@ class Broken(Driver):
 @pytest.mark.parametrize(("answer", "reason"), [(np.nan, "nan"), (-np.inf, "inf")])
 def test_an_answer_that_is_no_number_ends_only_its_own_case(answer, reason):
     cases = random_cases(40)
-    with World(8) as world:
-        trajectories = run_all(world, PovLibrary(8), Broken(8, answer), cases)
+    with World(8, scenario=US23) as world:
+        trajectories = run_all(world, PovLibrary(8, POVS), Broken(8, answer), cases)
     for case, trajectory in zip(cases, trajectories, strict=True):
         if case.v_pov0_mps > 30.0:
             assert trajectory.end is End.VUT_ERROR
@@ -225,8 +228,8 @@ def test_an_answer_that_is_no_number_ends_only_its_own_case(answer, reason):
 
 def test_a_vut_that_raises_when_it_is_reset_is_an_outcome():
     cases = random_cases(20)
-    with World(4) as world:
-        trajectories = run_all(world, PovLibrary(4), Broken(4, "raise"), cases)
+    with World(4, scenario=US23) as world:
+        trajectories = run_all(world, PovLibrary(4, POVS), Broken(4, "raise"), cases)
     for case, trajectory in zip(cases, trajectories, strict=True):
         failed = case.v_pov0_mps > 30.0
         assert (trajectory.end is End.VUT_ERROR) == failed
@@ -239,8 +242,8 @@ def test_a_wrong_shape_or_type_is_a_vut_error_and_no_case_is_lost(answer):
         def act(self, scene):
             return answer
 
-    with World(4) as world:
-        trajectories = run_all(world, PovLibrary(4), Wrong(4), random_cases(9))
+    with World(4, scenario=US23) as world:
+        trajectories = run_all(world, PovLibrary(4, POVS), Wrong(4), random_cases(9))
     assert all(t.end is End.VUT_ERROR and t.error for t in trajectories)
 
 
@@ -249,8 +252,8 @@ def test_answers_outside_the_limits_are_clipped_and_counted():
         def act(self, scene):
             return np.full(self.corridors, 7.0)
 
-    with World(4) as world:
-        for trajectory in run_all(world, PovLibrary(4), Strong(4), random_cases(6)):
+    with World(4, scenario=US23) as world:
+        for trajectory in run_all(world, PovLibrary(4, POVS), Strong(4), random_cases(6)):
             assert trajectory.clipped_steps == len(trajectory.motion) - 1
             assert (trajectory.a_vut_mps2[:-1] == A_MAX_MPS2).all()
 
@@ -260,7 +263,7 @@ def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
     monkeypatch, half_step
 ):
     cases = random_cases(30)
-    with World(4) as world:
+    with World(4, scenario=US23) as world:
         call, calls = getattr(world, half_step), iter(range(10_000))
 
         def failing(*arguments):
@@ -269,7 +272,7 @@ def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
             call(*arguments)
 
         monkeypatch.setattr(world, half_step, failing)
-        trajectories = run_all(world, PovLibrary(4), Level0Vut(4), cases)
+        trajectories = run_all(world, PovLibrary(4, POVS), Level0Vut(4), cases)
     broken = [t for t in trajectories if t.end is End.SIM_ERROR]
     assert len(broken) == 4
     assert all("the simulation broke" in t.error for t in broken)

@@ -15,6 +15,7 @@ from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import VutFactory
 
 PAPERS = Criterion()
+POVS = Povs(policies=policies_of(US23))
 
 
 def plan_for(

@@ -9,6 +9,7 @@ from plans import plan_for
 
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import VutFactory, vut_factory
@@ -21,7 +22,7 @@ class Level0:
 
 
 def cases_of(count: int, seed: int = 0) -> list[Case]:
-    return from_unit(np.random.default_rng(seed).random((count, 2)), level=0)
+    return from_unit(np.random.default_rng(seed).random((count, 2)), level=0, scenario=US23)
 
 
 def factory(spec: object, **options: Any) -> VutFactory:

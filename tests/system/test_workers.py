@@ -35,11 +35,12 @@ from merge_sumo.system.workers import (
     workers_or_cores,
 )
 from merge_sumo.values.case import from_unit
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
 KINDS = [1, 2]
 SETTINGS = CampaignSettings(
-    vut="design1", levels=(0, 1, 2), sampler="gpr", cases=60, batch=20, seed=3
+    vut="design1", levels=(0, 1, 2), sampler="gpr", cases=60, batch=20, seed=3, scenario=US23
 )
 
 
@@ -140,7 +141,7 @@ class TestAWorkerThatDies:
         assert found == [(place, -7 if place == 7 else place * place) for place in range(20)]
 
     def test_at_a_case_makes_it_a_sim_error_with_a_reason(self):
-        cases = from_unit(np.random.default_rng(0).random((4, 2)), 0)
+        cases = from_unit(np.random.default_rng(0).random((4, 2)), 0, scenario=US23)
         plan = plan_for("design1", corridors=4)
         with open_workers(2) as workers:
             work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
@@ -154,7 +155,7 @@ class TestAWorkerThatDies:
 
 class TestWhatTravels:
     def test_arrives_as_it_was_sent(self):
-        cases = from_unit(np.random.default_rng(0).random((1, 3)), 2)
+        cases = from_unit(np.random.default_rng(0).random((1, 3)), 2, scenario=US23)
         plan = plan_for("level0", corridors=1)
         (sent,) = run_cases(plan, cases)
         came = pickle.loads(pickle.dumps(sent))  # noqa: S301 (our own)
@@ -228,7 +229,7 @@ class TestACampaign:
 
     def test_closes_its_simulation_in_this_process(self, tmp_path):
         for name in ("first", "second"):
-            settings = CampaignSettings(vut="level0", levels=(0,), cases=2, batch=2)
+            settings = CampaignSettings(vut="level0", levels=(0,), cases=2, batch=2, scenario=US23)
             run_campaign(settings, tmp_path / name)
 
     def test_is_refused_by_workers_with_other_software(self):

@@ -14,7 +14,7 @@ from merge_sumo.values.scenario import US23
 R = reward.Reward(reward.RewardWeights(
     pov_acc=0.1, pov_v_hw=0.2, vut_acc=0.04, vut_v_min=0.3, vut_v_end=0.5,
     ttc=1.4, gap=0.6, gap_full_m=60.0, critical=0.9, crash=20.0,
-))  # fmt: skip
+), US23)  # fmt: skip
 
 
 def of(term, *numbers):

@@ -44,7 +44,7 @@ from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S, US23
 
 WEIGHTS = reward.RewardWeights()
-REWARD = reward.Reward(WEIGHTS)
+REWARD = reward.Reward(WEIGHTS, US23)
 ACTIONS_MPS2 = actions_mps2(US23)
 TINY = ddqn.DdqnSettings(transitions=3_000, warm_up=1_000, updates=1_000, width=16, batch=64)
 QUICK = refine.RefineSettings(rounds=2, starts=40, searched=10, beam=8, updates=50, batch=64)
@@ -100,7 +100,9 @@ class TestEnvironments:
                 open_games &= ~(terminated | truncated)
         finally:
             games.close()
-        cases = [Case(level=1, x_pov0_m=x, v_pov0_mps=v) for x, v in start[:, :2].tolist()]
+        cases = [
+            Case(level=1, x_pov0_m=x, v_pov0_mps=v, scenario=US23) for x, v in start[:, :2].tolist()
+        ]
         played = returns_of(play(cases, Level0Pov, Level0Vut), REWARD)
         assert returns == pytest.approx(played.safe + played.pov_ego, abs=1e-9)
 
@@ -167,12 +169,12 @@ class TestEnvironments:
 
     def test_same_seed_same_starts(self):
         for starts in (pool_starts, exploring_starts):
-            one, two = (starts(50, np.random.default_rng(7)) for _ in range(2))
+            one, two = (starts(50, np.random.default_rng(7), scenario=US23) for _ in range(2))
             assert np.array_equal(one, two)
 
     def test_starts_of_half_the_size_are_half_of_the_paper_s(self):
         for starts in (pool_starts, exploring_starts):
-            one = starts(500, np.random.default_rng(7))
+            one = starts(500, np.random.default_rng(7), scenario=US23)
             half = starts(500, np.random.default_rng(7), scenario=HALF)
             assert half == pytest.approx(one / 2, rel=1e-12)
 
@@ -195,7 +197,7 @@ class TestEnvironments:
             games.close()
 
     def test_exploring_starts_are_in_the_game_and_near_conflict(self):
-        starts = exploring_starts(4000, np.random.default_rng(0))
+        starts = exploring_starts(4000, np.random.default_rng(0), scenario=US23)
         assert (starts[:, 2] < 0.0).all()
         assert (starts[:, 1] > 0.0).all()
         assert 0.55 < (starts[:, 2] > -181.9).mean() < 0.65
@@ -272,7 +274,9 @@ class TestBestResponse:
         total = 0.0
         for step in range(300):
             hold = actions[min(step // 5, len(actions) - 1)]
-            level0 = float(level0_acceleration(np.array([vv]))[0])
+            level0 = float(
+                level0_acceleration(np.array([vv]), US23.level0_a_mps2, US23.level0_v_mps)[0]
+            )
             ap, av = (hold, level0) if role == "pov" else (0.0, hold)
             ego = REWARD.pov_step(np.array([vp]), np.array([ap]))
             if role == "vut":
@@ -294,7 +298,7 @@ class TestBestResponse:
         starts = np.stack([x, v, np.full(2, -182.0), np.full(2, 18.0)], axis=1)
         best = best_response.best_response(Game(role, None, REWARD), starts)
         for x0, v0, bound in zip(x.tolist(), v.tolist(), best.tolist(), strict=True):
-            case = Case(level=1, x_pov0_m=x0, v_pov0_mps=v0)
+            case = Case(level=1, x_pov0_m=x0, v_pov0_mps=v0, scenario=US23)
             tried = [
                 self.replayed(role, case, [a] * n + [b] * m + [1.0 if role == "vut" else 0.0])
                 for a, b in itertools.product(ACTIONS_MPS2.tolist(), repeat=2)
@@ -334,7 +338,7 @@ class TestBestResponse:
         assert (every.argmax(axis=1) > 0).any()
 
     def test_that_of_half_the_size_is_the_same(self):
-        start = pool_starts(8, np.random.default_rng(3))
+        start = pool_starts(8, np.random.default_rng(3), scenario=US23)
         for role in ("pov", "vut"):
             one = best_response.best_response(Game(role, None, reward.Reward.of(US23)), start)
             half = best_response.best_response(Game(role, None, reward.Reward.of(HALF)), start / 2)
@@ -373,7 +377,7 @@ class TestGame:
     ):
         torch.manual_seed(3)
         opponent = ddqn.export(ddqn.make_network(FEATURES, 16)) if learned else None
-        start, psi = pool_starts(200, np.random.default_rng(9)), np.zeros(200)
+        start, psi = pool_starts(200, np.random.default_rng(9), scenario=US23), np.zeros(200)
         one, half = (
             Game(role, opponent, reward.Reward.of(s)).play(start * size, psi, greedy(network, s))
             for s, size in ((US23, 1.0), (HALF, 0.5))
@@ -421,7 +425,7 @@ class TestGame:
 
     def test_playing_every_action_out_is_never_worse_than_the_policy(self, policy):
         game = Game("pov", None, REWARD)
-        start, svo_rad = pool_starts(40, np.random.default_rng(3)), np.zeros(40)
+        start, svo_rad = pool_starts(40, np.random.default_rng(3), scenario=US23), np.zeros(40)
         before = game.play(start, svo_rad, policy)
         after = game.play(start, svo_rad, game.improved(policy))
         assert (after >= before - 1e-9).all()
@@ -431,7 +435,7 @@ class TestGame:
         torch.manual_seed(2)
         agent = ddqn.export(ddqn.make_network(FEATURES, 16))
         game = Game("vut", None, REWARD)
-        start, svo_rad = pool_starts(5, np.random.default_rng(4)), np.zeros(5)
+        start, svo_rad = pool_starts(5, np.random.default_rng(4), scenario=US23), np.zeros(5)
         found = best_response.beam_search(game, start, svo_rad, agent, width=16)
         for n in range(5):
             actions = iter(found.plans[n])
@@ -464,7 +468,7 @@ class TestHelix:
     @classmethod
     def library(cls, tmp_path_factory):
         folder = tmp_path_factory.mktemp("policies")
-        train_library(folder, ("pov1",), settings=SMALL)
+        train_library(folder, ("pov1",), settings=SMALL, scenario=US23)
         return folder
 
     def test_a_network_has_a_manifest_entry_and_a_log(self, library):
@@ -481,19 +485,25 @@ class TestHelix:
     def test_a_finished_network_is_not_trained_again(self, library):
         before = (library / "pov1.safetensors").stat().st_mtime_ns
         told = []
-        train_library(library, ("pov1",), settings=SMALL, on_done=lambda *said: told.append(said))
+        train_library(
+            library,
+            ("pov1",),
+            settings=SMALL,
+            on_done=lambda *said: told.append(said),
+            scenario=US23,
+        )
         assert told == [("pov1", None)]
         assert (library / "pov1.safetensors").stat().st_mtime_ns == before
 
     def test_another_seed_does_not_overwrite_a_network(self, library):
         before = (library / "pov1.safetensors").read_bytes()
         with pytest.raises(UserError, match=r"has a pov1 of another scenario, seed.*--out"):
-            train_library(library, ("pov1",), seed=1, settings=SMALL)
+            train_library(library, ("pov1",), seed=1, settings=SMALL, scenario=US23)
         assert (library / "pov1.safetensors").read_bytes() == before
 
     def test_level_2_needs_level_1_first(self, library):
         with pytest.raises(UserError, match="pov2 is trained against vut1: train that one first"):
-            train_library(library, ("pov2",), settings=SMALL)
+            train_library(library, ("pov2",), settings=SMALL, scenario=US23)
 
     @pytest.mark.parametrize("cut", [0, 7, 100, -1])
     def test_a_truncated_or_altered_file_is_refused_with_a_sentence(self, library, tmp_path, cut):
@@ -582,9 +592,9 @@ class TestTrainingForAnotherScenario:
 
     def test_networks_of_two_scenarios_do_not_mix_in_a_folder(self, trained):
         with pytest.raises(UserError, match=r"pov1 .* was trained for another scenario, ring"):
-            train_library(trained[0], ("vut2",), settings=SMALL)
+            train_library(trained[0], ("vut2",), settings=SMALL, scenario=US23)
         with pytest.raises(UserError, match="has a pov1 of another scenario"):
-            train_library(trained[0], ("pov1",), settings=SMALL)
+            train_library(trained[0], ("pov1",), settings=SMALL, scenario=US23)
 
     @pytest.mark.parametrize(
         "record",

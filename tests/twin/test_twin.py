@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from campaigning import resume_campaign, run_campaign
 from conftest import some
-from plans import plan_for
+from plans import POVS, plan_for
 
 from merge_sumo.analysis.predictions import off_m, prediction_in_words, surprises
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -47,7 +47,7 @@ from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
 
-SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2)
+SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2, scenario=US23)
 SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 
 
@@ -100,8 +100,8 @@ class TestGames:
         assert off.sum() <= 1
 
     def test_go_on_until_the_timeout_for_a_vut_that_stops(self):
-        pool = Pool(levels=(0,))
-        found = TwinRollout(pool, Povs()).play(
+        pool = Pool(levels=(0,), scenario=US23)
+        found = TwinRollout(pool, POVS).play(
             np.full((3, 2), 0.5), 0, lambda inputs, now, rows: np.full(len(rows), -4.0)
         )
         assert np.isnan(found).all()
@@ -111,20 +111,20 @@ class TestGames:
     )
     def test_are_judged_as_cases_are(self, text, tmp_path):
         (tmp_path / "slows.py").write_text(SLOWS)
-        criterion, pool, road = Criterion(text), Pool(levels=(0,)), road_for(US23)
+        criterion, pool, road = Criterion(text), Pool(levels=(0,), scenario=US23), road_for(US23)
         points = np.random.default_rng(5).random((24, 2))
         plan = plan_for(f"{tmp_path / 'slows.py'}:vut", corridors=16)
         done = run_cases(plan, pool.cases(points, 0))
         lines = centre_lines(road)
         expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap_m for one in done]
-        found = TwinRollout(pool, Povs(), criterion, lines).play(
+        found = TwinRollout(pool, POVS, criterion, lines).play(
             points, 0, lambda inputs, now, rows: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
         )
         assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)
         assert (np.abs(found) < 6.0).any()
 
     def test_cannot_be_played_against_a_program(self):
-        assert not TwinRollout(Pool(levels=(0,)), Povs()).can_predict(3)
+        assert not TwinRollout(Pool(levels=(0,), scenario=US23), POVS).can_predict(3)
 
 
 class TestWatching:
@@ -155,7 +155,7 @@ class TestWatching:
 class TestTwin:
     def test_predicts_cases_that_it_has_not_seen(self, seen):
         outcomes, motions = seen
-        twin = Twin(Pool(levels=(0,)), Povs(), 0)
+        twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0)
         twin.tell(outcomes[:40], motions)
         points = np.random.default_rng(3).random((60, 2))[40:]
         found = twin.predict(0, points)
@@ -166,7 +166,7 @@ class TestTwin:
     def test_says_the_same_however_it_was_told(self, seen):
         outcomes, motions = seen
         points = np.random.default_rng(4).random((7, 2))
-        at_once, in_parts = (Twin(Pool(levels=(0,)), Povs(), 5) for _ in range(2))
+        at_once, in_parts = (Twin(Pool(levels=(0,), scenario=US23), POVS, 5) for _ in range(2))
         at_once.tell(outcomes, motions)
         in_parts.tell(outcomes[30:], motions)
         in_parts.predict(0, points)
@@ -178,7 +178,7 @@ class TestTwin:
         odd = {index: motion.copy() for index, motion in motions.items()}
         odd[8][:, 1, 2] = -4.0  # what this VUT never does
         points = np.random.default_rng(3).random((60, 2))
-        plain, taught = (Twin(Pool(levels=(0,)), Povs(), 0) for _ in range(2))
+        plain, taught = (Twin(Pool(levels=(0,), scenario=US23), POVS, 0) for _ in range(2))
         plain.tell(outcomes[:40], motions)
         taught.tell(outcomes[:40], odd)
         same = [
@@ -190,14 +190,14 @@ class TestTwin:
     @pytest.mark.parametrize("size", some([60, 20, 7], 7))
     def test_learns_from_batches_of_any_size(self, seen, size):
         outcomes, motions = seen
-        twin = Twin(Pool(levels=(0,)), Povs(), 0)
+        twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0)
         many = [replace(o, index=k, batch=k // size) for k, o in enumerate(outcomes * 3)]
         twin.tell(many, {o.index: motions[o.index % len(outcomes)] for o in many})
         assert twin.predict(0, np.full((1, 2), 0.5)).shape == (2, 4, 1)
 
     def test_needs_some_cases_and_learns_nothing_from_errors(self, seen):
         outcomes, motions = seen
-        twin = Twin(Pool(levels=(0,)), Povs(), 0)
+        twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0)
         twin.tell(
             [
                 replace(o, measures=replace(o.measures, end=End.VUT_ERROR, score=None))
@@ -209,7 +209,7 @@ class TestTwin:
 
     def test_lets_others_speak_for_a_vut_that_it_has_not_seen(self, seen):
         outcomes, motions = seen
-        twin = Twin(Pool(levels=(0,)), Povs(), 0, list(motions.values()))
+        twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0, list(motions.values()))
         assert twin.can_predict(0)
         off = np.abs(
             np.median(twin.predict(0, np.random.default_rng(3).random((60, 2))), axis=(0, 1))
@@ -221,7 +221,13 @@ class TestTwin:
 def outcome(
     index: int, dx_m: float, prediction: Prediction | None = None, level: int = 0
 ) -> Outcome:
-    case = Case(level=level, x_pov0_m=-300.0, v_pov0_mps=30.0, svo_rad=0.5 if level == 2 else None)
+    case = Case(
+        level=level,
+        x_pov0_m=-300.0,
+        v_pov0_mps=30.0,
+        svo_rad=0.5 if level == 2 else None,
+        scenario=US23,
+    )
     score = -600.0 if abs(dx_m) < 6.0 else -100.0
     measures = bare_measures(End.MERGED, score, dx_m=dx_m)
     return Outcome(index, 0, case, measures, prediction)
@@ -345,7 +351,7 @@ class TestACampaign:
 
 
 def test_a_sampler_without_games_is_the_surrogate_alone():
-    sampler = CoverageSampler(Pool(levels=(0,)), 1)
+    sampler = CoverageSampler(Pool(levels=(0,), scenario=US23), 1)
     sampler.tell([outcome(i, 30.0 + i) for i in range(5)])
     sampler.ask(3)
     assert [sampler.prediction(place) for place in range(3)] == [None] * 3
@@ -373,7 +379,7 @@ class TestTheReport:
     def test_expects_failures_where_they_are(self, whole):
         twin = learned_twin(whole, [0, 1])
         fails = [o.case for o in whole.outcomes if o.failed and o.case.level == 1]
-        assert np.median(nearness(twin, 1, to_unit(fails, 1), 6.0)) > 0.5
+        assert np.median(nearness(twin, 1, to_unit(fails, 1, scenario=US23), 6.0)) > 0.5
 
     def test_shows_what_a_file_says_that_is_as_we_write_it(self, whole, tmp_path):
         run = Run(Path(shutil.copytree(whole.folder, tmp_path / "run")))

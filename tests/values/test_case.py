@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case, dimensions, from_unit, to_unit
+from merge_sumo.values.scenario import US23
 
 
 def test_the_corners_of_the_unit_cube_are_the_bounds_of_the_pool():
-    low, high = from_unit(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), level=2)
+    low, high = from_unit(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), level=2, scenario=US23)
     assert (low.x_pov0_m, low.v_pov0_mps, low.svo_rad) == (-340.0, 25.0, 0.0)
     assert (high.x_pov0_m, high.v_pov0_mps) == (-180.0, 35.0)
     assert high.svo_rad < math.pi / 2
@@ -25,13 +26,15 @@ def test_the_corners_of_the_unit_cube_are_the_bounds_of_the_pool():
 
 def test_orientation_is_a_coordinate_only_at_level_2():
     assert [len(dimensions(level)) for level in (0, 1, 2)] == [2, 2, 3]
-    assert from_unit(np.array([[0.5, 0.5]]), level=1)[0].svo_rad is None
+    assert from_unit(np.array([[0.5, 0.5]]), level=1, scenario=US23)[0].svo_rad is None
 
 
 @given(st.sampled_from([0, 1, 2]), st.lists(st.floats(0.0, 0.999), min_size=3, max_size=3))
 def test_points_and_cases_are_inverse_to_each_other(level, coordinates):
     points = np.array([coordinates[: len(dimensions(level))]])
-    assert to_unit(from_unit(points, level), level) == pytest.approx(points, abs=1e-12)
+    assert to_unit(from_unit(points, level, scenario=US23), level, scenario=US23) == pytest.approx(
+        points, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(

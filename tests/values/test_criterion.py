@@ -276,17 +276,17 @@ class TestRecords:
         ):
             del record[name]
         record |= {"end": "COLLISION", "impact_speed_mps": 2.0, "after_merge": "forced"}
-        read = Outcome.from_json(json.dumps(record)).measures
+        read = Outcome.from_json(json.dumps(record), scenario=US23).measures
         assert (read.end, read.severity, read.is_close) == (End.MERGED, "contact", True)
         assert (read.bumper_gap_m, read.brake_after_mps2) == (0.5, None)
         record |= {"dx_m": 30.0, "score": -10.0, "end": "MERGED"}
-        read = Outcome.from_json(json.dumps(record)).measures
+        read = Outcome.from_json(json.dumps(record), scenario=US23).measures
         assert (read.severity, read.bumper_gap_m, read.impact_speed_mps) == ("safe", 25.0, None)
 
     def test_that_say_something_else_are_refused(self):
         record = PAPER_CRITERION.outcome(0, 0, ending(20.0)).to_record()
         with pytest.raises(UserError, match="severity"):
-            Outcome.from_json(json.dumps(record | {"severity": "<b>"}))
+            Outcome.from_json(json.dumps(record | {"severity": "<b>"}), scenario=US23)
 
 
 class TestNamed:
@@ -407,13 +407,13 @@ class TestOutcomes:
         outcome = Criterion("ttc_s < 4").outcome(7, 2, ending(-21.0, v_pov=32.0))
         record = json.loads(json.dumps(outcome.to_record()))
         assert list(record)[-1] == "margin"
-        assert Outcome.from_json(json.dumps(record)) == outcome
+        assert Outcome.from_json(json.dumps(record), scenario=US23) == outcome
 
     @pytest.mark.parametrize("margin", [True, "1", math.nan, [3]])
     def test_with_a_margin_that_is_none_are_refused(self, margin):
         record = Criterion("ttc_s < 4").outcome(0, 0, ending(9.0)).to_record()
         with pytest.raises(UserError, match=r"margin|JSON"):
-            Outcome.from_json(json.dumps(record | {"margin": margin}))
+            Outcome.from_json(json.dumps(record | {"margin": margin}), scenario=US23)
 
     def test_have_a_gap_of_6_m_where_the_criterion_turns(self):
         # A TTC of 4.2 s, against 4: 1 + 0.05; then 2 s, against 4: 1 / (1 + 0.5).

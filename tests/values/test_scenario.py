@@ -118,9 +118,11 @@ OTHER = replace(
 
 class TestACase:
     def test_keeps_what_it_always_had(self):
-        case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
+        case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
         assert case.scenario is US23
-        assert case == Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, v_vut0_mps=18.0)
+        assert case == Case(
+            level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, v_vut0_mps=18.0, scenario=US23
+        )
 
     def test_is_a_point_of_the_pool_of_its_scenario(self):
         pool = Pool(levels=(2,), v_vut0_mps=10.0, scenario=OTHER)
@@ -128,7 +130,7 @@ class TestACase:
         cases = pool.cases(points, 2)
         assert all(case.scenario is OTHER and case.v_vut0_mps == 10.0 for case in cases)
         assert cases[0].x_pov0_m == -300.0 + 200.0 * points[0, 0]
-        assert to_unit(cases, 2) == pytest.approx(points)
+        assert to_unit(cases, 2, scenario=US23) == pytest.approx(points)
 
     def test_outside_the_reach_of_its_scenario_is_refused(self):
         near = replace(US23, reach_m=400.0, v_start_max_mps=40.0)
@@ -142,7 +144,7 @@ class TestACase:
         verdicts = [
             measure(Trajectory(case, motion, End.MERGED)).is_close
             for case in (
-                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0),
+                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=US23),
                 Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=OTHER),
             )
         ]
@@ -253,5 +255,5 @@ def test_where_the_learned_drivers_extrapolate_is_said_in_numbers_of_their_train
 
 
 def test_points_of_one_scenario_are_cases_of_it():
-    (case,) = from_unit(np.array([[0.5, 0.5]]), 0, 10.0, OTHER)
+    (case,) = from_unit(np.array([[0.5, 0.5]]), 0, 10.0, scenario=OTHER)
     assert (case.x_pov0_m, case.v_pov0_mps) == (-200.0, 15.0)

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import DT_S, POV, VUT
+from merge_sumo.values.scenario import DT_S, POV, US23, VUT
 from merge_sumo.values.score import FAILURE_SCORE, Outcome, is_close, measure, time_to_collision
 from merge_sumo.values.trajectory import End, Trajectory
 
-CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 
 
 def ending(dx, v_pov=30.0, v_vut=26.0, end=End.MERGED, steps=10, a_vut=0.0):
@@ -170,4 +170,4 @@ class TestMeasures:
 def test_outcomes_round_trip_through_their_record():
     for trajectory in (ending(3.0), ending(30.0), eq4(-250.0, 30.0, 0.0, -182.0, 0.0, 0.0)):
         outcome = Outcome(7, 2, CASE, measure(trajectory))
-        assert Outcome.from_json(json.dumps(outcome.to_record())) == outcome
+        assert Outcome.from_json(json.dumps(outcome.to_record()), scenario=US23) == outcome

@@ -22,7 +22,7 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import MAX_STEPS
+from merge_sumo.values.scenario import MAX_STEPS, US23
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.registry import vut_factory
 
@@ -64,7 +64,9 @@ def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
 ):
     lines: list = []
     for spec in ("level0", vut(source, name)):
-        settings = CampaignSettings(vut=spec, levels=(0, 2), cases=60, batch=20, seed=3)
+        settings = CampaignSettings(
+            vut=spec, levels=(0, 2), cases=60, batch=20, seed=3, scenario=US23
+        )
         folder = tmp_path / f"run{len(lines)}"
         run_campaign(settings, folder)
         lines.append((folder / "outcomes.jsonl").read_bytes())
@@ -112,7 +114,9 @@ class Vut:
 
 
 def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(vut, tmp_path):
-    case = Case(level=2, x_pov0_m=-250.0, v_pov0_mps=30.0, svo_rad=0.5, v_vut0_mps=17.0)
+    case = Case(
+        level=2, x_pov0_m=-250.0, v_pov0_mps=30.0, svo_rad=0.5, v_vut0_mps=17.0, scenario=US23
+    )
     (trajectory,) = run_cases(factory(vut(WATCHER)), [case])
     at_reset, *steps = json.loads((tmp_path / "seen.json").read_text())
     start = {"t_s": 0.0, "x_pov_m": -250.0, "v_pov_mps": 30.0, "x_vut_m": -182.0, "v_vut_mps": 17.0}
@@ -317,9 +321,9 @@ def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
 def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
     hashes = []
     for source in (FUNCTION, FUNCTION + "# changed"):
-        settings = CampaignSettings(vut=vut(source), levels=(0,), cases=2, batch=2)
+        settings = CampaignSettings(vut=vut(source), levels=(0,), cases=2, batch=2, scenario=US23)
         (sha256,) = record_of(settings, resolve(settings))["vut_files"].values()
         hashes.append(sha256)
     assert hashes[0] != hashes[1]
-    built_in = CampaignSettings(vut="level0", levels=(0,))
+    built_in = CampaignSettings(vut="level0", levels=(0,), scenario=US23)
     assert record_of(built_in, resolve(built_in))["vut_files"] is None

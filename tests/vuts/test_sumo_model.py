@@ -13,11 +13,11 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import DT_S, VUT
+from merge_sumo.values.scenario import DT_S, US23, VUT
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.sumo_model import MODELS
 
-FREE = Case(level=0, x_pov0_m=0.0, v_pov0_mps=45.0)
+FREE = Case(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)
 """The POV is gone before the VUT arrives."""
 
 
@@ -39,14 +39,14 @@ def test_every_model_drives_the_same_in_1_and_in_8_corridors_and_by_eq_4(model):
 
 def test_every_model_reacts_to_the_pov(model):
     """The same start with a POV that meets the VUT at M, and with none near."""
-    meeting = Case(level=0, x_pov0_m=-253.0, v_pov0_mps=34.4)
+    meeting = Case(level=0, x_pov0_m=-253.0, v_pov0_mps=34.4, scenario=US23)
     free, met = run_cases(factory(model), [FREE, meeting])
     assert met.v_vut_mps[-1] < free.v_vut_mps[-1] - 0.5
 
 
 def test_a_campaign_finds_failures_that_replay_identically(model, tmp_path):
     settings = CampaignSettings(
-        vut=model, levels=(0,), sampler="uniform", cases=120, batch=40, seed=2
+        vut=model, levels=(0,), sampler="uniform", cases=120, batch=40, seed=2, scenario=US23
     )
     run = run_campaign(settings, tmp_path / "run")
     assert {o.measures.end for o in run.outcomes} <= {End.MERGED}
@@ -58,7 +58,7 @@ def test_a_campaign_finds_failures_that_replay_identically(model, tmp_path):
 def test_a_free_driver_follows_what_sumo_drives_by_itself(model):
     """SUMO moves by the new speed and eq. (4) by the old: less than a metre apart at M."""
     (ours,) = run_cases(factory(model), [FREE], corridors=1)
-    with World(1, vut_type=factory(model).vut.vut_type) as world:
+    with World(1, vut_type=factory(model).vut.vut_type, scenario=US23) as world:
         world.place(0, [(0.0, 45.0), (-182.0, 18.0)])
         x_m, speeds = [], []
         for _ in range(len(ours.motion) - 1):

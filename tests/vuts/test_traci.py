@@ -41,7 +41,7 @@ from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.traci.vut import TraciVut
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
-CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0)
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
     encoding="utf-8"
 )
