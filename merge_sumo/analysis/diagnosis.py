@@ -229,12 +229,12 @@ def failure_boxes(
     """
     from sklearn.tree import DecisionTreeClassifier
 
-    told = [o for o in outcomes if o.case.level == level and o.score is not None]
-    failed = np.array([o.failed for o in told], dtype=bool)
+    scored = [o for o in outcomes if o.case.level == level and o.score is not None]
+    failed = np.array([o.failed for o in scored], dtype=bool)
     if failed.sum() < FEWEST_FAILURES:
         return []
-    told_of = features(told[0].case.scenario, level)
-    places = np.array([[feature.value(o.case) for feature in told_of] for o in told])
+    axes = features(scored[0].case.scenario, level)
+    places = np.array([[feature.value(o.case) for feature in axes] for o in scored])
     tree = DecisionTreeClassifier(
         max_leaf_nodes=MOST_BOXES,
         min_samples_leaf=FEWEST_FAILURES,
@@ -244,8 +244,8 @@ def failure_boxes(
     leaf = tree.apply(places)
     failing = {node for node in set(leaf.tolist()) if failed[leaf == node].mean() >= 0.5}
     boxes = [
-        _box(level, _rounded(told_of, low, high), told, kinds)
-        for low, high in _leaf_boxes(tree.tree_, failing, len(told_of))
+        _box(level, _rounded(axes, low, high), scored, kinds)
+        for low, high in _leaf_boxes(tree.tree_, failing, len(axes))
     ]
     boxes = [box for box in boxes if box.failures >= FEWEST_FAILURES]
     return sorted(boxes, key=lambda box: -box.failures)
@@ -274,23 +274,23 @@ def _leaf_boxes(tree: Any, failing: set[int], dims: int) -> Iterator[tuple[Float
     yield from walk(0, np.full(dims, -np.inf), np.full(dims, np.inf))
 
 
-def _rounded(told_of: Sequence[Feature], low: FloatArray, high: FloatArray) -> Bounds:
+def _rounded(axes: Sequence[Feature], low: FloatArray, high: FloatArray) -> Bounds:
     def written(feature: Feature, value: float) -> float | None:
         return round(value, feature.decimals) if np.isfinite(value) else None
 
     return tuple(
         (feature, written(feature, a), written(feature, b))
-        for feature, a, b in zip(told_of, low.tolist(), high.tolist(), strict=True)
+        for feature, a, b in zip(axes, low.tolist(), high.tolist(), strict=True)
     )
 
 
 def _box(
-    level: int, bounds: Bounds, told: Sequence[Outcome], kinds: Mapping[int, Kind]
+    level: int, bounds: Bounds, scored: Sequence[Outcome], kinds: Mapping[int, Kind]
 ) -> FailureBox:
-    inside = [o for o in told if _inside(o, bounds)]
+    inside = [o for o in scored if _inside(o, bounds)]
     failures = [o for o in inside if o.failed]
-    found = Counter(kinds[o.index] for o in failures if o.index in kinds)
-    kinds_found, indices = tuple(found.most_common()), tuple(o.index for o in inside)
+    counts = Counter(kinds[o.index] for o in failures if o.index in kinds)
+    kinds_found, indices = tuple(counts.most_common()), tuple(o.index for o in inside)
     return FailureBox(level, bounds, len(inside), len(failures), kinds_found, indices)
 
 

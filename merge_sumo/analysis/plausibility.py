@@ -26,8 +26,8 @@ CLIPPED_SHARE: Final = 0.01
 
 def doubts(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
     """Return what is odd about the outcomes of a campaign; nothing for most."""
-    found = (_clipped(outcomes), _one_verdict(outcomes, criterion))
-    return [sentence for sentence in found if sentence is not None]
+    sentences = (_clipped(outcomes), _one_verdict(outcomes, criterion))
+    return [sentence for sentence in sentences if sentence is not None]
 
 
 def notes_on(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
@@ -62,7 +62,7 @@ def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> str | Non
         return None
     condition = condition_of(criterion.words)
     values = [values_of(outcome.measures, names_of(condition)) for outcome in judged]
-    for before, after, why in _beside(condition):
+    for before, after, why in _with_other_thresholds(condition):
         other = _with(condition, before, after)
         met = sum(other.margin(of_case) < 0.0 for of_case in values)
         if 0 < met < len(judged):
@@ -74,10 +74,11 @@ def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> str | Non
     return None
 
 
-def _beside(condition: Condition) -> Iterator[tuple[Comparison, Comparison, str]]:
+def _with_other_thresholds(condition: Condition) -> Iterator[tuple[Comparison, Comparison, str]]:
     """Yield comparisons with a threshold in another unit or of the other sign, and what it is."""
-    found = [c for c in comparisons_in(condition) if isinstance(c, Comparison)]
-    for comparison in found:
+    for comparison in comparisons_in(condition):
+        if not isinstance(comparison, Comparison):
+            continue
         sides = (comparison.left, comparison.right)
         numbers = [side for side in sides if isinstance(side, float)]
         names = [side for side in sides if isinstance(side, str)]

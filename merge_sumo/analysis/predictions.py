@@ -26,8 +26,8 @@ def off_m(outcome: Outcome) -> float | None:
     """Return how many metres the predicted gap was off; None where there was none to compare."""
     if outcome.prediction is None or outcome.measures.score is None:
         return None
-    said, came = outcome.prediction.median_dx_m, outcome.signed_gap_m
-    return None if said is None or came is None else abs(said - came)
+    predicted_m, gap_m = outcome.prediction.median_dx_m, outcome.signed_gap_m
+    return None if predicted_m is None or gap_m is None else abs(predicted_m - gap_m)
 
 
 def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:

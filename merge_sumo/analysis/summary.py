@@ -64,8 +64,8 @@ def summarise(outcomes: Sequence[Outcome], levels: Sequence[int]) -> Summary:
 
 def severities_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
     """Return the number of cases of each severity that occurs, the most severe first."""
-    found = Counter(outcome.measures.severity for outcome in outcomes)
-    return {severity.value: found[severity] for severity in Severity if found[severity]}
+    counts = Counter(outcome.measures.severity for outcome in outcomes)
+    return {severity.value: counts[severity] for severity in Severity if counts[severity]}
 
 
 def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:

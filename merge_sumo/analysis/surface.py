@@ -23,9 +23,9 @@ from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import Outcome
 
 FEWEST_FAILURES: Final = 5
-"""Failures at a level from which a surrogate has something to say of others."""
+"""Failures at a level from which a surrogate is learned. Chosen, not tuned."""
 PLAUSIBLE: Final = 0.1
-"""Chance to fail from which a place counts for `plausible_fmc`."""
+"""Chance to fail from which a place counts for `plausible_fmc`. Chosen, not tuned."""
 POOL_POINTS: Final = {2: 10_000, 3: 20_000, 4: 20_000, 5: 20_000, 6: 20_000}
 """Uniform points by dimension: up to three as many as the cases of a ground truth."""
 PART: Final = 4000
@@ -141,12 +141,12 @@ def _on_cores(
 def _on_workers(
     workers: Workers, history: LevelHistory, parts: Sequence[FloatArray]
 ) -> list[FloatArray]:
-    asked = partial(_learned_and_asked, history)
-    found = dict(workers.run(asked, parts, lambda part: asked([part])[0]))
-    return [found[place] for place in range(len(parts))]
+    chances = partial(_learn_and_predict, history)
+    by_place = dict(workers.run(chances, parts, lambda part: chances([part])[0]))
+    return [by_place[place] for place in range(len(parts))]
 
 
-def _learned_and_asked(history: LevelHistory, parts: Sequence[FloatArray]) -> list[FloatArray]:
+def _learn_and_predict(history: LevelHistory, parts: Sequence[FloatArray]) -> list[FloatArray]:
     with threadpool_limits(1):
         chance = _learned(history)
         return [chance(part) for part in parts]

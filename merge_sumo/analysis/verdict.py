@@ -91,9 +91,9 @@ class Verdict:
     @property
     def counts(self) -> str:
         """Return the result in a line: errors and timeouts, where there are any, then failures."""
-        found = in_counts(self.errors, self.timeouts, self.failures)
+        counts = in_counts(self.errors, self.timeouts, self.failures)
         contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
-        return f"{in_words(found)}{contacts} in {counted(self.cases, 'case')}"
+        return f"{in_words(counts)}{contacts} in {counted(self.cases, 'case')}"
 
     @property
     def sentences(self) -> list[str]:
@@ -222,7 +222,7 @@ class Gate:
         """Return whether a campaign meets the gate, and what it shows."""
         if self.what == "fmc":
             level, most = max(
-                ((level, found.fmc) for level, found in summary.levels.items()),
+                ((level, of_level.fmc) for level, of_level in summary.levels.items()),
                 key=lambda pair: pair[1],
                 default=(0, 0.0),
             )

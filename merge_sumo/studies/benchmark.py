@@ -50,9 +50,9 @@ class Search:
 
 
 ORACLE_STEP: Final = 5
-"""Divides all sizes of batches that samplers choose."""
+"""Cases between two points of the oracle's curve; divides all batch sizes that samplers choose."""
 COMPARED_BATCH: Final = 20
-"""Cases of a batch where nobody says, of samplers that have no wish of their own."""
+"""Cases of a batch by default, of samplers that choose none: that of Table II."""
 
 Task = tuple[str, tuple[int, ...], int, int | None, int]
 """A search: sampler, levels, cases, batch, seed."""
@@ -72,8 +72,8 @@ def _search(
 ) -> Search:
     pool = Pool(levels=levels, scenario=plan.scenario)
     lines = centre_lines(plan.road)
-    games = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
-    sampler = make_sampler(name, pool, seed, games)
+    twin = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
+    sampler = make_sampler(name, pool, seed, twin)
     spent = _Stopwatch()
     sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
@@ -155,24 +155,35 @@ def search(
     workers: Workers | None = None,
     on_search: Callable[[str, int], None] | None = None,
 ) -> dict[str, list[Search]]:
-    """Let samplers search the pool of a plan's scenario, with the seeds 0 to `seeds` - 1 each.
+    """Let samplers search the pool of a plan's scenario.
 
-    A search runs on one of the `workers`, by default in this process.
+    Args:
+        plan: how cases run.
+        levels: POV levels.
+        samplers: their names.
+        seeds: number of searches of each sampler, with the seeds 0 to `seeds` - 1.
+        cases: cases of a search.
+        batch: cases of a batch; by default what a sampler wants, or `COMPARED_BATCH`.
+        workers: each search runs on one of them, by default in this process.
+        on_search: told sampler and seed of a search that has ended.
+
+    Returns:
+        The searches of each sampler in the order of the seeds.
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
     for level in levels:
         plan.povs.check_level(level)
     plan = plan.for_cases(batch or COMPARED_BATCH)
-    found: dict[int, Search] = {}
-    with workers_or_here(workers) as there:
-        for place, one in there.run(partial(_searches, plan), tasks, _lost_search, chunk=1):
-            found[place] = one
+    by_place: dict[int, Search] = {}
+    with workers_or_here(workers) as processes:
+        for place, one in processes.run(partial(_searches, plan), tasks, _lost_search, chunk=1):
+            by_place[place] = one
             if on_search is not None:
                 name, *_, seed = tasks[place]
                 on_search(name, seed)
     searches: dict[str, list[Search]] = {name: [] for name in samplers}
     for place, (name, *_) in enumerate(tasks):
-        searches[name].append(found[place])
+        searches[name].append(by_place[place])
     return searches
 
 
@@ -189,10 +200,10 @@ def limit_fmc(
     A truth of a few thousand cases misses places that searches find. At each level this is the
     coverage of what truth and searches found together, or of a `dense` truth, whichever is more.
     """
-    found = list(searches)
+    known = list(searches)
     total = 0.0
     for level, truth in truths.items():
-        failing = [truth.failures, *(search.failures(level) for search in found)]
+        failing = [truth.failures, *(search.failures(level) for search in known)]
         together = fmc(np.concatenate([points for points in failing if len(points)] or failing[:1]))
         total += max(together, fmc(dense[level].failures) if level in dense else 0.0)
     return total
@@ -201,9 +212,12 @@ def limit_fmc(
 def compare(
     searches: Sequence[Search], truths: Mapping[int, Truth], limit: float | None = None
 ) -> SamplerSummary:
-    """Compare what one sampler found, one search a seed, with the truth at each level.
+    """Compare what one sampler found with the truth at each level.
 
-    `limit` is the coverage of all that is known to fail (`limit_fmc`).
+    Args:
+        searches: one search a seed.
+        truths: the truth by level.
+        limit: coverage of all that is known to fail (`limit_fmc`).
     """
     truth_fmc = sum(fmc(truth.failures) for truth in truths.values())
     real = [(level, region) for level, truth in truths.items() for region in truth.real_regions()]
@@ -213,7 +227,7 @@ def compare(
         for whole in (truth_fmc, limit)
     )
     failures = np.array([sum(o.failed for o in search.outcomes) for search in searches])
-    found = np.array(
+    regions_found = np.array(
         [sum(_found(s.failures(level), region) for level, region in real) for s in searches]
     )
     after = _cases_by_batch(searches[0])
@@ -228,9 +242,9 @@ def compare(
         fmc_over_limit_quartiles=_quartiles(of_limit),
         failures_median=float(np.median(failures)),
         failures_quartiles=_quartiles(failures),
-        regions_found_median=float(np.median(found)),
-        regions_found_quartiles=_quartiles(found),
-        seeds_with_all_regions=int((found == len(real)).sum()),
+        regions_found_median=float(np.median(regions_found)),
+        regions_found_quartiles=_quartiles(regions_found),
+        seeds_with_all_regions=int((regions_found == len(real)).sum()),
         cases_to_50_percent_median=_quantile(half, 0.5),
         cases_to_50_percent_quartiles=_quartiles(half),
         cases_to_90_percent_median=_quantile(most, 0.5),
@@ -280,7 +294,7 @@ def _level_share(searches: Sequence[Search], level: int) -> LevelShare:
 
 
 def _found(points: FloatArray, region: FloatArray) -> bool:
-    """Return whether some failure that was found lies in a region of the truth."""
+    """Return whether one of some failures, (m, d), lies in a region of the truth, (n, d)."""
     if not len(points):
         return False
     distance, _ = cKDTree(region).query(points)
@@ -317,19 +331,19 @@ def _greedy(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
     What a point adds never grows. So the best is one that still adds as much as it once did, if no
     other one ever did more (Minoux, 1978); of points that add the same it is the first.
     """
-    ground = CoverageGrid(points.shape[1])
+    grid = CoverageGrid(points.shape[1])
     queue = [(-1.0, place) for place in range(len(points))]
     order: list[int] = []
     gains: list[float] = []
     while queue and len(order) < most:
         once, place = queue[0]
-        ball = ground.balls(points[[place]])
-        new = float(ground.new(ball)[0])
+        ball = grid.balls(points[[place]])
+        new = float(grid.new(ball)[0])
         if new < -once:
             heapreplace(queue, (-new, place))
             continue
         heappop(queue)
-        ground.cover(ball[0], 1.0)
+        grid.cover(ball[0], 1.0)
         order.append(place)
         gains.append(new)
     return points[order], np.array(gains)

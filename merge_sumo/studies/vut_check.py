@@ -173,7 +173,7 @@ def _differences(
     return []
 
 
-def _why(plan: SimulationPlan, found: _Difference) -> str:
+def _why(plan: SimulationPlan, difference: _Difference) -> str:
     """Return why a VUT drives differently; a case that runs first, twice, tells it."""
     options, spec = plan.vut.options, plan.vut.spec
     goes_on = waits_for_client(spec, options.command)
@@ -185,7 +185,7 @@ def _why(plan: SimulationPlan, found: _Difference) -> str:
     motions = []
     for _ in range(2):
         with Simulator(plan.for_cases(1)) as ground:
-            motions.append(_run(ground, [found.case])[0].motion)
+            motions.append(_run(ground, [difference.case])[0].motion)
     if not np.array_equal(motions[0], motions[1]):
         return (
             "It draws random numbers, reads a clock, or keeps something outside of its process: as "
