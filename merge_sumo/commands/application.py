@@ -40,7 +40,6 @@ class GroupedCommand(TyperCommand):
     """A command whose options are grouped by `GROUPS`; it prints the notices of the API."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        """Set the group of each option, and sort the options by group."""
         super().__init__(*arguments, **options)
         order = {group: place for place, group in enumerate(GROUPS)}
         for parameter in self.params:
@@ -99,7 +98,6 @@ class Given:
         print_result(result, as_json=self.as_json, **more)
 
 
-KEYWORD_ONLY: Final = inspect.Parameter.KEYWORD_ONLY
 JSON: Final = Annotated[
     bool, typer.Option("--json", help="Print the result as one JSON object on standard output.")
 ]
@@ -109,7 +107,6 @@ class Commands(typer.Typer):
     """An application whose commands are `GroupedCommand`s, with options of `OPTIONS` and --json."""
 
     def __init__(self, *, help: str, **options: Any) -> None:
-        """Take the help, each paragraph of which may stand in several lines."""
         super().__init__(help=unwrapped(help), **options)
 
     def verb(
@@ -122,7 +119,7 @@ class Commands(typer.Typer):
 
         def register(function: Callable[..., None]) -> Callable[..., None]:
             _, *own = inspect.signature(function, eval_str=True).parameters.values()
-            shared = [OPTIONS[option].parameter(option) for option in options]
+            shared = [_parameter(option, *OPTIONS[option]) for option in options]
             keywords = {option: KEYWORDS.get(option, option) for option in options}
 
             def command(context: typer.Context, as_json: bool, **values: Any) -> None:
@@ -141,7 +138,8 @@ class Commands(typer.Typer):
 
             parameters = [
                 _parameter("context", typer.Context),
-                *(parameter.replace(kind=KEYWORD_ONLY) for parameter in (*own, *shared)),
+                *(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own),
+                *shared,
                 _parameter("as_json", JSON, default=False),
             ]
             command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -155,7 +153,9 @@ class Commands(typer.Typer):
 def _parameter(
     name: str, annotation: Any, default: object = inspect.Parameter.empty
 ) -> inspect.Parameter:
-    return inspect.Parameter(name, KEYWORD_ONLY, default=default, annotation=annotation)
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+    )
 
 
 app = Commands(

@@ -5,10 +5,9 @@ An option has one name, one meaning and one group in all commands.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -51,28 +50,22 @@ KEYWORDS: Final = {
 """Keywords of the API, by the shared options whose names are others."""
 
 
-class Shared(NamedTuple):
-    """An option that several commands share, or that is a setting of a campaign."""
-
-    annotation: Any
-    default: object = None
-
-    def parameter(self, name: str) -> inspect.Parameter:
-        """Return the option as a parameter of a command."""
-        kind = inspect.Parameter.KEYWORD_ONLY
-        return inspect.Parameter(name, kind, default=self.default, annotation=self.annotation)
+Shared = tuple[Any, object]
+"""The annotation of an option, and its default."""
 
 
 def _option(kind: Any, default: object, help: str, *flags: str, **others: Any) -> Shared:
-    return Shared(Annotated[kind, typer.Option(*flags, help=help, **others)], default)
+    return Annotated[kind, typer.Option(*flags, help=help, **others)], default
 
 
-VUT_HELP: Final = (
-    "Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
-    "`merge-sumo vuts` lists the kinds."
-)
 VutOption = Annotated[
-    str, typer.Option(metavar="SPEC", help=VUT_HELP, autocompletion=complete.vuts)
+    str,
+    typer.Option(
+        metavar="SPEC",
+        help="Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
+        "`merge-sumo vuts` lists the kinds.",
+        autocompletion=complete.vuts,
+    ),
 ]
 CoresOption = Annotated[
     int | None,
@@ -92,7 +85,7 @@ def _checked_tolerance(tolerance: float) -> float:
 
 
 OPTIONS: Final[Mapping[str, Shared]] = {
-    "vut": Shared(VutOption, ""),
+    "vut": (VutOption, ""),
     "level": _option(str, "all", "POV level: 0, 1, 2, own or all.", autocompletion=complete.levels),
     "pov": _option(
         str | None,
