@@ -1,11 +1,11 @@
-"""What a campaign remembers: a folder that one process writes, and anybody reads.
+"""The folder of a campaign: one process writes it, any process reads it.
 
 campaign.json             every resolved setting, versions, hashes, and the hash of itself
 outcomes.jsonl            one line per case, in order, synced after every batch
 trajectories/00007.npz    the motion of every case of a batch, and the hash of its lines
 
-`Run` reads and `Journal` writes whole batches. A bit that flips on a disk or on a way is found by
-the hashes, and in arrays by the checksums of the zip archive. Folders of older versions, without
+`Run` reads and `Journal` writes whole batches. A bit that flips on a disk or in a copy shows in
+the hashes, and in arrays in the checksums of the zip archive. Folders of older versions, without
 hashes, are read as they are.
 """
 
@@ -72,7 +72,7 @@ class Run:
     def __init__(self, folder: Path, outcomes: list[Outcome] | None = None) -> None:
         """Read settings and outcomes; trajectories are read when they are asked for.
 
-        `outcomes` are those of the folder, where who has written it knows them.
+        `outcomes` are those of the folder, where its writer has them in memory.
         """
         self.folder = folder
         self.settings = read_settings(folder)
@@ -115,8 +115,8 @@ class Run:
     @property
     def ran_again(self) -> int:
         """Number of cases that ran again because a process had died or had been stopped."""
-        said = self.settings.get(RAN_AGAIN)
-        return said if isinstance(said, int) and said > 0 else 0
+        count = self.settings.get(RAN_AGAIN)
+        return count if isinstance(count, int) and count > 0 else 0
 
     @property
     def ran_again_in_words(self) -> str:
@@ -270,10 +270,10 @@ def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:
 
     A region is a group of failures that are linked at the radius of the coverage (`fmc.regions`).
     """
-    found = failures(outcomes)
+    failing = failures(outcomes)
     region: dict[int, int] = {}
-    for level in sorted({outcome.case.level for outcome in found}):
-        own = [outcome for outcome in found if outcome.case.level == level]
+    for level in sorted({outcome.case.level for outcome in failing}):
+        own = [outcome for outcome in failing if outcome.case.level == level]
         points = to_unit((outcome.case for outcome in own), level, own[0].case.scenario)
         region |= zip((o.index for o in own), regions(points).tolist(), strict=True)
     return region
@@ -284,15 +284,15 @@ def spread_failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
 
     Neighbours fail alike: who looks at the first ten sees ten regions, where there are as many.
     """
-    found = failures(outcomes)
-    region = regions_of(found)
+    worst_first = failures(outcomes)
+    region = regions_of(worst_first)
     before: Counter[tuple[int, int]] = Counter()
     turns = []
-    for outcome in found:
+    for outcome in worst_first:
         own = outcome.case.level, region[outcome.index]
         turns.append(before[own])
         before[own] += 1
-    return [o for _, o in sorted(zip(turns, found, strict=True), key=lambda pair: pair[0])]
+    return [o for _, o in sorted(zip(turns, worst_first, strict=True), key=lambda pair: pair[0])]
 
 
 def batch_file(folder: Path, batch: int) -> Path:

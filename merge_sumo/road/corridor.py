@@ -102,11 +102,11 @@ class LanePath:
 
     def speed_limits_mps(self) -> list[tuple[float, float]]:
         """Return (x_m from where on, limit) wherever the limit of the lanes changes."""
-        found: list[tuple[float, float]] = []
+        limits: list[tuple[float, float]] = []
         for piece in self.pieces:
-            if not found or found[-1][1] != piece.speed_limit_mps:
-                found.append((piece.start_m, piece.speed_limit_mps))
-        return found
+            if not limits or limits[-1][1] != piece.speed_limit_mps:
+                limits.append((piece.start_m, piece.speed_limit_mps))
+        return limits
 
 
 @dataclass(frozen=True, slots=True)

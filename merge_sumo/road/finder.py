@@ -46,8 +46,8 @@ def find_corridor(
     junction_type = net.junction_type(meeting.ramp.source)
     paths, approaches = [], []
     links = (meeting.mainline, meeting.ramp)
-    for edges, found, link, other in zip(own, layers, links, reversed(links), strict=True):
-        before = _lanes_before(found[: len(edges) + meeting.place], link)
+    for edges, path_layers, link, other in zip(own, layers, links, reversed(links), strict=True):
+        before = _lanes_before(path_layers[: len(edges) + meeting.place], link)
         start_m = -math.fsum(lane.length_m for lane in before)
         paths.append(LanePath((*_placed(net, before, start_m), *shared)))
         if meeting.drop is not None:
@@ -150,13 +150,13 @@ def _meeting(
     net: NetFile, own: tuple[_Edges, _Edges], tail: _Edges, layers: list[list[_Layer]]
 ) -> _Meeting:
     """Return where the paths meet: by connections, or where a lane of one of them ends."""
-    mainline, ramp = (found[len(edges) :] for found, edges in zip(layers, own, strict=True))
+    mainline, ramp = (path[len(edges) :] for path, edges in zip(layers, own, strict=True))
     for place, edge in enumerate(tail):
         common = mainline[place].keys() & ramp[place].keys()
         both = [lane.id for lane in net.lanes(edge) if lane.id in common]
         if both:
-            one, other = (min(found[place][both[0]], key=_swerve) for found in (mainline, ramp))
-            return _Meeting(one, other, drop=None, place=place)
+            to_both = [min(path[place][both[0]], key=_swerve) for path in (mainline, ramp)]
+            return _Meeting(to_both[0], to_both[1], drop=None, place=place)
         if place + 1 == len(tail) or mainline[place + 1].keys() & ramp[place + 1].keys():
             continue
         links = _lane_drop(net, mainline[place], ramp[place], tail[place : place + 2])

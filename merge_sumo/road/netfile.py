@@ -106,8 +106,8 @@ class NetFile:
             hint = f"{meant(edge, named, ALIKE_EDGES)}{few}".strip()
             hint = f": {hint}" if hint else ""
             raise self.broken(f"it has no edge {edge}{hint}")
-        found = (self._lane(str(lane.get("id"))) for lane in self._edges[edge].iterfind("lane"))
-        lanes = tuple(lane for lane in found if lane.open_to_cars)
+        of_edge = (self._lane(str(lane.get("id"))) for lane in self._edges[edge].iterfind("lane"))
+        lanes = tuple(lane for lane in of_edge if lane.open_to_cars)
         if not lanes:
             raise self.broken(f"no lane of edge {edge} is open to cars")
         for lane in lanes:
@@ -213,11 +213,11 @@ class NetFile:
     @cached_property
     def _connections(self) -> dict[tuple[str, str], list[etree._Element]]:
         """Elements by the edge and lane index that they leave, in the order of the file."""
-        found: dict[tuple[str, str], list[etree._Element]] = {}
+        elements: dict[tuple[str, str], list[etree._Element]] = {}
         for element in self._root.iterfind("connection"):
             source = str(element.get("from")), str(element.get("fromLane"))
-            found.setdefault(source, []).append(element)
-        return found
+            elements.setdefault(source, []).append(element)
+        return elements
 
     @cached_property
     def _junctions(self) -> dict[str, etree._Element]:

@@ -1,4 +1,4 @@
-"""XML that somebody sent: read as data, with nothing left of it but what is allowed.
+"""XML from another person: read as data, reduced to the allowed elements and attributes.
 
 SUMO's files can name other files, devices and addresses, and SUMO reads and writes all of them.
 So no file that came from outside reaches SUMO or netconvert. It is read here, without opening what
@@ -25,7 +25,7 @@ from merge_sumo.errors import UserError
 
 MAX_BYTES: Final = 4 * 2**20
 MAX_NET_BYTES: Final = 2**28
-"""Of a net that a user names: that of a city has 50 MB. What somebody sent is a corridor."""
+"""Of a net that a user names: that of a city has 50 MB. A received scenario has one corridor."""
 MAX_ELEMENTS: Final = 5_000
 """A corridor has some twenty and a record less than a thousand; a world has its net 32 times."""
 MAX_CHARS: Final = 2**16
@@ -140,8 +140,8 @@ def parse(
     try:
         root = etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
-        said = str(error.msg).encode("ascii", "backslashreplace").decode()
-        raise UserError(f"{name} is not readable XML: {said:.200}") from error
+        reason = str(error.msg).encode("ascii", "backslashreplace").decode()
+        raise UserError(f"{name} is not readable XML: {reason:.200}") from error
     text = content.removeprefix(codecs.BOM_UTF8)
     plain = not text.startswith(b"<?xml") or _PLAIN_DECLARATION.match(text) is not None
     return root, plain and cleaner.intact

@@ -55,7 +55,7 @@ def closest_before_m(trajectories: Sequence[Trajectory], lines: CentreLines) -> 
     It is looked for where the lanes run together, and infinite where the VUT never came there.
     Episodes are looked at together: most of the time of one is the calls of numpy.
     """
-    found, parts, places = [math.inf] * len(trajectories), [], []
+    closest_m, parts, places = [math.inf] * len(trajectories), [], []
     for place, trajectory in enumerate(trajectories):
         x_vut_m = trajectory.motion[:, VUT, 0]
         steps = np.flatnonzero((x_vut_m > -lines.together_m) & (x_vut_m < 0.0))
@@ -71,7 +71,7 @@ def closest_before_m(trajectories: Sequence[Trajectory], lines: CentreLines) -> 
             parts.append(rows.reshape(-1, 4))
             places.append(place)
     if not parts:
-        return found
+        return closest_m
     x_car, x_vut, car_length, vut_length = np.concatenate(parts).T
     vut = _Bodies(lines.ramp, x_vut, vut_length)
     apart_m = _separation_m(vut, _Bodies(lines.mainline, x_car, car_length))
@@ -79,8 +79,8 @@ def closest_before_m(trajectories: Sequence[Trajectory], lines: CentreLines) -> 
     for place, clearance_m in zip(
         places, np.minimum.reduceat(apart_m, firsts).tolist(), strict=True
     ):
-        found[place] = clearance_m
-    return found
+        closest_m[place] = clearance_m
+    return closest_m
 
 
 def _at(line: FloatArray, along_m: FloatArray) -> FloatArray:

@@ -100,14 +100,14 @@ class Criterion:
         every one, at the speeds that the scenario names.
         """
         what = "--fail-when" if self.require is None else "--require"
-        found = []
+        remarks = []
         if self.require is None and self.fail_when not in CRITERIA:
             domain = domain_of(scenario, Speeds.possible(scenario), _texts())
-            found += [f"{what}: {part}" for part in idle_parts(condition_of(self.words), domain)]
+            remarks += [f"{what}: {part}" for part in idle_parts(condition_of(self.words), domain)]
         usual = Speeds.usual(scenario)
-        if not found and (why := self._emptiness(usual, scenario)) is not None:
-            found.append(f"{what}: at speeds up to {usual.vut_mps:g} m/s {why}")
-        return found
+        if not remarks and (why := self._emptiness(usual, scenario)) is not None:
+            remarks.append(f"{what}: at speeds up to {usual.vut_mps:g} m/s {why}")
+        return remarks
 
     def _emptiness(self, speeds: Speeds, scenario: Scenario) -> str | None:
         """Return in words that no case fails, or that every case does; None where some may."""
@@ -137,8 +137,8 @@ class Criterion:
     @property
     def in_short(self) -> str:
         """Return when a case fails, by name where there is one, at a length for a headline."""
-        said = f"{self.text}: {self.words}" if self.text in CRITERIA else self.text
-        return said if len(said) <= SHORT else f"{said[: SHORT - 3]}..."
+        condition = f"{self.text}: {self.words}" if self.text in CRITERIA else self.text
+        return condition if len(condition) <= SHORT else f"{condition[: SHORT - 3]}..."
 
     def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
         """Return the margin of an episode; None under the paper's criterion and after an error."""

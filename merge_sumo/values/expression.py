@@ -210,8 +210,8 @@ class _Parser:
             case ast.Compare(left=first, ops=signs, comparators=others):
                 sides = (first, *others)
                 pairs = zip(sides, signs, sides[1:], strict=False)
-                found = tuple(self._comparison(*pair) for pair in pairs)
-                return found[0] if len(found) == 1 else AllOf(found)
+                chain = tuple(self._comparison(*pair) for pair in pairs)
+                return chain[0] if len(chain) == 1 else AllOf(chain)
             case ast.Name(id=name) if name in self._named:
                 return self.condition(ast.parse(self._named[name], mode="eval").body)
             case ast.Name(id=name) if name in self._vocabulary:
@@ -279,9 +279,9 @@ class _Parser:
     def _finite(self, node: ast.Constant) -> float:
         if type(node.value) not in (int, float):
             raise self._error(node, f"{_shown(node)} is neither a measure nor a number nor a text")
-        if not math.isfinite(found := _as_float(node.value)):
+        if not math.isfinite(value := _as_float(node.value)):
             raise self._error(node, "a number is to be finite")
-        return found
+        return value
 
     def _unquoted(self, node: ast.expr, name: str, other: ast.expr) -> UserError | None:
         """Return the error for a text without quotes beside a measure that is a text."""

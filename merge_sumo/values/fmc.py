@@ -157,7 +157,7 @@ def _linked(places: FloatArray, limit: float) -> IntArray:
     """
     n, dimension = places.shape
     near = min(_FIRST_NEIGHBOURS + 1, n)
-    distance, other = cKDTree(places).query(places, k=np.arange(1, near + 1))
+    distance, neighbour = cKDTree(places).query(places, k=np.arange(1, near + 1))
     point, column = np.nonzero(distance <= limit)
     all_looked_at = (distance[:, -1] > limit) | (near == n)
     _, first, cell = np.unique(
@@ -168,7 +168,7 @@ def _linked(places: FloatArray, limit: float) -> IntArray:
     )
     cell = cell.reshape(-1)
     links = [
-        np.column_stack([point, other[point, column]]),
+        np.column_stack([point, neighbour[point, column]]),
         np.column_stack([np.arange(n), first[cell]]),
     ]
     component = _components(links, n)

@@ -1,4 +1,4 @@
-"""Records of release 0.1, as those of today."""
+"""Records of release 0.1, upgraded to the fields of this one."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """How severe an encounter is, by geometry alone: contact, conflict, harsh or safe.
 
 The four words are the same in records, terminal, report, history, exports and documentation. They
-follow from the bodies of the cars and from what the state at M asks of whoever is behind; what
-counts as a failure is another question (`criterion.py`).
+follow from the bodies of the cars and from the braking that the state at M requires of the car
+behind; what counts as a failure is another question (`criterion.py`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def severity_of(
         end: why the episode ended.
         clearance_m: smallest clearance of bodies from M on.
         is_close: whether the front bumpers were nearer at M than the paper allows.
-        brake_mps2: deceleration that whoever is behind at M needs.
+        brake_mps2: deceleration that the car behind at M needs.
     """
     if end is not End.MERGED:
         return None

@@ -1,7 +1,7 @@
 """Signals: named numbers and words that a controller leaves for each step, such as its mode.
 
 They decide nothing. They are kept with the motion of a case, drawn beside it, and exported. Names
-and words are a stranger's: they are bounded, and printable.
+and words come from the user's code: they are bounded, and made printable.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CHARACTERS: Final = 40
 
 
 def as_signals(left: object) -> Left:
-    """Return what a controller has left as it is kept; what is no number and no word is dropped.
+    """Return the numbers and words that a controller has left; other values are dropped.
 
     Numbers have six digits, names and words are cut. A number that is not finite is none.
     """
@@ -56,7 +56,7 @@ def _value(value: object) -> float | str | None:
 
 
 def _word(text: str) -> str:
-    # Of a kind of string of its own, the characters that it has.
+    # A subclass of `str` may override its methods: take its characters only.
     return printable(str.__str__(text)[:CHARACTERS])[:CHARACTERS]
 
 

@@ -55,19 +55,19 @@ def check_formula(text: str) -> str:
         raise UserError(f"--require has {len(text)} characters: {MOST_CHARACTERS} are the most")
     place = depth = 0
     while place < len(text):
-        found = _TOKEN.match(text, place)
-        if found is None:
+        token = _TOKEN.match(text, place)
+        if token is None:
             sign = printable(text[place])
             raise UserError(
                 f"{what}: at character {place + 1}: {sign!r} is no part of a formula over signals"
             )
-        word = found[0]
+        word = token[0]
         if word[0].isalpha() or word[0] == "_":
             _check_word(word, f"{what}: at character {place + 1}")
         depth += (word == "(") - (word == ")")
         if depth < 0:
             raise UserError(f"{what}: a bracket is closed that was not opened")
-        place = found.end()
+        place = token.end()
     for bounds in _BOUNDS.findall(text):
         ends_s = [float(number) for number in _NUMBER.findall(bounds)]
         if ends_s != sorted(ends_s) or max(ends_s, default=0.0) > MAX_EPISODE_S + MAX_FOLLOW_UP_S:
@@ -122,9 +122,9 @@ def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
 
 def robustness(text: str, trajectory: Trajectory) -> float:
     """Return the robustness of a formula at the begin of an episode: finite, and never 0."""
-    found = _robustness(text, signals(trajectory))
-    size = min(max(abs(found), LEAST_MARGIN), MOST_MARGIN)
-    return size if found > 0.0 else -size
+    value = _robustness(text, signals(trajectory))
+    size = min(max(abs(value), LEAST_MARGIN), MOST_MARGIN)
+    return size if value > 0.0 else -size
 
 
 def formula_range(text: str, scenario: Scenario, speeds: Speeds) -> Range:
@@ -141,7 +141,7 @@ def _robustness(text: str, values: dict[str, FloatArray]) -> float:
     time_s = [round(step * DT_S, 1) for step in range(steps)]
     data = {"time": time_s, **{name: of.tolist() for name, of in values.items()}}
     specification = _specification(text)
-    found = float(specification.evaluate(data)[0][1])
+    value = float(specification.evaluate(data)[0][1])
     # A minimum or a maximum over time hides what is no number, so that every part is looked at; an
     # operator with bounds in time appends infinities to its part.
     for node, part in specification.ast.offline_results.items():
@@ -151,7 +151,7 @@ def _robustness(text: str, values: dict[str, FloatArray]) -> float:
                 "infinite where no step is, so put them around a comparison, not into it; and "
                 "write no number that large"
             )
-    return found
+    return value
 
 
 @lru_cache(maxsize=8)

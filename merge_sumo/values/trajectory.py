@@ -38,7 +38,7 @@ _ADDRESS: Final = re.compile("0x[0-9a-fA-F]{6,}")
 
 
 def as_reason(text: str) -> str:
-    """Return what somebody said went wrong as it is recorded: one printable line, not too long.
+    """Return the reason of an error as records hold it: one printable line, not too long.
 
     Without memory addresses: they differ from run to run, and records of equal runs must not.
     """

@@ -218,10 +218,10 @@ class Domain:
                     if math.prod(map(len, each)) > MOST_ALTERNATIVES:
                         raise TooManyError
                     return [sum(chosen, ()) for chosen in product(*each)]
-                found = [alternative for of_part in each for alternative in of_part]
-                if len(found) > MOST_ALTERNATIVES:
+                alternatives = [alternative for of_part in each for alternative in of_part]
+                if len(alternatives) > MOST_ALTERNATIVES:
                     raise TooManyError
-                return found
+                return alternatives
 
     def _consistent(self, alternative: _Alternative) -> bool:
         """Return whether ranges leave a value for everything that a conjunction speaks of."""
@@ -390,8 +390,8 @@ def _absolute(a: Range) -> Range:
 
 
 def _times(a: Range, b: Range) -> Range:
-    found = [x * y for x in a for y in b]
-    return ANY if any(map(math.isnan, found)) else Range(min(found), max(found))
+    products = [x * y for x in a for y in b]
+    return ANY if any(map(math.isnan, products)) else Range(min(products), max(products))
 
 
 def _larger(a: Range, b: Range) -> Range:
