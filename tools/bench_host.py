@@ -28,8 +28,7 @@ from bench_record import add_record_option, append_record
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.engine.pov_library import PovLibrary
-from merge_sumo.engine.povs import Povs
+from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario

@@ -1,4 +1,4 @@
-"""Who drives the POV at each level: a value, so that every process can be told the same."""
+"""The drivers of the POV at each level: a value that every process can be told, and the drivers."""
 
 from __future__ import annotations
 
@@ -6,12 +6,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from merge_sumo.drivers.policies import how_to_train, policies_in, policies_of, policies_sha256
+import numpy as np
+
+from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
+from merge_sumo.drivers.level0 import Level0Pov
+from merge_sumo.drivers.policies import (
+    how_to_train,
+    load_driver,
+    policies_in,
+    policies_of,
+    policies_sha256,
+)
 from merge_sumo.errors import UserError
-from merge_sumo.values.scenario import ALL_LEVELS, OWN, Scenario, level_name
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, level_name
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.files import Files
 from merge_sumo.vuts.registry import VutFactory, kind_of, vut_factory
+from merge_sumo.vuts.sumo_model import SumoVut
 
 POLICIES: Final = {1: "pov1", 2: "pov2"}
 """The learned POVs by their level."""
@@ -122,3 +135,120 @@ def own_pov(spec: str, options: VutOptions) -> VutFactory:
         return vut_factory(spec, replace(options, command=None))
     except UserError as error:
         raise UserError(f"--pov {spec}: {error}") from error
+
+
+class PovLibrary(Driver):
+    """Plays a POV of level 0, 1 or 2, or one of a person's own, corridor by corridor."""
+
+    def __init__(self, corridors: int, povs: Povs, world: World | None = None) -> None:
+        """Prepare the drivers of all available levels."""
+        super().__init__(corridors)
+        self._drivers: dict[int, Driver] = {0: Level0Pov(corridors)}
+        for level in set(povs.levels) & set(POLICIES):
+            self._drivers[level] = load_driver(POLICIES[level], corridors, povs.policies)
+        if povs.own is not None:
+            self._drivers[OWN] = in_the_povs_seat(povs.own, corridors, world)
+        self._level = np.zeros(corridors, dtype=np.int64)
+        self._levels_playing = {0}
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Take the level of a case; KeyError when it has no policy."""
+        self._drivers[case.level].begin(corridor, case)
+        self._level[corridor] = case.level
+        self._levels_playing.add(case.level)
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return each corridor's answer by the driver of its level."""
+        levels = self._levels_playing
+        if levels == {0}:
+            return self._drivers[0].act(scene)
+        acceleration = np.zeros(self.corridors)
+        for level in levels:
+            mine = scene.active & (self._level == level)
+            if mine.any():
+                of_level = Scene(mine, scene.step, scene.x_m, scene.v_mps)
+                acceleration[mine] = self._drivers[level].act(of_level)[mine]
+        return acceleration
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what the driver of a corridor did wrong."""
+        return self._drivers[int(self._level[corridor])].reason(corridor)
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the files that a POV of a person's own has loaded so far."""
+        return self._drivers[OWN].files() if OWN in self._drivers else ()
+
+    def close(self) -> None:
+        """Close the drivers."""
+        for driver in self._drivers.values():
+            driver.close()
+
+
+BEFORE_M: Final = -1e-9
+"""A VUT starts before M; a car of the mainline may start there or past it."""
+
+
+def in_the_povs_seat(own: VutFactory, corridors: int, world: World | None) -> Driver:
+    """Return the driver of the C cars of the mainline of a world, for `corridors` = C K."""
+    driver = own(corridors, world)
+    if isinstance(driver, SumoVut):  # SUMO knows where its vehicles are
+        mainline = [row for row in range(driver.world.vehicles) if row != VUT]
+        return SumoVut(corridors, driver.world, mainline)
+    return PovAdapter(driver)
+
+
+class PovAdapter(Driver):
+    """Drives cars of the mainline by a driver of VUTs; `corridors` are those of all C cars."""
+
+    def __init__(self, driver: Driver) -> None:
+        """Take the driver."""
+        super().__init__(driver.corridors)
+        self._driver = driver
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Tell the driver of an episode as if its car were the VUT."""
+        cars = case.scenario.vehicles - 1
+        car = corridor * cars // self.corridors
+        self._driver.begin(corridor, seen_from(case, car))
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the driver's answers; raises `PovLostError`."""
+        other = Scene(scene.active, scene.step, scene.x_m[::-1], scene.v_mps[::-1])
+        try:
+            return self._driver.act(other)
+        except VutLostError as lost:
+            how = {"final": lost.final, "killed": lost.killed}
+            raise PovLostError(lost.reason, lost.corridor, **how) from lost
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what the driver did wrong in a corridor."""
+        return self._driver.reason(corridor)
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the files that the driver has loaded so far."""
+        return self._driver.files()
+
+    def close(self) -> None:
+        """Close the driver."""
+        self._driver.close()
+
+
+def seen_from(case: Case, car: int) -> Case:
+    """Return a case as a VUT in the place of a car of the mainline would be told it."""
+    starts = case.starts()
+    x_other_m, v_other_mps = starts.pop(VUT)
+    x_m, v_mps = starts[car]
+    scenario = replace(
+        case.scenario,
+        x_vut0_m=min(x_m, BEFORE_M),
+        v_vut0_mps=v_mps,
+        headway_ahead_s=None,
+        headway_behind_s=None,
+    )
+    return Case(
+        level=0,
+        x_pov0_m=x_other_m,
+        v_pov0_mps=v_other_mps,
+        v_vut0_mps=v_mps,
+        scenario=scenario,
+    )

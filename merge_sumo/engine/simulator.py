@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of

@@ -37,7 +37,7 @@ from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.engine.evaluate import opened_simulator, workers_or_here
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines

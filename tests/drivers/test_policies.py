@@ -16,7 +16,7 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.levelk import FEATURES, QNetwork, actions_mps2, features
 from merge_sumo.drivers.policies import NETWORKS, load_driver, load_network, read_manifest
-from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.sumo.world import World
 from merge_sumo.training import check as checking

@@ -28,7 +28,7 @@ from merge_sumo.drivers.safety_models import (
     rss_distance_m,
     ttc_s,
 )
-from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case
 from merge_sumo.values.merge import brake_after_mps2

@@ -26,8 +26,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import CHECKSUM, OUTCOMES, SETTINGS, Run
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.engine.pov_adapter import PovAdapter
-from merge_sumo.engine.povs import Povs, own_pov
+from merge_sumo.engine.povs import PovAdapter, Povs, own_pov
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import report_page

@@ -21,7 +21,7 @@ from foreign_nets import (
 )
 from plans import POVS
 
-from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Piece

@@ -25,7 +25,7 @@ from handmade import write_run
 from lxml import etree
 from plans import POVS
 
-from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario

@@ -11,7 +11,7 @@ from plans import POVS
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut
-from merge_sumo.engine.pov_library import PovLibrary
+from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import SimulationError, World
