@@ -27,13 +27,18 @@ CRITERIA: Final[Registry[NamedCriterion]] = Registry(
     "merge_sumo.verdicts",
     "criterion",
     {
-        PAPER: NamedCriterion("score < -500", "front bumpers within 6 m at M"),
-        "contact": NamedCriterion("clearance_m <= 0", "bodies touch"),
+        PAPER: NamedCriterion(
+            "score < -500",
+            "the front bumpers are within 6 m as the VUT reaches M: a contact or a conflict",
+        ),
+        "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies touch"),
         "unsafe": NamedCriterion(
-            "clearance_m <= 0 or brake_after_mps2 > 3", "a contact, or hard braking after M"
+            "clearance_m <= 0 or brake_after_mps2 > 3",
+            "a contact, or the rear vehicle must brake harder than UN Regulation No. 79 lets a "
+            "lane change demand of others (`after_drac_mps2` is a separate measure)",
         ),
     },
     accepts=lambda item: isinstance(item, NamedCriterion),
-    contract="a merge_sumo.values.criterion.NamedCriterion",
+    contract="a merge_sumo.values.criteria.NamedCriterion",
 )
 """Criteria by the name that a person writes after `--fail-when`."""
