@@ -8,20 +8,20 @@ policy lets nothing run but that script and lets nothing load at all.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from markupsafe import Markup
+
 from merge_sumo.analysis.summary import Summary
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
+from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.report_sections import (
     head_words,
-    page_template,
     sections_of,
     shared_words,
 )
@@ -51,8 +51,8 @@ def write_report(
     """
     check_report(run.folder)
     path = run.folder / REPORT
-    page = report_page(run, summary, workers, on_part)
-    replace_own(path, page.encode(errors="backslashreplace"))
+    html = report_page(run, summary, workers, on_part)
+    replace_own(path, html.encode(errors="backslashreplace"))
     return path
 
 
@@ -78,12 +78,6 @@ def report_page(
     on_part: OnPart = lambda _done, _total: None,
 ) -> str:
     """Return the report of a run as HTML."""
-    from markupsafe import Markup
-
-    style, script = (
-        (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
-        for name in ("report.css", "report.js")
-    )
     model = ReportModel(run, summary, workers, on_part)
     words = shared_words(model)
     sections = sections_of(model, words)
@@ -92,17 +86,12 @@ def report_page(
     # No "<" in the JSON: nothing in it can end its element.
     data = data.replace("<", "\\u003c")
     model.part_ended()
-    return page_template().render(
-        {**words, **head_words(model)},
+    return page(
+        "report.html.jinja",
+        styles=("report.css",),
+        script="report.js",
         sections=sections,
-        style=Markup(style),  # noqa: S704 (our own file)
-        script=Markup(script),  # noqa: S704 (our own file)
-        style_hash=policy_hash(style),
-        script_hash=policy_hash(script),
         data=Markup(data),  # noqa: S704 (JSON without "<")
+        **words,
+        **head_words(model),
     )
-
-
-def policy_hash(source: str) -> str:
-    """Return by what a page's policy names a style or a script in it."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()

@@ -9,9 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from markupsafe import Markup
 
@@ -28,6 +26,7 @@ from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
 from merge_sumo.reports.headline import Rule, after_words, avoidable_words, before_words, headline
+from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
 from merge_sumo.studies.counterfactuals import in_a_sentence
@@ -39,9 +38,6 @@ from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import meanings
 from merge_sumo.vuts.output import LOG, end_of
-
-if TYPE_CHECKING:
-    from jinja2 import Environment, Template
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,8 +58,7 @@ class ReportSection:
         words = self.words(model)
         if words is None:
             return None
-        rendered = _compiled(self.template).render({**shared, **words})
-        return Markup(rendered)  # noqa: S704 (the template has escaped its values)
+        return fragment(self.template, {**shared, **words})
 
 
 def shared_words(model: ReportModel) -> dict[str, Any]:
@@ -85,7 +80,6 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "counted": summary.cases - len(model.shown),
         "predicted": prediction_in_words(run.outcomes),
         "avoidance": _avoidance(model),
-        "level_name": level_name,
     }
 
 
@@ -255,28 +249,9 @@ def _shown(value: object) -> str:
     return printable(text[:ERROR_CHARACTERS])
 
 
-@cache
-def _environment() -> Environment:
-    from jinja2 import Environment, PackageLoader
-
-    loader = PackageLoader("merge_sumo.reports")
-    return Environment(loader=loader, autoescape=True, trim_blocks=True)
-
-
-@cache
-def _compiled(source: str) -> Template:
-    return _environment().from_string(source)
-
-
-def page_template() -> Template:
-    """Return the template of the page, around its sections."""
-    return _environment().get_template("report.html.jinja")
-
-
 def _own(name: str) -> str:
     """Return the source of a template of this package."""
-    path = Path(__file__).parent / "templates" / "sections" / f"{name}.html.jinja"
-    return path.read_text(encoding="utf-8")
+    return source_of(f"sections/{name}.html.jinja")
 
 
 SECTIONS: Final[Registry[ReportSection]] = Registry(

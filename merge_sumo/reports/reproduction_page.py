@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from merge_sumo.reports import figures
+from merge_sumo.reports.pages import page
 from merge_sumo.studies.reproduction import (
     SAMPLERS,
     ColumnResult,
@@ -87,11 +88,8 @@ def _column_figures(result: ColumnResult) -> Iterator[tuple[str, Figure, str]]:
 
 
 def _page(result: Reproduction, captions: dict[str, str]) -> str:
-    from jinja2 import Environment, PackageLoader
-
-    loader = PackageLoader("merge_sumo.reports")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
-    return environment.get_template("reproduce.html.jinja").render(
+    return page(
+        "reproduce.html.jinja",
         results=list(result.columns.values()),
         rows=dict(table_rows(result.columns)),
         samplers=SAMPLERS,

@@ -9,22 +9,18 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 from datetime import datetime
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
-from merge_sumo.reports.report import REPORT, check_report, policy_hash
+from merge_sumo.reports.pages import page
+from merge_sumo.reports.report import REPORT, check_report
 from merge_sumo.reports.static_map import StaticMap, map_of
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import quoted
-from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
-
-if TYPE_CHECKING:
-    from jinja2 import Template
 
 FIRST_S: Final = 2.0
 """Seconds after which the page first appears: a shorter campaign goes without."""
@@ -69,21 +65,17 @@ class RunningPage:
         self._is_there, self._is_given_up = False, True
         with suppress(UserError):
             check_report(self._path.parent)
-            page = running_page(progress, self._path.parent, stopped=stopped)
-            replace_own(self._path, page.encode(errors="backslashreplace"))
+            html = running_page(progress, self._path.parent, stopped=stopped)
+            replace_own(self._path, html.encode(errors="backslashreplace"))
             self._is_there, self._is_given_up = True, False
 
 
 def running_page(progress: CampaignProgress, folder: Path, *, stopped: bool = False) -> str:
     """Return the page of a campaign as HTML; of one that was `stopped`, with how to go on."""
-    from markupsafe import Markup
-
-    templates = Path(__file__).parent / "templates"
-    style = (templates / "report.css").read_text(encoding="utf-8")
     progress.refresh()
-    return _template().render(
-        style=Markup(style),  # noqa: S704 (our own file)
-        style_hash=policy_hash(style),
+    return page(
+        "running.html.jinja",
+        styles=("report.css",),
         every_s=EVERY_S,
         now=progress,
         stopped=stopped,
@@ -94,7 +86,6 @@ def running_page(progress: CampaignProgress, folder: Path, *, stopped: bool = Fa
         maps=_maps(progress),
         worst=progress.worst,
         severities=list(Severity),
-        level_name=level_name,
     )
 
 
@@ -112,13 +103,3 @@ def _mark(outcome: Outcome) -> str:
     """Return the CSS classes of a mark: the severity, and whether the case fails."""
     kind = outcome.measures.severity or ("unclassed" if outcome.failed else "error")
     return f"{kind} fail" if outcome.failed else kind
-
-
-@cache
-def _template() -> Template:
-    """Return the template, which is compiled once."""
-    from jinja2 import Environment, PackageLoader
-
-    loader = PackageLoader("merge_sumo.reports")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
-    return environment.get_template("running.html.jinja")

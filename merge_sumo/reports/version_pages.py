@@ -19,7 +19,7 @@ from merge_sumo.analysis.diagnosis import Kind
 from merge_sumo.analysis.verdict import counted, in_words
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
-from merge_sumo.reports.report import policy_hash
+from merge_sumo.reports.pages import page
 from merge_sumo.reports.static_map import map_of
 from merge_sumo.studies.history import History, LevelOfVersion, RegionChange
 from merge_sumo.studies.versions import Change, ComparedCase, RunComparison
@@ -110,25 +110,12 @@ class Chart:
     names: list[tuple[float, str]]
 
 
-def _page(template: str, **content: Any) -> str:
-    from jinja2 import Environment, PackageLoader
-    from markupsafe import Markup
-
-    folder = Path(__file__).parent / "templates"
-    style = "".join((folder / name).read_text("utf-8") for name in ("report.css", "history.css"))
-    loader = PackageLoader("merge_sumo.reports")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
-    return environment.get_template(template).render(
-        style=Markup(style),  # noqa: S704 (our own files)
-        style_hash=policy_hash(style),
-        level_name=level_name,
-        **content,
-    )
+STYLES: Final = ("report.css", "history.css")
 
 
-def write_page(page: str, path: Path) -> None:
+def write_page(html: str, path: Path) -> None:
     """Write a page as a new file; `UserError` where something is at `path`."""
-    write_new(path, page.encode(errors="backslashreplace"))
+    write_new(path, html.encode(errors="backslashreplace"))
 
 
 # Two campaigns.
@@ -176,8 +163,9 @@ def comparison_page(
         level: [case for case in compared.cases if case.case.level == level]
         for level in compared.levels
     }
-    return _page(
+    return page(
         "comparison.html.jinja",
+        styles=STYLES,
         runs=runs,
         compared=compared,
         why=compared.worse(tolerance),
@@ -262,8 +250,9 @@ def _motion_chart(title: str, rows: FloatArray, both: Sequence[FloatArray], end_
 
 def history_page(history: History) -> str:
     """Return the page of a history as HTML."""
-    return _page(
+    return page(
         "history.html.jinja",
+        styles=STYLES,
         history=history,
         charts=_history_charts(history),
         tables={level: _table(history, level) for level in history.levels},
