@@ -89,7 +89,7 @@ class Program:
             self._output.close()
 
     def _signal(self, number: int) -> None:
-        with suppress(ProcessLookupError, PermissionError):  # nobody may be left
+        with suppress(ProcessLookupError, PermissionError):  # none may be left
             if hasattr(os, "killpg"):
                 os.killpg(self._process.pid, number)
             else:

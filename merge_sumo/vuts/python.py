@@ -197,7 +197,8 @@ class BatchedVut(Driver):
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
 
-        Raises `VutLostError` when it fails and several episodes run: nobody knows whose it is.
+        Raises:
+            VutLostError: when it fails and several episodes run: the one at fault is unknown.
         """
         self._raised = None
         try:

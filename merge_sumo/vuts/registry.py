@@ -219,7 +219,7 @@ def _arrived(spec: str, options: VutOptions, files: Files | None, vut: Any) -> V
 
 
 def kind_of(spec: str) -> VutKind:
-    """Return the kind of VUT that a spec names; a name that nobody knows counts as installed."""
+    """Return the kind of VUT that a spec names; an unknown name counts as installed."""
     prefix, colon, _ = spec.partition(":")
     if prefix in KINDS:
         return KINDS[prefix]
@@ -252,7 +252,7 @@ def _argument(spec: str) -> str:
 
 
 def vut_factory(spec: str, options: VutOptions | None = None) -> VutFactory:
-    """Return what makes the VUT that `spec` names; `UserError` for a name nobody knows."""
+    """Return what makes the VUT that `spec` names; `UserError` for an unknown name."""
     return VutFactory(spec, options or VutOptions())
 
 
@@ -260,7 +260,7 @@ def find_vut(spec: str, options: VutOptions) -> Vut:
     """Return the VUT that a spec names, hosted in a process of its own where its kind says so.
 
     Raises:
-        UserError: for a name that nobody knows, and for a VUT that cannot be loaded.
+        UserError: for an unknown name, and for a VUT that cannot be loaded.
     """
     kind = kind_of(spec)
     if options.command is not None and not kind.by_command:
