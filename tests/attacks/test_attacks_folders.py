@@ -28,6 +28,7 @@ from merge_sumo.studies.certificate import CERTIFICATE
 from merge_sumo.studies.probability import failure_probability
 from merge_sumo.system.anchors import SUPPORTED
 from merge_sumo.system.folders import TEMPORARY, add_to, new_folder, replace_own, write_new
+from merge_sumo.values.scenario import US23
 
 pytestmark = pytest.mark.skipif(not SUPPORTED, reason="folders are held by descriptors on Linux")
 SETTINGS_OF: dict[str, Any] = {"vut": "design1", "levels": (0,), "sampler": "uniform", "seed": 1}
@@ -82,9 +83,11 @@ class TestACampaign:
         self, begin, common, private, other_account
     ):
         folder = common / "run"
-        settings = CampaignSettings(**SETTINGS_OF, cases=24, batch=6)
+        settings = CampaignSettings(**{"scenario": US23, **SETTINGS_OF}, cases=24, batch=6)
         if not begin:
-            run_campaign(CampaignSettings(**SETTINGS_OF, cases=6, batch=6), folder)
+            run_campaign(
+                CampaignSettings(**{"scenario": US23, **SETTINGS_OF}, cases=6, batch=6), folder
+            )
         swapped: list[None] = []
 
         def swap() -> None:
@@ -111,7 +114,7 @@ class TestACampaign:
             note_run(*arguments, **named)
 
         monkeypatch.setattr(store, "note_run", swap)
-        settings = CampaignSettings(**SETTINGS_OF, cases=2, batch=2)
+        settings = CampaignSettings(**{"scenario": US23, **SETTINGS_OF}, cases=2, batch=2)
         with pytest.raises(UserError):
             run_campaign(settings, common / "run")
 

@@ -75,7 +75,7 @@ def vut(tmp_path):
 def campaign(spec: str, folder: Path, workers: int = 1, **settings) -> Run:
     given = {"vut": spec, "levels": (0,), "cases": 60, "sampler": "uniform", **settings}
     with open_workers(workers) as there:
-        return run_campaign(CampaignSettings(**given), folder, workers=there)
+        return run_campaign(CampaignSettings(**{"scenario": US23, **given}), folder, workers=there)
 
 
 def test_a_class_without_reset_drives_as_one_with_it(vut, tmp_path):

@@ -38,6 +38,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system import folders, interrupt
 from merge_sumo.system.interrupt import Interrupt, Stopped
+from merge_sumo.values.scenario import US23
 
 BATCH = 8
 MOUNT = shutil.which("mount")
@@ -46,7 +47,7 @@ KILLER = Path(__file__).resolve().parents[2] / "tools" / "kill_campaigns.py"
 
 def settings(sampler: str = "annealing", **changes) -> CampaignSettings:
     values = {"vut": "design1", "levels": (0,), "cases": 28, "batch": BATCH, "seed": 2}
-    return CampaignSettings(sampler=sampler, **{**values, **changes})
+    return CampaignSettings(sampler=sampler, **{"scenario": US23, **{**values, **changes}})
 
 
 class StopAfter:

@@ -136,8 +136,10 @@ def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(tm
         "cases": 120,
         "batch": 20,
     }
-    whole = run_campaign(CampaignSettings(**plan), tmp_path / "whole")
-    early = run_campaign(CampaignSettings(**plan, stop_after_converged=0.9), tmp_path / "early")
+    whole = run_campaign(CampaignSettings(**{"scenario": US23, **plan}), tmp_path / "whole")
+    early = run_campaign(
+        CampaignSettings(**{"scenario": US23, **plan}, stop_after_converged=0.9), tmp_path / "early"
+    )
     assert 80 <= len(early.outcomes) < len(whole.outcomes) == 120
     assert len(early.outcomes) % 20 == 0
     text = (tmp_path / "whole" / "outcomes.jsonl").read_bytes()

@@ -20,6 +20,7 @@ from merge_sumo.system import pulse
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame
 from merge_sumo.system.pulse import PAUSE_S, AwakeClock, Pulse
 from merge_sumo.system.workers import open_workers
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX are needed")
@@ -59,7 +60,9 @@ class Vut:
 
 
 def settings(spec: str, **more: object) -> CampaignSettings:
-    return CampaignSettings(vut=spec, levels=(0,), cases=12, batch=12, seed=1, **more)  # type: ignore[arg-type]
+    return CampaignSettings(
+        vut=spec, levels=(0,), cases=12, batch=12, seed=1, **{"scenario": US23, **more}
+    )  # type: ignore[arg-type]
 
 
 def outcomes(run: Run) -> bytes:

@@ -97,7 +97,9 @@ def with_layers(
 
 def settings(policies: Path | None, **changes) -> CampaignSettings:
     named = None if policies is None else str(policies)
-    return CampaignSettings(vut="design2", policies=named, **{**SMALL, **changes})
+    return CampaignSettings(
+        vut="design2", policies=named, **{"scenario": US23, **{**SMALL, **changes}}
+    )
 
 
 class TestACampaign:
@@ -118,7 +120,7 @@ class TestACampaign:
         for name, folder in (("shipped", None), ("swapped", swapped)):
             values: dict[str, Any] = {**SMALL, "levels": (0,)}
             named = None if folder is None else str(folder)
-            level1 = CampaignSettings(vut="level1", policies=named, **values)
+            level1 = CampaignSettings(vut="level1", policies=named, **{"scenario": US23, **values})
             run_campaign(level1, tmp_path / name)
         assert outcomes(tmp_path / "swapped") != outcomes(tmp_path / "shipped")
 
@@ -299,7 +301,7 @@ class TestAFolder:
     @pytest.mark.parametrize("level", [1, 2])
     def test_without_a_network_says_how_to_make_it(self, one, level):
         values: dict[str, Any] = {**SMALL, "levels": (level,)}
-        named = CampaignSettings(vut="design1", policies=str(one), **values)
+        named = CampaignSettings(vut="design1", policies=str(one), **{"scenario": US23, **values})
         if level == 1:
             resolve(named)
             return

@@ -80,7 +80,7 @@ def pov(source: str, name: str = "my_pov.py") -> str:
 
 
 def settings(spec: str, **changes) -> CampaignSettings:
-    return CampaignSettings(pov=spec, **{**SMALL, **changes})
+    return CampaignSettings(pov=spec, **{"scenario": US23, **{**SMALL, **changes}})
 
 
 def outcomes(folder: Path) -> bytes:
@@ -462,7 +462,9 @@ class TestResuming:
 
     def test_with_force_takes_a_pov_that_was_not_there(self, call, tmp_path):
         values: dict[str, Any] = {**SMALL, "levels": (0,)}
-        folder = run_campaign(CampaignSettings(**values), tmp_path / "run").folder
+        folder = run_campaign(
+            CampaignSettings(**{"scenario": US23, **values}), tmp_path / "run"
+        ).folder
         pov(YIELDS)
         forced = ("campaign", "--resume", folder, "--pov", "my_pov.py:Pov", "--level", "own")
         assert call(*forced)[0] == 2
@@ -515,7 +517,9 @@ class TestTrust:
     ):
         pov(TELLTALE)
         values: dict[str, Any] = {**SMALL, "levels": (0,)}
-        folder = run_campaign(CampaignSettings(**values), tmp_path / "run").folder
+        folder = run_campaign(
+            CampaignSettings(**{"scenario": US23, **values}), tmp_path / "run"
+        ).folder
         record = json.loads((folder / SETTINGS).read_text())
         record.pop(CHECKSUM)
         (folder / SETTINGS).write_text(json.dumps(record | {"pov": forged, "levels": [3]}))

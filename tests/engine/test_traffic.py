@@ -99,7 +99,7 @@ class TestThePool:
         with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
             Case(**state, scenario=TRAFFIC)
         with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
-            Case(**state, headway_ahead_s=2.0, headway_behind_s=2.0)
+            Case(**{"scenario": US23, **state}, headway_ahead_s=2.0, headway_behind_s=2.0)
         with pytest.raises(UserError, match="3 m apart"):
             Case(**state, headway_ahead_s=0.1, headway_behind_s=2.0, scenario=TRAFFIC)
 

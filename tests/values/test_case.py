@@ -53,4 +53,4 @@ def test_points_and_cases_are_inverse_to_each_other(level, coordinates):
 def test_a_case_that_is_no_scenario_is_refused_with_a_sentence(change, sentence):
     values = {"level": 1, "x_pov0_m": -273.0, "v_pov0_mps": 33.0} | change
     with pytest.raises(UserError, match=sentence):
-        Case(**values)
+        Case(**{"scenario": US23, **values})

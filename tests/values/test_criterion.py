@@ -433,7 +433,12 @@ class TestOutcomes:
 
 
 def settings(**other):
-    return CampaignSettings(**{"vut": "design2", "levels": (0,), "cases": 40, "batch": 20, **other})
+    return CampaignSettings(
+        **{
+            "scenario": US23,
+            **{"vut": "design2", "levels": (0,), "cases": 40, "batch": 20, **other},
+        }
+    )
 
 
 @pytest.fixture(scope="module")

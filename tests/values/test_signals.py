@@ -20,6 +20,7 @@ from merge_sumo.reports.report import write_report
 from merge_sumo.system.arrays import read_arrays
 from merge_sumo.system.records import decode
 from merge_sumo.system.workers import open_workers
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.signals import (
     CHARACTERS,
     MOST_NAMES,
@@ -58,7 +59,11 @@ def campaign(tmp_path):
         given = {"levels": (0,), "cases": 24, "batch": 12, "sampler": "uniform", **settings}
         folder = tmp_path / f"run{len(list(tmp_path.iterdir()))}"
         with open_workers(workers) as there:
-            return run_campaign(CampaignSettings(vut=f"{path}:Vut", **given), folder, workers=there)
+            return run_campaign(
+                CampaignSettings(vut=f"{path}:Vut", **{"scenario": US23, **given}),
+                folder,
+                workers=there,
+            )
 
     return run
 

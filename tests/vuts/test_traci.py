@@ -340,8 +340,8 @@ def assert_same_to_1e9(one: list[dict], other: list[dict]) -> None:
 def test_the_same_law_by_traci_and_in_process_gives_the_same_measures(tmp_path, count):
     command = program(tmp_path, CONTROLLER)
     shared = {"levels": (0,), "sampler": "uniform", "cases": count, "batch": 20, "seed": 4}
-    by_traci = CampaignSettings(vut="traci", vut_command=command, **shared)
-    in_process = CampaignSettings(vut="level0", **shared)
+    by_traci = CampaignSettings(vut="traci", vut_command=command, **{"scenario": US23, **shared})
+    in_process = CampaignSettings(vut="level0", **{"scenario": US23, **shared})
     run_campaign(by_traci, tmp_path / "traci")
     run_campaign(in_process, tmp_path / "python")
     found = measures_of(tmp_path / "traci")
