@@ -19,7 +19,8 @@ from campaigning import resume_campaign, run_campaign
 
 from merge_sumo.campaigns import store
 from merge_sumo.campaigns.ownership import note_run
-from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import REPORT
@@ -243,7 +244,8 @@ class TestTheCasesOfAProbability:
     @pytest.fixture
     def asked(self, run, monkeypatch) -> dict[str, Any]:
         monkeypatch.setattr(probability, "WRITTEN", 5)
-        return {"run": run, "cases": 20}
+        settings = settings_of(run.folder, run.settings)
+        return {"run": run, "settings": settings, "plan": resolve(settings), "cases": 20}
 
     def test_that_somebody_changes_do_not_change_the_estimate(self, asked, tmp_path):
         honest = failure_probability(**asked, out=tmp_path / "honest.json")
