@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 
 
@@ -19,3 +20,8 @@ def end_with(lifeline: int) -> None:
         fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
     fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | asynchronous)
+    # An end that was closed before sends no signal any more.
+    ended = select.poll()
+    ended.register(lifeline, 0)
+    if ended.poll(0):
+        os.kill(os.getpid(), signal.SIGKILL)
