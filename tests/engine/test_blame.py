@@ -8,6 +8,7 @@ import signal
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from campaigning import run_campaign
@@ -60,9 +61,8 @@ class Vut:
 
 
 def settings(spec: str, **more: object) -> CampaignSettings:
-    return CampaignSettings(
-        vut=spec, levels=(0,), cases=12, batch=12, seed=1, **{"scenario": US23, **more}
-    )  # type: ignore[arg-type]
+    values: dict[str, Any] = {"scenario": US23, **more}
+    return CampaignSettings(vut=spec, levels=(0,), cases=12, batch=12, seed=1, **values)
 
 
 def outcomes(run: Run) -> bytes:
