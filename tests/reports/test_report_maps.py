@@ -142,8 +142,8 @@ class TestWords:
     def words(cls, tmp_path_factory):
         folder = tmp_path_factory.mktemp("traffic") / "run"
         model = ReportModel(write_run(folder, 40, error=None, scenario=TRAFFIC))
-        sections = (SECTIONS[name].words(model) for name in ("numbers", "words"))
-        return shared_words(model) | next(sections) | next(sections)
+        numbers, words = (SECTIONS[name].words(model) for name in ("numbers", "words"))
+        return {**shared_words(model), **numbers, **words}
 
     def test_name_the_pairs_and_what_they_explain(self, words):
         zero, _, two = words["levels"]
