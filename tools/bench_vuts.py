@@ -37,7 +37,7 @@ from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.world import SUMO_OPTIONS
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.onnx_export import export_onnx
@@ -45,7 +45,7 @@ from merge_sumo.vuts.registry import vut_factory
 
 STEPS = 80
 """Of an episode."""
-CASE = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
+CASE = MergeCase(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
 LAW = """
 class Vut:
     def act(self, seen):

@@ -19,7 +19,7 @@ from merge_sumo.engine.simulator import Simulator, road_for
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.scenario import DT_S, US23, Scenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import Trajectory
@@ -54,7 +54,7 @@ def _case(
     **headways_s: float,
 ) -> Case:
     """Return a case with the VUT's own speed in its scenario."""
-    return Case(
+    return MergeCase(
         level=level,
         x_pov0_m=x_pov0_m,
         v_pov0_mps=v_pov0_mps,

@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import astuple, dataclass
 
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import LEVELS, Dimension, Scenario
-
-WRITTEN: Final[dict[str, tuple[str, str, int]]] = {
-    "x_pov0_m": ("x_POV0", "m", 1),
-    "v_pov0_mps": ("v_POV0", "m/s", 2),
-    "v_vut0_mps": ("v_VUT0", "m/s", 2),
-    "headway_ahead_s": ("headway ahead", "s", 2),
-    "headway_behind_s": ("headway behind", "s", 2),
-    "svo_rad": ("psi", "rad", 2),
-}
-"""Name, unit and digits after the point, by the field of a case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +37,8 @@ class Coordinate:
 def coordinates(scenario: Scenario, levels: Sequence[int] = LEVELS) -> tuple[Coordinate, ...]:
     """Return the coordinates that a scenario has at any of some levels, in the pool's order."""
     most = max((scenario.dimensions(level) for level in levels), key=len)
-    return tuple(Coordinate(d, *WRITTEN[d.field]) for d in most)
+    notation = scenario.notation
+    return tuple(Coordinate(d, *astuple(notation[d.field])[:3]) for d in most)
 
 
 def described(case: Case) -> str:

@@ -653,14 +653,14 @@ class ScenarioList(Result, dict[str, Scenario]):
 
     def to_record(self) -> dict[str, Any]:
         """Return the numbers of each scenario."""
-        return {name: asdict(scenario) for name, scenario in self.items()}
+        return {name: scenario.to_record() for name, scenario in self.items()}
 
     def lines(self) -> list[str]:
         """Return the initial states of the POV in each scenario."""
+        ranges = {name: scenario.dimensions(0)[:2] for name, scenario in self.items()}
         return [
-            f"{name}: POV from {one.x_pov0_m[0]:g} to {one.x_pov0_m[1]:g} m at "
-            f"{one.v_pov0_mps[0]:g} to {one.v_pov0_mps[1]:g} m/s"
-            for name, one in self.items()
+            f"{name}: POV from {x.low:g} to {x.high:g} m at {v.low:g} to {v.high:g} m/s"
+            for name, (x, v) in ranges.items()
         ]
 
 

@@ -58,9 +58,10 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
         given.setdefault("v_vut0_mps", fixed)
     for dimension in scenario.dimensions(level):
         if dimension.field not in given:
+            option = FIELDS.get(dimension.field, dimension.field)
             raise UserError(
-                f"{FIELDS[dimension.field]} ({dimension.field}) is missing: the pool has "
-                f"{dimension.low:g} to {dimension.high:g}"
+                f"{option} ({dimension.field}) is missing: the pool has {dimension.low:g} to "
+                f"{dimension.high:g}"
             )
     known = {"v_vut0_mps", *(dimension.field for dimension in scenario.dimensions(level))}
     for name in given.keys() - known:
@@ -68,7 +69,8 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
             f"{FIELDS.get(name, name)} ({name}) is none of the coordinates of {scenario.name} at "
             f"level {level_name(level)}: leave it out"
         )
-    return Case(level=level, scenario=scenario, **given)
+    case: Case = scenario.case_type(level=level, scenario=scenario, **given)
+    return case
 
 
 def settings_and_case(

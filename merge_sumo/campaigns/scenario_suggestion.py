@@ -12,7 +12,7 @@ import numpy as np
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
 from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.values.scenario import US23, V_VUT0_MPS, Scenario
+from merge_sumo.values.scenario import US23, V_VUT0_MPS, MergeScenario, Scenario, as_merge
 from merge_sumo.values.scenario_scale import Units
 
 MARGIN: Final = 0.15
@@ -23,7 +23,7 @@ ROOM: Final = 0.98
 """Of the length of a path that is used."""
 
 
-def suggested(road: Corridor, name: str) -> Scenario:
+def suggested(road: Corridor, name: str) -> MergeScenario:
     """Return a scenario for a road: limits and lengths from the road, the rest as in the paper.
 
     The VUT starts as far from M as in the paper, or as the ramp allows; the POV where, at some
@@ -103,15 +103,17 @@ def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
     measure in the units of the scenario that they play, so what counts is what its numbers are like
     in the one that they were trained for. Outside, levels 1 and 2 are extrapolations.
     """
+    if not isinstance(scenario, MergeScenario):
+        return []
     folder = policies or policies_of(scenario)
     trained = {scenario_of(entry) for entry in read_manifest(folder).values()}
     if not trained:
         return [f"{folder} has no learned drivers"]
-    found = [sentence for known in trained for sentence in _differences(scenario, known)]
+    found = [sentence for known in trained for sentence in _differences(scenario, as_merge(known))]
     return list(dict.fromkeys(found))
 
 
-def _differences(scenario: Scenario, trained: Scenario) -> list[str]:
+def _differences(scenario: MergeScenario, trained: MergeScenario) -> list[str]:
     """Return the numbers of a scenario that are not like those of training, in sentences."""
     unit, known = Units.of(scenario), Units.of(trained)
     length, speed, gap = (

@@ -18,7 +18,7 @@ from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.system.records import RecordError, check_fields, convert
+from merge_sumo.system.records import RecordError, check_fields
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import (
@@ -149,7 +149,7 @@ class CampaignSettings:
 RECORDED_BY_DEFAULT: Final = {
     **{f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING},
     "v_vut0_mps": US23.v_vut0_mps,
-    "scenario": asdict(US23),
+    "scenario": US23.to_record(),
 }
 """What the settings were in a campaign that does not record them."""
 
@@ -168,6 +168,7 @@ def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any
     folder = None if settings.policies is None else str(plan.povs.policies)
     return {
         **asdict(settings),
+        "scenario": settings.scenario.to_record(),
         "policies": folder,
         "versions": dict(plan.versions),
         "vut_files": plan.vut.files or None,
@@ -212,8 +213,12 @@ def settings_of(
         known["scenario"] = scenario_of(record, folder / SETTINGS)
     if isinstance(known.get("policies"), str) and "policies" not in (given or {}):
         _check_still_there(folder, known["policies"])
+    required = (spec.name for spec in fields(CampaignSettings) if spec.default is MISSING)
+    for name in required:
+        if name not in known:
+            raise UserError(f"{folder / SETTINGS}: it has no {name}")
     try:
-        return convert(known, CampaignSettings)
+        return CampaignSettings(**known)
     except RecordError as error:
         raise UserError(f"{folder / SETTINGS}: {error}") from error
 

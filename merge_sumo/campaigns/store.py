@@ -35,12 +35,13 @@ from merge_sumo.system.anchors import Anchor
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_folder
 from merge_sumo.system.printable import printable, quoted
-from merge_sumo.system.records import convert, decode
+from merge_sumo.system.records import decode
 from merge_sumo.system.trust import begun_here
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario_kinds import scenario_of_record
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.signals import SignalRuns, Signals, from_runs, to_record
 from merge_sumo.values.trajectory import Trajectory
@@ -219,7 +220,7 @@ def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
     """
     recorded = settings.get("scenario")
     try:
-        return US23 if recorded is None else convert(recorded, Scenario)
+        return US23 if recorded is None else scenario_of_record(recorded)
     except UserError as error:
         raise UserError(f"{path} has no scenario: {error}") from error
 

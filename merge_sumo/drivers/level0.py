@@ -42,11 +42,20 @@ def level0_time_to(
 
 
 class Level0Pov(Driver):
-    """Keeps its speed."""
+    """Keeps the acceleration that its case gives it; at a merge that is 0."""
+
+    def __init__(self, corridors: int) -> None:
+        """Prepare for a number of corridors."""
+        super().__init__(corridors)
+        self._a_mps2 = np.zeros(corridors)
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Take the acceleration of a case."""
+        self._a_mps2[corridor] = case.level0_pov_mps2
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return zeros."""
-        return np.zeros(self.corridors)
+        """Return the accelerations, (K,)."""
+        return self._a_mps2.copy()
 
 
 class Level0Vut(Driver):

@@ -196,7 +196,7 @@ class LevelKDriver(Driver):
         self._svo_rad = np.zeros(corridors)
         self._held = np.zeros(corridors)
         """Accelerations, (K,); NaN where the action values of the last decision were not finite."""
-        self._scenarios = [US23]
+        self._scenarios: list[Scenario] = [US23]
         self._scenario = np.zeros(corridors, dtype=np.int64)
         """Which of them is a corridor's; a campaign has one."""
 

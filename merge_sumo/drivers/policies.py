@@ -17,6 +17,7 @@ from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import Record, convert, decode
 from merge_sumo.system.resources import resource
 from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario_kinds import scenario_of_record
 
 MANIFEST: Final = "manifest.json"
 NETWORKS: Final = ("pov1", "vut1", "pov2", "vut2")
@@ -99,7 +100,7 @@ def scenario_of(entry: dict[str, Any]) -> Scenario:
     record = entry.get("scenario", scenario_record(US23))
     if not set(convert(record, dict[str, Any])) <= {"name", *PLAYED, *LIMITS}:
         raise UserError("the scenario of a policy is a table of its numbers")
-    return convert(record, Scenario)
+    return scenario_of_record(record)
 
 
 def plays_as(one: Scenario, other: Scenario) -> bool:

@@ -19,7 +19,7 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, level_name
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.files import Files
@@ -238,17 +238,6 @@ def seen_from(case: Case, car: int) -> Case:
     starts = case.starts()
     x_other_m, v_other_mps = starts.pop(VUT)
     x_m, v_mps = starts[car]
-    scenario = replace(
-        case.scenario,
-        x_vut0_m=min(x_m, BEFORE_M),
-        v_vut0_mps=v_mps,
-        headway_ahead_s=None,
-        headway_behind_s=None,
-    )
-    return Case(
-        level=0,
-        x_pov0_m=x_other_m,
-        v_pov0_mps=v_other_mps,
-        v_vut0_mps=v_mps,
-        scenario=scenario,
-    )
+    scenario = replace(case.scenario, x_vut0_m=min(x_m, BEFORE_M), v_vut0_mps=v_mps)
+    told = (x_other_m, v_other_mps), (x_m, v_mps)
+    return ToldCase(level=0, v_vut0_mps=v_mps, scenario=scenario, told=told)

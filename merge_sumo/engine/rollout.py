@@ -124,6 +124,7 @@ class _Rollout:
         """Rows of the record at which episodes time out."""
         self.next_timeout = NEVER
         # One row per step of the world, shared by all corridors: x, v, a of every vehicle.
+        self.ends_as = End(world.scenario.ends_as)
         self.follow_steps = round(world.scenario.follow_up_s / DT_S)
         self.ring = RING_ROWS + self.follow_steps
         self.record = np.zeros((self.ring, vehicles, 3, corridors))
@@ -157,28 +158,28 @@ class _Rollout:
             if self.errors and self.was_paused() and self.excuse():
                 continue
             self.step += 1
-            arrived = world.x_m[VUT] >= 0.0
-            # In most steps no episode ends. Idle corridors stand before M.
+            arrived = world.scenario.has_ended(world.x_m, world.v_mps) & self.active
+            # In most steps no episode ends.
             if np.count_nonzero(arrived) or self.row >= self.next_timeout or self.errors:
                 ended = arrived | (self.row >= self.timeout_at)
                 ended[list(self.errors)] = True
                 corridors = np.flatnonzero(ended).tolist()
                 if self.follow_steps:
-                    corridors = [corridor for corridor in corridors if not self.goes_on(corridor)]
+                    corridors = [k for k in corridors if not self.goes_on(k, arrived=arrived[k])]
                 for corridor in corridors:
                     if corridor in self.errors:
                         yield self.finish(corridor, *self.errors.pop(corridor))
                     else:
                         yield self.finish(
-                            corridor, End.MERGED if arrived[corridor] else End.TIMEOUT
+                            corridor, self.ends_as if arrived[corridor] else End.TIMEOUT
                         )
                 self.refill(corridors)
 
-    def goes_on(self, corridor: int) -> bool:
+    def goes_on(self, corridor: int, *, arrived: bool) -> bool:
         """Return whether an episode goes on behind M; note where that begins."""
         episode, x_m = self.episodes[corridor], self.world.x_m[:, corridor]
         assert episode is not None, "only running episodes go on"  # noqa: S101
-        if corridor in self.errors or x_m[VUT] < 0.0:
+        if corridor in self.errors or not arrived:
             return False
         if episode.merge_row is None:
             episode.merge_row, episode.clipped = self.row, int(self.clipped[corridor])
@@ -382,7 +383,9 @@ class _Rollout:
         before, after = motion[: steps + 1].copy(), motion[steps:]
         before[-1, :, 2] = 0.0
         signals = series(episode.left, len(before))
-        merged = Trajectory(episode.case, before, End.MERGED, None, episode.clipped, after, signals)
+        merged = Trajectory(
+            episode.case, before, self.ends_as, None, episode.clipped, after, signals
+        )
         return episode.index, merged
 
 

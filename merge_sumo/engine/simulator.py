@@ -77,6 +77,6 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
     if net is None and scenario.net is not None:
         # Where a path says nothing of folders, the net is one that the package brings.
         net = resource("sumo_net") / scenario.net
-    road = road_of(net, scenario.mainline, scenario.ramp, scenario.room_after_m)
-    road.check_room(scenario.mainline_m, -scenario.x_vut0_m)
+    road = road_of(net, scenario.pov_edges, scenario.vut_edges, scenario.room_after_m)
+    road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)
     return road

@@ -23,7 +23,7 @@ from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
 from merge_sumo.values.fmc import RADIUS
-from merge_sumo.values.scenario import OWN, Dimension, level_name
+from merge_sumo.values.scenario import OWN, US23, Dimension, level_name
 from merge_sumo.values.score import FAILURE_SCORE
 
 if TYPE_CHECKING:
@@ -37,12 +37,6 @@ LEVEL_MARKERS: Final = {0: "o", 1: "s", 2: "^", OWN: "D"}
 SAFE_COLOUR: Final = "#c4c9cf"
 DPI: Final = 150
 KINDS: Final = (".png", ".svg", ".html")
-SYMBOLS: Final = {
-    "x_pov0_m": "$x_{POV}^0$ (m)",
-    "v_pov0_mps": "$v_{POV}^0$ (m/s)",
-    "svo_rad": "$\\psi$ (rad)",
-}
-"""Coordinates of a case as the paper writes them: start and speed of the POV, and its SVO."""
 STYLE: Final[Any] = {
     "font.size": 10,
     "axes.titlesize": 11,
@@ -245,8 +239,8 @@ def _pool_axes(axes: Axes, x: Dimension, y: Dimension) -> None:
 
     axes.set_xlim(x.low, x.high)
     axes.set_ylim(y.low, y.high)
-    axes.set_xlabel(SYMBOLS[x.field])
-    axes.set_ylabel(SYMBOLS[y.field])
+    axes.set_xlabel(US23.notation[x.field].symbol)
+    axes.set_ylabel(US23.notation[y.field].symbol)
     axes.xaxis.set_major_locator(MaxNLocator(5))
 
 
@@ -263,7 +257,7 @@ def _box(axes: Any, panel: Panel, level: int, ink: str) -> None:
     axes.scatter(*failing.T, s=14 if few else 7, color=ink, **dots)
     for side, d in zip("xyz", dimensions(level), strict=True):
         getattr(axes, f"set_{side}lim")(d.low, d.high)
-        getattr(axes, f"set_{side}label")(SYMBOLS[d.field])
+        getattr(axes, f"set_{side}label")(US23.notation[d.field].symbol)
         axis = getattr(axes, f"{side}axis")
         axis.set_pane_color((0.97, 0.97, 0.98, 1.0))
         axis.line.set_color("#57606a")

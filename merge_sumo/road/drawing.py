@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from lxml import etree
 
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.values.scenario import Scenario
+from merge_sumo.values.scenario import MergeScenario
 
 WIDTH_PX = 1000
 LANE_M = 3.2
 STEP_M = 5.0
 
 
-def road_svg(road: Corridor, scenario: Scenario) -> bytes:
+def road_svg(road: Corridor, scenario: MergeScenario) -> bytes:
     """Return the picture of a road with the starts of a scenario on it."""
     low_m = min(scenario.x_pov0_m[0], scenario.x_vut0_m)
     paths = {

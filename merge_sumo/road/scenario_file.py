@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.records import convert
 from merge_sumo.system.resources import resource
 from merge_sumo.system.suggestions import meant
 from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario_kinds import scenario_of_record
 
 SUFFIX: Final = ".toml"
 MAX_BYTES: Final = 1 << 20
@@ -73,7 +73,7 @@ def _read(path: Path) -> Scenario:
     except (ValueError, RecursionError) as error:
         raise UserError(f"the scenario {path} is no TOML: {error}") from error
     try:
-        return convert({"name": path.stem, **record}, Scenario)
+        return scenario_of_record({"name": path.stem, **record})
     except UserError as error:
         raise UserError(f"{path}{_line(text, str(error))}: {error}") from error
 

@@ -46,7 +46,7 @@ from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import read_indexed
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.bodies import CentreLines
-from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.case import Case, FloatArray, MergeCase
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S, EpisodeTime
@@ -233,7 +233,7 @@ def _unknown(_: Failure) -> None:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Counterfactual(Case):
+class _Counterfactual(MergeCase):
     """A failing case with another driver.
 
     Attributes:
@@ -325,7 +325,7 @@ def _latest_takeovers(stage: Stage, failures: Sequence[Trajectory]) -> list[int 
 
 
 def _counterfactual(failure: Trajectory, **other: Any) -> _Counterfactual:
-    same = {f.name: getattr(failure.case, f.name) for f in fields(Case)}
+    same = {f.name: getattr(failure.case, f.name) for f in fields(failure.case)}
     return _Counterfactual(**same, failure=failure, **other)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.case import Case, FloatArray, MergeCase
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.in_memory import is_here
@@ -22,7 +22,7 @@ from merge_sumo.vuts.registry import waits_for_client
 
 CORRIDORS: Final = 4
 CASES: Final = tuple(
-    Case(level=0, x_pov0_m=x, v_pov0_mps=v, scenario=US23)
+    MergeCase(level=0, x_pov0_m=x, v_pov0_mps=v, scenario=US23)
     for x, v in product((-340.0, -300.0, -260.0, -220.0), (25.0, 28.0, 31.0, 34.0))
 )
 FROM_STAND: Final = replace(CASES[0], v_vut0_mps=0.0)
@@ -134,8 +134,13 @@ def _meetings(trajectories: Sequence[Trajectory]) -> list[Case]:
     for one in sorted(trajectories, key=lambda one: -abs(_gap_m(one))):
         nearest[one.case.v_pov0_mps] = one
     return [
-        replace(one.case, x_pov0_m=min(max(one.case.x_pov0_m - _gap_m(one), low_m), high_m))
-        for one in nearest.values()
+        MergeCase(
+            level=0,
+            x_pov0_m=min(max(one.case.x_pov0_m - _gap_m(one), low_m), high_m),
+            v_pov0_mps=v_pov0_mps,
+            scenario=one.case.scenario,
+        )
+        for v_pov0_mps, one in nearest.items()
     ]
 
 

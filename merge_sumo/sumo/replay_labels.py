@@ -38,14 +38,6 @@ DOT: Final = 0.012
 """Diameter of the dots of the legend, as a share of the picture's width."""
 APART: Final = 0.13
 """Of two dots, as a share of the picture's width."""
-COORDINATES: Final = (
-    ("x_pov0_m", "x_POV0 {:.1f} m"),
-    ("v_pov0_mps", "v_POV0 {:.2f} m/s"),
-    ("v_vut0_mps", "v_VUT0 {:.2f} m/s"),
-    ("headway_ahead_s", "headway ahead {:.2f} s"),
-    ("headway_behind_s", "headway behind {:.2f} s"),
-    ("svo_rad", "psi {:.2f} rad"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +82,13 @@ def labels_of(outcome: Outcome, picture: Picture) -> etree._Element:
 
 def case_line(case: Case, index: int | None = None) -> str:
     """Return which case it is, with its index where it has one."""
-    values = ((getattr(case, field), words) for field, words in COORDINATES)
-    parts = [words.format(value) for value, words in values if value is not None]
+    notation = case.scenario.notation.items()
+    values = ((getattr(case, field), written) for field, written in notation)
+    parts = [
+        f"{written.name} {value:.{written.digits}f} {written.unit}"
+        for value, written in values
+        if value is not None
+    ]
     named = "" if index is None else f"case {index}, "
     return f"{named}POV level {level_name(case.level)}: {', '.join(parts)}"
 

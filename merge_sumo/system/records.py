@@ -103,6 +103,8 @@ def check_fields(value: Any) -> None:
     kind: Any = type(value)
     for name, hint in _hints(kind).items():
         known = getattr(value, name)
+        if isinstance(hint, type) and is_dataclass(hint) and isinstance(known, hint):
+            continue  # also of a subclass, which msgspec takes for another type
         plain = known.item() if isinstance(known, np.generic) else known
         try:
             object.__setattr__(value, name, msgspec.convert(plain, hint))

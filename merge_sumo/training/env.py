@@ -31,8 +31,8 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.world import World
 from merge_sumo.training.game import Role, of_two
 from merge_sumo.training.reward import Reward, RewardWeights, pov_reward
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import POV, SVO, US23, VUT, Scenario
+from merge_sumo.values.case import FloatArray, MergeCase
+from merge_sumo.values.scenario import POV, SVO, US23, VUT, Scenario, as_merge
 from merge_sumo.values.scenario_scale import Units
 
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
@@ -66,7 +66,7 @@ class MergeGame:
         The reward says which scenario is played; its road is the shipped one where none is given.
         """
         self.role, self.opponent, self.reward = role, opponent, reward
-        self.scenario = reward.scenario
+        self.scenario = as_merge(reward.scenario)
         self.actions_mps2 = actions_mps2(self.scenario)
         self.max_decisions = self.scenario.max_steps // DECISION_STEPS
         self.corridors = opponent.corridors
@@ -79,7 +79,7 @@ class MergeGame:
         x_pov = max(x_pov, -self.world.road.mainline.before_m)
         self.world.place(corridor, [(x_pov, v_pov), (x_vut, v_vut)])
         level = 1 if svo_rad is None else 2
-        case = Case(
+        case = MergeCase(
             level=level,
             x_pov0_m=self.scenario.x_pov0_m[0],
             v_pov0_mps=self.scenario.v_pov0_mps[0],
@@ -139,8 +139,9 @@ class MergeGame:
 
 def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
     """Return `n` starting states, (n, 4), uniform over the pool."""
-    x_pov = rng.uniform(*scenario.x_pov0_m, n)
-    v_pov = rng.uniform(*scenario.v_pov0_mps, n)
+    merge = as_merge(scenario)
+    x_pov = rng.uniform(*merge.x_pov0_m, n)
+    v_pov = rng.uniform(*merge.v_pov0_mps, n)
     v_vut = _starting_speeds(n, rng, scenario)
     return np.stack([x_pov, v_pov, np.full(n, scenario.x_vut0_m), v_vut], axis=1)
 
@@ -161,7 +162,8 @@ def exploring_starts(
     """
     unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
     x_vut0, a, v_cruise = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
-    (x_low, _), (v_low, v_high) = scenario.x_pov0_m, scenario.v_pov0_mps
+    merge = as_merge(scenario)
+    (x_low, _), (v_low, v_high) = merge.x_pov0_m, merge.v_pov0_mps
     x_vut = rng.uniform(x_vut0, -1.0 * unit.length, n)
     v_vut0 = _starting_speeds(n, rng, scenario)
     on_profile = np.sqrt(v_vut0**2 + 2.0 * a * (x_vut - x_vut0)) + rng.normal(

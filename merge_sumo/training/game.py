@@ -26,15 +26,15 @@ from merge_sumo.drivers.levelk import (
 )
 from merge_sumo.training.reward import Reward, pov_reward
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, Scenario
+from merge_sumo.values.scenario import DT_S, MergeScenario, Scenario, as_merge
 
 Role = Literal["pov", "vut"]
 IntArray = NDArray[np.int64]
 
 
-def of_two(scenario: Scenario) -> Scenario:
+def of_two(scenario: Scenario) -> MergeScenario:
     """Return a scenario without other cars: a level is a driver's answer to the VUT alone."""
-    return replace(scenario, headway_ahead_s=None, headway_behind_s=None)
+    return replace(as_merge(scenario), headway_ahead_s=None, headway_behind_s=None)
 
 
 Policy = Callable[[FloatArray, FloatArray], IntArray]

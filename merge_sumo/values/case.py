@@ -1,9 +1,10 @@
 """A test case, and the pool that it is drawn from (Wang et al., section V-A).
 
-A case is s = [x_POV0, v_POV0, psi, L]: where the POV starts, how fast, its social value
-orientation, and its level of reasoning. The orientation exists only at level 2, so the pool is
-three boxes: two-dimensional at levels 0 and 1, three-dimensional at level 2. Where a scenario has
-traffic, or a range of the VUT's speed, these are further coordinates.
+`Case` is what every kind of scenario has. A case of a merge is s = [x_POV0, v_POV0, psi, L]: where
+the POV starts, how fast, its social value orientation, and its level of reasoning. The orientation
+exists only at level 2, so the pool is three boxes: two-dimensional at levels 0 and 1,
+three-dimensional at level 2. Where a scenario has traffic, or a range of the VUT's speed, these are
+further coordinates.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from merge_sumo.values.scenario import (
     V_VUT0_MPS,
     VUT,
     Dimension,
+    MergeScenario,
     Scenario,
 )
 
@@ -46,20 +48,27 @@ def dimensions(level: int, scenario: Scenario = US23) -> tuple[Dimension, ...]:
 @quickly_pickled
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Case:
-    """One test case, a point of a scenario; `svo_rad` is None below level 2.
+    """One test case, a point of a scenario; a kind of scenario has a subclass with its coordinates.
 
     Raises `UserError` for values with which the scenario cannot be set up. Values outside the
     pool are allowed: a person may want to look at one.
+
+    Attributes:
+        level: level of the POV.
+        svo_rad: its social value orientation; None below level 2.
+        v_vut0_mps: speed of the VUT at the start.
+        scenario: the scenario.
     """
 
     level: int
-    x_pov0_m: float
-    v_pov0_mps: float
     svo_rad: float | None = None
     v_vut0_mps: float = V_VUT0_MPS
-    headway_ahead_s: float | None = None
-    headway_behind_s: float | None = None
     scenario: Scenario = field(repr=False)
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Coordinates of a kind are fields of its own `Case`."""
 
     def __post_init__(self) -> None:
         """Check that the numbers describe a scenario."""
@@ -69,20 +78,47 @@ class Case:
             )
         if (self.svo_rad is None) == (self.level == 2):
             raise UserError("svo_rad belongs to level 2, and only there: give it or leave it out")
-        reach_m, most_mps = self.scenario.reach_m, self.scenario.v_start_max_mps
-        if not -reach_m <= self.x_pov0_m <= 0.0:
-            raise UserError(f"x_pov0_m is {self.x_pov0_m}: choose between {-reach_m:g} and 0")
-        for name in ("v_pov0_mps", "v_vut0_mps"):
-            if not 0.0 <= getattr(self, name) <= most_mps:
-                raise UserError(
-                    f"{name} is {getattr(self, name)}: choose between 0 and {most_mps:g}"
-                )
+        self._check_coordinates()
         if self.svo_rad is not None and not 0.0 <= self.svo_rad < math.pi / 2:
             raise UserError(f"svo_rad is {self.svo_rad}: choose between 0 and below pi/2")
-        self._check_headways()
 
-    def _check_headways(self) -> None:
-        in_traffic, reach_m = self.scenario.vehicles > 2, self.scenario.reach_m
+    def _check_coordinates(self) -> None:
+        """Raise `UserError` where a coordinate of the kind does not describe a scenario."""
+        raise NotImplementedError
+
+    def _check_speed(self, name: str) -> None:
+        most_mps = self.scenario.v_start_max_mps
+        if not 0.0 <= getattr(self, name) <= most_mps:
+            raise UserError(f"{name} is {getattr(self, name)}: choose between 0 and {most_mps:g}")
+
+    def starts(self) -> list[tuple[float, float]]:
+        """Return position and speed of every vehicle at the start, in the order of their rows."""
+        raise NotImplementedError
+
+    @property
+    def level0_pov_mps2(self) -> float:
+        """Acceleration of a level-0 POV, which it keeps whatever the VUT does."""
+        return 0.0
+
+
+@quickly_pickled
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MergeCase(Case):
+    """A case of a merge: start and speed of the POV and, in traffic, headways to its neighbours."""
+
+    x_pov0_m: float
+    v_pov0_mps: float
+    headway_ahead_s: float | None = None
+    headway_behind_s: float | None = None
+
+    def _check_coordinates(self) -> None:
+        """Raise `UserError` where a vehicle would start too far away, too fast or in another."""
+        reach_m = self.scenario.reach_m
+        if not -reach_m <= self.x_pov0_m <= 0.0:
+            raise UserError(f"x_pov0_m is {self.x_pov0_m}: choose between {-reach_m:g} and 0")
+        self._check_speed("v_pov0_mps")
+        self._check_speed("v_vut0_mps")
+        in_traffic = self.scenario.vehicles > 2
         for name in ("headway_ahead_s", "headway_behind_s"):
             headway_s = getattr(self, name)
             if (headway_s is not None) != in_traffic:
@@ -107,10 +143,22 @@ class Case:
         return [rows[row] for row in range(len(rows))]
 
 
-RECORDED: Final = ("level", "x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad")
-"""Fields of a case that its record has; the scenario is that of its campaign."""
-RECORDED_IN_TRAFFIC: Final = ("headway_ahead_s", "headway_behind_s")
-"""And these where there is traffic."""
+MergeScenario.case_type = MergeCase
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ToldCase(Case):
+    """What the driver of a vehicle may know of a case: where vehicles start, and own limits."""
+
+    told: tuple[tuple[float, float], ...]
+    """Position and speed of every vehicle at the start, in the order of their rows."""
+
+    def _check_coordinates(self) -> None:
+        """Accept all: the case was checked where it was made."""
+
+    def starts(self) -> list[tuple[float, float]]:
+        """Return position and speed of every vehicle at the start, in the order of their rows."""
+        return list(self.told)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -156,5 +204,5 @@ def from_unit(
         values |= {d.field: d.low + u * (d.high - d.low) for d, u in zip(dims, row, strict=True)}
         if level == 2:
             values["svo_rad"] = min(values["svo_rad"], math.nextafter(SVO.high, 0.0))
-        cases.append(Case(level=level, scenario=scenario, **values))
+        cases.append(scenario.case_type(level=level, scenario=scenario, **values))
     return cases

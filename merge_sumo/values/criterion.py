@@ -33,7 +33,7 @@ SHORT: Final = 120
 
 NUMBERS: Final = tuple(measure.name for measure in OURS if measure.missing is not None)
 TEXTS: Final = {
-    "end": frozenset({End.MERGED.value, End.TIMEOUT.value}),
+    "end": frozenset(end.value for end in End if not end.is_error),
     "severity": frozenset(severity.value for severity in Severity),
     "merged_first": frozenset({"VUT", "POV"}),
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},

@@ -1,20 +1,26 @@
-"""The merging scenario as a value: where vehicles start, what they can do, what is too near.
+"""Scenarios as values: where vehicles start, what they can do, what is too near.
 
-Each lane has its own coordinate: the distance of the front bumper along the lane from the merge
-point M, in metres, negative before M. A case is a point of a scenario and knows which; so drivers,
-rollout and score take what holds for it from the case. `US23` is the paper's: Wang et al., sections
-VI and VII and Table I.
+`Scenario` is what every kind of scenario has; `MergeScenario` is the kind of this package, a merge
+from a ramp. Each path has its own coordinate: the distance of the front bumper along its lanes from
+a reference point M, in metres, negative before M; of a merge that is the merge point. A case is a
+point of a scenario and knows which: drivers, rollout and score take what holds for it from the
+case. `US23` is the paper's: Wang et al., sections VI and VII and Table I.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Annotated, Final
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from msgspec import Meta
 
 from merge_sumo.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 DT_S: Final = 0.1
 """Step of the equations of motion, eq. (4)."""
@@ -52,6 +58,16 @@ class Dimension:
     field: str
     low: float
     high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Notation:
+    """How people write a coordinate: name, unit, digits after the point, and in formulas."""
+
+    name: str
+    unit: str
+    digits: int
+    symbol: str
 
 
 SVO: Final = Dimension("svo_rad", 0.0, math.pi / 2)
@@ -104,60 +120,62 @@ RANGES: Final[dict[str, Bounds]] = {
 
 V_VUT0_MPS: Final = 18.0
 """Speed at which the paper's VUT starts."""
-COORDINATES: Final = (
-    *("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "headway_ahead_s", "headway_behind_s"),
-)
-"""Numbers of a scenario that are coordinates of its pool where they are ranges."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Scenario:
-    """A merge and what is asked of it; raises `UserError` for numbers that make none.
+    """What every kind of scenario has; a kind is a subclass, registered in `SCENARIO_KINDS`.
+
+    A kind says what its cases are (`case_type`, `notation`, `case_fields`), which roads they need
+    (`pov_edges`, `vut_edges`), when an episode ends (`has_ended`) and what is measured of it
+    (`measures`). Raises `UserError` for numbers that make no scenario.
 
     Attributes:
         name: how people call it.
         net: the SUMO net; None for the shipped one.
-        mainline: edges of the mainline, in driving order, past M.
-        ramp: edges of the ramp, in driving order, past M.
-        x_pov0_m: where the POV may start, low and high.
-        v_pov0_mps: how fast it may be then.
         x_vut0_m: where the VUT starts.
         v_vut0_mps: how fast the VUT is then, unless a campaign says otherwise: it is observed, not
             chosen by the tester. A range makes it a coordinate of the pool.
-        headway_ahead_s: time headways at which a car drives ahead of the POV, low and high: the
-            distance of their front bumpers is the headway times the POV's speed, which is also
-            that of the car. A coordinate of the pool; None where there is no such car.
-        headway_behind_s: the same of a car behind the POV; given with the other, or not at all.
         tau_s: reaction time with which a car of the mainline follows the one ahead of it (Krauss).
         min_gap_m: distance that it keeps from it at a stand.
-        pov_length_m: length of the cars of the mainline.
+        pov_length_m: length of the POV and of other cars of the mainline.
         vut_length_m: length of the VUT.
-        a_min_mps2: hardest braking of both, negative.
-        a_max_mps2: hardest acceleration of both.
+        a_min_mps2: hardest braking of all vehicles, negative.
+        a_max_mps2: hardest acceleration of all vehicles.
         timeout_s: an episode that has not ended by then is a TIMEOUT.
-        follow_up_s: how long both drive on behind M; the verdict of the paper is at M.
+        follow_up_s: how long all drive on behind M; the verdict of the paper is at M.
         v_hw_min_mps: lowest speed that the mainline drives at.
         v_hw_max_mps: highest speed that it drives at.
         v_min_mps: below this the VUT is slow.
         ttc_min_s: a time to collision below this is short.
-        dx_crash_m: front bumpers nearer than this when the VUT is at M are a collision.
+        dx_crash_m: front bumpers nearer than this are a collision under the paper's rule.
         dx_critical_m: nearer than this is critical.
-        level0_a_mps2: a level-0 VUT accelerates so,
-        level0_v_mps: up to this speed, and holds it (section VI-B).
+        level0_a_mps2: acceleration of a level-0 VUT (section VI-B),
+        level0_v_mps: up to this speed, which it holds.
         reach_m: no vehicle starts farther from M than this.
         v_start_max_mps: no vehicle starts faster than this.
     """
 
-    name: str = "us23"
+    kind: ClassVar[str]
+    """Name of the kind in `SCENARIO_KINDS`."""
+    case_type: ClassVar[type[Any]]
+    """The `Case` of the kind."""
+    measures: ClassVar[Callable[..., Any]]
+    """Gives the `Measures` of episodes of the kind, in a list, by their trajectories, the centre
+    lines of the road (None: nothing is measured before M), and whether the last way out is searched
+    for."""
+    levels: ClassVar[tuple[int, ...]] = ALL_LEVELS
+    """POV levels that the kind has."""
+    notation: ClassVar[Mapping[str, Notation]]
+    """The coordinates of the pool, in order: fields of a case. A field of the scenario of the same
+    name says by its range whether it is one; the SVO is one at level 2."""
+    ends_as: ClassVar[str]
+    """The `End` of an episode that `has_ended`."""
+
+    name: str
     net: str | None = None
-    mainline: Edges = ("main_in", "main_out")
-    ramp: Edges = ("ramp", "main_out")
-    x_pov0_m: Bounds = (-340.0, -180.0)
-    v_pov0_mps: Bounds = (25.0, 35.0)
     x_vut0_m: float = -182.0
     v_vut0_mps: float | Bounds = V_VUT0_MPS
-    headway_ahead_s: Bounds | None = None
-    headway_behind_s: Bounds | None = None
     tau_s: float = 1.0
     min_gap_m: float = 2.5
     pov_length_m: float = 5.0
@@ -178,34 +196,28 @@ class Scenario:
     v_start_max_mps: float = 45.0
 
     def __post_init__(self) -> None:
-        """Check the numbers one by one, then how they go together."""
+        """Check the numbers one by one, then together."""
         for field in fields(self):
             self._check_range(field.name)
-        v_vut0, slowest_mps = self.bounds("v_vut0_mps"), self.v_pov0_mps[0]
-        shortest_s = (self.pov_length_m + self.min_gap_m) / max(slowest_mps, 1e-9)
-        apart = f"low < high, from {shortest_s:.2f} up: else cars overlap at {slowest_mps:g} m/s"
-        for name, fits, wanted in (
-            ("x_pov0_m", -self.reach_m <= self.x_pov0_m[0] < self.x_pov0_m[1] <= 0.0, self._ahead),
-            ("v_pov0_mps", 0.0 <= self.v_pov0_mps[0] < self.v_pov0_mps[1], "from 0 up, low < high"),
-            ("v_pov0_mps", self.v_pov0_mps[1] <= self.v_start_max_mps, self._speeds),
-            ("x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, self._ahead),
-            ("v_vut0_mps", 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps, self._speeds),
-            ("v_vut0_mps", type(self.v_vut0_mps) is float or v_vut0[0] < v_vut0[1], "low < high"),
-            ("headway_behind_s", self._has_both_headways, "both headways, or none"),
-            ("headway_ahead_s", self._apart(self.headway_ahead_s, shortest_s), apart),
-            ("headway_behind_s", self._apart(self.headway_behind_s, shortest_s), apart),
-            ("headway_behind_s", self._farthest_m <= self.reach_m, self._near_enough),
-            ("a_min_mps2", self.a_min_mps2 < 0.0, "below 0"),
-            ("a_max_mps2", self.a_max_mps2 > 0.0, "above 0"),
-            ("v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"),
-            ("v_min_mps", self.v_min_mps > 0.0, "above 0"),
-            ("ttc_min_s", self.ttc_min_s > 0.0, "above 0"),
-            ("dx_crash_m", 0.0 < self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"),
-            ("level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"),
-            ("level0_v_mps", self.level0_v_mps > 0.0, "above 0"),
-        ):
+        for name, fits, wanted in self._checks():
             if not fits:
                 raise UserError(f"{name} is {getattr(self, name)}: choose {wanted}")
+
+    def _checks(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield (field, whether it fits with the others, what would)."""
+        v_vut0 = self.bounds("v_vut0_mps")
+        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, self._before_m
+        yield "v_vut0_mps", 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps, self._speeds
+        is_number = type(self.v_vut0_mps) is float
+        yield "v_vut0_mps", is_number or v_vut0[0] < v_vut0[1], "low < high"
+        yield "a_min_mps2", self.a_min_mps2 < 0.0, "below 0"
+        yield "a_max_mps2", self.a_max_mps2 > 0.0, "above 0"
+        yield "v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"
+        yield "v_min_mps", self.v_min_mps > 0.0, "above 0"
+        yield "ttc_min_s", self.ttc_min_s > 0.0, "above 0"
+        yield "dx_crash_m", 0.0 < self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"
+        yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
+        yield "level0_v_mps", self.level0_v_mps > 0.0, "above 0"
 
     def _check_range(self, name: str) -> None:
         """Raise `UserError` where a number is not finite, or none of a road and its cars."""
@@ -219,31 +231,18 @@ class Scenario:
         if not all(low <= x <= high for x in numbers):
             raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
 
+    def to_record(self) -> dict[str, Any]:
+        """Return the scenario as JSON keeps it; `kind` is left out where it is a merge."""
+        kind = {} if self.kind == MergeScenario.kind else {"kind": self.kind}
+        return kind | asdict(self)
+
     @property
-    def _ahead(self) -> str:
+    def _before_m(self) -> str:
         return f"metres before M, -{self.reach_m:g} to 0, low < high"
 
     @property
     def _speeds(self) -> str:
         return f"between 0 and {self.v_start_max_mps:g}"
-
-    @property
-    def _near_enough(self) -> str:
-        return f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
-
-    @property
-    def _has_both_headways(self) -> bool:
-        return (self.headway_ahead_s is None) == (self.headway_behind_s is None)
-
-    @property
-    def _farthest_m(self) -> float:
-        """Distance to M of the farthest start on the mainline."""
-        behind_s = 0.0 if self.headway_behind_s is None else self.headway_behind_s[1]
-        return behind_s * self.v_pov0_mps[1] - self.x_pov0_m[0]
-
-    @staticmethod
-    def _apart(headway_s: Bounds | None, shortest_s: float) -> bool:
-        return headway_s is None or shortest_s <= headway_s[0] < headway_s[1]
 
     def bounds(self, name: str) -> Bounds:
         """Return the bounds of a number that may be a range; twice the number where it is none."""
@@ -253,12 +252,30 @@ class Scenario:
     @property
     def vehicles(self) -> int:
         """A: how many vehicles an episode has, the VUT among them."""
-        return 2 if self.headway_ahead_s is None else len(VEHICLES)
+        return 2
 
     @property
-    def mainline_m(self) -> float:
-        """Length before M that the mainline needs."""
-        return self._farthest_m
+    def pov_edges(self) -> tuple[str, ...]:
+        """Edges of the net on which the POV and other cars drive, in order, past M."""
+        raise NotImplementedError
+
+    @property
+    def vut_edges(self) -> tuple[str, ...]:
+        """Edges on which the VUT drives, past M, where they merge with those of the POV.
+
+        Where both drive on one lane, they are the same, and M is where the last edge begins.
+        """
+        raise NotImplementedError
+
+    @property
+    def farthest_start_m(self) -> float:
+        """Distance to M of the farthest start of a car other than the VUT."""
+        return self.reach_m
+
+    @property
+    def fastest_start_mps(self) -> float:
+        """Highest speed at which a car other than the VUT starts."""
+        return self.v_start_max_mps
 
     @property
     def max_steps(self) -> int:
@@ -275,19 +292,129 @@ class Scenario:
     def dimensions(self, level: int) -> tuple[Dimension, ...]:
         """Return the continuous coordinates of the pool at a level: those that have a range.
 
-        Start and speed of the POV, then the speed of the VUT and the headways where the scenario
-        has ranges of them; at level 2 the POV's orientation is the last one.
+        At level 2 the POV's orientation is the last one.
         """
-        found = [
+        ranges = [
             Dimension(name, *value)
-            for name in COORDINATES
-            if isinstance(value := getattr(self, name), tuple)
+            for name in self.notation
+            if isinstance(value := getattr(self, name, None), tuple)
         ]
-        return (*found, SVO) if level == 2 else tuple(found)
+        return (*ranges, SVO) if level == 2 and SVO.field in self.notation else tuple(ranges)
+
+    @property
+    def case_fields(self) -> tuple[str, ...]:
+        """Fields of a case beside its level that say where it is in the scenario."""
+        ranges = (dimension.field for dimension in self.dimensions(0))
+        return tuple(dict.fromkeys((*ranges, "v_vut0_mps")))
+
+    def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return in which corridors the episode has ended in states (A, K), (K,)."""
+        raise NotImplementedError
 
 
-US23: Final = Scenario()
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MergeScenario(Scenario):
+    """A merge: the VUT comes from the ramp and the POV on the mainline, and an episode ends at M.
+
+    Attributes:
+        mainline: edges of the mainline, in driving order, past M.
+        ramp: edges of the ramp, in driving order, past M.
+        x_pov0_m: where the POV may start, low and high.
+        v_pov0_mps: how fast it may be then.
+        headway_ahead_s: time headways at which a car drives ahead of the POV, low and high: the
+            distance of their front bumpers is the headway times the POV's speed, which is also
+            that of the car. A coordinate of the pool; None where there is no such car.
+        headway_behind_s: the same of a car behind the POV; given with the other, or not at all.
+    """
+
+    kind: ClassVar[str] = "merge"
+    notation: ClassVar[Mapping[str, Notation]] = {
+        "x_pov0_m": Notation("x_POV0", "m", 1, "$x_{POV}^0$ (m)"),
+        "v_pov0_mps": Notation("v_POV0", "m/s", 2, "$v_{POV}^0$ (m/s)"),
+        "v_vut0_mps": Notation("v_VUT0", "m/s", 2, "$v_{VUT}^0$ (m/s)"),
+        "headway_ahead_s": Notation("headway ahead", "s", 2, "headway ahead (s)"),
+        "headway_behind_s": Notation("headway behind", "s", 2, "headway behind (s)"),
+        "svo_rad": Notation("psi", "rad", 2, "$\\psi$ (rad)"),
+    }
+    ends_as: ClassVar[str] = "MERGED"
+
+    name: str = "us23"
+    mainline: Edges = ("main_in", "main_out")
+    ramp: Edges = ("ramp", "main_out")
+    x_pov0_m: Bounds = (-340.0, -180.0)
+    v_pov0_mps: Bounds = (25.0, 35.0)
+    headway_ahead_s: Bounds | None = None
+    headway_behind_s: Bounds | None = None
+
+    def _checks(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield (field, whether it fits with the others, what would)."""
+        x_m, v_mps = self.x_pov0_m, self.v_pov0_mps
+        shortest_s = (self.pov_length_m + self.min_gap_m) / max(v_mps[0], 1e-9)
+        apart = f"low < high, from {shortest_s:.2f} up: else cars overlap at {v_mps[0]:g} m/s"
+        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, self._before_m
+        yield "v_pov0_mps", 0.0 <= v_mps[0] < v_mps[1], "from 0 up, low < high"
+        yield "v_pov0_mps", v_mps[1] <= self.v_start_max_mps, self._speeds
+        has_both = (self.headway_ahead_s is None) == (self.headway_behind_s is None)
+        yield "headway_behind_s", has_both, "both headways, or none"
+        for name in ("headway_ahead_s", "headway_behind_s"):
+            headway_s = getattr(self, name)
+            fits = headway_s is None or shortest_s <= headway_s[0] < headway_s[1]
+            yield name, fits, apart
+        near = f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
+        yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
+        # No zero-argument super(): `slots` makes another class of this one.
+        yield from Scenario._checks(self)
+
+    @property
+    def vehicles(self) -> int:
+        """A: how many vehicles an episode has, the VUT among them."""
+        return 2 if self.headway_ahead_s is None else len(VEHICLES)
+
+    @property
+    def pov_edges(self) -> tuple[str, ...]:
+        """The mainline."""
+        return self.mainline
+
+    @property
+    def vut_edges(self) -> tuple[str, ...]:
+        """The ramp."""
+        return self.ramp
+
+    @property
+    def farthest_start_m(self) -> float:
+        """Distance to M of the farthest start on the mainline."""
+        behind_s = 0.0 if self.headway_behind_s is None else self.headway_behind_s[1]
+        return behind_s * self.v_pov0_mps[1] - self.x_pov0_m[0]
+
+    @property
+    def fastest_start_mps(self) -> float:
+        """Highest speed at which a car of the mainline starts."""
+        return self.v_pov0_mps[1]
+
+    @property
+    def case_fields(self) -> tuple[str, ...]:
+        """Start and speed of the POV, speed of the VUT, orientation; in traffic, headways."""
+        headways = ("headway_ahead_s", "headway_behind_s") if self.vehicles > 2 else ()
+        return ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad", *headways)
+
+    def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return in which corridors the VUT is at M or past it in states (A, K), (K,)."""
+        arrived: NDArray[np.bool_] = x_m[VUT] >= 0.0
+        return arrived
+
+
+US23: Final = MergeScenario()
 """The paper's."""
+
+
+def as_merge(scenario: Scenario) -> MergeScenario:
+    """Return a scenario that is a merge; `UserError` for another kind."""
+    if not isinstance(scenario, MergeScenario):
+        raise UserError(
+            f"{scenario.name} is a scenario of kind {scenario.kind}: this needs a merge"
+        )
+    return scenario
+
 
 # The paper's numbers by name, for what is of this scenario alone: training and shipped policies.
 A_MIN_MPS2: Final = US23.a_min_mps2

@@ -20,12 +20,21 @@ from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.records import convert, decode, record_type, to_plain
 from merge_sumo.values.avoidability import last_avoidable_s
 from merge_sumo.values.bodies import CentreLines, closest_before_m
-from merge_sumo.values.case import RECORDED, RECORDED_IN_TRAFFIC, Case, FloatArray
+from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.measures import OURS, Further, further_measures, further_of
 from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
 from merge_sumo.values.migration import upgrade_from_0_1
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.scenario import DT_S, DX_CRASH_M, POV, VEHICLES, VUT, Scenario, Vehicle
+from merge_sumo.values.scenario import (
+    DT_S,
+    DX_CRASH_M,
+    POV,
+    VEHICLES,
+    VUT,
+    MergeScenario,
+    Scenario,
+    Vehicle,
+)
 from merge_sumo.values.severity import Severity, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
@@ -172,7 +181,8 @@ class Outcome:
         if isinstance(record, dict) and "severity" not in record:
             upgrade_from_0_1(record, scenario)
         known = convert(record, flat)
-        case = Case(**{name: getattr(known, name) for name in case_names}, scenario=scenario)
+        coordinates = {name: getattr(known, name) for name in case_names}
+        case = scenario.case_type(**coordinates, scenario=scenario)
         measures = Measures(
             **{name: getattr(known, name) for name in measure_names},
             further=tuple((name, getattr(known, name)) for name in further_measures()),
@@ -186,15 +196,19 @@ FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
 
 def record_fields(scenario: Scenario) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
     """Return the fields of a case and of measures that a record has, and the type of the record."""
-    return _record_fields(scenario.vehicles > 2, scenario.follow_up_s > 0.0)
+    kind: Any = type(scenario)
+    case_fields, in_traffic = scenario.case_fields, scenario.vehicles > 2
+    return _record_fields(kind, case_fields, in_traffic, scenario.follow_up_s > 0.0)
 
 
 @cache
-def _record_fields(traffic: bool, followed: bool) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
-    case_names = (*RECORDED, *RECORDED_IN_TRAFFIC) if traffic else RECORDED
+def _record_fields(
+    kind: type[Scenario], case_fields: tuple[str, ...], traffic: bool, followed: bool
+) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
+    case_names = ("level", *case_fields)
     left_out = {"further", *(() if traffic else ("nearest",)), *(() if followed else FOLLOWED_UP)}
     measure_names = tuple(name for name in Measures.__slots__ if name not in left_out)
-    types = {"index": int, "batch": int, **get_type_hints(Case), **get_type_hints(Measures)}
+    types = get_type_hints(kind.case_type) | get_type_hints(Measures) | {"index": int, "batch": int}
     required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
     further = [(name, float | None, None) for name in further_measures()]
     optional = [*further, ("margin", float | None, None), ("foretold", Prediction | None, None)]
@@ -228,17 +242,18 @@ def measure(
         avoidability: whether `last_avoidable_s` is computed, which takes most of the time.
         further: names of the further measures that are taken; all by default.
     """
-    before_m = math.inf if lines is None else closest_before_m([trajectory], lines)[0]
-    measures = _measure(trajectory, before_m, avoidability=avoidability)
-    return _with_further(measures, trajectory, lines, further)
+    taken = trajectory.case.scenario.measures([trajectory], lines, avoidability=avoidability)
+    return _with_further(taken[0], trajectory, lines, further)
 
 
 def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[Measures]:
     """Return the verdict and the measures of episodes, which takes less time than one by one."""
-    before = closest_before_m(trajectories, lines)
+    if not trajectories:
+        return []
+    taken = trajectories[0].case.scenario.measures(trajectories, lines)
     return [
-        _with_further(_measure(trajectory, before_m, avoidability=True), trajectory, lines)
-        for trajectory, before_m in zip(trajectories, before, strict=True)
+        _with_further(measures, trajectory, lines)
+        for measures, trajectory in zip(taken, trajectories, strict=True)
     ]
 
 
@@ -250,6 +265,18 @@ def _with_further(
 ) -> Measures:
     further = further_of(trajectory, lines, names)
     return replace(measures, further=further) if further else measures
+
+
+def measure_merges(
+    trajectories: Sequence[Trajectory], lines: CentreLines | None, *, avoidability: bool = True
+) -> list[Measures]:
+    """Return the verdict and the measures of merges: see `measure`."""
+    never_m = [math.inf] * len(trajectories)
+    before_m = never_m if lines is None else closest_before_m(trajectories, lines)
+    return [
+        _measure(*pair, avoidability=avoidability)
+        for pair in zip(trajectories, before_m, strict=True)
+    ]
 
 
 def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> Measures:
@@ -360,3 +387,6 @@ def _post_encroachment_time(trajectory: Trajectory) -> float | None:
         t_pov = trajectory.t_end_s - float(trajectory.x_pov_m[-1]) / v_end
     assert t_vut is not None, "only called once the VUT has arrived"  # noqa: S101
     return abs(t_pov - t_vut)
+
+
+MergeScenario.measures = staticmethod(measure_merges)

@@ -43,7 +43,7 @@ def severity_of(
         is_close: whether the front bumpers were nearer at M than the paper allows.
         brake_mps2: deceleration that the car behind at M needs.
     """
-    if end is not End.MERGED:
+    if not end.is_tested:
         return None
     if clearance_m <= 0.0:
         return Severity.CONTACT

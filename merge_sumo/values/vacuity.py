@@ -72,10 +72,10 @@ class Speeds:
     def possible(cls, scenario: Scenario) -> Speeds:
         """Return those that no vehicle of a scenario can pass, whatever drives it."""
         a_mps2, time_s = scenario.a_max_mps2, scenario.timeout_s
-        v_vut0, v_car0 = scenario.v_start_max_mps, scenario.v_pov0_mps[1]
+        v_vut0, v_car0 = scenario.v_start_max_mps, scenario.fastest_start_mps
         vut_mps = _after_mps(scenario, v_vut0, -scenario.x_vut0_m)
         # Bodies touch where the car is at most a length, and a second's way, from M.
-        near_m = scenario.mainline_m + 2.0 * _length_m(scenario) + vut_mps * REACTION_S
+        near_m = scenario.farthest_start_m + 2.0 * _length_m(scenario) + vut_mps * REACTION_S
         impact_mps = vut_mps + _after_mps(scenario, v_car0, near_m)
         car_mps, added_mps = v_car0 + a_mps2 * time_s + ROUNDING, a_mps2 * scenario.follow_up_s
         if added_mps:  # a body may be hit far behind M
@@ -86,7 +86,7 @@ class Speeds:
     def usual(cls, scenario: Scenario) -> Speeds:
         """Return those that a scenario names: where vehicles start, and what the road allows."""
         v_mps = max(
-            *(scenario.bounds("v_vut0_mps")[1], scenario.v_pov0_mps[1]),
+            *(scenario.bounds("v_vut0_mps")[1], scenario.fastest_start_mps),
             *(scenario.v_hw_max_mps, scenario.level0_v_mps),
         )
         return cls(v_mps, v_mps, v_mps, 0.0)
@@ -120,7 +120,7 @@ def measure_ranges(scenario: Scenario, speeds: Speeds) -> dict[str, Range]:
         "clearance_m": Range(-deepest_m, inf),
         "before_clearance_m": Range(-(length_m + WIDTH_M), inf),
         "bumper_gap_m": Range(-length_m, inf),
-        "dx_m": Range(-(scenario.mainline_m + speeds.vut_mps * DT_S + ROUNDING), inf),
+        "dx_m": Range(-(scenario.farthest_start_m + speeds.vut_mps * DT_S + ROUNDING), inf),
         "dv_mps": Range(-speeds.vut_mps, speeds.car_mps),
         "drac_mps2": NOT_NEGATIVE,
         "brake_after_mps2": NOT_NEGATIVE,
@@ -145,7 +145,7 @@ def signal_ranges(scenario: Scenario, speeds: Speeds, never_s: float) -> dict[st
     v_pov = Range(0.0, speeds.car_mps + speeds.added_behind_mps)
     accelerations = Range(scenario.a_min_mps2, scenario.a_max_mps2)
     return {
-        "x_pov_m": Range(-scenario.mainline_m, math.inf),
+        "x_pov_m": Range(-scenario.farthest_start_m, math.inf),
         "v_pov_mps": v_pov,
         "a_pov_mps2": accelerations,
         "x_vut_m": Range(scenario.x_vut0_m, math.inf),

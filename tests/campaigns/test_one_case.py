@@ -18,12 +18,12 @@ from merge_sumo.reports.motion import lines_of, motion_lines
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.live import LABEL, Window
 from merge_sumo.sumo.replay_labels import TEXT, case_line, verdict_line
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23
 
 STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
 SAFE = ("--level", "0", "--x", "-300", "--v", "34")
-COLLIDES = Case(level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6, scenario=US23)
+COLLIDES = MergeCase(level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6, scenario=US23)
 
 
 class TestTheCommand:

@@ -21,7 +21,7 @@ from merge_sumo.campaigns.store import Journal, Run, failures, read_outcomes, to
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
 from merge_sumo.values.severity import Severity
@@ -42,7 +42,7 @@ maybe = st.none() | number
 def cases(draw) -> Case:
     level = draw(st.sampled_from([0, 1, 2]))
     svo = st.floats(0.0, math.nextafter(math.pi / 2, 0.0)) if level == 2 else st.none()
-    return Case(
+    return MergeCase(
         level=level,
         x_pov0_m=draw(st.floats(-900.0, 0.0)),
         v_pov0_mps=draw(st.floats(0.0, 45.0)),
@@ -88,7 +88,7 @@ any_outcome = st.builds(
 def episode(index: int, batch: int = 0, steps: int = 60) -> tuple[Outcome, Trajectory]:
     """Return an episode with numbers that no short decimal holds, and its outcome."""
     rng = np.random.default_rng(index)
-    case = Case(
+    case = MergeCase(
         level=0, x_pov0_m=-200.0 - index / 3.0, v_pov0_mps=30.0 + 1.0 / (index + 3.0), scenario=US23
     )
     motion = rng.normal(size=(steps + 1, 2, 3))
@@ -135,7 +135,7 @@ class TestARecord:
 
     def test_has_no_orientation_below_level_2(self):
         outcome, _ = episode(0)
-        social = Case(level=2, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=0.25, scenario=US23)
+        social = MergeCase(level=2, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=0.25, scenario=US23)
         assert json.loads(to_line(outcome))["svo_rad"] is None
         assert json.loads(to_line(replace(outcome, case=social)))["svo_rad"] == 0.25
 

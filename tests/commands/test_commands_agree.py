@@ -18,7 +18,7 @@ from conftest import some
 
 import merge_sumo as ms
 from merge_sumo.campaigns.store import OUTCOMES
-from merge_sumo.values.case import Case, Pool
+from merge_sumo.values.case import Case, MergeCase, Pool
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import Scenario
@@ -157,7 +157,7 @@ def probability_judges_as_run(world: World) -> None:
     for record in fresh[:3]:
         given = {name: record.get(name) for name in OF_A_CASE}
         fixed = record["v_vut0_mps"]
-        case = Case(level=record["level"], scenario=world.scenario, v_vut0_mps=fixed, **given)
+        case = MergeCase(level=record["level"], scenario=world.scenario, v_vut0_mps=fixed, **given)
         assert world.judged(case) is fails(record)
 
 
@@ -191,4 +191,4 @@ def test_a_certificate_judges_a_case_alike(name, monkeypatch, tmp_path, command_
     for values in of_level["worst"][:3]:
         case = {name: value for name, value in values.items() if name in OF_A_CASE}
         case["v_vut0_mps"] = world.scenario.bounds("v_vut0_mps")[0]
-        assert world.judged(Case(level=world.tried.level, scenario=world.scenario, **case))
+        assert world.judged(MergeCase(level=world.tried.level, scenario=world.scenario, **case))

@@ -30,12 +30,12 @@ from merge_sumo.drivers.safety_models import (
 )
 from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.merge import brake_after_mps2
-from merge_sumo.values.scenario import DT_S, US23, Scenario
+from merge_sumo.values.scenario import DT_S, US23, MergeScenario
 from merge_sumo.values.trajectory import End, Trajectory
 
-CASE = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=US23)
+CASE = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=US23)
 TABLES = Path(__file__).parents[1] / "data" / "reference"
 OF_TABLE = {"CC": "careful", "FSM": "fsm", "Reg157": "reg157", "RSS": "rss"}
 
@@ -51,7 +51,7 @@ def one(value):
 
 def started(driver, scenario=US23):
     made = driver(1)
-    made.begin(0, Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
+    made.begin(0, MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
     return made
 
 
@@ -148,11 +148,11 @@ class TestRampDrivers:
         assert answers(started(CarefulVut), at_m(0.0), 13) == [0.0] * 13
         # Perceived for the first time: 0.4 s and 0.75 s, with the pedal released.
         near = scene(-36.0, 20.0, -55.9, 28.0)
-        found = answers(started(CarefulVut, Scenario(a_min_mps2=-9.0)), near, 15)
+        found = answers(started(CarefulVut, MergeScenario(a_min_mps2=-9.0)), near, 15)
         assert found == [-0.4] * 12 + [-1.665, -2.93, -4.195]
 
     def test_a_conflict_that_was_predicted_before_is_perceived_already(self):
-        careful = started(CarefulVut, Scenario(a_min_mps2=-9.0))
+        careful = started(CarefulVut, MergeScenario(a_min_mps2=-9.0))
         assert answers(careful, scene(-40.0, 20.0, -57.0, 28.0), 3) == [0.0] * 3
         found = answers(careful, scene(-36.0, 20.0, -55.9, 28.0), 11)
         assert found == [-0.4] * 9 + [-1.665, -2.93]
@@ -185,12 +185,12 @@ class TestRampDrivers:
         assert answers(fsm, at_m(0.0), 9) == [0.0] * 8 + [-1.265]
 
     def test_a_scenario_that_lets_them_brake_harder_does(self):
-        hard = started(Reg157Vut, Scenario(a_min_mps2=-9.0))
+        hard = started(Reg157Vut, MergeScenario(a_min_mps2=-9.0))
         # 0.35 * 28 + 28^2 / 12 = 75.1 m.
         assert answers(hard, at_m(0.0, x_vut_m=-75.0), 5)[-1] == -6.0
 
     def test_fsm_brakes_by_6_where_4_is_too_late(self):
-        hard = Scenario(a_min_mps2=-9.0)
+        hard = MergeScenario(a_min_mps2=-9.0)
         # 0.5 s before M braking by 4 m/s2 costs 0.02 s and by 6 m/s2 0.03 s: 0.6 m and 0.9 m.
         late = answers(started(FsmVut, hard), at_m(5.25, x_vut_m=-14.0), 14)[-1]
         early = answers(started(FsmVut, hard), at_m(5.25, x_vut_m=-80.0), 14)[-1]
@@ -255,7 +255,7 @@ class TestTables:
         rows = [row for row in rows_of("ramp.csv") if row["driver"] == name]
         assert len(rows) == 240
         cases = [
-            Case(
+            MergeCase(
                 level=int(row["level"]),
                 x_pov0_m=float(row["x_pov0_m"]),
                 v_pov0_mps=float(row["v_pov0_mps"]),
@@ -325,7 +325,8 @@ def test_only_the_blind_driver_collides_where_both_are_due_at_the_same_time(name
     due_s = level0_time_to(one(182), one(18), US23.level0_a_mps2, US23.level0_v_mps)[0]
     speeds = np.arange(25.0, 35.5, 2.0)
     cases = [
-        Case(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v, scenario=US23) for v in speeds.tolist()
+        MergeCase(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v, scenario=US23)
+        for v in speeds.tolist()
     ]
     with Simulator(plan_for(name, corridors=6)) as ground:
         gaps = [abs(ran.x_pov_m[-1] - ran.x_vut_m[-1]) for _, ran in ground.run(cases)]

@@ -29,7 +29,7 @@ from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario import US23, MergeScenario
 from merge_sumo.values.trajectory import End
 
 SMALL = {"levels": (1,), "cases": 24, "batch": 8, "seed": 2, "sampler": "uniform"}
@@ -374,10 +374,10 @@ class TestAFolder:
         shutil.copytree(same, shipped / "my-ring")
         (shipped / "without").mkdir()
         monkeypatch.setattr("merge_sumo.drivers.policies.resource", lambda _: shipped)
-        assert policies_of(Scenario(name="my-ring")) == shipped / "my-ring"
+        assert policies_of(MergeScenario(name="my-ring")) == shipped / "my-ring"
         for name in ("us23", "without", "..", ".", "", "/", "../shipped/my-ring", "my-ring/"):
-            assert policies_of(Scenario(name=name)) == shipped
-        ring = CampaignSettings(vut="level1", levels=(1,), scenario=Scenario(name="my-ring"))
+            assert policies_of(MergeScenario(name=name)) == shipped
+        ring = CampaignSettings(vut="level1", levels=(1,), scenario=MergeScenario(name="my-ring"))
         plan = resolve(ring)
         assert plan.povs.policies == shipped / "my-ring"
         assert plan.vut.options.policies == shipped / "my-ring"

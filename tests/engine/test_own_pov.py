@@ -32,8 +32,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.case import Case, from_unit
-from merge_sumo.values.scenario import LEVELS, OWN, US23, Scenario
+from merge_sumo.values.case import Case, MergeCase, from_unit
+from merge_sumo.values.scenario import LEVELS, OWN, US23, MergeScenario
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions, seen_at_start
@@ -134,7 +134,9 @@ class TestTheSeat:
     def test_shows_the_car_of_the_mainline_as_vut_and_the_vut_as_pov(self):
         noting = Noting(2)
         seat = PovAdapter(noting)
-        case = Case(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, v_vut0_mps=17.0, scenario=US23)
+        case = MergeCase(
+            level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, v_vut0_mps=17.0, scenario=US23
+        )
         seat.begin(1, case)
         assert noting.begun == [(1, (0.0, -182.0, 17.0, -273.0, 33.0))]
         active, step = np.array([False, True]), np.array([0, 7])
@@ -150,7 +152,7 @@ class TestTheSeat:
     def test_takes_a_case_from_wherever_the_pov_starts(self, x_pov0_m):
         noting = Noting(1)
         PovAdapter(noting).begin(
-            0, Case(level=OWN, x_pov0_m=x_pov0_m, v_pov0_mps=33.0, scenario=US23)
+            0, MergeCase(level=OWN, x_pov0_m=x_pov0_m, v_pov0_mps=33.0, scenario=US23)
         )
         assert noting.begun[0][1].x_vut_m == pytest.approx(x_pov0_m, abs=1e-9)
 
@@ -190,7 +192,7 @@ class TestAPov:
                 return 0.5
         """
         spec = pov(dedent(source))
-        case = Case(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
+        case = MergeCase(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
         (motion,) = run(spec, [case], vut="level0")
         first, *_, last = Path("seen.txt").read_text().splitlines()
         state = "x_pov_m=-182.0, v_pov_mps=18.0, x_vut_m=-273.0, v_vut_mps=33.0"
@@ -253,19 +255,21 @@ class TestSumosOwnPov:
     @pytest.mark.parametrize("model", ["IDM", *map(LONG, ("Krauss", "EIDM", "ACC", "CACC"))])
     def test_keeps_its_speed_where_nobody_is(self, model):
         # It starts so near to M that it is past it long before the VUT.
-        case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=31.0, scenario=US23)
+        case = MergeCase(level=OWN, x_pov0_m=-20.0, v_pov0_mps=31.0, scenario=US23)
         (motion,) = run(f"sumo:{model}", [case])
         assert motion.v_pov_mps == pytest.approx(31.0, abs=0.3)
 
     def test_goes_for_the_speed_that_it_is_told_within_the_limits(self):
-        case = Case(level=OWN, x_pov0_m=-20.0, v_pov0_mps=34.0, scenario=US23)
+        case = MergeCase(level=OWN, x_pov0_m=-20.0, v_pov0_mps=34.0, scenario=US23)
         (motion,) = run("sumo:IDM?maxSpeed=30", [case])
         assert motion.v_pov_mps[-1] == pytest.approx(30.0, abs=0.1)
         assert motion.a_pov_mps2.min() == pytest.approx(-4.0)
 
     def test_brakes_for_the_vut_where_level_0_does_not(self):
         (motion,) = run(
-            "sumo:IDM", [Case(level=OWN, x_pov0_m=-280.0, v_pov0_mps=33.0, scenario=US23)], "level0"
+            "sumo:IDM",
+            [MergeCase(level=OWN, x_pov0_m=-280.0, v_pov0_mps=33.0, scenario=US23)],
+            "level0",
         )
         assert motion.a_pov_mps2.min() < -1.0
         assert measure(motion).end is End.MERGED
@@ -596,6 +600,6 @@ def test_settings_know_a_scenario_with_its_own_speeds():
         "v_pov0_mps": (5.0, 12.0),
         "x_pov0_m": (-80.0, -20.0),
     }
-    scenario = Scenario(name="slow", **slow)
+    scenario = MergeScenario(name="slow", **slow)
     cases = from_unit(np.random.default_rng(1).random((3, 2)), OWN, scenario=scenario)
     assert all(motion.error is None for motion in run("sumo:IDM", cases))

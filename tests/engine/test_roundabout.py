@@ -45,12 +45,12 @@ from merge_sumo.training.env import MergeGame
 from merge_sumo.training.reward import Reward, RewardWeights
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import US23
+from merge_sumo.values.scenario import US23, as_merge
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
 
 ROOT = Path(__file__).resolve().parents[2]
-ROUNDABOUT = named_scenario("roundabout")
+ROUNDABOUT = as_merge(named_scenario("roundabout"))
 RADIUS_M = 25.0
 
 

@@ -22,7 +22,7 @@ from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.replay_folder import HOLD_STEPS, RECORD, write_scenario
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case, Pool, from_unit, to_unit
+from merge_sumo.values.case import Case, MergeCase, Pool, from_unit, to_unit
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, VUT, Scenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
@@ -97,11 +97,11 @@ class TestThePool:
     def test_refuses_a_case_without_its_headways_or_with_some_that_do_not_belong_there(self):
         state: dict[str, Any] = {"level": 0, "x_pov0_m": -300.0, "v_pov0_mps": 30.0}
         with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
-            Case(**state, scenario=TRAFFIC)
+            MergeCase(**state, scenario=TRAFFIC)
         with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
-            Case(**{"scenario": US23, **state}, headway_ahead_s=2.0, headway_behind_s=2.0)
+            MergeCase(**{"scenario": US23, **state}, headway_ahead_s=2.0, headway_behind_s=2.0)
         with pytest.raises(UserError, match="3 m apart"):
-            Case(**state, headway_ahead_s=0.1, headway_behind_s=2.0, scenario=TRAFFIC)
+            MergeCase(**state, headway_ahead_s=0.1, headway_behind_s=2.0, scenario=TRAFFIC)
 
 
 def test_the_safe_speed_is_that_of_sumos_original_krauss_model():
@@ -125,7 +125,12 @@ class TestCarsOfTheMainline:
     def test_that_are_far_away_change_nothing(self, level):
         alone = cases_of(level, 60, US23)
         far = [
-            replace(case, headway_ahead_s=18.0, headway_behind_s=16.0, scenario=TRAFFIC)
+            replace(
+                case,  # type: ignore[call-arg]
+                headway_ahead_s=18.0,
+                headway_behind_s=16.0,
+                scenario=TRAFFIC,
+            )
             for case in alone
         ]
         for one, other in zip(run("design2", alone), run("design2", far), strict=True):
@@ -186,7 +191,7 @@ class TestWhatTheVutMeets:
         assert seen.others[0].x_m == -150.0
 
     def test_is_the_pov_where_there_is_no_other(self):
-        seen = seen_at_start(Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23))
+        seen = seen_at_start(MergeCase(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23))
         assert seen.others == ((-300.0, 30.0),)
         assert len(seen) == 5
 
@@ -224,7 +229,7 @@ class TestWhatTheVutMeets:
 
     def test_is_all_cars_for_sumos_own_drivers(self):
         # Behind M the car ahead is its leader; far away there is none.
-        near = Case(
+        near = MergeCase(
             level=0,
             x_pov0_m=-340.0,
             v_pov0_mps=25.0,

@@ -19,7 +19,6 @@ from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.analysis import diagnosis
-from merge_sumo.analysis.coordinates import WRITTEN
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report
@@ -56,7 +55,7 @@ def made(tmp_path_factory) -> Run:
     return run
 
 
-FIELDS = {name: field for field, (name, *_) in WRITTEN.items()}
+FIELDS = {notation.name: field for field, notation in US23.notation.items()}
 INSIDE = """() => views.filter((view) => view.moving).flatMap(({ svg, cars }) => {
     const all = svg.getBoundingClientRect();
     return Object.values(cars).map(({ group }) => {

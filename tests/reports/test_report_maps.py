@@ -18,7 +18,7 @@ from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.report_sections import SECTIONS, shared_words
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.truth import Truth
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23
 
 TRAFFIC = named_scenario("us23-traffic")
@@ -173,9 +173,9 @@ class TestWords:
 
 
 def test_a_case_is_described_by_its_coordinates():
-    plain = Case(level=2, x_pov0_m=-240.0, v_pov0_mps=30.0, svo_rad=0.5, scenario=US23)
+    plain = MergeCase(level=2, x_pov0_m=-240.0, v_pov0_mps=30.0, svo_rad=0.5, scenario=US23)
     assert described(plain) == "x_POV0 -240.0 m, v_POV0 30.00 m/s, psi 0.50 rad"
-    queued = Case(
+    queued = MergeCase(
         level=0,
         x_pov0_m=-240.0,
         v_pov0_mps=30.0,

@@ -48,7 +48,7 @@ from merge_sumo.sumo.replay_folder import (
     write_scenario,
 )
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.case import MergeCase, from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
@@ -94,7 +94,7 @@ def driven(road, count: int) -> list[Trajectory]:
 def commanded(a_mps2: np.ndarray, road) -> Trajectory:
     """Return the motion of eq. (4) under accelerations, (steps, 2); no speed falls below 0."""
     far_m = (road.mainline.before_m, road.ramp.before_m)
-    case = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
+    case = MergeCase(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
     x, v = -np.minimum([-case.x_pov0_m, 182.0], far_m), np.array([case.v_pov0_mps, case.v_vut0_mps])
     rows = []
     for wanted in a_mps2:
@@ -421,7 +421,7 @@ def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net
 
     client = threading.Thread(target=drive)
     client.start()
-    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
     with World(1, road, scenario=US23) as world:
         vut = TraciVut(
             1, world.road, world.scenario, port, None, VutOptions(deadline_s=5.0, connect_s=10.0)

@@ -15,7 +15,7 @@ from merge_sumo.samplers.allocation import (
     whole_shares,
 )
 from merge_sumo.testing.contracts import bare_measures
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
@@ -41,7 +41,7 @@ batch_sizes = st.integers(0, 300)
 def outcome(index: int, batch: int, level: int, *, failed: bool) -> Outcome:
     end, score = End.MERGED, -700.0 if failed else -3.0
     svo = 0.5 if level == 2 else None
-    case = Case(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo, scenario=US23)
+    case = MergeCase(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo, scenario=US23)
     return Outcome(index, batch, case, bare_measures(end, score))
 
 

@@ -36,7 +36,7 @@ from merge_sumo.sumo.replay_folder import (
     VIEW,
     write_scenario,
 )
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.scenario import DT_S, US23, V_VUT0_MAX_MPS, X_VUT0_M
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
@@ -73,7 +73,7 @@ def brake_then_go(step: int) -> float:
 
 
 def at_level_0(x_pov0_m: float, v_pov0_mps: float, v_vut0_mps: float = 18.0) -> Case:
-    return Case(
+    return MergeCase(
         level=0, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, v_vut0_mps=v_vut0_mps, scenario=US23
     )
 
@@ -239,7 +239,7 @@ class TestAnHonestRecordReplaysIdentically:
         assert_identical(write(tmp_path / "case", trajectory), 0)
 
     def test_of_a_case_at_level_2(self, tmp_path):
-        case = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
+        case = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
         trajectory = drive(case, lambda s: (s // 5) % 7 - 4.0, lambda _: 1.0, 83, End.MERGED)
         assert_identical(write(tmp_path / "case", trajectory), 83)
 

@@ -15,7 +15,7 @@ from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import SimulationError, World
-from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.case import Case, MergeCase, from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, POV, US23, VUT
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
@@ -169,7 +169,7 @@ def test_a_pov_that_accelerates_until_the_timeout_stays_on_the_road():
         def act(self, scene):
             return np.full(self.corridors, A_MIN_MPS2)
 
-    case = Case(level=0, x_pov0_m=-180.0, v_pov0_mps=35.0, scenario=US23)
+    case = MergeCase(level=0, x_pov0_m=-180.0, v_pov0_mps=35.0, scenario=US23)
     with World(1, scenario=US23) as world:
         (trajectory,) = run_all(world, Fastest(1), Stop(1), [case])
     assert trajectory.end is End.TIMEOUT

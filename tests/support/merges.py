@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any
 
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario import US23, MergeScenario
 
-LIKE_A_ROUNDABOUT = Scenario(
+LIKE_A_ROUNDABOUT = MergeScenario(
     name="ring",
     x_pov0_m=(-60.0, -20.0),
     v_pov0_mps=(4.0, 10.0),
@@ -24,7 +24,7 @@ LIKE_A_ROUNDABOUT = Scenario(
 else many ways end at M to the last bit, and rounding decides in which step."""
 
 
-def times(scenario: Scenario, factor: float, units: tuple[str, ...]) -> Scenario:
+def times(scenario: MergeScenario, factor: float, units: tuple[str, ...]) -> MergeScenario:
     """Return a scenario with the numbers of some units multiplied."""
 
     def multiplied(value: Any) -> Any:
@@ -34,7 +34,7 @@ def times(scenario: Scenario, factor: float, units: tuple[str, ...]) -> Scenario
 
     changed = {
         field.name: multiplied(getattr(scenario, field.name))
-        for field in fields(Scenario)
+        for field in fields(scenario)
         if field.name.endswith(units)
     }
     return replace(scenario, name="multiple", **changed)

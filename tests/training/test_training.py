@@ -40,7 +40,7 @@ from merge_sumo.training.env import (
 from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.scenario import DT_S, US23
 
 WEIGHTS = reward.RewardWeights()
@@ -100,8 +100,9 @@ class TestEnvironments:
                 open_games &= ~(terminated | truncated)
         finally:
             games.close()
-        cases = [
-            Case(level=1, x_pov0_m=x, v_pov0_mps=v, scenario=US23) for x, v in start[:, :2].tolist()
+        cases: list[Case] = [
+            MergeCase(level=1, x_pov0_m=x, v_pov0_mps=v, scenario=US23)
+            for x, v in start[:, :2].tolist()
         ]
         played = returns_of(play(cases, Level0Pov, Level0Vut), REWARD)
         assert returns == pytest.approx(played.safe + played.pov_ego, abs=1e-9)
@@ -298,7 +299,7 @@ class TestBestResponse:
         starts = np.stack([x, v, np.full(2, -182.0), np.full(2, 18.0)], axis=1)
         best = best_response.best_response(Game(role, None, REWARD), starts)
         for x0, v0, bound in zip(x.tolist(), v.tolist(), best.tolist(), strict=True):
-            case = Case(level=1, x_pov0_m=x0, v_pov0_mps=v0, scenario=US23)
+            case = MergeCase(level=1, x_pov0_m=x0, v_pov0_mps=v0, scenario=US23)
             tried = [
                 self.replayed(role, case, [a] * n + [b] * m + [1.0 if role == "vut" else 0.0])
                 for a, b in itertools.product(ACTIONS_MPS2.tolist(), repeat=2)

@@ -40,7 +40,7 @@ from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.twin.observation import NOW, Observation
 from merge_sumo.twin.rollout import TwinRollout
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.case import MergeCase, Pool, to_unit
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import US23
@@ -221,7 +221,7 @@ class TestTwin:
 def outcome(
     index: int, dx_m: float, prediction: Prediction | None = None, level: int = 0
 ) -> Outcome:
-    case = Case(
+    case = MergeCase(
         level=level,
         x_pov0_m=-300.0,
         v_pov0_mps=30.0,

@@ -19,8 +19,8 @@ from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
-from merge_sumo.values.case import Case, Pool, from_unit, to_unit
-from merge_sumo.values.scenario import RANGES, US23, Scenario
+from merge_sumo.values.case import MergeCase, Pool, from_unit, to_unit
+from merge_sumo.values.scenario import RANGES, US23, MergeScenario
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -70,7 +70,7 @@ class TestAFile:
         assert said in str(refused.value)
         assert str(refused.value).startswith(f"{path}, line 3: ")
 
-    @pytest.mark.parametrize("field", [f for f in fields(Scenario) if f.name in RANGES])
+    @pytest.mark.parametrize("field", [f for f in fields(MergeScenario) if f.name in RANGES])
     @pytest.mark.parametrize("number", ["1e200", "-1e200", "1" + "0" * 400, "1e5"])
     def test_beyond_a_road_and_its_cars_is_refused_with_a_range(self, tmp_path, field, number):
         value = f"[{number}, {number}]" if field.type.startswith("Bounds") else number
@@ -118,9 +118,9 @@ OTHER = replace(
 
 class TestACase:
     def test_keeps_what_it_always_had(self):
-        case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+        case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
         assert case.scenario is US23
-        assert case == Case(
+        assert case == MergeCase(
             level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, v_vut0_mps=18.0, scenario=US23
         )
 
@@ -135,17 +135,17 @@ class TestACase:
     def test_outside_the_reach_of_its_scenario_is_refused(self):
         near = replace(US23, reach_m=400.0, v_start_max_mps=40.0)
         with pytest.raises(UserError, match="choose between -400 and 0"):
-            Case(level=0, x_pov0_m=-401.0, v_pov0_mps=30.0, scenario=near)
+            MergeCase(level=0, x_pov0_m=-401.0, v_pov0_mps=30.0, scenario=near)
         with pytest.raises(UserError, match=r"v_pov0_mps is 41\.0: choose between 0 and 40"):
-            Case(level=0, x_pov0_m=-300.0, v_pov0_mps=41.0, scenario=near)
+            MergeCase(level=0, x_pov0_m=-300.0, v_pov0_mps=41.0, scenario=near)
 
     def test_is_judged_by_its_scenario(self):
         motion = np.array([[[x, 20.0, 0.0] for x in row] for row in ((-10.0, -2.0), (-5.0, 0.0))])
         verdicts = [
             measure(Trajectory(case, motion, End.MERGED)).is_close
             for case in (
-                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=US23),
-                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=OTHER),
+                MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=US23),
+                MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=OTHER),
             )
         ]
         assert verdicts == [True, False]
@@ -200,7 +200,7 @@ class TestACampaign:
 
 
 def test_a_campaign_of_the_paper_is_recorded_with_all_numbers(run):
-    assert {field.name for field in fields(Scenario)} == set(run.settings["scenario"])
+    assert {field.name for field in fields(MergeScenario)} == set(run.settings["scenario"])
     assert run.scenario == US23
 
 

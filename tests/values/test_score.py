@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, POV, US23, VUT
 from merge_sumo.values.score import FAILURE_SCORE, Outcome, is_close, measure, time_to_collision
 from merge_sumo.values.trajectory import End, Trajectory
 
-CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 
 
 def ending(dx, v_pov=30.0, v_vut=26.0, end=End.MERGED, steps=10, a_vut=0.0):

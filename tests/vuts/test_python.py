@@ -21,7 +21,7 @@ from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import MAX_STEPS, US23
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.registry import vut_factory
@@ -114,7 +114,7 @@ class Vut:
 
 
 def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(vut, tmp_path):
-    case = Case(
+    case = MergeCase(
         level=2, x_pov0_m=-250.0, v_pov0_mps=30.0, svo_rad=0.5, v_vut0_mps=17.0, scenario=US23
     )
     (trajectory,) = run_cases(factory(vut(WATCHER)), [case])

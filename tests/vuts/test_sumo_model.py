@@ -12,12 +12,12 @@ from merge_sumo.campaigns.store import failures
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23, VUT
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.sumo_model import MODELS
 
-FREE = Case(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)
+FREE = MergeCase(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)
 """The POV is gone before the VUT arrives."""
 
 
@@ -39,7 +39,7 @@ def test_every_model_drives_the_same_in_1_and_in_8_corridors_and_by_eq_4(model):
 
 def test_every_model_reacts_to_the_pov(model):
     """The same start with a POV that meets the VUT at M, and with none near."""
-    meeting = Case(level=0, x_pov0_m=-253.0, v_pov0_mps=34.4, scenario=US23)
+    meeting = MergeCase(level=0, x_pov0_m=-253.0, v_pov0_mps=34.4, scenario=US23)
     free, met = run_cases(factory(model), [FREE, meeting])
     assert met.v_vut_mps[-1] < free.v_vut_mps[-1] - 0.5
 

@@ -34,14 +34,14 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.traci.vut import TraciVut
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
-CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
     encoding="utf-8"
 )

@@ -7,7 +7,6 @@ answer with the same number.
 from __future__ import annotations
 
 import json
-import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from merge_sumo.drivers.base import NO_SIGNALS, Scene
-from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.scenario import RANGES, US23, Scenario
 from merge_sumo.values.signals import Left, as_signals
 
@@ -89,7 +88,8 @@ def from_json(content: bytes, kind: type[Any]) -> Any:
     return value
 
 
-_BEGIN: Final = struct.Struct("<I10d")
+_BEGIN: Final = struct.Struct("<I5d")
+"""Corridor, and what a VUT is told of its scenario; position and speed of each vehicle follow."""
 _HEAD: Final = struct.Struct("<IIII")
 """Episodes that begin, corridors, vehicles, and whether the cars that are met are told."""
 
@@ -105,9 +105,8 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
         scenario = case.scenario
         profile = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
         limits = scenario.a_min_mps2, scenario.a_max_mps2
-        headways = case.headway_ahead_s or math.nan, case.headway_behind_s or math.nan
-        state = case.x_pov0_m, case.v_pov0_mps, case.v_vut0_mps
-        parts.append(_BEGIN.pack(corridor, *state, *headways, *profile, *limits))
+        parts.append(_BEGIN.pack(corridor, *profile, *limits))
+        parts.append(np.array(case.starts(), dtype=np.float64).tobytes())
     arrays = [scene.active, scene.step, scene.x_m, scene.v_mps]
     if scene.facing is not None:
         arrays.append(scene.facing)
@@ -122,14 +121,8 @@ def _any_scenario(
     level0_v_mps: float,
     a_min_mps2: float,
     a_max_mps2: float,
-    *,
-    in_traffic: bool,
 ) -> Scenario:
-    """Return a scenario with what a VUT is told of its own; of the rest it is told nothing.
-
-    Its bounds are the widest: cases were checked where they were made.
-    """
-    headways_s = (1.0, 2.0) if in_traffic else None
+    """Return a scenario with what a VUT is told of its own; of the rest it is told nothing."""
     return replace(
         US23,
         x_vut0_m=x_vut0_m,
@@ -137,11 +130,7 @@ def _any_scenario(
         level0_v_mps=level0_v_mps,
         a_min_mps2=a_min_mps2,
         a_max_mps2=a_max_mps2,
-        headway_ahead_s=headways_s,
-        headway_behind_s=headways_s,
-        pov_length_m=RANGES["pov_length_m"][0],
         reach_m=RANGES["reach_m"][1],
-        v_start_max_mps=RANGES["v_start_max_mps"][1],
     )
 
 
@@ -149,22 +138,15 @@ def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     """Return what `pack_scene` packed; level and orientation of the cases are not in it."""
     count, k, vehicles, tells_met = _HEAD.unpack_from(content)
     at = _HEAD.size
-    begun = []
+    begun: list[tuple[int, Case]] = []
     for _ in range(count):
-        corridor, x_pov0_m, v_pov0_mps, v_vut0_mps, *more = _BEGIN.unpack_from(content, at)
-        ahead_s, behind_s, *of_scenario = more
-        in_traffic = vehicles > 2
-        case = Case(
-            level=0,
-            x_pov0_m=x_pov0_m,
-            v_pov0_mps=v_pov0_mps,
-            v_vut0_mps=v_vut0_mps,
-            headway_ahead_s=ahead_s if in_traffic else None,
-            headway_behind_s=behind_s if in_traffic else None,
-            scenario=_any_scenario(*of_scenario, in_traffic=in_traffic),
-        )
-        begun.append((corridor, case))
+        corridor, *of_scenario = _BEGIN.unpack_from(content, at)
         at += _BEGIN.size
+        starts = np.frombuffer(content, np.float64, 2 * vehicles, at).reshape(vehicles, 2)
+        at += starts.nbytes
+        told = tuple((x_m, v_mps) for x_m, v_mps in starts.tolist())
+        case = ToldCase(level=0, scenario=_any_scenario(*of_scenario), told=told)
+        begun.append((corridor, case))
     active = np.frombuffer(content, np.bool_, k, at)
     step = np.frombuffer(content, np.int64, k, at + k)
     at += 9 * k
