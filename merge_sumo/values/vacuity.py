@@ -23,6 +23,7 @@ from merge_sumo.values.measures import further_measures
 from merge_sumo.values.merge import REACTION_S
 from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario
 from merge_sumo.values.score import MU_CRASH, MU_SAFETY, MU_TASK
+from merge_sumo.values.trajectory import End
 
 ROUNDING: Final = 1.0
 """Added to a length in m and a speed in m/s that follow from sums of rounded steps."""
@@ -303,7 +304,8 @@ KMH_PER_MPS: Final = 3.6
 def domain_of(scenario: Scenario, speeds: Speeds, texts: dict[str, frozenset[str]]) -> Domain:
     """Return what measures can be in a scenario; `texts` are those that its texts can be."""
     cars = {VEHICLES[POV]} if scenario.vehicles == 2 else set(VEHICLES) - {VEHICLES[VUT]}
-    return Domain(measure_ranges(scenario, speeds), texts | {"nearest": frozenset(cars)})
+    possible = {"nearest": frozenset(cars), "end": frozenset({scenario.ends_as, End.TIMEOUT.value})}
+    return Domain(measure_ranges(scenario, speeds), texts | possible)
 
 
 def emptiness(condition: Condition, domain: Domain) -> str | None:

@@ -217,7 +217,7 @@ CONDITIONS = st.recursive(ATOMS, _grown, max_leaves=6)
 @st.composite
 def cases(draw: Any) -> dict[str, Any]:
     """Return a value inside the range of each measure; often one that conditions name."""
-    found: dict[str, Any] = {"end": draw(st.sampled_from(sorted(TEXTS["end"])))}
+    found: dict[str, Any] = {"end": draw(st.sampled_from(sorted(DOMAIN.texts["end"])))}
     for name in NAMES:
         low, high = DOMAIN.ranges[name]
         near = [math.nextafter(x, to) for x in LIMITS for to in (-math.inf, x, math.inf)]
