@@ -92,8 +92,8 @@ def failure_probability(
             raise UserError(f"--{name} is {number}: {bounds}")
     _same_system(run, record_of(settings, plan))
     stated = read_distribution(distribution, settings.levels, settings.scenario)
-    lines = out.with_suffix(LINES)
     check_new_file(out)
+    lines = out.with_suffix(LINES)
     if lines == out:
         raise UserError(f"--out is {out}: end it in .json, as cases go to {LINES} beside it")
     check_new_file(lines)

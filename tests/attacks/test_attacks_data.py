@@ -408,18 +408,15 @@ class TestACache:
             self.assert_not_believed(content[:end], tmp_path)
 
     @pytest.mark.parametrize(
-        "other",
-        [
-            key_of(cases=CASES, vut="design2"),
-            key_of(cases=CASES, level=1),
-            key_of(cases=CASES, seed=1),
-        ],
+        ("vut", "level", "seed"),
+        [("design2", 0, 0), ("design1", 1, 0), ("design1", 0, 1)],
         ids=["another VUT", "another level", "another seed"],
     )
     def test_with_a_file_of_the_same_shape_under_another_name_runs_again(
-        self, true, other, tmp_path
+        self, true, vut, level, seed, tmp_path
     ):
-        ground_truth(plan_for(other.vut), other.level, CASES, other.seed, cache=tmp_path)
+        ground_truth(plan_for(vut), level, CASES, seed, cache=tmp_path)
+        other = key_of(cases=CASES, vut=vut, level=level, seed=seed)
         other.path(tmp_path).rename(KEPT.path(tmp_path))
         counted: list[int] = []
         again = ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path, on_cases=counted.append)

@@ -147,17 +147,12 @@ STOP = "this test runs no cases"
 def no_cases(monkeypatch) -> None:
     """Stop campaigns and reproductions where their first case would run."""
 
-    class Stop:
-        """What runs cases, ahead or when it is asked to."""
+    def stop(*_: object, **_options: object) -> None:
+        raise UserError(STOP)
 
-        def __call__(self, *_: object) -> None:
-            raise UserError(STOP)
-
-        def chunks(self, _: object) -> Iterator:
-            yield from ()
-
-    stop = Stop()
-    monkeypatch.setattr(conductor, "open_simulators", lambda *_: stop)
+    monkeypatch.setattr(conductor, "open_simulators", lambda *_: None)
+    for name in ("evaluate", "evaluate_chunks"):
+        monkeypatch.setattr(conductor, name, stop)
     monkeypatch.setattr(reproduction._Work, "column", stop)
 
 
@@ -287,7 +282,7 @@ class TestAHundredNames:
         assert not {"table.json", "new/sub", "x" * 255} & set(appeared)
 
     def test_of_a_training_touch_nothing(self, world, call, monkeypatch, names):
-        monkeypatch.setattr(helix, "_train_beside", lambda *_: [])
+        monkeypatch.setattr(helix, "_train_in_parallel", lambda *_: [])
         appeared = assert_nothing_was_touched(
             world, lambda name: call("train", "--only", "pov1", f"--out={name}"), names
         )
@@ -518,7 +513,7 @@ class TestAFolderOfPolicies:
             asked.append(folder)
             return []
 
-        monkeypatch.setattr(helix, "_train_beside", train)
+        monkeypatch.setattr(helix, "_train_in_parallel", train)
         for _ in range(2):
             helix.train_library(tmp_path / "new", ("pov1",), scenario=US23)
             (tmp_path / "new" / "pov1.training.jsonl").write_text("{}\n")

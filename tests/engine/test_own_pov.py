@@ -73,6 +73,12 @@ def of_a_user(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / "here")
 
 
+@pytest.fixture
+def call(command_line):
+    """Return what runs the command line, in that folder."""
+    return command_line
+
+
 def pov(source: str, name: str = "my_pov.py") -> str:
     """Write a POV and return what a person writes for it."""
     Path(name).write_text(source)
