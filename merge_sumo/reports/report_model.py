@@ -186,14 +186,15 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         and settings.get("versions") == versions()
         and settings.get("v_vut0_mps") == (fixed if isinstance(fixed, float) else None)
     )
-    if not same:
+    policies = settings.get("policies_sha256", {})
+    if not same or not isinstance(policies, dict):
         return None
     plan = plan_key(
         vut=str(settings.get("vut")),
         vut_command=settings.get("vut_command"),
         deadline_s=settings.get("deadline_s", DEADLINE_S),
         pov=settings.get("pov") if level == OWN else None,
-        policies_sha256=settings.get("policies_sha256", {}),
+        policies_sha256=policies,
         road_sha256=road.sha256,
         scenario=run.scenario,
         criterion=run.criterion,
