@@ -160,4 +160,6 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] == [] or sys.argv[1] not in GENERATED:
+        sys.exit(f"name one of the pages {', '.join(GENERATED)}")
     print(GENERATED[sys.argv[1]]())

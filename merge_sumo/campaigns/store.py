@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, Self
@@ -78,14 +79,22 @@ class Run:
         self.folder = folder
         self.settings = read_settings(folder)
         self.scenario = scenario_of(self.settings, folder / SETTINGS)
-        self.criterion = _criterion_of(self.settings, folder / SETTINGS)
         self._batches: dict[int, dict[int, FloatArray]] = {}
         self._signals: dict[int, Signals] = {}
         """By index, of the batches that were read."""
-        if outcomes is None:
-            self._read()
-        else:
-            self.outcomes, self.torn = outcomes, False
+        try:
+            self.criterion = _criterion_of(self.settings, folder / SETTINGS)
+            if outcomes is None:
+                self._read()
+            else:
+                self.outcomes, self.torn = outcomes, False
+        except UserError as error:
+            if absent := _absent_packages(self.settings):
+                raise UserError(
+                    f"{folder} was recorded with {absent}, which is not installed here, and cannot "
+                    "be read without it"
+                ) from error
+            raise
 
     def _read(self) -> None:
         folder = self.folder
@@ -234,6 +243,19 @@ def _criterion_of(settings: Mapping[str, Any], path: Path) -> Criterion:
     if not (require is None or isinstance(require, str)):
         raise UserError(f"{path} has something else than a formula as require")
     return Criterion(_FORMER_NAME.sub("bumper_gap_m", _FORMER.get(fail_when, fail_when)), require)
+
+
+def _absent_packages(settings: Mapping[str, Any]) -> str:
+    """Return the recorded packages that are not installed, as a list in words; empty for none."""
+    recorded = settings.get("versions")
+    absent = []
+    for name, number in (recorded if isinstance(recorded, dict) else {}).items():
+        try:
+            if name != "python":
+                version(name)
+        except (PackageNotFoundError, ValueError):
+            absent.append(f"{name} {number}"[:NAME_CHARACTERS])
+    return printable(", ".join(absent))
 
 
 def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outcome], bool]:

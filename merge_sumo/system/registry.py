@@ -137,6 +137,12 @@ class Registry(Mapping[str, T], Generic[T]):
     def _checked(self, name: str, item: T, package: str) -> T:
         if not self._accepts(item):
             raise UserError(f"the {self.noun} {name!r} of {package} is not {self._contract}")
+        own = getattr(item, "name", name)
+        if isinstance(own, str) and own != name:
+            raise UserError(
+                f"the {self.noun} {name!r} of {package} names itself {own!r}: register it by that "
+                "name"
+            )
         return item
 
 

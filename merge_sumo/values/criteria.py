@@ -24,7 +24,7 @@ class NamedCriterion:
 
 
 CRITERIA: Final[Registry[NamedCriterion]] = Registry(
-    "merge_sumo.verdicts",
+    "merge_sumo.criteria",
     "criterion",
     {
         PAPER: NamedCriterion(

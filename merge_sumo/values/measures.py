@@ -1,8 +1,8 @@
 """Measures of an episode: what each is, its unit, and how it is shown.
 
-Those of this package are measured together, by `score.py`, into the fields of `Measures`. A further
-one has a function of its own: it is recorded under its name after ours, conditions may name it, and
-the report, exports and documentation show it as any other.
+The fields of `Measures` are computed together, by `score.py`. A further measure has a function of
+its own, `of`: it is recorded under its name after the fields, conditions may name it, and the
+report, exports and documentation show it like any other.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
+from traceback import extract_tb
 from typing import Final, Literal
 
 from merge_sumo.errors import UserError
@@ -276,7 +277,7 @@ OURS: Final = (
         worse="high",
     ),
 )
-"""The fields of `Measures`, in the order in which an episode is listed; further ones come last."""
+"""The fields of `Measures`, in the order in which an episode is listed, then measures with `of`."""
 
 RESERVED: Final = frozenset({"index", "batch", "level", "margin", "foretold"})
 """Names of a record that are no measures."""
@@ -296,7 +297,10 @@ MEASURES: Final[Registry[Measure]] = Registry(
     "measure",
     {measure.name: measure for measure in OURS},
     accepts=_is_measure,
-    contract="a merge_sumo.values.measures.Measure with a name, a function and a missing value",
+    contract=(
+        "a merge_sumo.values.measures.Measure with a function `of`, a number `missing`, and a name "
+        f"that is an identifier and none of {', '.join(sorted(RESERVED))}"
+    ),
 )
 
 
@@ -332,7 +336,9 @@ def _value(measure: Measure, trajectory: Trajectory, lines: CentreLines | None) 
         value = measure.of(trajectory, lines)
         number = None if value is None else float(value)
     except Exception as error:
+        last = extract_tb(error.__traceback__)[-1]
         raise UserError(
-            f"the measure {measure.name!r} failed: {type(error).__name__}: {error}"
+            f"the measure {measure.name!r} failed in {last.filename}, line {last.lineno}: "
+            f"{type(error).__name__}: {error}"
         ) from error
     return number if number is not None and math.isfinite(number) else None

@@ -96,3 +96,9 @@ def test_an_object_may_be_registered_in_this_process():
         tools.register("ours", int)
     with pytest.raises(UserError, match="not a class"):
         tools.register("third", 3)  # type: ignore[arg-type]
+
+
+def test_an_object_that_names_itself_otherwise_is_refused(install):
+    install("odd", "speed = odd:Tool", "class Tool:\n    name = 'mean_speed'")
+    with pytest.raises(UserError, match="names itself 'mean_speed'"):
+        registry()["speed"]
