@@ -12,18 +12,18 @@ from merge_sumo.samplers.prediction_skill import compressed
 from merge_sumo.values.score import Outcome
 
 LAST: Final = 200
-"""Cases, the last ones, whose prediction error is summarised."""
+"""Last cases whose prediction error is summarised."""
 LIKELY: Final = 0.5
 """Predicted chance of failing from which a case is a likely failure. Chosen, not tuned."""
 
 
 def has_predictions(outcomes: Sequence[Outcome]) -> bool:
-    """Return whether anything was predicted of some of the cases."""
+    """Return whether some cases have a prediction."""
     return any(outcome.prediction is not None for outcome in outcomes)
 
 
-def off_m(outcome: Outcome) -> float | None:
-    """Return how many metres the predicted gap was off; None where there was none to compare."""
+def prediction_error_m(outcome: Outcome) -> float | None:
+    """Return the error of the predicted gap in m; None without a prediction or a gap."""
     if outcome.prediction is None or outcome.measures.score is None:
         return None
     predicted_m, gap_m = outcome.prediction.median_dx_m, outcome.signed_gap_m
@@ -31,14 +31,14 @@ def off_m(outcome: Outcome) -> float | None:
 
 
 def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:
-    """Return the cases that were predicted, the largest surprise first.
+    """Return the cases with a prediction, the largest surprise first.
 
-    A metre counts more where the gap is small, and a case in which the VUT never arrived, or was
-    predicted not to, counts as one with a large gap.
+    Gaps compare on a logarithmic scale, as a failure is a small gap. A case in which the VUT never
+    arrived, or was predicted not to, counts as one with a large gap.
     """
 
     def surprise(outcome: Outcome) -> float:
-        assert outcome.prediction is not None, "only these are asked"  # noqa: S101
+        assert outcome.prediction is not None, "filtered below"  # noqa: S101
         gaps = np.array([outcome.prediction.median_dx_m, outcome.signed_gap_m], dtype=np.float64)
         return abs(float(np.diff(compressed(gaps, limit_m))[0]))
 
@@ -47,9 +47,9 @@ def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:
 
 
 def prediction_in_words(outcomes: Sequence[Outcome]) -> str | None:
-    """Return how well the last cases were predicted; None where none was."""
+    """Return the prediction error of the last cases in words; None without predictions."""
     last = [outcome for outcome in outcomes if outcome.prediction is not None][-LAST:]
-    off = [gap for outcome in last if (gap := off_m(outcome)) is not None]
+    off = [gap for outcome in last if (gap := prediction_error_m(outcome)) is not None]
     if not off:
         return None
     likely = [o for o in last if o.prediction is not None and o.prediction.p_fail >= LIKELY]

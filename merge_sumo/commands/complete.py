@@ -18,7 +18,7 @@ Completions = list[tuple[str, str]]
 """Values with a help text each, which may be empty."""
 
 
-def _beginning(incomplete: str, values: Iterable[tuple[str, str]]) -> Completions:
+def _matching(incomplete: str, values: Iterable[tuple[str, str]]) -> Completions:
     return [(value, about) for value, about in values if value.startswith(incomplete)]
 
 
@@ -28,15 +28,17 @@ def vuts(incomplete: str) -> Completions:
     from merge_sumo.vuts.registry import KINDS, built_in_vuts
 
     if ":" in incomplete:
-        return _beginning(incomplete, _names_in(incomplete.rpartition(":")[0]))
+        return _matching(incomplete, _names_in(incomplete.rpartition(":")[0]))
     named = [(name, "built in") for name in built_in_vuts()]
     named += [(name, "installed") for name in installed_vuts()]
-    named += [(_begun(name, kind.form), kind.what) for name, kind in KINDS.items() if kind.form]
-    return _beginning(incomplete, [*named, *_files(incomplete, (".py",), ":")])
+    named += [
+        (_common_prefix(name, kind.form), kind.what) for name, kind in KINDS.items() if kind.form
+    ]
+    return _matching(incomplete, [*named, *_files(incomplete, (".py",), ":")])
 
 
-def _begun(name: str, form: str) -> str:
-    """Return the beginning of the specs of a kind, as far as all of them have it."""
+def _common_prefix(name: str, form: str) -> str:
+    """Return the common prefix of all specs of a kind."""
     return f"{name}:" if form.startswith(f"{name}:") else name
 
 
@@ -71,12 +73,12 @@ def _files(incomplete: str, suffixes: tuple[str, ...], behind: str = "") -> Comp
 
 def levels(incomplete: str) -> Completions:
     """Return the POV levels, and all of them."""
-    return [*one_level(incomplete), *_beginning(incomplete, [("all", "every level")])]
+    return [*one_level(incomplete), *_matching(incomplete, [("all", "every level")])]
 
 
 def one_level(incomplete: str) -> Completions:
     """Return the POV levels."""
-    return _beginning(incomplete, [*LEVELS, ("own", "a POV of your own: --pov")])
+    return _matching(incomplete, [*LEVELS, ("own", "a POV of your own: --pov")])
 
 
 def samplers(incomplete: str) -> Completions:
@@ -85,9 +87,7 @@ def samplers(incomplete: str) -> Completions:
 
     before = incomplete.rpartition(",")[0]
     front, named = (f"{before},", before.split(",")) if before else ("", [])
-    return _beginning(
-        incomplete, [(f"{front}{name}", "") for name in SAMPLERS if name not in named]
-    )
+    return _matching(incomplete, [(f"{front}{name}", "") for name in SAMPLERS if name not in named])
 
 
 def scenarios(incomplete: str) -> Completions:
@@ -95,21 +95,21 @@ def scenarios(incomplete: str) -> Completions:
     from merge_sumo.road.scenario_file import shipped_scenarios
 
     shipped = [(name, "shipped") for name in shipped_scenarios()]
-    return _beginning(incomplete, [*shipped, *_files(incomplete, (".toml",))])
+    return _matching(incomplete, [*shipped, *_files(incomplete, (".toml",))])
 
 
 def criteria(incomplete: str) -> Completions:
     """Return the names of criteria."""
     from merge_sumo.values.criteria import CRITERIA
 
-    return _beginning(incomplete, [(name, "") for name in CRITERIA])
+    return _matching(incomplete, [(name, "") for name in CRITERIA])
 
 
 def formats(incomplete: str) -> Completions:
     """Return the formats of an export."""
     from merge_sumo.reports.formats import FORMATS
 
-    return _beginning(incomplete, [(name, item.about) for name, item in FORMATS.items()])
+    return _matching(incomplete, [(name, item.about) for name, item in FORMATS.items()])
 
 
 def gates(incomplete: str) -> Completions:
@@ -119,14 +119,14 @@ def gates(incomplete: str) -> Completions:
         ("errors", "a case errs"),
         ("timeouts", "a case never ends"),
     )
-    return _beginning(incomplete, [*known, ("fmc>", "coverage of failures above a number")])
+    return _matching(incomplete, [*known, ("fmc>", "coverage of failures above a number")])
 
 
 def networks(incomplete: str) -> Completions:
     """Return the learned networks."""
     from merge_sumo.drivers.policies import NETWORKS
 
-    return _beginning(incomplete, [(name, "") for name in NETWORKS])
+    return _matching(incomplete, [(name, "") for name in NETWORKS])
 
 
 def runs(incomplete: str) -> Completions:
@@ -142,4 +142,4 @@ def runs(incomplete: str) -> Completions:
     newest = [(folder, "campaign") for _, folder in sorted(by_time, reverse=True)[:MOST_RUNS]]
     known = {f"{folder}/" for folder, _ in newest}
     others = [entry for entry in _files(incomplete, ()) if entry[0] not in known]
-    return _beginning(incomplete, [*newest, *others])
+    return _matching(incomplete, [*newest, *others])

@@ -73,7 +73,7 @@ class CampaignPanel:
 
     def _counted(self, phase: Phase, done: int, total: int) -> None:
         begins = self.progress.phase is not phase
-        self.progress.counted(phase, done, total)
+        self.progress.advance(phase, done, total)
         self._show(begins=begins)
 
     def _appear(self) -> None:

@@ -38,21 +38,21 @@ FAILURE_S: Final = 0.02
 LEVEL_S: Final = 1.5
 """Expected time per level of the phase `REPORT`: 4.5 s for the three levels of 400 cases."""
 KEPT: Final = 2000
-"""Outcomes that are kept to be drawn, the newest, and failures, the newest."""
+"""Newest outcomes, and newest failures, that are kept for the drawing."""
 WORST: Final = 10
-"""Failures that are listed."""
+"""Listed failures."""
 
 
 @dataclass(slots=True)
 class Work:
-    """How far a phase is.
+    """The progress of a phase.
 
     Attributes:
-        total: things to do.
-        start_s: when it began, by the monotonic clock.
-        done: things done.
-        before: things of these that were done before this process took over.
-        end_s: when it ended; None while it goes on.
+        total: items of the phase.
+        start_s: begin of the phase, by the monotonic clock.
+        done: items done.
+        before: items done before a resume.
+        end_s: end of the phase; None while it runs.
     """
 
     total: int
@@ -98,7 +98,7 @@ class CampaignProgress:
         """Count a case."""
         level = outcome.case.level
         self.work[Phase.CASES].done += 1
-        # A campaign that was forced on may have cases of a level that it has no more.
+        # After --force, a campaign may have cases of a level outside its settings.
         self.cases[level] = self.cases.get(level, 0) + 1
         self.errors += outcome.measures.end.is_error
         self.timeouts += outcome.measures.end is End.TIMEOUT
@@ -110,14 +110,14 @@ class CampaignProgress:
             self._stale.add(level)
 
     def ran_before(self, outcome: Outcome) -> None:
-        """Count a case that ran before: it says nothing of how fast this goes."""
+        """Count a case that ran before a resume; it does not count for the rate."""
         self.case_ended(outcome)
         work = self.work[Phase.CASES]
         work.before += 1
         work.start_s = time.monotonic()
 
-    def counted(self, phase: Phase, done: int, total: int) -> None:
-        """Set how far a phase behind the cases is; the one before it has ended."""
+    def advance(self, phase: Phase, done: int, total: int) -> None:
+        """Set the progress of a phase after the cases; the phase before it has ended."""
         if phase not in self.work:
             now_s = time.monotonic()
             self.work[self.phase].end_s = now_s
@@ -132,10 +132,10 @@ class CampaignProgress:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until the report is written; None where nobody knows.
+        """Seconds until the report is written; None if unknown.
 
-        The phase that goes on is extrapolated by its own rate, those to come by what they took
-        elsewhere.
+        The present phase is extrapolated by its own rate, later phases by times measured on
+        another machine.
         """
         left_s = self.work[self.phase].left_s
         if left_s is None:
@@ -145,7 +145,7 @@ class CampaignProgress:
         return None if left_s is None else left_s + sum(s for s in expected if s is not None)
 
     def _expected_s(self, phase: Phase) -> float | None:
-        """Return how long a phase is expected to take; None of cases that nobody has seen run."""
+        """Return the expected time of a phase; None for the cases, whose rate is unknown."""
         if phase is Phase.CASES:
             return None
         if phase is Phase.REPORT:

@@ -103,8 +103,8 @@ def failures_in_words(failures: Sequence[Outcome], rule: Rule) -> str:
     return f"{counted(len(failures), 'failure')} ({told})"
 
 
-def avoidable_words(failures: Sequence[Outcome], crash_m: float) -> str | None:
-    """Return how many failures need not have been, among those of which that is known."""
+def avoidable_text(failures: Sequence[Outcome], crash_m: float) -> str | None:
+    """Return the number of avoidable failures in words; None if it is unknown for all."""
     told = [o.measures.avoidable for o in failures if o.measures.avoidable is not None]
     if not told:
         return None
@@ -115,8 +115,8 @@ def avoidable_words(failures: Sequence[Outcome], crash_m: float) -> str | None:
     )
 
 
-def after_words(outcomes: Iterable[Outcome], crash_m: float) -> str | None:
-    """Return how many cases without a failure are no harmless merges either."""
+def harmful_merges_text(outcomes: Iterable[Outcome], crash_m: float) -> str | None:
+    """Return the number of cases that are not failures and not harmless either, in words."""
     found = Counter(o.measures.severity for o in outcomes if not o.failed)
     said = {
         Severity.CONTACT: "bodies touch",
@@ -129,8 +129,8 @@ def after_words(outcomes: Iterable[Outcome], crash_m: float) -> str | None:
     return f"No failures, but no harmless merges: {in_words(parts)} (--fail-when unsafe)."
 
 
-def before_words(outcomes: Iterable[Outcome]) -> str | None:
-    """Return in how many cases bodies overlap before M and nowhere else."""
+def overlaps_before_m_text(outcomes: Iterable[Outcome]) -> str | None:
+    """Return the number of cases in which bodies overlap before M alone, in words."""
     before = sum(
         (o.measures.before_clearance_m or 0.0) < 0.0 and o.measures.severity != Severity.CONTACT
         for o in outcomes

@@ -16,7 +16,7 @@ from merge_sumo.analysis.diagnosis import (
     Diagnosis,
     Kind,
 )
-from merge_sumo.analysis.predictions import off_m
+from merge_sumo.analysis.predictions import prediction_error_m
 from merge_sumo.analysis.verdict import shortened
 from merge_sumo.reports.report_maps import maps_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
@@ -192,7 +192,7 @@ def _search(facts: ReportModel) -> dict[str, Any]:
             so_far = points[failed & (group <= number)]
             wanted = (last - number) % stride == 0
             covered.append(round(fmc(so_far), 5) if wanted else None)
-        off = np.array([off_m(o) for o in at], dtype=np.float64)
+        off = np.array([prediction_error_m(o) for o in at], dtype=np.float64)
         levels.append(
             {
                 "level": level,

@@ -25,7 +25,13 @@ from merge_sumo.campaigns import repeats
 from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
-from merge_sumo.reports.headline import Rule, after_words, avoidable_words, before_words, headline
+from merge_sumo.reports.headline import (
+    Rule,
+    avoidable_text,
+    harmful_merges_text,
+    headline,
+    overlaps_before_m_text,
+)
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
@@ -115,9 +121,9 @@ def _numbers(model: ReportModel) -> dict[str, Any]:
         "plausible_chance": f"{PLAUSIBLE:.0%}",
         "fewest_failures": FEWEST_FAILURES,
         "radii": _radii({len(model.run.scenario.dimensions(level)) for level in model.levels}),
-        "avoidable": avoidable_words(model.worst, crash_m),
-        "after": after_words(outcomes, crash_m),
-        "before": before_words(outcomes),
+        "avoidable": avoidable_text(model.worst, crash_m),
+        "after": harmful_merges_text(outcomes, crash_m),
+        "before": overlaps_before_m_text(outcomes),
         "batches": len({o.batch for o in outcomes}),
         "recorded": _recorded(model.run),
         "driven": _duration(sum(o.measures.t_end_s for o in outcomes)),

@@ -9,7 +9,7 @@ from unicodedata import category
 
 
 def printable(text: str) -> str:
-    """Return a line with everything escaped that moves a cursor, ends a line or is no character."""
+    """Return a text with control characters, line ends and invalid characters escaped."""
     return "".join(
         letter if letter.isprintable() or category(letter) == "Zs" else _escaped(letter)
         for letter in text
@@ -21,7 +21,7 @@ def _escaped(letter: str) -> str:
 
 
 def two_digits(value: float) -> str:
-    """Return a number with two digits that mean something: 110, 6.9, 0.42."""
+    """Return a number with two significant digits: 110, 6.9, 0.42."""
     return f"{float(f'{value:.2g}'):.12g}"
 
 

@@ -152,15 +152,15 @@ class TestARate:
         for outcome in outcomes[60:]:
             clock[0] += 1.0
             progress.case_ended(outcome)
-        progress.counted(Phase.CAREFUL, 0, 40)
+        progress.advance(Phase.CAREFUL, 0, 40)
         clock[0] += 10.0
-        progress.counted(Phase.CAREFUL, 10, 40)
+        progress.advance(Phase.CAREFUL, 10, 40)
         assert "careful drivers, 10/40 failures, 1.0 failures/s" in progress.line
         assert progress.left_s == pytest.approx(30.0 + report_s)
-        progress.counted(Phase.REPORT, 0, 6)
+        progress.advance(Phase.REPORT, 0, 6)
         assert progress.left_s == pytest.approx(report_s)
         clock[0] += 8.0
-        progress.counted(Phase.REPORT, 4, 6)
+        progress.advance(Phase.REPORT, 4, 6)
         assert progress.left_s == pytest.approx(4.0)
         assert progress.rate(Phase.CASES) == "1.0 cases/s", "a phase that ended keeps its rate"
 

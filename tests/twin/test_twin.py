@@ -15,7 +15,7 @@ from campaigning import resume_campaign, run_campaign
 from conftest import some
 from plans import POVS, plan_for
 
-from merge_sumo.analysis.predictions import off_m, prediction_in_words, surprises
+from merge_sumo.analysis.predictions import prediction_error_m, prediction_in_words, surprises
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.drivers.policies import policies_of
@@ -373,8 +373,8 @@ class TestTheReport:
         told = [outcome(i, 10.0 + i, said(10.0, 0.5, 0.5)) for i in range(3)]
         missed = outcome(3, -2.0, said(math.nan, 0.5, 0.5))
         assert [o.index for o in surprises([*told, missed, outcome(4, 0.0)], 6.0)] == [3, 2, 1, 0]
-        assert off_m(told[2]) == 2.0
-        assert off_m(missed) is None
+        assert prediction_error_m(told[2]) == 2.0
+        assert prediction_error_m(missed) is None
 
     def test_expects_failures_where_they_are(self, whole):
         twin = learned_twin(whole, [0, 1])
