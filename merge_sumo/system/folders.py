@@ -164,8 +164,13 @@ def make_folder(path: Path, option: str = "--out") -> None:
 def make_place(folder: Path, option: str = "--out") -> None:
     """Make a folder unless it is there; `UserError` where it cannot be."""
     check_place(folder, option)
-    if not folder.is_dir():
+    if folder.is_dir():
+        return
+    try:
         make_folder(folder, option)
+    except UserError:
+        if not folder.is_dir():  # made by another process since
+            raise
 
 
 def _make_above(path: Path, undo: ExitStack) -> None:
