@@ -163,14 +163,14 @@ def make_folder(path: Path, option: str = "--out") -> None:
 
 def make_place(folder: Path, option: str = "--out") -> None:
     """Make a folder unless it is there; `UserError` where it cannot be."""
-    check_place(folder, option)
-    if folder.is_dir():
-        return
     try:
-        make_folder(folder, option)
+        check_place(folder, option)
+        if not folder.is_dir():
+            make_folder(folder, option)
     except UserError:
-        if not folder.is_dir():  # made by another process since
+        if folder.name in ("", "..") or not _is_folder(folder):
             raise
+        check_place(folder, option)  # made by another process since
 
 
 def _make_above(path: Path, undo: ExitStack) -> None:
