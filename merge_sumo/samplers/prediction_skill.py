@@ -1,6 +1,6 @@
 """P(fail) from the predictions of a twin, weighted by the skill of its predictions so far.
 
-A *predictor*, which knows the POVs and has observed the VUT, plays cases out and predicts the gap
+A *predictor*, which knows the POVs and has observed the VUT, rolls cases out and predicts the gap
 at M. It has experts of several kinds, and of each several members who know
 different things, so that they disagree where they guess. How much is to be made of what they say is
 in the record: what they had said of the cases that have run since.
@@ -162,7 +162,7 @@ class PredictionSkill:
         return np.asarray(said.std(axis=0) * np.exp(-0.25 * np.square(np.median(said, axis=0))))
 
     def annotated(self, proposal: Proposal, predict: PredictGaps) -> Proposal:
-        """Return a proposal of the surrogate's with what games say of it: that may change."""
+        """Return a proposal of the surrogate's with what rollouts say of it, which may change."""
         gaps_m = predict(proposal.points)
         said = tuple(
             Prediction.of(gaps_m[..., i], float(p), float(chance), float(chance))
@@ -227,7 +227,7 @@ class PredictionSkill:
         return np.asarray(0.5 ** (age / HALF_LIFE) * np.where(own, 1.0, OTHER_LEVELS))
 
     def _learn_weights(self, known: Known, weight: FloatArray) -> None:
-        """Learn where the games, and where the surrogate, predicted the verdicts better."""
+        """Learn where the rollouts, and where the surrogate, predicted the verdicts better."""
         failed = np.array([o.failed for o, _ in known])
         same = self._agreed(np.stack([told.gaps_m for _, told in known], axis=-1))
         chances = np.array([(told.p_twin, told.p_surrogate) for _, told in known])

@@ -1,1 +1,1 @@
-"""A twin of the VUT: what it will do, learned from what it did, and the games that follow."""
+"""A twin of the VUT: what it will do, learned from what it did, and its rollouts."""

@@ -1,4 +1,4 @@
-"""Games played out by eq. (4), against the very POVs of the levels, without SUMO."""
+"""Rollouts by eq. (4), against the very POVs of the levels, without SUMO."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Answer = Callable[[Inputs, int, NDArray[np.int64]], FloatArray]
 """Gives accelerations of the VUT, (R,), by inputs, (R, inputs), of which some are of the present,
 and the numbers of the rows, (R,), in rising order."""
 STILL: Final = 0.8
-"""Share of rows that still play below which the others are dropped."""
+"""Share of rows that still move below which the others are dropped."""
 
 
 class TwinRollout:
-    """Plays cases of a pool out against a VUT that is given as a function."""
+    """Rolls cases of a pool out against a VUT that is given as a function."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class TwinRollout:
     def can_predict(self, level: int) -> bool:
         """Return whether the POV of a level is known, and not a program of a person's own.
 
-        A game ends at M, so none can be played where what happens behind it counts.
+        A rollout ends at M, so none is possible where what happens behind it counts.
         """
         known = level == 0 or level in self._networks
         return known and (self._criterion.is_papers or not self._scenario.follow_up_s)

@@ -20,7 +20,7 @@ Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class Prediction(Record, frozen=True):
-    """The gaps at M that a twin of the VUT had in its games, and the chances of failing.
+    """The gaps at M that a twin of the VUT had in its rollouts, and the chances of failing.
 
     Attributes:
         dx_m: signed gap at M by each member of each expert, (E, G); None where the VUT never
