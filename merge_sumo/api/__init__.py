@@ -15,32 +15,35 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from merge_sumo.analysis.coordinates import outside_of_the_pool
 from merge_sumo.analysis.verdict import parse_gates
 from merge_sumo.api.keywords import (
+    CampaignKeywords,
     CaseKeywords,
     Hosting,
-    Settings,
+    RerunKeywords,
+    Runner,
+    Running,
     Setup,
+    StudyKeywords,
     check_keywords,
+    given_again,
     recordable,
+    runner_of,
     scenario_of,
     settings_for,
 )
 from merge_sumo.api.results import (
-    Benchmark,
     CampaignRun,
     CaseRun,
     CertificateResult,
-    CheckResult,
     PolicyChecks,
     ProbabilityResult,
     Reproduction,
@@ -72,7 +75,7 @@ from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policie
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.povs import Povs, one_level, parse_levels, policies_folder
+from merge_sumo.engine.povs import ONE, one_level, parse_levels, policies_folder
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
@@ -80,7 +83,7 @@ from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
-from merge_sumo.reports.progress import Bars, Counter, TrainingBars, is_watched, rate_text
+from merge_sumo.reports.progress import Bars, TrainingBars, is_watched
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction_page
 from merge_sumo.reports.version_pages import comparison_page, history_page, write_page
@@ -92,12 +95,14 @@ from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenar
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies import benchmark, certificate, reproduction, versions, vut_check
 from merge_sumo.studies import probability as estimates
+from merge_sumo.studies.benchmark import Benchmark
 from merge_sumo.studies.certificate import runs_points_on
 from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
-from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth
+from merge_sumo.studies.truth import Truth
 from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
+from merge_sumo.studies.vut_check import VutCheck
 from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
 from merge_sumo.sumo.replay import Replay
@@ -112,7 +117,7 @@ from merge_sumo.system.folders import (
 )
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.workers import Workers, workers_or_cores
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import LEVELS, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
@@ -126,7 +131,7 @@ if TYPE_CHECKING:
     from merge_sumo.values.case import Case
 
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
-__all__ += ["RunComparison", "Seen", "SeenBatch", "Settings", "Setup", "campaign", "certify"]
+__all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign", "certify"]
 __all__ += ["check_scenario", "check_vut", "compare", "compare_runs", "dated", "export"]
 __all__ += ["export_policy", "history", "new_scenario", "open_in_gui", "open_run"]
 __all__ += ["probability", "replay", "report", "reproduce", "rerun", "resume", "run_case"]
@@ -145,14 +150,7 @@ def campaign(
     *,
     net: AnyPath | None = None,
     out: AnyPath | None = None,
-    workers: int | None = 1,
-    dask: str | None = None,
-    on_case: OnCase | None = None,
-    check: Callable[[], None] | None = None,
-    progress: bool | None = None,
-    gates: Iterable[str] = (),
-    junit: AnyPath | None = None,
-    **settings: Unpack[Settings],
+    **given: Unpack[CampaignKeywords],
 ) -> CampaignRun:
     """Test a VUT and return the campaign; the same as `merge-sumo campaign`.
 
@@ -160,32 +158,25 @@ def campaign(
         vut: vehicle under test: a spec, a class, a function, or an object.
         net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/<vut>-<date>` by default.
-        workers: processes that run cases; the outcomes are the same.
-        dask: address of a Dask scheduler whose workers run the cases instead.
-        on_case: called with the outcome of every case as it ends.
-        check: called after every batch; may raise to stop there.
-        progress: show progress; by default in a notebook and on a terminal.
-        gates: "failures", "errors", "timeouts" or "fmc>X": what `passed` of the result depends on.
-        junit: new file to write for CI: JUnit XML.
-        settings: which cases are chosen (`level`, `sampler`, `cases`, `batch`, `seed`,
-            `v_vut0_mps`, `stop_after_converged`, `learn_from`), and how a case is run and judged
-            (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`, `vut_command`,
-            `deadline_s`, `vut_memory_gib`, `in_process`); see `Settings` and `Setup`.
+        given: which cases are chosen (`level`, `sampler`, `cases`, `batch`, `seed`, `v_vut0_mps`,
+            `stop_after_converged`, `learn_from`), how a case is run and judged (`scenario`,
+            `follow_up_s`, `fail_when`, `require`, `policies`, `pov`, `vut_command`, `deadline_s`,
+            `vut_memory_gib`, `in_process`), where it runs (`workers`, `dask`), and who is told
+            (`progress`, `on_case`, `check`, `gates`, `junit`); see `CampaignKeywords`.
 
     An interrupted campaign goes on with `resume`. Raises `UserError` for values that make no
     campaign, or when the folder exists.
     """
-    check_keywords("campaign", settings, Settings)
-    checked, count = settings_for(vut, settings, workers=workers)
-    folder = dated(checked.vut) if out is None else Path(out)
-    plan = resolve(checked, _path(net))
-    _notice_untrained(checked, plan, settings)
-    running = _Running(count, dask, on_case, check or _go_on, progress, gates, junit)
+    check_keywords("campaign", given, CampaignKeywords)
+    settings, runner = settings_for(vut, given)
+    folder = dated(settings.vut) if out is None else Path(out)
+    plan = resolve(settings, _path(net))
+    _notice_untrained(settings, plan, given)
 
     def run(opened: Workers, _: CampaignPanel, on_case: OnCase) -> Run:
-        return run_campaign(checked, plan, folder, on_case, workers=opened, check=running.check)
+        return run_campaign(settings, plan, folder, on_case, workers=opened, check=runner.checks)
 
-    return _concluded(checked, plan, folder, run, running)
+    return _concluded(settings, plan, folder, run, runner)
 
 
 def resume(
@@ -195,14 +186,7 @@ def resume(
     net: AnyPath | None = None,
     force: bool = False,
     trust_vut: bool = False,
-    workers: int | None = 1,
-    dask: str | None = None,
-    on_case: OnCase | None = None,
-    check: Callable[[], None] | None = None,
-    progress: bool | None = None,
-    gates: Iterable[str] = (),
-    junit: AnyPath | None = None,
-    **given: Unpack[Settings],
+    **given: Unpack[CampaignKeywords],
 ) -> CampaignRun:
     """Go on with a campaign that was stopped; the same as `merge-sumo campaign --resume`.
 
@@ -213,23 +197,22 @@ def resume(
         net: net for that; must be the one of the campaign.
         force: go on although something differs that decides outcomes.
         trust_vut: run the controller that a folder names although it was not made here.
-        workers: processes that run cases; the outcomes are the same.
-        dask: address of a Dask scheduler whose workers run the cases instead.
-        on_case: called with the outcome of every case as it ends.
-        check: called after every batch; may raise to stop there.
-        progress: show progress; by default in a notebook and on a terminal.
-        gates: as of `campaign`.
-        junit: as of `campaign`.
-        given: settings, which must be those of the campaign: `cases` may be more.
+        given: as of `campaign`. The settings must be those of the campaign: `cases` may be more.
 
     Raises `UserError` for a folder that is no campaign, or something that differs.
     """
-    check_keywords("resume", given, Settings)
+    check_keywords("resume", given, CampaignKeywords)
     folder = run.folder if isinstance(run, CampaignRun) else Path(run)
-    settings, count = _settings_again(folder, {"vut": vut, **given}, workers, trust=trust_vut)
+    recorded = read_settings(folder)
+    named = {name: value for name, value in given.items() if value is not None}
+    fields, runner = given_again(vut, named, {name: recorded.get(name) for name in ("vut", "pov")})
+    settings = settings_of(folder, recorded, fields, trust=trust_vut)
+    if "level" in named:
+        policies = policies_folder(settings.policies, settings.scenario)
+        levels = parse_levels(str(named["level"]), policies, own=settings.pov is not None)
+        settings = replace(settings, levels=levels)
     check_report(folder)
     plan = resolve(settings, _path(net))
-    running = _Running(count, dask, on_case, check or _go_on, progress, gates, junit)
 
     def go_on(opened: Workers, panel: CampaignPanel, on_case: OnCase) -> Run:
         return resume_campaign(
@@ -240,49 +223,11 @@ def resume(
             on_before=panel.ran_before,
             force=force,
             workers=opened,
-            check=running.check,
+            check=runner.checks,
             warn=lambda sentence: warnings.warn(sentence, Notice, stacklevel=2),
         )
 
-    return _concluded(settings, plan, folder, go_on, running)
-
-
-def _settings_again(
-    folder: Path, given: Mapping[str, Any], workers: int | None, *, trust: bool
-) -> tuple[CampaignSettings, int | None]:
-    """Return the settings of a campaign, as its folder records them or as they are given again.
-
-    With them comes the number of workers that the drivers allow.
-    """
-    recorded = read_settings(folder)
-    named = {name: value for name, value in given.items() if value is not None}
-    vut, pov = (named.get(name, recorded.get(name)) for name in ("vut", "pov"))
-    spec, pov_spec, count = drivers_of("" if vut is None else vut, pov, workers, stacklevel=4)
-    specs = {"vut": spec, "pov": pov_spec}
-    fields = recordable(named | {name: specs[name] for name in specs if name in named})
-    settings = settings_of(folder, recorded, fields, trust=trust)
-    if "level" in named:
-        policies = policies_folder(settings.policies, settings.scenario)
-        levels = parse_levels(str(named["level"]), policies, own=settings.pov is not None)
-        settings = replace(settings, levels=levels)
-    return settings, count
-
-
-@dataclass(frozen=True, slots=True)
-class _Running:
-    """Where a campaign runs and who is told of it: nothing here decides an outcome."""
-
-    workers: int | None
-    dask: str | None
-    on_case: OnCase | None
-    check: Callable[[], None]
-    progress: bool | None
-    gates: Iterable[str]
-    junit: AnyPath | None
-
-
-def _go_on() -> None:
-    """Let a verb go on: the `check` after every batch where none is given."""
+    return _concluded(settings, plan, folder, go_on, runner)
 
 
 def _concluded(
@@ -290,51 +235,34 @@ def _concluded(
     plan: SimulationPlan,
     folder: Path,
     run: Callable[[Workers, CampaignPanel, OnCase], Run],
-    running: _Running,
+    runner: Runner,
 ) -> CampaignRun:
     """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
 
     `run` runs its cases on workers, with the panel that shows it and what is called with every
     case. An interruption has a note on how to go on.
     """
-    gates = list(running.gates)
+    gates = list(runner.gates)
     parse_gates(gates)
-    junit = None if running.junit is None else Path(running.junit)
+    junit = _path(runner.junit)
     if junit is not None:
         check_junit(junit, folder)
-    shown = is_watched() if running.progress is None else running.progress
+    quiet = not (is_watched() if runner.progress is None else runner.progress)
+    title, cases, levels = _title(settings), settings.cases, settings.levels
     try:
         with (
-            evaluation_workers(plan.workers(running.workers), running.dask) as opened,
-            panel_of(
-                _title(settings),
-                settings.cases,
-                settings.levels,
-                folder,
-                workers=opened.count,
-                quiet=not shown,
-            ) as panel,
+            runner.open(plan) as opened,
+            panel_of(title, cases, levels, folder, workers=opened.count, quiet=quiet) as panel,
         ):
 
             def case_ended(outcome: Outcome) -> None:
                 panel.case_ended(outcome)
-                if running.on_case is not None:
-                    running.on_case(outcome)
+                if runner.on_case is not None:
+                    runner.on_case(outcome)
 
             done = run(opened, panel, case_ended)
-            note_avoidance(
-                done,
-                plan,
-                workers=opened,
-                check=running.check,
-                on_part=panel.driven_again,
-            )
-            link_latest(done.folder)
             result = CampaignRun(done, gates)
-            # Learned on another machine, surrogates may differ in a last bit.
-            local = opened if running.dask is None else None
-            note_expectation(done)
-            write_report(done, result.summary, local, panel.report_part)
+            _write_findings(result, plan, opened, panel, runner)
     except (KeyboardInterrupt, Stopped) as stop:
         if folder.exists():
             link_latest(folder)
@@ -345,6 +273,23 @@ def _concluded(
     return result
 
 
+def _write_findings(
+    result: CampaignRun,
+    plan: SimulationPlan,
+    opened: Workers,
+    panel: CampaignPanel,
+    runner: Runner,
+) -> None:
+    """Write what follows the cases into the folder: counterfactuals, expectation, report."""
+    done = result.run
+    note_avoidance(done, plan, workers=opened, check=runner.checks, on_part=panel.driven_again)
+    link_latest(done.folder)
+    # Learned on another machine, surrogates may differ in a last bit.
+    local = opened if runner.dask is None else None
+    note_expectation(done)
+    write_report(done, result.summary, local, panel.report_part)
+
+
 def _title(settings: CampaignSettings) -> str:
     return f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 
@@ -353,7 +298,9 @@ def _path(path: AnyPath | None) -> Path | None:
     return None if path is None else Path(path)
 
 
-def _notice_untrained(settings: CampaignSettings, plan: SimulationPlan, given: Settings) -> None:
+def _notice_untrained(
+    settings: CampaignSettings, plan: SimulationPlan, given: CampaignKeywords
+) -> None:
     """Warn with a `Notice` where learned POVs are missing, or were not trained on the scenario."""
     if given.get("level", "all") == "all" and not set(settings.levels) >= set(LEVELS):
         levels = ", ".join(map(level_name, settings.levels))
@@ -449,14 +396,6 @@ def run_case(
     return CaseRun(run_one(plan, one, live=gui, on_end=ended))
 
 
-def _case_fields(vut: AnyVut | None, setup: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that are given for one case."""
-    spec, pov_spec, _ = drivers_of("" if vut is None else vut, setup.get("pov"), 1, stacklevel=5)
-    specs = {"vut": None if vut is None else spec, "pov": pov_spec}
-    fields = {**setup, **{name: value for name, value in specs.items() if value is not None}}
-    return recordable(fields)
-
-
 def _recorded_case(
     vut: AnyVut | None,
     recorded: tuple[AnyRun, int],
@@ -467,7 +406,7 @@ def _recorded_case(
     trust: bool,
 ) -> tuple[CampaignSettings, Case]:
     """Return a case of a campaign with other settings and coordinates, and how it is run."""
-    fields = _case_fields(vut, setup)
+    fields, _ = given_again(vut, setup, {})
     run, index = _opened(recorded[0]).run, recorded[1]
     number = run.outcome(index).case.level
     if level is not None:
@@ -484,7 +423,7 @@ def _given_case(
     values: Mapping[str, Any],
 ) -> tuple[CampaignSettings, Case]:
     """Return a case by its coordinates, which win over those of a row, and how it is run."""
-    fields = _case_fields(vut, {"scenario": US23, **setup})
+    fields, _ = given_again(vut, {"scenario": US23, **setup}, {})
     coordinates = {name: row[name] for name in FIELDS if row.get(name) is not None}
     name = level_name(int(row.get("level", 0))) if level is None else str(level)
     policies = policies_folder(setup.get("policies"), fields["scenario"])
@@ -500,10 +439,7 @@ def rerun(
     level: int | str | None = None,
     net: AnyPath | None = None,
     trust_vut: bool = False,
-    workers: int | None = 1,
-    dask: str | None = None,
-    progress: bool | None = None,
-    **hosting: Unpack[Hosting],
+    **given: Unpack[RerunKeywords],
 ) -> Rerun:
     """Run recorded cases again with a changed VUT; the same as `merge-sumo rerun`.
 
@@ -514,29 +450,19 @@ def rerun(
         level: only the cases with a POV of this level; "all" by default.
         net: net for that; must be the one of the campaign.
         trust_vut: run the controller that a folder names although it was not made here.
-        workers: processes that run cases.
-        dask: address of a Dask scheduler whose workers run the cases instead.
-        progress: show progress; by default in a notebook and on a terminal.
-        hosting: others to change: `policies`, `pov`, `vut_command`, `deadline_s`,
-            `vut_memory_gib`, `in_process`; see `Hosting`.
+        given: how the drivers run, where it is to change, and where the cases run: see
+            `RerunKeywords`.
 
     Raises `UserError` for a case that does not exist, and for another net or POV than recorded.
     """
-    check_keywords("rerun", hosting, Hosting)
-    before, count = _opened(run).run, workers_or_cores(workers)
+    check_keywords("rerun", given, RerunKeywords)
+    before = _opened(run).run
     wanted = _of_level(before, _listed(indices), level)
-    given: dict[str, Any] = dict(hosting)
-    if vut is not None or hosting.get("pov") is not None:
-        spec, pov, able = drivers_of("" if vut is None else vut, hosting.get("pov"), workers)
-        given |= {name: one for name, one in (("vut", spec), ("pov", pov)) if one}
-        count = able or count
-    today = settings_today(before, recordable(given), trust=trust_vut)
+    fields, runner = given_again(vut, given, {})
+    today = settings_today(before, fields, trust=trust_vut)
     plan = resolve(today, _path(net))
     total = len(set(wanted) or before.outcomes)
-    with (
-        evaluation_workers(plan.workers(count), dask) as opened,
-        Counter(f"{today.vut} again", total, "cases", shown=progress) as counter,
-    ):
+    with runner.open(plan) as opened, runner.counter(f"{today.vut} again", total) as counter:
         return versions.rerun(before, today, plan, wanted, workers=opened, on_case=counter.ended)
 
 
@@ -713,18 +639,15 @@ def truth(
     *,
     cases: int | None = None,
     seed: int = 0,
-    workers: int | None = 1,
-    dask: str | None = None,
-    progress: bool | None = None,
-    **setup: Unpack[Setup],
+    **given: Unpack[StudyKeywords],
 ) -> Truth:
     """Return the ground truth of a VUT at one level; see `truths`, whose arguments these are."""
-    check_keywords("truth", setup, Setup)
-    settings, count = settings_for(vut, {**setup, "level": level}, workers=workers)
-    policies = policies_folder(settings.policies, settings.scenario)
-    number = one_level(str(level), policies, own=settings.pov is not None)
-    with _study(settings, count, dask, progress) as study:
-        return study.truth(number, cases, seed)
+    check_keywords("truth", given, StudyKeywords)
+    if str(level) == "all":
+        raise UserError(f"--level all does not go here: choose {ONE}")
+    settings, runner = settings_for(vut, {**given, "level": level})
+    with _study(settings, runner) as study:
+        return study.truth(settings.levels[0], cases, seed)
 
 
 def truths(
@@ -733,10 +656,7 @@ def truths(
     *,
     cases: int | None = None,
     seed: int = 0,
-    workers: int | None = 1,
-    dask: str | None = None,
-    progress: bool | None = None,
-    **setup: Unpack[Setup],
+    **given: Unpack[StudyKeywords],
 ) -> TruthResult:
     """Find the ground truth of a VUT by uniform cases; the same as `merge-sumo truth`.
 
@@ -745,17 +665,14 @@ def truths(
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         cases: uniform cases of a level; by default 10,000, and 20,000 at level 2.
         seed: same seed, same cases.
-        workers: processes that run cases; None is one a core.
-        dask: address of a Dask scheduler whose workers run the cases instead.
-        progress: show progress; by default in a notebook and on a terminal.
-        setup: how a case is run and judged: see `Setup`.
+        given: how a case is run and judged, and where: see `StudyKeywords`.
 
     A cached truth is used again. The truth of an object of this process is not kept: its name does
     not tell it from another object.
     """
-    check_keywords("truths", setup, Setup)
-    settings, count = settings_for(vut, {**setup, "level": level}, workers=workers)
-    with _study(settings, count, dask, progress) as study:
+    check_keywords("truths", given, StudyKeywords)
+    settings, runner = settings_for(vut, {**given, "level": level})
+    with _study(settings, runner) as study:
         by_level = {number: study.truth(number, cases, seed) for number in settings.levels}
     if study.plan.vut.vut.named_only and not is_here(settings.vut):
         warnings.warn(
@@ -767,66 +684,17 @@ def truths(
     return TruthResult(settings.vut, by_level, settings.criterion)
 
 
-@dataclass(frozen=True, slots=True)
-class _Study:
-    """A plan, and what a study of truths and searches runs it with."""
-
-    plan: SimulationPlan
-    workers: Workers
-    cache: Path | None
-    progress: bool | None
-
-    def truth(self, level: int, cases: int | None, seed: int = 0) -> Truth:
-        """Return the truth at a level, from the cache where it is kept."""
-        total = TRUTH_CASES[level] if cases is None else cases
-        title = f"truth of {self.plan.vut.spec} at level {level_name(level)}"
-        with Counter(title, total, "cases", shown=self.progress) as counter:
-            return ground_truth(
-                *(self.plan, level, total, seed),
-                workers=self.workers,
-                cache=self.cache,
-                on_cases=counter.ended,
-            )
-
-    def dense_truths(self, levels: Sequence[int], wanted: bool | None) -> dict[int, Truth]:
-        """Return the dense truths by level: made where `wanted`, where that is None the kept."""
-        if wanted is False:
-            return {}
-        if wanted:
-            return {level: self.truth(level, DENSE_CASES) for level in levels}
-        kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
-        return {level: truth for level, truth in kept.items() if truth is not None}
-
-    def searches(
-        self, settings: CampaignSettings, samplers: Sequence[str], seeds: int
-    ) -> dict[str, list[benchmark.Search]]:
-        """Let each sampler search with each seed; return the searches by sampler."""
-        total = len(samplers) * seeds
-        with Counter(_title(settings), total, "runs", shown=self.progress) as counter:
-            return benchmark.search(
-                self.plan,
-                settings.levels,
-                samplers,
-                seeds=seeds,
-                cases=settings.cases,
-                batch=settings.batch,
-                workers=self.workers,
-                on_search=lambda name, _: counter.ended(1, name),
-            )
-
-
 @contextmanager
-def _study(
-    settings: CampaignSettings, workers: int | None, dask: str | None, progress: bool | None
-) -> Iterator[_Study]:
+def _study(settings: CampaignSettings, runner: Runner) -> Iterator[benchmark.Study]:
     """Open a study; the cache of objects of this process is a passing one."""
     plan = resolve(settings)
-    with evaluation_workers(plan.workers(workers), dask) as opened:
-        if not (is_here(settings.vut) or is_here(settings.pov or "")):
-            yield _Study(plan, opened, None, progress)
-            return
-        with tempfile.TemporaryDirectory(prefix="merge-sumo-") as passing:
-            yield _Study(plan, opened, Path(passing), progress)
+    passing = is_here(settings.vut) or is_here(settings.pov or "")
+    with (
+        runner.open(plan) as opened,
+        tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder,
+        Bars(shown=runner.progress) as bars,
+    ):
+        yield benchmark.Study(plan, opened, Path(folder) if passing else None, bars.counted)
 
 
 def compare(
@@ -840,10 +708,7 @@ def compare(
     truth_cases: int | None = None,
     dense: bool | None = None,
     figure: AnyPath | None = None,
-    workers: int | None = 1,
-    dask: str | None = None,
-    progress: bool | None = None,
-    **setup: Unpack[Setup],
+    **given: Unpack[StudyKeywords],
 ) -> Benchmark:
     """Compare samplers with each other and with the ground truth; as `merge-sumo compare`.
 
@@ -857,14 +722,11 @@ def compare(
         truth_cases: cases of the truth at a level; by default 10,000, and 20,000 at level 2.
         dense: make the dense truths of 1,000,000 cases, or go without; by default those kept.
         figure: new file for FMC against cases: .png, .svg or .html.
-        workers: processes that run cases; None is one a core.
-        dask: address of a Dask scheduler whose workers run the cases instead.
-        progress: show progress; by default in a notebook and on a terminal.
-        setup: how a case is run and judged: see `Setup`.
+        given: how a case is run and judged, and where: see `StudyKeywords`.
 
     Raises `UserError` for values that make no comparison.
     """
-    check_keywords("compare", setup, Setup)
+    check_keywords("compare", given, StudyKeywords)
     picture = _path(figure)
     if picture is not None:
         figures.check_figure(picture)
@@ -872,30 +734,22 @@ def compare(
     if not names:
         raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}")
     search = {"level": level, "sampler": names[0], "cases": cases, "batch": batch}
-    settings, count = settings_for(vut, {**setup, **search}, workers=workers)
+    settings, runner = settings_for(vut, {**given, **search})
     for name in names[1:]:
         replace(settings, sampler=name)
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")
-    with _study(settings, count, dask, progress) as study:
-        by_level = {number: study.truth(number, truth_cases) for number in settings.levels}
+    with _study(settings, runner) as study:
+        truths = {number: study.truth(number, truth_cases) for number in settings.levels}
         dense_truths = study.dense_truths(settings.levels, dense)
-        searches = study.searches(settings, names, seeds)
-    limit = benchmark.limit_fmc(chain.from_iterable(searches.values()), by_level, dense_truths)
-    result = Benchmark(
-        samplers={name: benchmark.compare(s, by_level, limit) for name, s in searches.items()},
-        truths=by_level,
-        dense=dense_truths,
-        limit_fmc=limit,
-        oracle_fmc=benchmark.oracle(by_level, cases, batch),
-        cases=cases,
-        figure=picture,
-    )
-    if picture is not None:
-        title = f"{_title(settings)}, {seeds} seeds"
-        curves = (result.samplers, result.truth_fmc, result.oracle_fmc, result.limit_fmc)
-        figures.save(figures.coverage_curves(title, *curves), picture)
-    return result
+        searches = study.searches(settings.levels, names, seeds, cases, batch)
+    result = Benchmark.of(searches, truths, dense_truths, cases, batch)
+    if picture is None:
+        return result
+    curves = (result.samplers, result.truth_fmc, result.oracle_fmc, result.limit_fmc)
+    drawn = figures.coverage_curves(f"{_title(settings)}, {seeds} seeds", *curves)
+    figures.save(drawn, picture)
+    return replace(result, figure=picture)
 
 
 def certify(
@@ -906,11 +760,8 @@ def certify(
     net: AnyPath | None = None,
     out: AnyPath | None = None,
     resume: bool = False,
-    workers: int | None = 1,
-    dask: str | None = None,
-    check: Callable[[], None] | None = None,
-    progress: bool | None = None,
-    **setup: Unpack[Setup],
+    check: Callable[[], None] = lambda: None,
+    **given: Unpack[StudyKeywords],
 ) -> CertificateResult:
     """Certify that no ball of a radius in the pool fails throughout; as `merge-sumo certify`.
 
@@ -921,16 +772,13 @@ def certify(
         net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/certify-<vut>-<date>` by default.
         resume: go on with the certificate in `out`.
-        workers: processes that run cases; None is one a core.
-        dask: address of a Dask scheduler whose workers run the cases instead.
         check: called after every block of cases; may raise to stop there.
-        progress: show progress; by default in a notebook and on a terminal.
-        setup: how a case is run and judged: see `Setup`.
+        given: how a case is run and judged, and where: see `StudyKeywords`.
 
     Raises `UserError` for values that make no certificate, and when the folder exists.
     """
-    check_keywords("certify", setup, Setup)
-    settings, count = settings_for(vut, {**setup, "level": level}, workers=workers)
+    check_keywords("certify", given, StudyKeywords)
+    settings, runner = settings_for(vut, {**given, "level": level})
     lattices = certificate.lattices_of(settings, radius)
     if resume and out is None:
         raise UserError("say with out= which folder is resumed")
@@ -939,10 +787,7 @@ def certify(
         check_new(folder)
     plan = resolve(settings, _path(net))
     total = sum(map(len, lattices.values()))
-    with (
-        evaluation_workers(plan.workers(count), dask) as opened,
-        Counter(_title(settings), total, "cases", shown=progress) as counter,
-    ):
+    with runner.open(plan) as opened, runner.counter(_title(settings), total) as counter:
         done = certificate.certify(
             settings,
             radius,
@@ -951,7 +796,7 @@ def certify(
             runs_points_on(opened, settings, plan, folder),
             resume=resume,
             on_cases=counter.ended,
-            check=check or _go_on,
+            check=check,
         )
     return CertificateResult(done, folder / certificate.CERTIFICATE)
 
@@ -966,10 +811,7 @@ def probability(
     net: AnyPath | None = None,
     out: AnyPath | None = None,
     trust_vut: bool = False,
-    workers: int | None = 1,
-    dask: str | None = None,
-    progress: bool | None = None,
-    **hosting: Unpack[Hosting],
+    **given: Unpack[RerunKeywords],
 ) -> ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail; as `merge-sumo probability`.
 
@@ -982,32 +824,25 @@ def probability(
         net: net for that; must be the one of the campaign.
         out: new file to write; `probability.json` in the folder of the campaign by default.
         trust_vut: run the controller that a folder names although it was not made here.
-        workers: processes that run cases.
-        dask: address of a Dask scheduler whose workers run the cases instead.
-        progress: show progress; by default in a notebook and on a terminal.
-        hosting: settings that may be otherwise: `policies`, `pov`, `vut_command`, `deadline_s`,
-            `vut_memory_gib`, `in_process`; see `Hosting`.
+        given: how the drivers run, where it is to change, and where the cases run: see
+            `RerunKeywords`.
 
     Raises `UserError` for another net or POV than recorded, and when the file exists.
     """
-    check_keywords("probability", hosting, Hosting)
+    check_keywords("probability", given, RerunKeywords)
     before = _opened(run).run
     target = before.folder / estimates.RESULT if out is None else Path(out)
-    _, pov, count = drivers_of(before.vut, hosting.get("pov"), workers)
-    given = recordable({**hosting, **({} if pov is None else {"pov": pov})})
-    settings = settings_of(before.folder, before.settings, given, trust=trust_vut)
+    fields, runner = given_again(None, given, {"vut": before.vut})
+    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
     plan = resolve(settings, _path(net))
-    with (
-        evaluation_workers(plan.workers(count), dask) as opened,
-        Counter("fresh cases", cases, "cases", shown=progress) as counter,
-    ):
+    with runner.open(plan) as opened, runner.counter("fresh cases", cases) as counter:
         estimate = estimates.failure_probability(
             before,
             settings,
             plan,
             target,
             cases=cases,
-            distribution=None if distribution is None else Path(distribution),
+            distribution=_path(distribution),
             confidence=confidence,
             seed=seed,
             workers=opened,
@@ -1023,9 +858,7 @@ def reproduce(
     quick: bool = False,
     dense: bool | None = None,
     policies: AnyPath | None = None,
-    workers: int | None = 1,
-    dask: str | None = None,
-    progress: bool | None = None,
+    **given: Unpack[Running],
 ) -> Reproduction:
     """Reproduce Table II and the figures of the paper; the same as `merge-sumo reproduce`.
 
@@ -1035,25 +868,26 @@ def reproduce(
         quick: few and short runs and a small truth: a first look.
         dense: make the dense truths of 1,000,000 cases, or go without; by default those kept.
         policies: folder of learned drivers instead of the shipped ones.
-        workers: processes that run cases; None is one a core.
-        dask: address of a Dask scheduler whose workers run the cases instead.
-        progress: show progress; by default in a notebook and on a terminal.
+        given: where the cases run: see `Running`.
 
     Raises `UserError` for no seeds, and when the folder exists.
     """
+    check_keywords("reproduce", given, Running)
+    runner, _ = runner_of(given)
     count = (2 if quick else 10) if seeds is None else seeds
     scale = reproduction.quick(count) if quick else reproduction.Scale(seeds=count)
     if dense is not None:
         scale = replace(scale, dense=dense)
-    povs = Povs(policies=policies_folder(policies, US23))
+    trained = policies_folder(policies, US23)
     folder = dated("reproduce") if out is None else Path(out)
     figures.require_matplotlib()
-    with evaluation_workers(workers, dask) as opened, Bars(shown=progress) as bars:
-
-        def ran(title: str, done: int, total: int, unit: str) -> None:
-            bars.show(title, done, total, rate_text(done, bars.elapsed_s(title), unit))
-
-        reproduction.reproduce(folder, scale, povs=povs, workers=opened, on_run=ran)
+    with (
+        evaluation_workers(runner.workers, runner.dask) as opened,
+        Bars(shown=runner.progress) as bars,
+    ):
+        reproduction.reproduce(
+            folder, scale, policies=trained, workers=opened, on_part=bars.counted
+        )
     return Reproduction(write_reproduction_page(folder))
 
 
@@ -1071,7 +905,7 @@ def vuts(policies: AnyPath | None = None) -> VutList:
     return VutList(built_in, list(installed_vuts()), kinds)
 
 
-def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> CheckResult:
+def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> VutCheck:
     """Let a VUT drive a few cases and say what is wrong with it; as `merge-sumo check-vut`.
 
     Args:
@@ -1083,7 +917,7 @@ def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> CheckResult:
     spec, _, _ = drivers_of(vut, None, 1)
     fields = recordable({name: value for name, value in hosting.items() if name != "pov"})
     settings = CampaignSettings(vut=spec, levels=(0,), scenario=US23, **fields)
-    return CheckResult(spec, vut_check.check_vut(resolve(settings)))
+    return vut_check.check_vut(resolve(settings))
 
 
 def scenarios() -> ScenarioList:
@@ -1176,11 +1010,7 @@ def train(
             f"the shipped policies are for {US23.name}: say with --out where those for "
             f"{played.name} are to go"
         )
-    wanted = set(only) or set(NETWORKS)
-    unknown = wanted - set(NETWORKS)
-    if unknown:
-        raise UserError(f"there is no network {min(unknown)!r}: choose {', '.join(NETWORKS)}")
-    names = tuple(name for name in NETWORKS if name in wanted)
+    names = _networks(only)
     for package in ("torch", "gymnasium"):
         if find_spec(package) is None:
             raise UserError(
@@ -1193,18 +1023,25 @@ def train(
     if not check:
         with TrainingBars(shown=progress) as bars:
             train_library(
-                folder,
-                names,
-                seed,
+                *(folder, names, seed),
                 scenario=played,
                 on_progress=bars.progressed,
                 on_done=bars.done,
             )
     manifest = _manifest_for(folder, names, scenario)
     if check:
-        checks = {str(n): check_policy(n, folder, count=cases, scenario=played) for n in names}
+        checks = {n: check_policy(n, folder, count=cases, scenario=played) for n in names}
         return PolicyChecks(checks)
-    return PolicyChecks({str(n): PolicyCheck(**manifest[n]["check"]) for n in names})
+    return PolicyChecks({n: PolicyCheck(**manifest[n]["check"]) for n in names})
+
+
+def _networks(only: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of networks in their order, all for none; `UserError` for an unknown one."""
+    wanted = set(only) or set(NETWORKS)
+    unknown = wanted - set(NETWORKS)
+    if unknown:
+        raise UserError(f"there is no network {min(unknown)!r}: choose {', '.join(NETWORKS)}")
+    return tuple(name for name in NETWORKS if name in wanted)
 
 
 def _manifest_for(

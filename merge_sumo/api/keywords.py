@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
+from merge_sumo.campaigns.campaign import OnCase
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.evaluate import evaluation_workers
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import Notice, UserError
+from merge_sumo.reports.progress import Counter
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
 
@@ -97,6 +102,80 @@ class Settings(Setup, total=False):
     learn_from: Sequence[Path | str] | None
 
 
+class Running(TypedDict, total=False):
+    """Where the cases of a verb run; the outcomes are the same everywhere.
+
+    Attributes:
+        workers: processes that run cases, 1 by default; None is one a core.
+        dask: address of a Dask scheduler whose workers run the cases instead.
+        progress: show progress; by default in a notebook and on a terminal.
+    """
+
+    workers: int | None
+    dask: str | None
+    progress: bool | None
+
+
+class StudyKeywords(Setup, Running, total=False):
+    """Keywords of a study: those of `Setup`, how a case is run and judged, and of `Running`."""
+
+
+class RerunKeywords(Hosting, Running, total=False):
+    """Keywords of what runs cases of a recorded campaign: those of `Hosting` and `Running`."""
+
+
+class CampaignKeywords(Settings, Running, total=False):
+    """Keywords of a campaign: those of `Settings` and `Running`, and who is told of it.
+
+    Attributes:
+        on_case: called with the outcome of every case as it ends.
+        check: called after every batch; may raise to stop there.
+        gates: "failures", "errors", "timeouts" or "fmc>X": what `passed` of the result depends on.
+        junit: new file to write for CI: JUnit XML.
+    """
+
+    on_case: OnCase | None
+    check: Callable[[], None] | None
+    gates: Iterable[str]
+    junit: Path | str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Runner:
+    """Where cases run, and who is told: nothing here decides an outcome.
+
+    The fields are those of `Running` and the last four of `CampaignKeywords`.
+    """
+
+    workers: int | None = 1
+    dask: str | None = None
+    progress: bool | None = None
+    on_case: OnCase | None = None
+    check: Callable[[], None] | None = None
+    gates: Iterable[str] = ()
+    junit: Path | str | None = None
+
+    def checks(self) -> None:
+        """Call `check`, where there is one."""
+        if self.check is not None:
+            self.check()
+
+    def open(self, plan: SimulationPlan) -> Workers:
+        """Return the workers that run the cases of a plan, to be used in `with`."""
+        return evaluation_workers(plan.workers(self.workers), self.dask)
+
+    def counter(self, title: str, total: int) -> Counter:
+        """Return a bar that counts cases, to be used in `with`."""
+        return Counter(title, total, "cases", shown=self.progress)
+
+
+def runner_of(given: Mapping[str, Any]) -> tuple[Runner, dict[str, Any]]:
+    """Return what keywords say of where cases run, and the other keywords."""
+    names = Runner.__dataclass_fields__.keys()
+    others = {name: value for name, value in given.items() if name not in names}
+    return Runner(**{name: given[name] for name in names & given.keys()}), others
+
+
 def check_keywords(function: str, given: Mapping[str, Any], known: Any) -> None:
     """Raise `TypeError`, as Python does, for a keyword that a function does not have."""
     names = known.__optional_keys__
@@ -133,26 +212,44 @@ def recordable(given: Mapping[str, Any]) -> dict[str, Any]:
     return fields
 
 
-def settings_for(
-    vut: AnyVut, given: Mapping[str, Any], *, workers: int | None = 1
-) -> tuple[CampaignSettings, int | None]:
-    """Return the settings that keywords make, and the number of workers that they allow.
+def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSettings, Runner]:
+    """Return the settings that keywords make, and where their cases run.
 
     Args:
         vut: a spec, or a class, function or object of this process.
-        given: keywords of `Settings`.
-        workers: number of workers that is wanted; None is one a core.
+        given: keywords of `CampaignKeywords`.
 
-    Raises:
-        UserError: for values that make no settings.
-
-    Warns with a `Notice` of what is odd about the criterion.
+    Raises `UserError` for values that make no settings. Warns with a `Notice` of what is odd about
+    the criterion.
     """
-    spec, pov_spec, workers = drivers_of(vut, given.get("pov"), workers, stacklevel=4)
+    runner, given = runner_of(given)
+    spec, pov_spec, workers = drivers_of(vut, given.get("pov"), runner.workers, stacklevel=4)
     fields = recordable({"scenario": US23, **given, "pov": pov_spec})
     policies = policies_folder(fields.get("policies"), fields["scenario"])
     levels = parse_levels(str(given.get("level", "all")), policies, own=pov_spec is not None)
     settings = CampaignSettings(vut=spec, levels=levels, **fields)
     for note in settings.criterion.notes(settings.scenario):
         warnings.warn(f"note: {note}", Notice, stacklevel=3)
-    return settings, workers
+    return settings, replace(runner, workers=workers)
+
+
+def given_again(
+    vut: AnyVut | None, given: Mapping[str, Any], recorded: Mapping[str, Any]
+) -> tuple[dict[str, Any], Runner]:
+    """Return the fields of settings that are given for a recorded campaign, and where cases run.
+
+    Args:
+        vut: the VUT, where it is given.
+        given: the other keywords.
+        recorded: VUT and POV where they are not given.
+    """
+    runner, given = runner_of(given)
+    named = {
+        name: one for name, one in (("vut", vut), ("pov", given.get("pov"))) if one is not None
+    }
+    drivers = {"vut": "", "pov": None, **recorded, **named}
+    spec, pov_spec, workers = drivers_of(
+        drivers["vut"], drivers["pov"], runner.workers, stacklevel=4
+    )
+    specs = {"vut": spec, "pov": pov_spec}
+    return recordable({**given, **{n: specs[n] for n in named}}), replace(runner, workers=workers)

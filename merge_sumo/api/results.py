@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -31,13 +30,11 @@ from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.store import SETTINGS, Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, verdict_of
-from merge_sumo.studies.benchmark import Quartiles, SamplerSummary
 from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.importance import Estimate
 from merge_sumo.studies.reproduction import TABLE_JSON, TABLE_MARKDOWN
-from merge_sumo.studies.truth import DENSE_CASES, REAL_REGION, Truth
-from merge_sumo.studies.vut_check import VutCheck
+from merge_sumo.studies.truth import REAL_REGION, Truth
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
@@ -389,105 +386,6 @@ def _region_sizes(truth: Truth) -> list[int]:
     return [labels.count(label) for label in range(max(labels, default=-1) + 1)]
 
 
-HEADINGS: Final = (
-    *("FMC / truth", "FMC / limit", "FMC", "failures", "regions"),
-    *("to 50 %", "to 90 %", "sampler s"),
-)
-
-
-@dataclass(frozen=True, repr=False)
-class Benchmark(Result):
-    """Samplers beside each other, and beside the ground truth, over several seeds.
-
-    Attributes:
-        samplers: `SamplerSummary` by name: medians and quartiles over the seeds.
-        truths: the truth by level.
-        dense: the dense truth of the levels that have one.
-        limit_fmc: coverage of all that truth and searches found, or of the dense truths.
-        oracle_fmc: coverage of an oracle by number of cases.
-        cases: cases of each search.
-        figure: file that was drawn, if any.
-    """
-
-    samplers: dict[str, SamplerSummary]
-    truths: dict[int, Truth]
-    dense: dict[int, Truth]
-    limit_fmc: float
-    oracle_fmc: dict[int, float]
-    cases: int
-    figure: Path | None = None
-
-    @property
-    def truth_fmc(self) -> float:
-        """Failure mode coverage of the truth, summed over the levels."""
-        return sum(fmc(truth.failures) for truth in self.truths.values())
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        first = next(iter(self.samplers.values()))
-        return {
-            "truth_fmc": self.truth_fmc,
-            "limit_fmc": self.limit_fmc,
-            "dense_levels": list(self.dense),
-            "oracle_fmc_by_batch": [self.oracle_fmc[n] for n in first.cases_by_batch],
-            **{name: asdict(result) for name, result in self.samplers.items()},
-        }
-
-    def lines(self) -> list[str]:
-        """Return truth, limit and oracle, and a table of the samplers."""
-        failures = sum(len(truth.failures) for truth in self.truths.values())
-        real = sum(len(truth.real_regions()) for truth in self.truths.values())
-        return [
-            f"truth: FMC {self.truth_fmc:.4f}, {failures} failures, {real} regions",
-            f"limit: FMC {self.limit_fmc:.4f}, {limit_of(self.dense, list(self.truths))}",
-            f"oracle: FMC {self.oracle_fmc[self.cases]:.4f} with {self.cases} cases",
-            *_table(self.samplers),
-            *([] if self.figure is None else [f"figure: {self.figure}"]),
-        ]
-
-
-def limit_of(dense: Collection[int], levels: Sequence[int]) -> str:
-    """Return in words what the limit is the coverage of, with dense truths at some levels."""
-    if not dense:
-        return "of all that truth and searches found (--dense runs 1,000,000 cases)"
-    part = "" if len(dense) == len(levels) else " at some levels"
-    return f"of {DENSE_CASES:,} uniform cases{part}, or of all that was found, where that is more"
-
-
-def _table(compared: Mapping[str, SamplerSummary]) -> list[str]:
-    """Return a line per sampler: medians, with the quartiles in brackets."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, caption=r"medians \[quartiles]", caption_justify="left")
-    table.add_column("sampler")
-    for heading in HEADINGS:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for name, one in compared.items():
-        table.add_row(
-            name,
-            _spread(one.fmc_over_truth_median, one.fmc_over_truth_quartiles, ".3f"),
-            _spread(one.fmc_over_limit_median, one.fmc_over_limit_quartiles, ".3f"),
-            _spread(one.fmc_median, one.fmc_quartiles, ".4f"),
-            _spread(one.failures_median, one.failures_quartiles, ".0f"),
-            _spread(one.regions_found_median, one.regions_found_quartiles, ".1f"),
-            _spread(one.cases_to_50_percent_median, one.cases_to_50_percent_quartiles, ".0f"),
-            _spread(one.cases_to_90_percent_median, one.cases_to_90_percent_quartiles, ".0f"),
-            f"{one.sampler_s_median:.2f}",
-        )
-    text = StringIO()
-    # As wide as it is: a line of a table that is read by a program must not be broken.
-    Console(width=200, highlight=False, soft_wrap=True, file=text).print(table)
-    return [line.rstrip() for line in text.getvalue().splitlines()]
-
-
-def _spread(median: float | None, quartiles: Quartiles, form: str) -> str:
-    median_text, low, high = (
-        "-" if value is None else f"{value:{form}}" for value in (median, *quartiles)
-    )
-    return f"{median_text} [{low}, {high}]"
-
-
 @dataclass(frozen=True, repr=False)
 class CertificateResult(Result):
     """A certificate that is complete.
@@ -568,37 +466,6 @@ class ProbabilityResult(Result):
             f"  for comparison, the {arm.cases} plain cases among them alone: {arm.failures} "
             f"failures, [{arm.low:.3g}, {arm.high:.3g}]",
             f"written: {self.file}",
-        ]
-
-
-@dataclass(frozen=True, repr=False)
-class CheckResult(Result):
-    """Result of `check_vut`.
-
-    Attributes:
-        vut: the VUT.
-        found: `problems`, `notes`, and the cost of a step in microseconds.
-    """
-
-    vut: str
-    found: VutCheck
-
-    @property
-    def ok(self) -> bool:
-        """Whether nothing is wrong."""
-        return not self.found.problems
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        return {"vut": self.vut, "ok": self.ok, **asdict(self.found)}
-
-    def lines(self) -> list[str]:
-        """Return what is wrong in sentences, and the cost of a step."""
-        return [
-            *(self.found.problems or ["nothing wrong"]),
-            *(f"note: {sentence}" for sentence in self.found.notes),
-            f"a step costs {self.found.us_per_step_median:.0f} us (median), "
-            f"{self.found.us_per_step_worst:.0f} us at worst",
         ]
 
 

@@ -121,6 +121,10 @@ class Bars:
         if completed >= total:
             self._opened_s = time.monotonic()
 
+    def counted(self, title: str, done: int, total: int, unit: str, note: str = "") -> None:
+        """Set a bar that counts things called `unit`, with their rate."""
+        self.show(title, done, total, f"{rate_text(done, self.elapsed_s(title), unit)}  {note}")
+
     def _say_line(self, title: str, completed: int, total: int, said: str) -> None:
         since = completed - self._shown.get(title, 0)
         if since >= tenth(total) or (completed >= total and since):
@@ -161,8 +165,7 @@ class Counter(Bars):
     def ended(self, count: int, note: str = "") -> None:
         """Count things that have ended."""
         self._count += count
-        rate = rate_text(self._count, self.elapsed_s(self._title), self._unit)
-        self.show(self._title, self._count, self._total, f"{rate}  {note}")
+        self.counted(self._title, self._count, self._total, self._unit, note)
 
 
 class TrainingBars(Bars):

@@ -6,15 +6,18 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from heapq import heappop, heapreplace
-from itertools import accumulate
+from io import StringIO
+from itertools import accumulate, chain, count
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
@@ -22,11 +25,12 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.truth import Truth
+from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit
 from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 
 
@@ -347,3 +351,185 @@ def _greedy(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
         order.append(place)
         gains.append(new)
     return points[order], np.array(gains)
+
+
+OnPart = Callable[[str, int, int, str, str], None]
+"""Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A plan, and what truths and searches run it with.
+
+    Attributes:
+        plan: how cases run.
+        workers: where they run; by default in this process.
+        cache: folder of the truths, by default the user's.
+        on_part: told how far each truth is, and all searches together.
+    """
+
+    plan: SimulationPlan
+    workers: Workers | None = None
+    cache: Path | None = None
+    on_part: OnPart = lambda *_: None
+
+    def truth(self, level: int, cases: int | None = None, seed: int = 0) -> Truth:
+        """Return the truth at a level, from the cache where it is kept."""
+        total, ended = TRUTH_CASES[level] if cases is None else cases, 0
+        size = "dense truth" if total == DENSE_CASES else "truth"
+        title = f"{size} of {self.plan.vut.spec} at level {level_name(level)}"
+
+        def ran(more: int) -> None:
+            nonlocal ended
+            ended += more
+            self.on_part(title, ended, total, "cases", "")
+
+        return ground_truth(
+            self.plan, level, total, seed, workers=self.workers, cache=self.cache, on_cases=ran
+        )
+
+    def dense_truths(self, levels: Sequence[int], wanted: bool | None) -> dict[int, Truth]:
+        """Return the dense truths by level: made where `wanted`, where that is None the kept."""
+        if wanted is False:
+            return {}
+        if wanted:
+            return {level: self.truth(level, DENSE_CASES) for level in levels}
+        kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
+        return {level: truth for level, truth in kept.items() if truth is not None}
+
+    def searches(
+        self,
+        levels: tuple[int, ...],
+        samplers: Sequence[str],
+        seeds: int,
+        cases: int,
+        batch: int | None,
+    ) -> dict[str, list[Search]]:
+        """Let each sampler search with each seed; return the searches by sampler: see `search`."""
+        title = f"{self.plan.vut.spec} v level {'/'.join(map(level_name, levels))}"
+        number = count(1)
+        return search(
+            self.plan,
+            levels,
+            samplers,
+            seeds=seeds,
+            cases=cases,
+            batch=batch,
+            workers=self.workers,
+            on_search=lambda name, _: self.on_part(
+                title, next(number), len(samplers) * seeds, "runs", name
+            ),
+        )
+
+
+HEADINGS: Final = (
+    *("FMC / truth", "FMC / limit", "FMC", "failures", "regions"),
+    *("to 50 %", "to 90 %", "sampler s"),
+)
+
+
+@dataclass(frozen=True, repr=False)
+class Benchmark(Result):
+    """Samplers beside each other, and beside the ground truth, over several seeds.
+
+    Attributes:
+        samplers: `SamplerSummary` by name: medians and quartiles over the seeds.
+        truths: the truth by level.
+        dense: the dense truth of the levels that have one.
+        limit_fmc: coverage of all that truth and searches found, or of the dense truths.
+        oracle_fmc: coverage of an oracle by number of cases.
+        cases: cases of each search.
+        figure: file that was drawn, if any.
+    """
+
+    samplers: dict[str, SamplerSummary]
+    truths: dict[int, Truth]
+    dense: dict[int, Truth]
+    limit_fmc: float
+    oracle_fmc: dict[int, float]
+    cases: int
+    figure: Path | None = None
+
+    @property
+    def truth_fmc(self) -> float:
+        """Failure mode coverage of the truth, summed over the levels."""
+        return sum(fmc(truth.failures) for truth in self.truths.values())
+
+    @classmethod
+    def of(
+        cls,
+        searches: Mapping[str, Sequence[Search]],
+        truths: dict[int, Truth],
+        dense: dict[int, Truth],
+        cases: int,
+        batch: int | None,
+    ) -> Benchmark:
+        """Compare searches of so many cases, by sampler, with the truths by level."""
+        limit = limit_fmc(chain.from_iterable(searches.values()), truths, dense)
+        summaries = {name: compare(of_name, truths, limit) for name, of_name in searches.items()}
+        return cls(summaries, truths, dense, limit, oracle(truths, cases, batch), cases)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        first = next(iter(self.samplers.values()))
+        return {
+            "truth_fmc": self.truth_fmc,
+            "limit_fmc": self.limit_fmc,
+            "dense_levels": list(self.dense),
+            "oracle_fmc_by_batch": [self.oracle_fmc[n] for n in first.cases_by_batch],
+            **{name: asdict(result) for name, result in self.samplers.items()},
+        }
+
+    def lines(self) -> list[str]:
+        """Return truth, limit and oracle, and a table of the samplers."""
+        failures = sum(len(truth.failures) for truth in self.truths.values())
+        real = sum(len(truth.real_regions()) for truth in self.truths.values())
+        return [
+            f"truth: FMC {self.truth_fmc:.4f}, {failures} failures, {real} regions",
+            f"limit: FMC {self.limit_fmc:.4f}, {self._limit_is()}",
+            f"oracle: FMC {self.oracle_fmc[self.cases]:.4f} with {self.cases} cases",
+            *_table(self.samplers),
+            *([] if self.figure is None else [f"figure: {self.figure}"]),
+        ]
+
+    def _limit_is(self) -> str:
+        if not self.dense:
+            return "of all that truth and searches found (--dense runs 1,000,000 cases)"
+        part = "" if len(self.dense) == len(self.truths) else " at some levels"
+        return (
+            f"of {DENSE_CASES:,} uniform cases{part}, or of all that was found, where that is more"
+        )
+
+
+def _table(compared: Mapping[str, SamplerSummary]) -> list[str]:
+    """Return a line per sampler: medians, with the quartiles in brackets."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, caption=r"medians \[quartiles]", caption_justify="left")
+    table.add_column("sampler")
+    for heading in HEADINGS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, one in compared.items():
+        table.add_row(
+            name,
+            _spread(one.fmc_over_truth_median, one.fmc_over_truth_quartiles, ".3f"),
+            _spread(one.fmc_over_limit_median, one.fmc_over_limit_quartiles, ".3f"),
+            _spread(one.fmc_median, one.fmc_quartiles, ".4f"),
+            _spread(one.failures_median, one.failures_quartiles, ".0f"),
+            _spread(one.regions_found_median, one.regions_found_quartiles, ".1f"),
+            _spread(one.cases_to_50_percent_median, one.cases_to_50_percent_quartiles, ".0f"),
+            _spread(one.cases_to_90_percent_median, one.cases_to_90_percent_quartiles, ".0f"),
+            f"{one.sampler_s_median:.2f}",
+        )
+    text = StringIO()
+    # As wide as it is: a line of a table that is read by a program must not be broken.
+    Console(width=200, highlight=False, soft_wrap=True, file=text).print(table)
+    return [line.rstrip() for line in text.getvalue().splitlines()]
+
+
+def _spread(median: float | None, quartiles: Quartiles, form: str) -> str:
+    median_text, low, high = (
+        "-" if value is None else f"{value:{form}}" for value in (median, *quartiles)
+    )
+    return f"{median_text} [{low}, {high}]"

@@ -10,9 +10,8 @@ table2.json, table2.md  Table II, for a program and to read
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -23,20 +22,13 @@ from numpy.typing import NDArray
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.engine.plan import SimulationPlan, versions
+from merge_sumo.engine.plan import versions
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.benchmark import (
-    SamplerSummary,
-    Search,
-    compare,
-    limit_fmc,
-    oracle,
-    search,
-)
-from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth
+from merge_sumo.studies.benchmark import Benchmark, OnPart, SamplerSummary, Search, Study
+from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import make_folder, replace_own, write_new
 from merge_sumo.system.workers import Workers
@@ -197,40 +189,45 @@ class Reproduction:
     versions: dict[str, str]
 
 
-OnRun = Callable[[str, int, int, str], None]
-"""Told what is going on: title, things done, things in all, and what a thing is."""
-
-
 def reproduce(
     folder: Path,
     scale: Scale,
     *,
-    povs: Povs | None = None,
+    policies: Path | None = None,
     workers: Workers | None = None,
-    on_run: OnRun = lambda *_: None,
+    on_part: OnPart = lambda *_: None,
 ) -> Reproduction:
     """Run what Table II and the figures need, and write it into a new folder.
 
     Args:
         folder: new; `reproduction.json` is written after each column.
         scale: how much is run.
-        povs: drivers of the POV, by default the shipped ones.
+        policies: folder of the learned POVs, by default the shipped ones.
         workers: where cases run, by default in this process.
-        on_run: told how far it is.
+        on_part: told how far it is.
 
     Raises:
         UserError: when the folder exists or cannot be written, or where a level has no POV.
     """
-    povs = povs or Povs(policies=policies_of(US23))
+    povs = Povs(policies=policies or policies_of(US23))
     for level in LEVELS:
         povs.check_level(level)
     make_folder(folder)
-    work = _Work(scale, povs, workers, on_run)
+
+    def study(vut: str) -> Study:
+        folder = str(povs.policies)
+        settings = CampaignSettings(vut=vut, levels=(0,), scenario=US23, policies=folder)
+        return Study(resolve(settings), workers, on_part=on_part)
+
     result = Reproduction(scale, {}, {}, versions())
     for column in TABLE_II:
-        result.columns[column.title] = work.column(column)
+        result.columns[column.title] = _column(column, scale, study(column.vut))
         _write(folder, result)
-    result.levels.update(work.all_levels())
+    batch = 2 * scale.batch
+    together = study("design2").searches(
+        LEVELS, ADAPTIVE, scale.seeds, scale.batches * batch, batch
+    )
+    result.levels.update({name: _level_batches(of_name) for name, of_name in together.items()})
     _write(folder, result)
     record = {**table_record(result), "policies_sha256": povs.sha256()}
     write_new(folder / TABLE_JSON, (json.dumps(record, allow_nan=False) + "\n").encode())
@@ -238,110 +235,45 @@ def reproduce(
     return result
 
 
-class _Work:
-    """Truths and searches of the columns, with one scale, POVs and workers."""
+def _column(column: Column, scale: Scale, study: Study) -> ColumnResult:
+    """Run one column of the table."""
+    level, cases = column.level, scale.batches * scale.batch
+    truth = study.truth(level, scale.truth_cases[level])
+    dense = study.dense_truths((level,), scale.dense)
+    # In batches of Table II's size; those of `coverage` are a part of it.
+    searches = study.searches((level,), SAMPLERS, scale.seeds, cases, None)
+    found = Benchmark.of(searches, {level: truth}, dense, cases, scale.batch)
+    seeds = {name: _median_seed(of_name) for name, of_name in searches.items()}
+    medians = {name: searches[name][seed].outcomes for name, seed in seeds.items()}
+    panels = {name: _panel(medians[name], level) for name in reversed(SAMPLERS)}
+    shown = Panel(truth.points, truth.score < FAILURE_SCORE, fmc(truth.failures))
+    return ColumnResult(
+        column=column,
+        truth_fmc=found.truth_fmc,
+        truth_failures=len(truth.failures),
+        truth_regions=len(truth.real_regions()),
+        dense_fmc=fmc(dense[level].failures) if dense else None,
+        limit_fmc=found.limit_fmc,
+        compared=found.samplers,
+        oracle=found.oracle_fmc,
+        panels={"truth": shown, **panels},
+        predicted=_predicted(medians["gpr"], seeds["gpr"], scale) if level == 1 else {},
+    )
 
-    def __init__(self, scale: Scale, povs: Povs, workers: Workers | None, on_run: OnRun) -> None:
-        self.scale, self.povs, self.workers, self.on_run = scale, povs, workers, on_run
 
-    def plan(self, vut: str) -> SimulationPlan:
-        """Return the plan for a VUT of the paper on its road, by its criterion."""
-        policies = str(self.povs.policies)
-        return resolve(CampaignSettings(vut=vut, levels=(0,), scenario=US23, policies=policies))
-
-    def column(self, column: Column) -> ColumnResult:
-        """Run one column of the table."""
-        level, cases = column.level, self.scale.batches * self.scale.batch
-        truth = self.truth(column, self.scale.truth_cases[level])
-        if self.scale.dense is None:
-            dense = known_truth(self.plan(column.vut), level, DENSE_CASES)
-        else:
-            dense = self.truth(column, DENSE_CASES) if self.scale.dense else None
-        searches = self.search(column.vut, (level,), SAMPLERS)
-        truths, denses = {level: truth}, {} if dense is None else {level: dense}
-        limit = limit_fmc(chain.from_iterable(searches.values()), truths, denses)
-        shown = Panel(truth.points, truth.score < FAILURE_SCORE, fmc(truth.failures))
-        seeds = {name: _median_seed(of_name) for name, of_name in searches.items()}
-        panels = {
-            name: _panel(searches[name][seeds[name]].outcomes, level) for name in reversed(SAMPLERS)
-        }
-        gpr = searches["gpr"][seeds["gpr"]].outcomes
-        return ColumnResult(
-            column,
-            fmc(truth.failures),
-            len(truth.failures),
-            len(truth.real_regions()),
-            None if dense is None else fmc(dense.failures),
-            limit,
-            {name: compare(of_name, truths, limit) for name, of_name in searches.items()},
-            oracle(truths, cases, self.scale.batch),
-            {"truth": shown, **panels},
-            self.predicted(gpr, level, seeds["gpr"]) if level == 1 else {},
-        )
-
-    def truth(self, column: Column, cases: int) -> Truth:
-        """Return the truth of a column, from the cache where it is there."""
-        title = f"{'dense ' if cases == DENSE_CASES else ''}truth of {column.title}"
-        done = 0
-
-        def count(more: int) -> None:
-            nonlocal done
-            done += more
-            self.on_run(title, done, cases, "cases")
-
-        count(0)
-        truth = ground_truth(
-            self.plan(column.vut), column.level, cases, workers=self.workers, on_cases=count
-        )
-        self.on_run(title, cases, cases, "cases")
-        return truth
-
-    def search(
-        self,
-        vut: str,
-        levels: tuple[int, ...],
-        samplers: tuple[str, ...],
-        batch: int | None = None,
-    ) -> dict[str, list[Search]]:
-        """Let samplers search with all seeds, in batches of the paper's size if nobody says.
-
-        `coverage` has batches of its own then: they are a part of it.
-        """
-        title = f"{vut} v level {'/'.join(map(str, levels))}"
-        runs = len(samplers) * self.scale.seeds
-        counter = iter(range(1, runs + 1))
-        self.on_run(title, 0, runs, "runs")
-        return search(
-            self.plan(vut),
-            levels,
-            samplers,
-            seeds=self.scale.seeds,
-            cases=self.scale.batches * (batch or self.scale.batch),
-            batch=batch,
-            workers=self.workers,
-            on_search=lambda *_: self.on_run(title, next(counter), runs, "runs"),
-        )
-
-    def predicted(
-        self, outcomes: Sequence[Outcome], level: int, seed: int
-    ) -> dict[int, PredictedScores]:
-        """Return what the surrogate of `gpr` predicts after some batches of a search."""
-        axis = np.linspace(0.0, 1.0, SURFACE_POINTS)
-        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        result = {}
-        for batch in (b for b in SURFACE_BATCHES if b <= self.scale.batches):
-            known = [outcome for outcome in outcomes if outcome.batch < batch]
-            sampler = make_sampler("gpr", Pool(levels=(level,), scenario=US23), seed)
-            sampler.tell(known)
-            score = predicted_score(sampler.history(level), grid)
-            square = score.reshape(SURFACE_POINTS, SURFACE_POINTS)
-            result[batch] = PredictedScores(square, _panel(known, level))
-        return result
-
-    def all_levels(self) -> dict[str, LevelBatches]:
-        """Run all levels together and return how the samplers shared their batches out."""
-        searches = self.search("design2", LEVELS, ADAPTIVE, 2 * self.scale.batch)
-        return {name: _level_batches(of_name) for name, of_name in searches.items()}
+def _predicted(outcomes: Sequence[Outcome], seed: int, scale: Scale) -> dict[int, PredictedScores]:
+    """Return what the surrogate of `gpr` predicts after some batches of a search at level 1."""
+    axis = np.linspace(0.0, 1.0, SURFACE_POINTS)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    result = {}
+    for batch in (b for b in SURFACE_BATCHES if b <= scale.batches):
+        known = [outcome for outcome in outcomes if outcome.batch < batch]
+        sampler = make_sampler("gpr", Pool(levels=(1,), scenario=US23), seed)
+        sampler.tell(known)
+        score = predicted_score(sampler.history(1), grid)
+        square = score.reshape(SURFACE_POINTS, SURFACE_POINTS)
+        result[batch] = PredictedScores(square, _panel(known, 1))
+    return result
 
 
 def _median_seed(searches: Sequence[Search]) -> int:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from time import perf_counter
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from merge_sumo.analysis.result import Result
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
@@ -30,21 +31,41 @@ LONG_BEGIN_US: Final = 20e3
 """A campaign of hundreds of cases feels it when an episode takes longer than this to begin."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class VutCheck:
+@dataclass(frozen=True, kw_only=True, slots=True, repr=False)
+class VutCheck(Result):
     """What the drill found.
 
     Attributes:
+        vut: the VUT.
         problems: sentences on what makes the VUT's results wrong or worthless.
         notes: sentences on what its author may want to know.
         us_per_step_median: cost of one step of one episode, microseconds, without SUMO.
         us_per_step_worst: cost of the slowest step.
     """
 
-    problems: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    vut: str
+    problems: list[str]
+    notes: list[str]
     us_per_step_median: float
     us_per_step_worst: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {"vut": self.vut, "ok": self.ok, **asdict(self)}
+
+    def lines(self) -> list[str]:
+        """Return what is wrong in sentences, and the cost of a step."""
+        return [
+            *(self.problems or ["nothing wrong"]),
+            *(f"note: {sentence}" for sentence in self.notes),
+            f"a step costs {self.us_per_step_median:.0f} us (median), "
+            f"{self.us_per_step_worst:.0f} us at worst",
+        ]
 
 
 def check_vut(plan: SimulationPlan) -> VutCheck:
@@ -76,6 +97,7 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
         ]
         problems.append(_why(plan, differing[0]))
     return VutCheck(
+        vut=plan.vut.spec,
         problems=problems,
         notes=notes,
         us_per_step_median=statistics.median(timed.us_per_step),

@@ -53,8 +53,7 @@ class TestCompare:
 
     @pytest.mark.long
     def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
-        for module in ("merge_sumo.api", "merge_sumo.api.results"):
-            monkeypatch.setattr(f"{module}.DENSE_CASES", 900)
+        monkeypatch.setattr("merge_sumo.studies.benchmark.DENSE_CASES", 900)
         tiny = (*COMPARE, "--samplers", "uniform", "--seeds", 1, "--cases", 10, "--batch", 10)
         found: dict = {}
         for option in ("", "--dense", "--dense", "", "--no-dense"):

@@ -43,7 +43,7 @@ def tiny(tmp_path_factory):
     said = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MERGE_SUMO_CACHE", str(folder.parent / "cache"))
-        reproduce(folder, TINY, on_run=lambda *what: said.append(what))
+        reproduce(folder, TINY, on_part=lambda *what: said.append(what))
     return write_reproduction_page(folder), said
 
 
@@ -95,10 +95,10 @@ class TestATinyReproduction:
 
     def test_says_how_far_it_is(self, tiny):
         _, said = tiny
-        last = {title: (done, total) for title, done, total, _ in said}
+        last = {title: (done, total) for title, done, total, *_ in said}
         assert last["design1 v level 0"] == (5, 5)
         assert last["design2 v level 0/1/2"] == (2, 2)
-        assert last["truth of level-2 POV, design2"] == (300, 300)
+        assert last["truth of design2 at level 2"] == (300, 300)
 
     def test_is_drawn_again_from_its_file_alone(self, tiny, tmp_path):
         index, _ = tiny
