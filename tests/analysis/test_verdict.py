@@ -49,6 +49,7 @@ def vuts(tmp_path_factory) -> dict[str, str]:
 
 def campaign(vut: str, folder: Path, *options: object) -> Result:
     small = ("--level", 0, "--cases", 20, "--batch", 10, "--seed", 1, "--sampler", "uniform", "-q")
+    small += ("--in-process",)
     return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)
 
 
@@ -300,7 +301,14 @@ class TestACampaignThatTestedNothing:
 def mixed(vuts, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("mixed") / "run"
     settings = CampaignSettings(
-        vut=vuts["mixed"], levels=(0,), sampler="uniform", cases=20, batch=10, seed=1, scenario=US23
+        vut=vuts["mixed"],
+        levels=(0,),
+        sampler="uniform",
+        cases=20,
+        batch=10,
+        seed=1,
+        scenario=US23,
+        in_process=True,
     )
     found = judge(run_campaign(settings, folder).outcomes)
     assert min(found.errors, found.timeouts, found.tested) > 0
@@ -422,7 +430,14 @@ def folders(vuts, tmp_path_factory) -> dict[str, Path]:
     place = tmp_path_factory.mktemp("versions")
     for name, vut in {"good": "design2", **vuts}.items():
         settings = CampaignSettings(
-            vut=vut, levels=(0,), sampler="uniform", cases=20, batch=10, seed=1, scenario=US23
+            vut=vut,
+            levels=(0,),
+            sampler="uniform",
+            cases=20,
+            batch=10,
+            seed=1,
+            scenario=US23,
+            in_process=True,
         )
         run_campaign(settings, place / name)
     return {path.name: path for path in place.iterdir()}
@@ -493,6 +508,7 @@ class TestTwoVersions:
             batch=8,
             seed=5,
             scenario=US23,
+            in_process=True,
         )
         run_campaign(settings, tmp_path / "run")
         for a, b in ((folders["mixed"], tmp_path / "run"), (tmp_path / "run", folders["mixed"])):

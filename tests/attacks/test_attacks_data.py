@@ -487,12 +487,10 @@ def assert_fit_for_a_terminal(said: str) -> None:
 
 
 SOME_TEXTS = [
-    name
-    if name in ("every control", "10 MB of markup")
-    else pytest.param(name, marks=pytest.mark.long)
+    name if name in ("every control", "markup") else pytest.param(name, marks=pytest.mark.long)
     for name in TEXTS
 ]
-"""In the default run what is odd, and what is markup and long."""
+"""In the default run what is odd, and what is markup."""
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,10 @@ from merge_sumo.system.limits import EXHAUSTED, check_threads, exhausted
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX is needed")
 
 SETPRIV = shutil.which("setpriv")
-CAMPAIGN = "campaign --vut design1 --level 0 --cases 4 --quiet --workers {workers} --out new"
+CAMPAIGN = (
+    "campaign --vut design1 --level 0 --cases 4 --sampler uniform --quiet --workers {workers} "
+    "--out new"
+)
 CLOSED = ("<&-", ">&-", "2>&-", "<&- >&- 2>&-")
 COMMANDS = {
     "--version": 0,

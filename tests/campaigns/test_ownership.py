@@ -192,7 +192,9 @@ class TestAReceivedFolder:
 
     @pytest.mark.parametrize("vut", ["level0", "design1", "sumo:IDM"])
     def test_runs_what_is_of_this_package_or_of_sumo(self, tmp_path, stranger, vut):
-        settings = CampaignSettings(vut=vut, levels=(0,), cases=2, batch=2, scenario=US23)
+        settings = CampaignSettings(
+            vut=vut, levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
+        )
         run = run_campaign(settings, tmp_path / "run")
         stranger()
         assert len(resume_campaign(run.folder).outcomes) == 2

@@ -50,13 +50,15 @@ def calls(monkeypatch):
 
 
 def test_settings_load_no_vut_and_start_no_process(spec, calls):
-    CampaignSettings(vut=spec, levels=(0,), cases=4, scenario=US23)
-    CampaignSettings(vut="nowhere.py:f", levels=(0,), cases=4, scenario=US23)
+    CampaignSettings(vut=spec, levels=(0,), cases=4, sampler="uniform", scenario=US23)
+    CampaignSettings(vut="nowhere.py:f", levels=(0,), cases=4, sampler="uniform", scenario=US23)
     assert not calls
 
 
 def test_a_plan_asks_a_vut_once_what_it_is(spec, calls):
-    plan = resolve(CampaignSettings(vut=spec, levels=(0,), cases=4, scenario=US23))
+    plan = resolve(
+        CampaignSettings(vut=spec, levels=(0,), cases=4, sampler="uniform", scenario=US23)
+    )
     assert calls == {"processes": 1, "found": 1}
     assert plan.workers(2) == 2
     plan.for_cases(4)

@@ -74,6 +74,7 @@ def vut(tmp_path):
 
 def campaign(spec: str, folder: Path, workers: int = 1, **settings) -> Run:
     given = {"vut": spec, "levels": (0,), "cases": 60, "sampler": "uniform", **settings}
+    given = {"in_process": workers == 1 and "deadline_s" not in given, **given}
     with open_workers(workers) as there:
         return run_campaign(CampaignSettings(**{"scenario": US23, **given}), folder, workers=there)
 
@@ -151,7 +152,7 @@ def test_a_callable_object_of_python_begins_every_episode_as_it_was_given(tmp_pa
 def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, name):
     spec, folder = vut(REMEMBERING[name]), tmp_path / "run"
     arguments = ["campaign", "--vut", spec, "--level", "0", "--cases", "60", "--sampler"]
-    arguments += ["uniform"]
+    arguments += ["uniform", "--in-process"]
     done = CliRunner().invoke(cli.app, [*arguments, "--out", str(folder), "-q"])
     assert done.stdout.startswith("Not repeatable: ")
     run = Run(folder)
@@ -168,7 +169,7 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, n
     assert said.split(" (case")[0] in write_report(run).read_text()
     assert said.split(" (case")[0] in ms.open_run(folder)._repr_html_()
     # check-vut tells that it is no randomness, and rerun that no file has changed.
-    checked = CliRunner().invoke(cli.app, ["check-vut", spec])
+    checked = CliRunner().invoke(cli.app, ["check-vut", spec, "--in-process"])
     assert checked.exit_code == 1
     assert "It keeps something from earlier episodes" in checked.stdout
     again = rerun(run, today := settings_today(run, trust=True), resolve(today))
@@ -180,7 +181,7 @@ def test_a_random_controller_is_found_and_told_from_one_that_remembers(vut, tmp_
     run = campaign(vut(RANDOM), tmp_path / "run", cases=40)
     repeats = read_repeats(run)
     assert {one.differs_from_s for one in repeats} == {0.0}
-    checked = CliRunner().invoke(cli.app, ["check-vut", run.settings["vut"]])
+    checked = CliRunner().invoke(cli.app, ["check-vut", run.settings["vut"], "--in-process"])
     assert "It draws random numbers, reads a clock" in checked.stdout
 
 
@@ -194,7 +195,7 @@ def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path)
 
 
 def test_a_certificate_of_what_remembers_is_none(vut, tmp_path):
-    settings = CampaignSettings(vut=vut(IN_ITS_CLASS), levels=(0,), scenario=US23)
+    settings = CampaignSettings(vut=vut(IN_ITS_CLASS), levels=(0,), scenario=US23, in_process=True)
     plan = resolve(settings)
     with open_workers(1) as there:
         run = runs_points_on(there, settings, plan, tmp_path)

@@ -15,13 +15,11 @@ import time
 from pathlib import Path
 
 import pytest
-from calling import contents
+from calling import contents, invoke
 from campaigning import resume_campaign, run_campaign
 from conftest import some
 from processes import wait_for
-from typer.testing import CliRunner
 
-from merge_sumo import cli
 from merge_sumo.campaigns.campaign import SCENARIOS
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import (
@@ -387,13 +385,8 @@ def started(folder: Path, *options: str) -> subprocess.Popen[str]:
 
 class TestTheCommand:
     def test_goes_on_by_its_folder_alone(self, whole, folder):
-        done = subprocess.run(
-            [*COMMAND, "--resume", str(folder), "--json"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
+        done = invoke("campaign", "--resume", folder, "--json")
+        assert done.exit_code == 0, done.stderr
         assert json.loads(done.stdout)["cases"] == 28
         assert outcomes(folder) == outcomes(whole)
 
@@ -408,7 +401,7 @@ class TestTheCommand:
     )
     def test_refuses_in_a_sentence(self, folder, options, sentence):
         before = contents(folder)
-        result = CliRunner().invoke(cli.app, ["campaign", "--resume", str(folder), *options])
+        result = invoke("campaign", "--resume", folder, *options)
         assert isinstance(result.exception, UserError)
         assert sentence in str(result.exception)
         assert contents(folder) == before
@@ -466,7 +459,7 @@ def kill_campaigns(kills: int, seed: int) -> str:
 
 
 def test_campaigns_that_are_killed_and_resumed_have_the_same_outcomes():
-    assert "the same outcomes.jsonl after 2 of 2 kills" in kill_campaigns(2, seed=1)
+    assert "the same outcomes.jsonl after 1 of 1 kills" in kill_campaigns(1, seed=1)
 
 
 @pytest.mark.long

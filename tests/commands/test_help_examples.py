@@ -17,8 +17,8 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.values.scenario import US23
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = {"--cases": "40", "--seeds": "1", "--radius": "0.3"}
-MORE = {"compare": ["--cases", "40", "--truth-cases", "300"]}
+SMALL = {"--cases": "20", "--seeds": "1", "--radius": "0.3"}
+MORE = {"compare": ["--cases", "20", "--truth-cases", "100"]}
 ELSEWHERE = {"train", "reproduce"}
 """These take minutes: tests/training/test_training.py and the README's commands run them small."""
 

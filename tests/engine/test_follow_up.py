@@ -127,7 +127,20 @@ class TestDrivingOn:
 
     def test_is_what_the_command_line_asks_for(self, tmp_path, command_line):
         code, _, err = command_line(
-            *("campaign", "--vut", "level0", "--level", 0, "--cases", 4, "--follow-up", 2, "-q"),
+            *(
+                "campaign",
+                "--vut",
+                "level0",
+                "--level",
+                0,
+                "--cases",
+                4,
+                "--follow-up",
+                2,
+                "-q",
+                "--sampler",
+                "uniform",
+            ),
             *("--fail-when", "after_drac_mps2 > 1", "--out", tmp_path / "run"),
         )
         assert (code, err) == (0, "")

@@ -136,7 +136,9 @@ class TestACampaign:
 
     def test_of_all_levels_is_of_those_that_are_trained_there(self, call, one):
         code, out, err = call(
-            *("campaign", "--vut", "level0", "--cases", 4, "--policies", one, "--json")
+            *("campaign", "--vut", "level0", "--cases", 4, "--policies", one, "--json"),
+            "--sampler",
+            "uniform",
         )
         assert code == 0
         assert list(json.loads(out)["levels"]) == ["0", "1"]
@@ -336,7 +338,20 @@ class TestAFolder:
         folder = with_layers(same, tmp_path / "policies", name, layers)
         vut = "level1" if name == "vut1" else "design2"
         code, _, err = call(
-            *("campaign", "--vut", vut, "--level", "1", "--cases", 4, "--workers", 1, "-q"),
+            *(
+                "campaign",
+                "--vut",
+                vut,
+                "--level",
+                "1",
+                "--cases",
+                4,
+                "--workers",
+                1,
+                "-q",
+                "--sampler",
+                "uniform",
+            ),
             *("--policies", folder, "--out", tmp_path / "run"),
         )
         assert code == 2

@@ -62,7 +62,11 @@ SMALL = {
     "batch": 6,
     "seed": 2,
     "sampler": "uniform",
+    "in_process": True,
 }
+
+
+FEW = ("--cases", 8, "--sampler", "uniform", "--in-process")
 
 
 @pytest.fixture(autouse=True)
@@ -98,16 +102,25 @@ def own(cases: list[Case]) -> list[Case]:
 
 
 def run(
-    spec: str | None, cases: list[Case], vut: str = "design2", corridors: int = 4, **options
+    spec: str | None,
+    cases: list[Case],
+    vut: str = "design2",
+    corridors: int = 4,
+    *,
+    hosted: bool = False,
+    **options,
 ) -> list[Trajectory]:
     """Return what became of every case against a POV of one's own."""
+    options["in_process"] = not hosted
     povs = Povs(
         policies=policies_of(US23),
         own=None if spec is None else own_pov(spec, VutOptions(**options)),
     )
     scenario = cases[0].scenario
     with Simulator(
-        plan_for(factory(vut), scenario=scenario, povs=povs, corridors=corridors)
+        plan_for(
+            factory(vut, in_process=not hosted), scenario=scenario, povs=povs, corridors=corridors
+        )
     ) as ground:
         found = dict(ground.run(cases))
     return [found[place] for place in range(len(cases))]
@@ -210,11 +223,8 @@ class TestAPov:
 
     def test_may_be_the_very_file_that_is_the_vut(self):
         spec = pov(YIELDS)
-        hosted = run(spec, own(cases_of(6)), vut=spec)
-        povs = Povs(policies=policies_of(US23), own=own_pov(spec, VutOptions(in_process=True)))
-        with Simulator(plan_for(factory(spec, in_process=True), povs=povs, corridors=4)) as ground:
-            found = dict(ground.run(own(cases_of(6))))
-        assert same(hosted, [found[k] for k in range(6)])
+        hosted = run(spec, own(cases_of(6)), vut=spec, hosted=True)
+        assert same(hosted, run(spec, own(cases_of(6)), vut=spec))
         assert any(trajectory.a_pov_mps2.min() == -1.0 for trajectory in hosted)
 
     @pytest.mark.parametrize("corridors", some([1, 8], 8))
@@ -316,10 +326,10 @@ class TestWhatItDoesWrong:
         with none_left():
             if how.refused:
                 with pytest.raises(UserError) as refused:
-                    run(spec, CASES, **options)
+                    run(spec, CASES, hosted=True, **options)
                 assert how.reason in str(refused.value)
                 return
-            ran = run(spec, CASES, **options)
+            ran = run(spec, CASES, hosted=True, **options)
         assert {trajectory.end for trajectory in ran} <= {End.MERGED, End.TIMEOUT, End.SIM_ERROR}
         if how.shared:
             return
@@ -357,7 +367,7 @@ class TestWhatItDoesWrong:
         dies = "import os\ndef Pov(seen):\n    return os._exit(3) if seen.{} > 34.0 else 0.0\n"
         vut, other = pov(dies.format("v_pov_mps"), "vut.py"), pov(dies.format("v_vut_mps"))
         with none_left():
-            ran = run(other, CASES, vut=vut)
+            ran = run(other, CASES, vut=vut, hosted=True)
         for case, trajectory in zip(CASES, ran, strict=True):
             assert (trajectory.error is not None) == (case.v_pov0_mps > GUILTY_MPS)
 
@@ -375,15 +385,14 @@ class TestACampaign:
 
     def test_has_the_same_outcomes_on_two_workers_and_in_process(self, done, tmp_path):
         with open_workers(2) as workers:
-            run_campaign(settings("my_pov.py:Pov"), tmp_path / "two", workers=workers)
-        run_campaign(settings("my_pov.py:Pov", in_process=True), tmp_path / "here-too")
+            hosted = settings("my_pov.py:Pov", in_process=False)
+            run_campaign(hosted, tmp_path / "two", workers=workers)
         assert outcomes(tmp_path / "two") == outcomes(done.folder)
-        assert outcomes(tmp_path / "here-too") == outcomes(done.folder)
 
     def test_of_all_levels_has_the_own_one_too(self, call):
         pov(YIELDS)
         code, out, err = call(
-            *("campaign", "--vut", "level0", "--pov", "my_pov.py:Pov", "--cases", 8, "--json")
+            *("campaign", "--vut", "level0", "--pov", "my_pov.py:Pov", *FEW, "--json")
         )
         assert code == 0
         assert list(json.loads(out)["levels"]) == ["0", "1", "2", "3"]
@@ -391,13 +400,14 @@ class TestACampaign:
 
     def test_from_python_takes_one(self, tmp_path):
         options = {"level": "own", "cases": 4, "out": tmp_path / "run", "pov": pov(YIELDS)}
+        options |= {"sampler": "uniform", "in_process": True}
         done = ms.campaign("design2", **options)
         assert {row["level"] for row in done.cases} == {3}
         assert "<td>own</td>" in done._repr_html_()
 
     def test_says_own_where_a_person_reads(self, call, tmp_path):
         pov(YIELDS)
-        given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", "--cases", 20)
+        given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", *FEW)
         junit = tmp_path / "junit.xml"
         code, out, _ = call("campaign", *given, "--junit", junit, "--out", "run", "-q")
         assert code == 0
@@ -409,10 +419,10 @@ class TestACampaign:
 
     def test_whose_pov_errs_is_not_the_vuts_but_an_error_all_the_same(self, call):
         pov("def Pov(seen):\n    raise ValueError('no idea')\n")
-        given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", "--cases", 3)
+        given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", *FEW)
         code, out, err = call("campaign", *given, "-q", "--gate", "failures", "--gate", "errors")
         assert code == 1
-        assert "3 SIM_ERROR, the first in case 0: the POV: ValueError: no idea" in out
+        assert "8 SIM_ERROR, the first in case 0: the POV: ValueError: no idea" in out
         assert "nothing was tested" in err
         assert "failures is not met" in err or "failures" in err
 
@@ -494,7 +504,8 @@ class TestTrust:
     @pytest.fixture
     def theirs(self, tmp_path, monkeypatch) -> Path:
         """Return a campaign with a POV that somebody sent; nobody here has its key."""
-        folder = run_campaign(settings(pov(TELLTALE)), tmp_path / "run").folder
+        few = settings(pov(TELLTALE), in_process=False, cases=4, batch=2)
+        folder = run_campaign(few, tmp_path / "run").folder
         Path("it-ran").unlink()
         monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
         return folder

@@ -10,6 +10,7 @@ import re
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,7 @@ from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.studies.versions import compare_runs
 from merge_sumo.values.scenario import POV, US23
 
+LONG = partial(pytest.param, marks=pytest.mark.long)
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
 
@@ -106,15 +108,13 @@ def marks(page, kind: str) -> int:
     return page.locator(f".map[data-level='2'] {kind}").count()
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"viewport": {"width": 1280, "height": 900}},
-        {"viewport": {"width": 380, "height": 800}},
-        {"color_scheme": "dark"},
-    ],
-    ids=["wide", "narrow", "dark"],
+NARROW = {"viewport": {"width": 380, "height": 800}}
+LOOKS = pytest.mark.parametrize(
+    "options", [NARROW, LONG({"color_scheme": "dark"})], ids=["narrow", "dark"]
 )
+
+
+@LOOKS
 def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options):
     with shown(browser, made.folder / report.REPORT, **options) as page:
         assert page.locator(".map .mark.fail").count() == len(failures(made.outcomes))
@@ -122,15 +122,7 @@ def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options
         assert width <= page.viewport_size["width"]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"viewport": {"width": 1280, "height": 900}},
-        {"viewport": {"width": 390, "height": 800}},
-        {"color_scheme": "dark"},
-    ],
-    ids=["wide", "narrow", "dark"],
-)
+@LOOKS
 def test_pages_without_a_script_open_without_a_complaint_and_fit_the_window(
     browser, made, tmp_path, options
 ):
@@ -236,10 +228,13 @@ def click(page, part: str) -> None:
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
 
 
-WINDOWS = pytest.mark.parametrize("size", [(1280, 900), (390, 800)], ids=["wide", "phone"])
+WIDE, PHONE = (1280, 900), (390, 800)
+WINDOWS = pytest.mark.parametrize("size", [WIDE, LONG(PHONE)], ids=["wide", "phone"])
+BOTH = pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
+"""Where the layout itself is what the test looks at."""
 
 
-@WINDOWS
+@BOTH
 def test_a_click_on_a_mark_shows_its_case_and_the_mark_without_scrolling(browser, made, size):
     viewport = {"width": size[0], "height": size[1]}
     level = failures(made.outcomes)[0].case.level
@@ -419,23 +414,23 @@ def test_the_address_keeps_the_filters_through_reload_back_and_forward(browser, 
         assert all_rows(page) == of_level
 
 
-@pytest.mark.parametrize(
-    "address",
-    [
-        "#verdict=nothing&level=7&kind=%3Cscript%3E&region=9:9&box=99&avoided=me&from=x&to=1e999",
-        "#case-1e3&level=%E0%A4%A&__proto__=1&constructor=2&box=-1&measure=__proto__&from=",
-        "#&&&===&verdict&%00" + "&level=0" * 0 + "&x=" + "y" * 10_000,
-        "#case-0x1&verdict=failure%0A&kind=" + EVIL,
-    ],
-)
-def test_what_an_address_says_wrongly_is_left_out(browser, made, address):
+ADDRESSES = [
+    "#verdict=nothing&level=7&kind=%3Cscript%3E&region=9:9&box=99&avoided=me&from=x&to=1e999",
+    "#case-1e3&level=%E0%A4%A&__proto__=1&constructor=2&box=-1&measure=__proto__&from=",
+    "#&&&===&verdict&%00&x=" + "y" * 10_000,
+    "#case-0x1&verdict=failure%0A&kind=" + EVIL,
+]
+
+
+def test_what_an_address_says_wrongly_is_left_out(browser, made):
     with shown(browser, made.folder / report.REPORT) as page:
-        page.evaluate("(address) => { location.hash = address; }", address)
-        page.wait_for_timeout(100)
-        assert len(all_rows(page)) == 180
-        page.reload()
-        assert len(all_rows(page)) == 180
-        assert page.locator(".map .mark").count() == 180
+        for address in ADDRESSES:
+            page.evaluate("(address) => { location.hash = address; }", address)
+            page.wait_for_timeout(100)
+            assert len(all_rows(page)) == 180, address
+            page.reload()
+            assert len(all_rows(page)) == 180, address
+            assert page.locator(".map .mark").count() == 180, address
 
 
 def test_the_table_is_downloaded_as_it_is_filtered_and_no_text_in_it_is_a_formula(
@@ -529,7 +524,7 @@ def placed(page, view: str, who: str) -> tuple[float, float]:
     return float(x), float(y)
 
 
-@WINDOWS
+@BOTH
 def test_two_top_views_move_together_and_show_the_same_stretch_of_road(browser, tmp_path, size):
     run = write_run(tmp_path / "run", 20, error=None, timeouts=(0,))
     report.write_report(run)
@@ -663,28 +658,24 @@ def test_nothing_from_outside_runs(browser, tmp_path):
         assert EVIL in page.inner_text("#case-words")
 
 
-def test_errors_and_timeouts_are_drawn_as_no_result_and_shown_first(browser, tmp_path):
-    run = write_run(tmp_path / "run", 20, errors={4: "boom"}, timeouts=(0, 3, 6))
-    report.write_report(run)
-    with shown(browser, run.folder / report.REPORT) as page:
+def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(browser, tmp_path):
+    run = write_run(
+        tmp_path / "run", 20, errors={4: "boom", 9: EVIL, 11: "boom"}, timeouts=(0, 3, 6)
+    )
+    with shown(browser, report.write_report(run)) as page:
         drawn = page.locator(".map .mark.error").evaluate_all(
             "all => all.map((m) => m.dataset.case)"
         )
-        assert sorted(map(int, drawn)) == [0, 3, 4, 6]
+        assert sorted(map(int, drawn)) == [0, 3, 4, 6, 9, 11]
         assert page.inner_text("#case-words").startswith("VUT_ERROR: boom")
         page.locator(".list [data-case='3']").click()
         assert page.inner_text("#case-words").startswith("Timeout: the VUT did not arrive")
-
-
-def test_errors_and_timeouts_are_grouped_by_message_in_the_table(browser, tmp_path):
-    run = write_run(tmp_path / "run", 20, errors={4: "boom", 9: EVIL, 11: "boom"}, timeouts=(0, 6))
-    with shown(browser, report.write_report(run)) as page:
         verdict = page.locator("#filters [name=verdict]")
         for label, expected in (
             ("boom (2)", [4, 11]),
             (f"{EVIL[:60]} (1)", [9]),
             ("VUT_ERROR (3)", [4, 9, 11]),
-            ("TIMEOUT (2)", [0, 6]),
+            ("TIMEOUT (3)", [0, 3, 6]),
         ):
             verdict.select_option(label=label)
             assert sorted(rows(page)) == expected
@@ -745,15 +736,7 @@ def drawn_at(page, outcome, axes: Sequence[str]) -> tuple[float, float]:
     return x - u, y - v
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"viewport": {"width": 1280, "height": 900}},
-        {"viewport": {"width": 380, "height": 800}},
-        {"color_scheme": "dark"},
-    ],
-    ids=["wide", "narrow", "dark"],
-)
+@LOOKS
 def test_a_campaign_in_traffic_fits_the_window_too(browser, in_traffic, options):
     with shown(browser, in_traffic.folder / report.REPORT, **options) as page:
         width = page.evaluate("document.documentElement.scrollWidth")

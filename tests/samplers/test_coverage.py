@@ -167,7 +167,7 @@ def test_expects_less_of_the_next_batch_the_more_it_has_covered():
     assert sampler.expected_gain(20) == math.inf
     play(sampler, 4)
     early = sampler.expected_gain(20)
-    play(later := CoverageSampler(Pool(levels=(0,), scenario=US23), 2), 14)
+    play(later := CoverageSampler(Pool(levels=(0,), scenario=US23), 2), 9)
     assert later.expected_gain(20) < 0.5 * early
 
 

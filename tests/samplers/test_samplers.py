@@ -27,7 +27,7 @@ POOLS = {
     "4-d and 5-d": Pool(levels=(1, 2), v_vut0_mps=17.5, scenario=TRAFFIC),
     "6-d": Pool(levels=(2,), scenario=replace(TRAFFIC, v_vut0_mps=(14.0, 22.0))),
 }
-LONG = ("3-d", "4-d and 5-d", "6-d")
+LONG = ("2-d", "3-d", "4-d and 5-d", "6-d")
 
 
 @pytest.fixture(scope="module", params=sorted(SAMPLERS))

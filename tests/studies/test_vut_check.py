@@ -20,7 +20,8 @@ def check(tmp_path):
     def run(source: str, *arguments: str) -> tuple[int, str]:
         path = tmp_path / f"vut{len(list(tmp_path.iterdir()))}.py"
         path.write_text(source)
-        done = CliRunner().invoke(cli.app, ["check-vut", f"{path}:Vut", *arguments])
+        arguments = "check-vut", f"{path}:Vut", "--in-process", *arguments
+        done = CliRunner().invoke(cli.app, arguments)
         return done.exit_code, done.stdout
 
     return run

@@ -29,6 +29,11 @@ def factory(spec: object, **options: Any) -> VutFactory:
     return vut_factory(str(spec), VutOptions(**options))
 
 
+def in_process(spec: object, **options: Any) -> VutFactory:
+    """Return a VUT that drives in this process; `vuts/test_hosted.py` is of those in another."""
+    return factory(spec, in_process=True, **options)
+
+
 def run_cases(vut: VutFactory, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
     """Return what became of every case, in order; every case must come back exactly once."""
     found: dict[int, Trajectory] = {}

@@ -38,7 +38,6 @@ from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
-KINDS = [1, 2]
 SETTINGS = CampaignSettings(
     vut="design1", levels=(0, 1, 2), sampler="gpr", cases=60, batch=20, seed=3, scenario=US23
 )
@@ -92,9 +91,19 @@ def no_loss(item):
     pytest.fail(f"{item} was given up")
 
 
-@pytest.fixture(scope="module", params=KINDS, ids=["in process", "2 processes"])
+@pytest.fixture(scope="module")
+def two():
+    """Return two processes; where a test kills one, another takes its place."""
+    with open_workers(2) as opened:
+        yield opened
+
+
+@pytest.fixture(params=["in process", "2 processes"])
 def workers(request):
-    with open_workers(request.param) as opened:
+    if request.param == "2 processes":
+        yield request.getfixturevalue("two")
+        return
+    with open_workers(1) as opened:
         yield opened
 
 
@@ -127,25 +136,22 @@ class TestAnyWorkers:
 
 
 class TestAWorkerThatDies:
-    def test_once_loses_nothing(self, tmp_path):
-        with open_workers(2) as workers:
-            work = partial(killed_once_at, tmp_path / "flag", 7)
-            found = sorted(workers.run(work, range(20), no_loss, chunk=4))
+    def test_once_loses_nothing(self, two, tmp_path):
+        work = partial(killed_once_at, tmp_path / "flag", 7)
+        found = sorted(two.run(work, range(20), no_loss, chunk=4))
         assert (tmp_path / "flag").exists()
         assert found == [(place, place * place) for place in range(20)]
 
-    def test_each_time_at_one_item_loses_that_one_and_no_other(self):
-        with open_workers(2) as workers:
-            work = partial(killed_always_at, {7})
-            found = sorted(workers.run(work, range(20), lambda item: -item, chunk=10))
+    def test_each_time_at_one_item_loses_that_one_and_no_other(self, two):
+        work = partial(killed_always_at, {7})
+        found = sorted(two.run(work, range(20), lambda item: -item, chunk=10))
         assert found == [(place, -7 if place == 7 else place * place) for place in range(20)]
 
-    def test_at_a_case_makes_it_a_sim_error_with_a_reason(self):
+    def test_at_a_case_makes_it_a_sim_error_with_a_reason(self, two):
         cases = from_unit(np.random.default_rng(0).random((4, 2)), 0, scenario=US23)
         plan = plan_for("design1", corridors=4)
-        with open_workers(2) as workers:
-            work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
-            ran = dict(workers.run(work, cases, _lost, chunk=1))
+        work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
+        ran = dict(two.run(work, cases, _lost, chunk=1))
         ends = [ran[place].measures.end for place in range(4)]
         assert ends[2] is End.SIM_ERROR
         assert "worker process died 2 times" in ran[2].measures.error
@@ -172,14 +178,13 @@ class TestLocalProcesses:
         assert len(set(found.values())) == 3
         assert os.getpid() not in found.values()
 
-    def test_do_not_hear_ctrl_c(self):
-        with open_workers(2) as workers:
-            ids = set(dict(workers.run(process_ids, range(8), no_loss, chunk=1)).values())
-            results = workers.run(slowly, range(4), no_loss, chunk=1)
-            first = next(results)
-            for process in ids:
-                os.kill(process, signal.SIGINT)
-            assert sorted([first, *results]) == [(place, place * place) for place in range(4)]
+    def test_do_not_hear_ctrl_c(self, two):
+        ids = set(dict(two.run(process_ids, range(8), no_loss, chunk=1)).values())
+        results = two.run(slowly, range(4), no_loss, chunk=1)
+        first = next(results)
+        for process in ids:
+            os.kill(process, signal.SIGINT)
+        assert sorted([first, *results]) == [(place, place * place) for place in range(4)]
 
     def test_end_with_a_parent_that_is_killed(self, tmp_path):
         script = tmp_path / "parent.py"
@@ -215,9 +220,8 @@ def running(process: int) -> bool:
 
 
 class TestACampaign:
-    def test_has_the_same_outcomes_on_two_workers(self, expected, tmp_path):
-        with open_workers(2) as workers:
-            run_campaign(SETTINGS, tmp_path / "run", workers=workers)
+    def test_has_the_same_outcomes_on_two_workers(self, two, expected, tmp_path):
+        run_campaign(SETTINGS, tmp_path / "run", workers=two)
         assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
 
     @pytest.mark.long
@@ -229,7 +233,9 @@ class TestACampaign:
 
     def test_closes_its_simulation_in_this_process(self, tmp_path):
         for name in ("first", "second"):
-            settings = CampaignSettings(vut="level0", levels=(0,), cases=2, batch=2, scenario=US23)
+            settings = CampaignSettings(
+                vut="level0", levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
+            )
             run_campaign(settings, tmp_path / name)
 
     def test_is_refused_by_workers_with_other_software(self):

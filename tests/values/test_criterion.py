@@ -453,6 +453,8 @@ class TestCampaigns:
         (tmp_path / "stops.py").write_text(STOPS, encoding="utf-8")
         code, out, _ = command_line(
             *("campaign", "--vut", f"{tmp_path / 'stops.py'}:Stops", "--cases", 2, "--level", 0),
+            "--sampler",
+            "uniform",
             *("--fail-when", 'end == "TIMEOUT"', "--out", tmp_path / "run", "--json"),
             *("-q", "--in-process", "--gate", "failures"),
         )

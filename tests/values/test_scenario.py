@@ -184,7 +184,12 @@ class TestACampaign:
     def test_clips_at_the_limits_of_its_scenario(self, tmp_path):
         (tmp_path / "hard.py").write_text("def vut(seen):\n    return 2.0\n")
         settings = CampaignSettings(
-            vut=f"{tmp_path / 'hard.py'}:vut", levels=(0,), cases=1, batch=1, scenario=OTHER
+            vut=f"{tmp_path / 'hard.py'}:vut",
+            levels=(0,),
+            cases=1,
+            sampler="uniform",
+            batch=1,
+            scenario=OTHER,
         )
         trajectory = run_campaign(settings, tmp_path / "run").trajectory(0)
         assert trajectory.a_vut_mps2.max() == 1.5
@@ -193,7 +198,12 @@ class TestACampaign:
     def test_times_out_when_its_scenario_says(self, tmp_path):
         (tmp_path / "stop.py").write_text("def vut(seen):\n    return -4.0\n")
         settings = CampaignSettings(
-            vut=f"{tmp_path / 'stop.py'}:vut", levels=(0,), cases=1, batch=1, scenario=OTHER
+            vut=f"{tmp_path / 'stop.py'}:vut",
+            levels=(0,),
+            cases=1,
+            sampler="uniform",
+            batch=1,
+            scenario=OTHER,
         )
         (outcome,) = run_campaign(settings, tmp_path / "run").outcomes
         assert (outcome.measures.end, outcome.measures.t_end_s) == (End.TIMEOUT, 12.0)

@@ -57,6 +57,7 @@ def campaign(tmp_path):
         path = tmp_path / "my_vut.py"
         path.write_text(source, encoding="utf-8")
         given = {"levels": (0,), "cases": 24, "batch": 12, "sampler": "uniform", **settings}
+        given = {"in_process": workers == 1, **given}
         folder = tmp_path / f"run{len(list(tmp_path.iterdir()))}"
         with open_workers(workers) as there:
             return run_campaign(
@@ -87,6 +88,7 @@ def test_every_step_has_what_was_left_at_it(campaign, source, in_process):
             )
 
 
+@pytest.mark.long
 def test_any_number_of_workers_leaves_the_same_bytes(campaign):
     one, two = campaign(LEAVES), campaign(LEAVES, workers=2)
     for name in ("00000.npz", "00001.npz"):

@@ -160,7 +160,19 @@ class TestRobustness:
 
     def test_decides_a_campaign(self, tmp_path, command_line):
         code, out, err = command_line(
-            *("campaign", "--vut", "design1", "--level", 0, "--cases", 20, "--json", "-q"),
+            *(
+                "campaign",
+                "--vut",
+                "design1",
+                "--level",
+                0,
+                "--cases",
+                20,
+                "--json",
+                "-q",
+                "--sampler",
+                "uniform",
+            ),
             *("--sampler", "gpr"),
             *("--require", NEAR, "--out", tmp_path / "run"),
         )

@@ -56,7 +56,7 @@ def spec(tmp_path):
 
 def campaign(spec: str, out: Path, *more: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", spec, "--level", "0"]
-    command += ["--cases", "4", "--batch", "4", "--quiet", "--out", str(out), *more]
+    command += ["--cases", "4", "--sampler", "uniform", "--quiet", "--out", str(out), *more]
     return subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
 
 
@@ -87,7 +87,9 @@ def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
 
 def test_a_campaign_that_was_interrupted_goes_on_to_the_same_bytes(spec, tmp_path):
     vut = spec(LEVEL0_CLASS.replace("Level0", "Vut"))
-    settings = CampaignSettings(vut=vut, levels=(0,), cases=8, batch=4, scenario=US23)
+    settings = CampaignSettings(
+        vut=vut, levels=(0,), cases=8, batch=4, sampler="uniform", scenario=US23
+    )
     whole = run_campaign(settings, tmp_path / "whole")
 
     def stop():
@@ -102,7 +104,9 @@ def test_a_campaign_that_was_interrupted_goes_on_to_the_same_bytes(spec, tmp_pat
 
 def test_a_vut_that_changed_is_not_gone_on_with(spec, tmp_path):
     source = LEVEL0_CLASS.replace("Level0", "Vut")
-    settings = CampaignSettings(vut=spec(source), levels=(0,), cases=2, batch=2, scenario=US23)
+    settings = CampaignSettings(
+        vut=spec(source), levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
+    )
     run_campaign(settings, tmp_path / "run")
     spec(source + "# changed\n")
     with pytest.raises(UserError, match=r"vut_files\..*my_vut.py differs"):
@@ -198,7 +202,8 @@ def test_a_host_that_cannot_start_is_a_sentence(spec, monkeypatch):
 def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
     vut = spec('print("loading \\x1b[31m")\ndef Vut(seen):\n    print("acting")\n    return 1.0\n')
     run = run_campaign(
-        CampaignSettings(vut=vut, levels=(0,), cases=2, batch=2, scenario=US23), tmp_path / "run"
+        CampaignSettings(vut=vut, levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23),
+        tmp_path / "run",
     )
     log = (run.folder / "controller.log").read_bytes()
     assert log.startswith(b"loading \x1b[31m\nacting\n")
@@ -340,7 +345,9 @@ def test_the_outcomes_hold_no_address_and_no_control_characters(spec, tmp_path):
     vut = spec("def Vut(seen):\n    raise ValueError(object(), '\\x1b[0m')\n")
     lines = []
     for name in ("a", "b"):
-        settings = CampaignSettings(vut=vut, levels=(0,), cases=2, batch=2, scenario=US23)
+        settings = CampaignSettings(
+            vut=vut, levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
+        )
         run = run_campaign(settings, tmp_path / name)
         lines.append((run.folder / "outcomes.jsonl").read_bytes())
     assert lines[0] == lines[1]

@@ -11,7 +11,7 @@ import pytest
 from merges import HALF, SMALLER
 from plans import plan_for
 from typer.testing import CliRunner
-from vut_contract import cases_of, factory, run_cases
+from vut_contract import cases_of, in_process, run_cases
 
 from merge_sumo.cli import app
 from merge_sumo.drivers.levelk import features
@@ -54,7 +54,7 @@ def test_an_exported_policy_as_vut_drives_like_the_built_in_one(tmp_path, scenar
     export_onnx("vut1", tmp_path / "vut1.onnx", scenario=scenario)
     cases = from_unit(np.random.default_rng(1).random((40, 3)), level=2, scenario=scenario)
     by_onnx, built_in = (
-        run_cases(factory(vut), cases) for vut in (f"onnx:{tmp_path / 'vut1.onnx'}", "level1")
+        run_cases(in_process(vut), cases) for vut in (f"onnx:{tmp_path / 'vut1.onnx'}", "level1")
     )
     for one, other in zip(by_onnx, built_in, strict=True):
         assert np.array_equal(one.motion, other.motion)
@@ -97,7 +97,7 @@ def test_one_number_is_an_acceleration_and_seven_are_values_of_actions(tmp_path,
     one = network(tmp_path / "one.onnx", answer=[0.5], dtype=dtype)
     seven = network(tmp_path / "seven.onnx", answer=[0, 0, 0, 0, 0, 3, 1], dtype=dtype)
     for path, expected in ((one, 0.5), (seven, 1.0)):
-        (trajectory,) = run_cases(factory(f"onnx:{path}"), cases_of(1))
+        (trajectory,) = run_cases(in_process(f"onnx:{path}"), cases_of(1))
         assert (trajectory.a_vut_mps2[:-1] == expected).all()
 
 
@@ -113,10 +113,10 @@ def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
             location="weights.bin" if name == "a.onnx" else None,
             size_threshold=size,
         )
-    assert [Path(f).name for f in factory(f"onnx:{path}").files] == ["here.onnx"]
+    assert [Path(f).name for f in in_process(f"onnx:{path}").files] == ["here.onnx"]
     vut = f"onnx:{tmp_path / 'a.onnx'}"
-    assert sorted(Path(f).name for f in factory(vut).files) == ["a.onnx", "weights.bin"]
-    separate = sorted(Path(f).name for f in factory(f"onnx:{tmp_path / 'b.onnx'}").files)
+    assert sorted(Path(f).name for f in in_process(vut).files) == ["a.onnx", "weights.bin"]
+    separate = sorted(Path(f).name for f in in_process(f"onnx:{tmp_path / 'b.onnx'}").files)
     assert separate == ["b", "b.onnx", "w"]
     truth = [ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").score]
     weights = tmp_path / "weights.bin"
@@ -149,7 +149,7 @@ def test_an_answer_that_is_no_number_is_a_vut_error(tmp_path, answer):
         model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([value]), name))
     model.graph.node.append(onnx.helper.make_node("Add", ["out", "spoilt"], ["shown"]))
     path.write_bytes(model.SerializeToString())
-    assert run_cases(factory(f"onnx:{path}"), cases_of(1))[0].end is End.VUT_ERROR
+    assert run_cases(in_process(f"onnx:{path}"), cases_of(1))[0].end is End.VUT_ERROR
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -161,7 +161,7 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, value):
     model.graph.initializer[0].CopyFrom(onnx.numpy_helper.from_array(weight, "w"))
     path.write_bytes(model.SerializeToString())
     with pytest.raises(UserError, match=r"bad\.onnx has weights that are not finite, in 'w'"):
-        factory(f"onnx:{path}")
+        in_process(f"onnx:{path}")
 
 
 def test_infinity_as_a_limit_is_no_weight(tmp_path):
@@ -171,7 +171,7 @@ def test_infinity_as_a_limit_is_no_weight(tmp_path):
     model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(-np.inf), "low"))
     model.graph.node.append(onnx.helper.make_node("Clip", ["out", "low"], ["clipped"]))
     path.write_bytes(model.SerializeToString())
-    (trajectory,) = run_cases(factory(f"onnx:{path}"), cases_of(1))
+    (trajectory,) = run_cases(in_process(f"onnx:{path}"), cases_of(1))
     assert (trajectory.a_vut_mps2[:-1] == 0.5).all()
 
 
@@ -190,7 +190,7 @@ def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
         f"{good}?period=1": "there is no option 'period'",
     }.items():
         with pytest.raises(UserError, match=r"onnx|ONNX") as refused:
-            factory(f"onnx:{spec}")
+            in_process(f"onnx:{spec}")
         assert said in str(refused.value)
 
 

@@ -16,7 +16,7 @@ import pytest
 from campaigning import run_campaign
 from conftest import some
 from processes import at_most_cpu_s
-from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+from vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
 
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
@@ -65,7 +65,7 @@ def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
     lines: list = []
     for spec in ("level0", vut(source, name)):
         settings = CampaignSettings(
-            vut=spec, levels=(0, 2), cases=60, batch=20, seed=3, scenario=US23
+            vut=spec, levels=(0, 2), cases=60, batch=20, seed=3, sampler="gpr", scenario=US23
         )
         folder = tmp_path / f"run{len(lines)}"
         run_campaign(settings, folder)
@@ -77,7 +77,7 @@ def test_a_module_in_the_working_folder_is_found(vut, tmp_path, monkeypatch):
     vut(LEVEL0_CLASS, file="module_of_a_user.py")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
-    assert run_cases(factory("module_of_a_user:Level0"), cases_of(3))[0].end is End.MERGED
+    assert run_cases(in_process("module_of_a_user:Level0"), cases_of(3))[0].end is End.MERGED
 
 
 def test_an_installed_package_can_register_a_name(tmp_path, monkeypatch):
@@ -89,15 +89,15 @@ def test_an_installed_package_can_register_a_name(tmp_path, monkeypatch):
         "[merge_sumo.vuts]\nmine = registered_vut:Level0\nbad = registered_vut:Nothing\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    assert run_cases(factory("mine"), cases_of(3))[0].end is End.MERGED
+    assert run_cases(in_process("mine"), cases_of(3))[0].end is End.MERGED
     with pytest.raises(UserError, match="cannot load the VUT bad"):
-        factory("bad")
+        in_process("bad")
     with pytest.raises(UserError, match=r"choose one of .*mine"):
-        factory("nobody")
+        in_process("nobody")
 
 
 def test_a_factory_travels_to_another_process_as_plain_values(vut):
-    made = factory(vut(LEVEL0_CLASS, "Level0"), deadline_s=2.0)
+    made = in_process(vut(LEVEL0_CLASS, "Level0"), deadline_s=2.0)
     assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301 (our own bytes)
 
 
@@ -117,7 +117,7 @@ def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(vut, tmp_pa
     case = MergeCase(
         level=2, x_pov0_m=-250.0, v_pov0_mps=30.0, svo_rad=0.5, v_vut0_mps=17.0, scenario=US23
     )
-    (trajectory,) = run_cases(factory(vut(WATCHER)), [case])
+    (trajectory,) = run_cases(in_process(vut(WATCHER)), [case])
     at_reset, *steps = json.loads((tmp_path / "seen.json").read_text())
     start = {"t_s": 0.0, "x_pov_m": -250.0, "v_pov_mps": 30.0, "x_vut_m": -182.0, "v_vut_mps": 17.0}
     assert at_reset == start
@@ -137,7 +137,7 @@ class Vut:
         assert self.count == round(seen.t_s * 10) + 1, self.count
         return 1.0
 """
-    assert {t.end for t in run_cases(factory(vut(source)), cases_of(40))} == {End.MERGED}
+    assert {t.end for t in run_cases(in_process(vut(source)), cases_of(40))} == {End.MERGED}
 
 
 WRONG_ANSWERS = {
@@ -169,7 +169,7 @@ def test_what_it_does_wrong_is_the_outcome_of_its_own_case(vut, answer):
     cases = cases_of(8)
     spec = vut(SOMETIMES.format(answer=answer))
     with at_most_cpu_s(20.0):
-        trajectories = run_cases(factory(spec, deadline_s=0.3), cases)
+        trajectories = run_cases(in_process(spec, deadline_s=0.3), cases)
     for case, trajectory in zip(cases, trajectories, strict=True):
         if case.v_pov0_mps > 30.0:
             assert trajectory.end is End.VUT_ERROR
@@ -200,7 +200,7 @@ class Vut:
 """
     cases = cases_of(8)
     for case, trajectory in zip(
-        cases, run_cases(factory(vut(source), deadline_s=0.3), cases), strict=True
+        cases, run_cases(in_process(vut(source), deadline_s=0.3), cases), strict=True
     ):
         if case.v_pov0_mps > 30.0:
             assert trajectory.error.startswith(reason)
@@ -218,7 +218,7 @@ class Vut:
         self.broken = seen.t_s > 0.2
         return 1.0
 """
-    errors = [t.error for t in run_cases(factory(vut(source)), cases_of(3), corridors=1)]
+    errors = [t.error for t in run_cases(in_process(vut(source)), cases_of(3), corridors=1)]
     assert errors == ["RuntimeError: still broken (my_vut.py, line 6)"] * 3
 
 
@@ -228,25 +228,25 @@ class Vut:
 )
 def test_a_wrong_batch_fails_its_cases_and_none_is_lost(vut, answer, reason):
     source = BATCHED.replace("np.clip((28.0 - seen.v_vut_mps) / 0.1, 0.0, 1.0)", answer)
-    trajectories = run_cases(factory(vut(source)), cases_of(9))
+    trajectories = run_cases(in_process(vut(source)), cases_of(9))
     assert all(t.end is End.VUT_ERROR and reason in t.error for t in trajectories)
 
 
 def test_a_batched_vut_cannot_move_the_cars(vut):
     source = BATCHED.replace("return ", "seen.x_vut_m[:] = 5.0; seen.v_vut_mps[:] = 1.0; return ")
-    assert {t.end for t in run_cases(factory(vut(source)), cases_of(4))} == {End.MERGED}
+    assert {t.end for t in run_cases(in_process(vut(source)), cases_of(4))} == {End.MERGED}
 
 
 def test_answers_outside_the_limits_are_clipped_and_counted_but_rounding_is_not(vut):
     for answer, clipped in ((7.0, True), (2.0 + 1e-12, False), (2, False)):
         source = f"def Vut(seen):\n    return {answer}\n"
-        (trajectory,) = run_cases(factory(vut(source, file=f"v{answer}.py")), cases_of(1))
+        (trajectory,) = run_cases(in_process(vut(source, file=f"v{answer}.py")), cases_of(1))
         assert trajectory.clipped_steps == (len(trajectory.motion) - 1) * clipped
         assert (trajectory.a_vut_mps2[:-1] == 2.0).all()
 
 
 def test_a_vut_that_stands_is_a_timeout(vut):
-    (trajectory,) = run_cases(factory(vut("def Vut(seen):\n    return -4.0\n")), cases_of(1))
+    (trajectory,) = run_cases(in_process(vut("def Vut(seen):\n    return -4.0\n")), cases_of(1))
     assert trajectory.end is End.TIMEOUT
     assert len(trajectory.motion) == MAX_STEPS + 1
 
@@ -261,7 +261,7 @@ class Vut:
         print("goodbye")
         raise ValueError("too late")
 """
-    (trajectory,) = run_cases(factory(vut(source)), cases_of(1), corridors=1)
+    (trajectory,) = run_cases(in_process(vut(source)), cases_of(1), corridors=1)
     said = capsys.readouterr()
     assert trajectory.end is End.MERGED
     assert said.out == ""
@@ -285,23 +285,23 @@ class Vut:
 )
 def test_what_cannot_be_a_vut_is_refused_in_a_sentence(vut, source, name, said):
     with pytest.raises(UserError, match=r"(?i)vut") as refused:
-        factory(vut(source, name))
+        in_process(vut(source, name))
     assert said in str(refused.value)
 
 
 def test_what_cannot_be_found_or_made_is_refused_in_a_sentence(vut, tmp_path):
     with pytest.raises(UserError, match=r"cannot read the VUT .*No such file"):
-        factory(tmp_path / "nothing.py:Vut")
+        in_process(tmp_path / "nothing.py:Vut")
     with pytest.raises(UserError, match="cannot load the VUT no_such_module_here"):
-        factory("no_such_module_here:Vut")
+        in_process("no_such_module_here:Vut")
     source = "class Vut:\n    def __init__(self, x): ...\n    def act(self, seen): return 1.0\n"
     with pytest.raises(UserError, match="cannot be made without arguments: TypeError"):
-        run_cases(factory(vut(source)), cases_of(1))
+        run_cases(in_process(vut(source)), cases_of(1))
     for deadline in (0.0, -1.0, float("nan")):
         with pytest.raises(UserError, match="--deadline is"):
-            factory("level0", deadline_s=deadline)
+            in_process("level0", deadline_s=deadline)
     with pytest.raises(UserError, match="--vut-command goes with --vut traci"):
-        factory("level0", command="python x.py")
+        in_process("level0", command="python x.py")
 
 
 def test_built_in_names_still_work():
@@ -313,7 +313,7 @@ def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
     text = page.read_text(encoding="utf-8")
     (source,) = re.findall(r"```python\n(class MyVut.*?)```", text, flags=re.DOTALL)
     assert len(source.strip().splitlines()) <= 10
-    trajectories = run_cases(factory(vut(source, "MyVut")), cases_of(20))
+    trajectories = run_cases(in_process(vut(source, "MyVut")), cases_of(20))
     assert {t.end for t in trajectories} == {End.MERGED}
     assert any(t.a_vut_mps2.min() == -2.0 for t in trajectories)
 
@@ -321,7 +321,9 @@ def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
 def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
     hashes = []
     for source in (FUNCTION, FUNCTION + "# changed"):
-        settings = CampaignSettings(vut=vut(source), levels=(0,), cases=2, batch=2, scenario=US23)
+        settings = CampaignSettings(
+            vut=vut(source), levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
+        )
         (sha256,) = record_of(settings, resolve(settings))["vut_files"].values()
         hashes.append(sha256)
     assert hashes[0] != hashes[1]
