@@ -169,7 +169,7 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, n
     assert said.split(" (case")[0] in write_report(run).read_text()
     assert said.split(" (case")[0] in ms.open_run(folder)._repr_html_()
     # check-vut tells that it is no randomness, and rerun that no file has changed.
-    checked = CliRunner().invoke(cli.app, ["check-vut", spec, "--in-process"])
+    checked = CliRunner().invoke(cli.app, ["check-vut", spec])
     assert checked.exit_code == 1
     assert "It keeps something from earlier episodes" in checked.stdout
     again = rerun(run, today := settings_today(run, trust=True), resolve(today))
@@ -181,7 +181,7 @@ def test_a_random_controller_is_found_and_told_from_one_that_remembers(vut, tmp_
     run = campaign(vut(RANDOM), tmp_path / "run", cases=40)
     repeats = read_repeats(run)
     assert {one.differs_from_s for one in repeats} == {0.0}
-    checked = CliRunner().invoke(cli.app, ["check-vut", run.settings["vut"], "--in-process"])
+    checked = CliRunner().invoke(cli.app, ["check-vut", run.settings["vut"]])
     assert "It draws random numbers, reads a clock" in checked.stdout
 
 

@@ -446,22 +446,13 @@ class TestFromAnotherFolder:
         assert len(resume_campaign(folder).outcomes) == 28
 
 
-def kill_campaigns(kills: int, seed: int) -> str:
-    """Kill and resume campaigns, and return what was said of each."""
+@pytest.mark.long
+def test_campaigns_that_are_killed_and_resumed_have_the_same_outcomes():
     done = subprocess.run(
-        [sys.executable, str(KILLER), "--kills", str(kills), "--seed", str(seed)],
+        [sys.executable, str(KILLER), "--kills", "2", "--seed", "1"],
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-def test_campaigns_that_are_killed_and_resumed_have_the_same_outcomes():
-    assert "the same outcomes.jsonl after 1 of 1 kills" in kill_campaigns(1, seed=1)
-
-
-@pytest.mark.long
-def test_100_campaigns_that_are_killed_and_resumed_have_the_same_outcomes():
-    assert "the same outcomes.jsonl after 100 of 100 kills" in kill_campaigns(100, seed=0)
+    assert "the same outcomes.jsonl after 2 of 2 kills" in done.stdout

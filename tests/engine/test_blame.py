@@ -83,6 +83,14 @@ def campaign(tmp_path):
     return run
 
 
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory) -> Run:
+    """Return a campaign in which nothing dies."""
+    folder = tmp_path_factory.mktemp("calm")
+    (folder / "calm.py").write_text(CALM, encoding="utf-8")
+    return run_campaign(settings(f"{folder / 'calm.py'}:Vut"), folder / "run")
+
+
 class TestBlame:
     def test_is_for_what_dies_again_alone(self):
         blame = Blame[int]()
@@ -138,8 +146,7 @@ class TestKills:
         ("how", "times"),
         [(KILLED, 1), (KILLED, MAX_KILLS - 1), ("os._exit(3)", 1), ("os.abort()", 1)],
     )
-    def test_that_a_case_did_not_earn_leave_it_as_it_is(self, campaign, how, times, capsys):
-        calm = campaign("calm", CALM)
+    def test_that_a_case_did_not_earn_leave_it_as_it_is(self, campaign, calm, how, times):
         struck = campaign("struck", DIES.format(how=how, times=times))
         assert outcomes(struck) == outcomes(calm)
         bad = sum(outcome.case.v_pov0_mps > 33.0 for outcome in calm.outcomes)
@@ -163,7 +170,7 @@ class TestKills:
                 assert not outcome.measures.end.is_error
         assert run.ran_again == 0
 
-    def test_while_a_vut_is_opened_do_not_end_the_campaign(self, campaign, tmp_path):
+    def test_while_a_vut_is_opened_do_not_end_the_campaign(self, campaign, calm):
         once = """
 import os, pathlib, signal
 flag = pathlib.Path(__file__).with_name("opened")
@@ -171,11 +178,11 @@ if not flag.exists():
     flag.touch()
     os.kill(os.getpid(), signal.SIGKILL)
 """
-        assert outcomes(campaign("once", once + CALM)) == outcomes(campaign("calm", CALM))
+        assert outcomes(campaign("once", once + CALM)) == outcomes(calm)
         with pytest.raises(UserError, match=r"opening the VUT .* by signal 9 \(SIGKILL\)"):
             campaign("always", f"import os, signal\n{KILLED}\n{CALM}")
 
-    def test_of_a_vut_that_is_opened_again_are_not_those_of_all_cases(self, campaign):
+    def test_of_a_vut_that_is_opened_again_are_not_those_of_all_cases(self, campaign, calm):
         """The process dies at a case, and again when it starts anew: the other cases pass."""
         source = DIES.format(how="(FLAGS / 'again').touch(); os._exit(3)", times=1)
         source += """
@@ -183,7 +190,7 @@ if (FLAGS / "again").exists():
     (FLAGS / "again").unlink()
     os.kill(os.getpid(), signal.SIGKILL)
 """
-        assert outcomes(campaign("struck", source)) == outcomes(campaign("calm", CALM))
+        assert outcomes(campaign("struck", source)) == outcomes(calm)
 
     def test_of_a_worker_mark_what_ran_again(self, tmp_path):
         with open_workers(2) as workers:
@@ -207,8 +214,7 @@ def marked(result):
 
 
 @pytest.mark.parametrize("hosted", some(["yes", ""], "yes"))
-def test_a_stop_of_all_of_us_is_no_error_of_the_vut(campaign, hosted):
-    calm = campaign("calm", CALM)
+def test_a_stop_of_all_of_us_is_no_error_of_the_vut(campaign, calm, hosted):
     source = STOPS.replace("{hosted}", hosted)
     stopped = campaign("stopped", source, deadline_s=2.0, in_process=not hosted)
     assert (stopped.folder.parent / "went-on").exists()
