@@ -113,14 +113,14 @@ class Belief:
         experts += [] if self._branches is None else [self._branches]
         for expert in experts:
             chance = expert.left_out()
-            fits = []
-            for width, prior in zip(WIDTHS.tolist(), log_prior.tolist(), strict=True):
-                evidence = _evidence(_lowered(chance, distances, width), distances, learned.dims)
-                calibration, posterior = _calibrated(evidence, learned.failed)
-                fits.append((posterior + prior, width, calibration))
-            posterior, width, calibration = max(fits, key=lambda fit: fit[0])
-            self._fitted.append((width, calibration))
-            best.append(posterior)
+            lowered = _lowered(chance, distances, WIDTHS[:, None])
+            evidence = _evidence(lowered, distances, learned.dims)
+            calibrations, posteriors = _calibrated(evidence, learned.failed)
+            posteriors = posteriors + log_prior
+            place = int(posteriors.argmax())
+            posterior, width, calibration = posteriors[place], WIDTHS[place], calibrations[place]
+            self._fitted.append((float(width), calibration))
+            best.append(float(posterior))
         self._weights = np.exp(np.array(best) - max(best))
 
 
@@ -227,11 +227,12 @@ def _nearest_other(points: FloatArray, group: NDArray[np.bool_]) -> FloatArray:
 
 
 def _lowered(
-    probability: FloatArray, distances: list[FloatArray], typical_width: float
+    probability: FloatArray, distances: list[FloatArray], typical_width: float | FloatArray
 ) -> FloatArray:
     """Return P(fail) with what a closed bracket of safe cases says against it.
 
-    `distances` are those to the nearest failure and to the nearest safe case on either side.
+    `distances` are those to the nearest failure and to the nearest safe case on either side. The
+    result is (m,), or (W, m) for typical widths of shape (W, 1).
     """
     to_failing, before, behind = distances
     width = before + behind
@@ -240,36 +241,48 @@ def _lowered(
 
 
 def _evidence(chance: FloatArray, distances: list[FloatArray], dims: int) -> FloatArray:
-    """Return what speaks for and against failures, (m, 4): see CALIBRATION."""
+    """Return what speaks for and against failures, (..., m, 4), by P(fail), (..., m).
+
+    See CALIBRATION.
+    """
     to_failing, before, behind = distances
     radius = radius_for(dims)
     odds = logit(np.clip(chance, SURE, 1.0 - SURE))
     to_curve = np.maximum(before, behind)
     near = [np.log((distance + NEAR) / (radius + NEAR)) for distance in (to_failing, to_curve)]
-    return np.column_stack([odds, np.ones(len(chance)), *near])
+    return np.stack(np.broadcast_arrays(odds, 1.0, *near), axis=-1)
 
 
-def _calibrated(evidence: FloatArray, failed: NDArray[np.bool_]) -> tuple[FloatArray, float]:
-    """Return the weights of the evidence, (4,), that predict best, and their log posterior.
+def _calibrated(evidence: FloatArray, failed: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Return the weights of the evidence, (W, 4), that predict best, and log posteriors, (W,).
 
-    Logistic regression by Newton's method; a step that makes it worse is halved.
+    The evidence is of W kinds, (W, N, 4). Logistic regressions by Newton's method, all at once; a
+    step that makes one worse is halved.
     """
     mean, deviation = CALIBRATION
     signs = np.where(failed, 1.0, -1.0)
 
-    def posterior(weights: FloatArray) -> float:
-        prior = -0.5 * np.square((weights - mean) / deviation).sum()
-        return float(log_expit(signs * (evidence @ weights)).sum() + prior)
+    def posterior(evidence: FloatArray, weights: FloatArray) -> FloatArray:
+        prior = -0.5 * np.square((weights - mean) / deviation).sum(axis=1)
+        odds = (evidence @ weights[..., None])[..., 0]
+        return np.asarray(log_expit(signs * odds).sum(axis=1) + prior, dtype=np.float64)
 
-    weights, best = mean, posterior(mean)
+    weights = np.tile(mean, (len(evidence), 1))
+    best = posterior(evidence, weights)
+    open_ = np.arange(len(evidence))
     for _ in range(NEWTON_STEPS):
-        chance = expit(evidence @ weights)
-        slope = evidence.T @ (failed - chance) - (weights - mean) / deviation**2
-        spread = (evidence.T * (chance * (1.0 - chance))) @ evidence + np.diag(deviation**-2.0)
-        step = np.linalg.solve(spread, slope)
-        while (reached := posterior(weights + step)) < best and np.abs(step).max() > SURE:
-            step = 0.5 * step
-        if reached <= best:
+        of, now = evidence[open_], weights[open_]
+        chance = expit((of @ now[..., None])[..., 0])
+        slope = ((failed - chance)[:, None] @ of)[:, 0] - (now - mean) / deviation**2
+        spread = (of * (chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ of
+        step = np.linalg.solve(spread + np.diag(deviation**-2.0), slope[..., None])[..., 0]
+        reached = posterior(of, now + step)
+        while (worse := (reached < best[open_]) & (np.abs(step).max(axis=1) > SURE)).any():
+            step[worse] *= 0.5
+            reached[worse] = posterior(of[worse], now[worse] + step[worse])
+        better = reached > best[open_]
+        open_, now, reached = open_[better], (now + step)[better], reached[better]
+        if not len(open_):
             break
-        weights, best = weights + step, reached
+        weights[open_], best[open_] = now, reached
     return weights, best

@@ -186,7 +186,8 @@ class PredictionSkill:
         How far they are off is seen where they predicted; where nobody did, and to tell them from
         each other, what they now make of cases that they have not learned from has to do.
         """
-        off, own = [], []
+        off: list[tuple[Outcome, FloatArray]] = []
+        own: list[tuple[Outcome, FloatArray]] = []
         for outcome in outcomes:
             said = replayed.get(outcome.index)
             if outcome.prediction is not None:
@@ -196,28 +197,33 @@ class PredictionSkill:
             if said is not None:
                 own.append((outcome, said[:, None]))
         if off:
-            weight = self._weights([outcome for outcome, _ in off], level)
-            density = np.array([self._density(*one) for one in off])
-            self._mixture = np.array([_mixture(of, weight) for of in density.transpose(1, 0, 2)])
+            density, weight = self._densities(off), self._weights([o for o, _ in off], level)
+            self._mixture = np.array([_mixture(of, weight) for of in density])
         judges = own or off
         if judges:
             weight = self._weights([outcome for outcome, _ in judges], level)
-            density = np.array([self._density(*one) for one in judges]).transpose(1, 0, 2)
+            density = self._densities(judges)
             evidence = [weight @ np.log(of @ _mixture(of, weight)) for of in density]
             lead = np.exp(TEMPERED * (np.array(evidence) - max(evidence)))
             self.experts = lead / lead.sum()
 
-    def _density(self, outcome: Outcome, gaps_m: FloatArray) -> FloatArray:
-        """Return how likely a case's gap was with every width, and anywhere, (E, widths + 1).
+    def _densities(self, predicted: Sequence[tuple[Outcome, FloatArray]]) -> FloatArray:
+        """Return how likely each gap was with every width, and anywhere, (E, N, widths + 1).
 
-        By gaps, (E, G): a member of an expert is as good as any other.
+        By predicted gaps, (E, G) of each case: a member of an expert is as good as any other.
         """
-        true = compressed(np.array(outcome.signed_gap_m, dtype=np.float64), self._limit_m)
-        off = (true - compressed(gaps_m, self._limit_m))[..., None]
-        density = np.exp(-0.5 * np.square(off / WIDTHS)) / (WIDTHS * np.sqrt(2.0 * np.pi))
-        by_width = density.mean(axis=1)
-        anywhere = np.full((len(by_width), 1), 1.0 / REACH)
-        return np.asarray(np.concatenate([by_width, anywhere], axis=1), dtype=np.float64)
+        true_m = np.array([o.signed_gap_m for o, _ in predicted], dtype=np.float64)
+        true = compressed(true_m, self._limit_m)
+        experts = len(predicted[0][1])
+        densities = np.full((experts, len(predicted), len(WIDTHS) + 1), 1.0 / REACH)
+        members = np.array([gaps_m.shape[1] for _, gaps_m in predicted])
+        for count in np.unique(members).tolist():
+            places = np.flatnonzero(members == count)
+            gaps_m = np.array([predicted[place][1] for place in places])
+            off = (true[places, None, None] - compressed(gaps_m, self._limit_m))[..., None]
+            density = np.exp(-0.5 * np.square(off / WIDTHS)) / (WIDTHS * np.sqrt(2.0 * np.pi))
+            densities[:, places, :-1] = density.mean(axis=2).transpose(1, 0, 2)
+        return densities
 
     @staticmethod
     def _weights(outcomes: Sequence[Outcome], level: int) -> FloatArray:

@@ -53,6 +53,8 @@ class Twin:
         self._rollout = TwinRollout(pool, povs, criterion, lines)
         self._batch: dict[int, int] = {}
         self._steps: dict[int, Steps] = {}
+        self._learned: dict[int, tuple[int, ...]] = {}
+        """By group, the cases that its members learn from; empty after each new outcome."""
         self._others = self._observed_steps(others, own=False)
         self._experts = (*EXPERTS, *TAUGHT) if self._others else EXPERTS
         self._members: dict[tuple[int, int], tuple[tuple[int, ...], Any]] = {}
@@ -62,6 +64,7 @@ class Twin:
         """Take outcomes and their motions by index; an episode that went wrong teaches nothing."""
         new = [o for o in outcomes if not o.measures.end.is_error and o.index not in self._batch]
         watched = self._observed_steps([motions[o.index] for o in new])
+        self._learned.clear()
         for outcome, steps in zip(new, watched, strict=True):
             self._batch[outcome.index] = outcome.batch
             self._steps[outcome.index] = steps
@@ -129,7 +132,9 @@ class Twin:
 
     def _member(self, expert: int, group: int) -> Any:
         """Return what a member of an expert has learned by now."""
-        indices = self._learned_by(group)
+        if group not in self._learned:
+            self._learned[group] = self._learned_by(group)
+        indices = self._learned[group]
         known = self._members.get((expert, group))
         if known is None or known[0] != indices:
             cases = [steps for place, steps in enumerate(self._others) if place % GROUPS != group]
