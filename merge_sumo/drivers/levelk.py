@@ -177,7 +177,9 @@ class QNetwork:
         """
         hidden = inputs.astype(np.float32)
         for weight, bias in self._single[:-1]:
-            hidden = np.maximum(hidden @ weight + bias, 0.0)
+            hidden = hidden @ weight
+            hidden += bias
+            np.maximum(hidden, 0.0, out=hidden)
         weight, bias = self._single[-1]
         return np.asarray(hidden @ weight + bias, dtype=np.float32)
 

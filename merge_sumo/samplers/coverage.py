@@ -8,7 +8,6 @@ the batch is picked from them greedily.
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -20,7 +19,7 @@ from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spr
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, greedy
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.prediction_skill import PredictionSkill
+from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
 from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.fmc import radius_for
@@ -108,35 +107,54 @@ class CoverageSampler(Sampler):
         return gain / covered if covered > 0.0 else np.inf
 
     def _proposals(self, n: int) -> dict[int, Proposal]:
-        """Return the batch of each level on its own."""
-        return {level: self._propose(level, n) for level in self.pool.levels}
+        """Return the batch of each level on its own.
 
-    def _propose(self, level: int, n: int) -> Proposal:
+        The searches of the levels go in step, so that the predictor answers all of them at once.
+        """
         from threadpoolctl import threadpool_limits
 
-        history, rng = self.history(level), self.rng(level)
-        few = len(history.points) < FEWEST
+        proposals: dict[int, Proposal] = {}
+        searches = {level: self._propose(level, n) for level in self.pool.levels}
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
-            if self.predictor is None or not self.predictor.can_predict(level):
-                if few:
-                    chance = np.ones(n)
-                    spread = spread_out(n, history.dims, rng)
-                    return Proposal(spread, chance, chance, (None,) * n)
-                return _Search(history, rng, n).batch(n)
-            predict = partial(self.predictor.predict, level)
-            skill = self._skill(level, history)
-            if skill.is_worthless and not few:
-                return skill.annotated(_Search(history, rng, n).batch(n), predict)
-            return twin_guided_batch(history, n, rng, predict, skill)
+            answers: dict[int, FloatArray | None] = dict.fromkeys(searches)
+            while answers:
+                queries = {}
+                for level, gaps_m in answers.items():
+                    try:
+                        # A generator is begun by sending None.
+                        queries[level] = searches[level].send(gaps_m)  # type: ignore[arg-type]
+                    except StopIteration as ended:
+                        proposals[level] = ended.value
+                answers = {}
+                if queries and self.predictor is not None:
+                    gaps = self.predictor.predict(list(queries.values()))
+                    answers.update(zip(queries, gaps, strict=True))
+        return {level: proposals[level] for level in self.pool.levels}
 
-    def _skill(self, level: int, history: LevelHistory) -> PredictionSkill:
+    def _propose(self, level: int, n: int) -> Asking[Proposal]:
+        history, rng = self.history(level), self.rng(level)
+        few = len(history.points) < FEWEST
+        if self.predictor is None or not self.predictor.can_predict(level):
+            if few:
+                chance = np.ones(n)
+                spread = spread_out(n, history.dims, rng)
+                return Proposal(spread, chance, chance, (None,) * n)
+            return _Search(history, rng, n).batch(n)
+        skill = yield from self._skill(level, history)
+        if skill.is_worthless and not few:
+            batch = _Search(history, rng, n).batch(n)
+            gaps_m = yield Query(level, batch.points)
+            return skill.annotated(batch, gaps_m)
+        return (yield from twin_guided_batch(history, n, rng, level, skill))
+
+    def _skill(self, level: int, history: LevelHistory) -> Asking[PredictionSkill]:
         """Return the skill of the predictions so far, of all levels."""
         last = self.observed(level)[-REPLAYED:]
         replayed: dict[int, FloatArray] = {}
-        if last and self.predictor is not None:
+        if last:
             indices = [outcome.index for outcome in last]
-            gaps_m = self.predictor.predict_held_out(level, indices, history.points[-REPLAYED:])
+            gaps_m = yield Query(level, history.points[-REPLAYED:], held_out=indices)
             replayed = dict(zip(indices, gaps_m.T, strict=True))
         outcomes = self.observed()
         # The stand-in for a gap under another criterion has the limit of the paper's scenario.

@@ -8,9 +8,9 @@ in the record: what they had said of the cases that have run since.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Final, Protocol
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +49,27 @@ EDGE: Final = float(np.arcsinh(1.0))
 """The limit of a failure on the scale of `compressed`."""
 
 
-PredictGaps = Callable[..., FloatArray]
-"""Predicts the gaps of cases of one level: see `Predictor.predict`."""
+@dataclass(frozen=True, slots=True)
+class Query:
+    """Cases of one level whose gaps are to be predicted.
+
+    Attributes:
+        level: that of the POV.
+        points: cases, (n, d), of the unit cube.
+        screening: the one expert of which one member predicts; None for all members of all experts.
+        held_out: indices of the cases where they were told before: each case is predicted by a
+            member of each expert that has not learned from the case.
+    """
+
+    level: int
+    points: FloatArray
+    screening: int | None = None
+    held_out: Sequence[int] = ()
+
+
+R = TypeVar("R")
+Asking = Generator[Query, FloatArray, R]
+"""Yields queries, is sent the gaps of each, and returns a result."""
 
 
 class Predictor(Protocol):
@@ -62,18 +81,10 @@ class Predictor(Protocol):
     def can_predict(self, level: int) -> bool:
         """Return whether the outcomes so far suffice to predict cases of a level."""
 
-    def predict(self, level: int, points: FloatArray, screening: int | None = None) -> FloatArray:
-        """Return the gaps at M in m of cases, (n, d), of the unit cube, as (E, G, n).
+    def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
+        """Return the gaps at M in m of each query; NaN where the VUT never arrives.
 
-        NaN where the VUT never arrives. `screening` is the one expert of which one member predicts.
-        """
-
-    def predict_held_out(
-        self, level: int, indices: Sequence[int], points: FloatArray
-    ) -> FloatArray:
-        """Return the gaps at M in m, (E, n), of cases told before, by their indices.
-
-        Each case is predicted by a member of each expert that has not learned from the case.
+        They are (E, G, n), (1, 1, n) where one member screens, and (E, n) of cases held out.
         """
 
 
@@ -161,9 +172,8 @@ class PredictionSkill:
         said = compressed(gaps_m, self._limit_m).reshape(-1, gaps_m.shape[-1])
         return np.asarray(said.std(axis=0) * np.exp(-0.25 * np.square(np.median(said, axis=0))))
 
-    def annotated(self, proposal: Proposal, predict: PredictGaps) -> Proposal:
+    def annotated(self, proposal: Proposal, gaps_m: FloatArray) -> Proposal:
         """Return a proposal of the surrogate's with what rollouts say of it, which may change."""
-        gaps_m = predict(proposal.points)
         said = tuple(
             Prediction.of(gaps_m[..., i], float(p), float(chance), float(chance))
             for i, (p, chance) in enumerate(

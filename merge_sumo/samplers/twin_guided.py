@@ -19,7 +19,7 @@ from merge_sumo.samplers.candidates import (
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, Proposal, greedy
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.prediction_skill import PredictGaps, PredictionSkill
+from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.prediction import Prediction
@@ -50,17 +50,18 @@ def twin_guided_batch(
     history: LevelHistory,
     n: int,
     rng: np.random.Generator,
-    predict: PredictGaps,
+    level: int,
     skill: PredictionSkill,
-) -> Proposal:
+) -> Asking[Proposal]:
     """Return a batch of `n` cases of a level that the predictor can predict.
 
     P(fail) of a candidate is that of the twin and that of the surrogate, weighted by the skill of
     the predictions so far. Without outcomes at the level there is no surrogate, and half of the
     batch is spread over the cube.
     """
-    candidates = _Candidates(history, predict, skill)
-    candidates.add(_first_candidates(candidates, history, n, rng))
+    candidates = _Candidates(history, level, skill)
+    first_points = yield from _first_candidates(candidates, history, n, rng)
+    yield from candidates.add(first_points)
     reach = REFINED_REACH * radius_for(history.dims)
     for _ in range(ROUNDS):
         batch, _ = greedy(
@@ -68,12 +69,12 @@ def twin_guided_batch(
         )
         best = candidates.best(candidates.points, candidates.p_fail, n)
         centres = np.concatenate([best, candidates.points[batch]])
-        candidates.add(around(centres, REFINED, reach, rng))
+        yield from candidates.add(around(centres, REFINED, reach, rng))
     first: list[int] = []
     if candidates.surrogate is None:
         spread = spread_out(n - n // 2, history.dims, rng)
         first = [*range(len(candidates.points), len(candidates.points) + len(spread))]
-        candidates.add(spread)
+        yield from candidates.add(spread)
         candidates.grid.cover(candidates.grid.balls(spread), PICKED)
     explores = n >= EXPLORES_FROM and not skill.is_doubted
     information = skill.disagreement(candidates.gaps_m) if explores else None
@@ -96,8 +97,8 @@ class _Candidates:
         p_fail: P(fail) by twin and surrogate together, (m,).
     """
 
-    def __init__(self, history: LevelHistory, predict: PredictGaps, skill: PredictionSkill) -> None:
-        self.predict, self.skill = predict, skill
+    def __init__(self, history: LevelHistory, level: int, skill: PredictionSkill) -> None:
+        self.level, self.skill = level, skill
         self.grid = CoverageGrid(history.dims)
         self.grid.cover(self.grid.balls(history.points[history.failed]), 1.0)
         self.surrogate = Belief(history) if len(history.points) >= FEWEST else None
@@ -113,9 +114,9 @@ class _Candidates:
     def p_fail(self) -> FloatArray:
         return self._predictions[-1]
 
-    def add(self, points: FloatArray) -> None:
+    def add(self, points: FloatArray) -> Asking[None]:
         """Add candidates, (k, d), with the predictions of all members."""
-        gaps_m = self.predict(points)
+        gaps_m = yield Query(self.level, points)
         p_twin = self.skill.chance(gaps_m)
         p_surrogate = (
             p_twin if self.surrogate is None else self.surrogate_chance(self.surrogate, points)
@@ -153,7 +154,7 @@ class _Candidates:
 
 def _first_candidates(
     candidates: _Candidates, history: LevelHistory, n: int, rng: np.random.Generator
-) -> FloatArray:
+) -> Asking[FloatArray]:
     """Return the candidates, (m, d), that all members predict first.
 
     One member of one expert screens many; the surrogate chooses among its own.
@@ -171,6 +172,7 @@ def _first_candidates(
         screened.append(around(failing, NEAR, LOCAL_REACH * radius_for(history.dims), rng))
     points = np.concatenate(screened)
     expert = skill.expert(rng)
-    chance = skill.chance(candidates.predict(points, expert), expert)
+    gaps_m = yield Query(candidates.level, points, screening=expert)
+    chance = skill.chance(gaps_m, expert)
     chosen.append(candidates.best(points, chance, SCREENED))
     return np.concatenate(chosen)

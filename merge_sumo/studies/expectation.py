@@ -24,6 +24,7 @@ from merge_sumo.engine.povs import Povs
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.samplers.prediction_skill import Query
 from merge_sumo.studies.versions import levels_of
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
@@ -106,7 +107,7 @@ def nearness(twin: Twin, level: int, points: FloatArray, limit_m: float) -> Floa
     the members of the twin.
     """
     parts = np.array_split(points, len(points) // MOST_CASES + 1)
-    gaps_m = np.concatenate([twin.predict(level, part) for part in parts], axis=-1)
+    gaps_m = np.concatenate([twin.predict([Query(level, part)])[0] for part in parts], axis=-1)
     far = np.nan_to_num(np.abs(gaps_m), nan=np.inf) / (2.0 * limit_m)
     return np.asarray(np.clip(1.0 - far, 0.0, 1.0).mean(axis=(0, 1)), dtype=np.float64)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,11 +20,25 @@ from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
 from merge_sumo.values.trajectory import End, Trajectory
 
-Answer = Callable[[Inputs, int, NDArray[np.int64]], FloatArray]
-"""Gives accelerations of the VUT, (R,), by inputs, (R, inputs), of which some are of the present,
-and the numbers of the rows, (R,), in rising order."""
+Answer = Callable[[Inputs], FloatArray]
+"""Gives accelerations of the VUT, (R,), by inputs, (R, inputs)."""
 STILL: Final = 0.8
 """Share of rows that still move below which the others are dropped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Starts:
+    """Cases of one level to roll out.
+
+    Attributes:
+        level: that of the POV.
+        points: cases, (n, d), of the unit cube.
+        labels: further inputs of the answer, (L, n), the same number for all `Starts` together.
+    """
+
+    level: int
+    points: FloatArray
+    labels: Inputs | None = None
 
 
 class TwinRollout:
@@ -71,23 +86,26 @@ class TwinRollout:
             x_m[BEHIND] = x_m[POV] - values["headway_behind_s"] * v_mps[POV]
         return x_m, v_mps, values.get("svo_rad", np.zeros(n))
 
-    def play(self, points: FloatArray, level: int, answer: Answer) -> FloatArray:
-        """Return the gaps at M to the cars that are nearest there, (R,), of cases, (R, d).
+    def play(self, starts: Sequence[Starts], answer: Answer) -> list[FloatArray]:
+        """Return the gaps at M to the cars that are nearest there, (n,) for each of the starts.
 
-        Cases are points of the unit cube; NaN where the VUT never arrives. Under another criterion
-        than the paper's it is what stands for the gap: see `Outcome.signed_gap_m`.
+        All step together, as arrays. NaN where the VUT never arrives. Under another criterion than
+        the paper's it is what stands for the gap: see `Outcome.signed_gap_m`.
         """
-        if not self._criterion.is_papers:
-            return self._judged(points, level, answer)
-        return self._play(points, level, answer)
+        if self._criterion.is_papers:
+            gap_m = self._play(starts, answer)
+        else:
+            gap_m = self._judged(starts, answer)
+        return np.split(gap_m, np.cumsum([len(some.points) for some in starts])[:-1])
 
-    def _judged(self, points: FloatArray, level: int, answer: Answer) -> FloatArray:
+    def _judged(self, starts: Sequence[Starts], answer: Answer) -> FloatArray:
         """Return what stands for the gaps at M, (R,)."""
         played: list[FloatArray] = []
-        gap_m = self._play(points, level, answer, played)
+        gap_m = self._play(starts, answer, played)
         motion = np.array(played)
-        found = np.empty(len(points))
-        for row, case in enumerate(self._pool.cases(points, level)):
+        found = np.empty(len(gap_m))
+        cases = [case for some in starts for case in self._pool.cases(some.points, some.level)]
+        for row, case in enumerate(cases):
             arrived = motion[:, VUT, 0, row] >= 0.0
             last = int(arrived.argmax()) if arrived.any() else len(motion) - 1
             of_row = motion[: last + 1, :, :, row].copy()
@@ -99,29 +117,33 @@ class TwinRollout:
 
     def _play(
         self,
-        points: FloatArray,
-        level: int,
+        starts: Sequence[Starts],
         answer: Answer,
         played: list[FloatArray] | None = None,
     ) -> FloatArray:
         """Return the gaps at M, (R,); add every step, (A, 3, R), to what is `played`."""
         scenario = self._scenario
-        x_m, v_mps, svo_rad = self._starts(points, level)
-        rows = np.arange(len(points))
+        begun = [self._starts(some.points, some.level) for some in starts]
+        x_m, v_mps, svo_rad = (np.concatenate(each, axis=-1) for each in zip(*begun, strict=True))
+        levels = np.repeat([some.level for some in starts], [len(some.points) for some in starts])
+        rows = np.arange(len(levels))
         gap_m = np.full(len(rows), np.nan)
         cars = [row for row in range(len(x_m)) if row != VUT]
         a_mps2 = np.zeros_like(x_m)
         held = np.zeros((len(cars), len(rows)))
-        observation = Observation(scenario, len(rows))
+        labels = [some.labels for some in starts if some.labels is not None]
+        observation = Observation(
+            scenario, len(rows), np.concatenate(labels, axis=1) if labels else None
+        )
         taken_m, decel = scenario.pov_length_m + scenario.min_gap_m, -scenario.a_min_mps2
         for step in range(scenario.max_steps):
             inputs = observation.see(x_m, v_mps, a_mps2[VUT])
-            if level and step % DECISION_STEPS == 0:
-                held = self._decide(x_m[cars], v_mps[cars], x_m[VUT], v_mps[VUT], svo_rad, level)
+            if step % DECISION_STEPS == 0:
+                self._decide(held, x_m[cars], v_mps[cars], x_m[VUT], v_mps[VUT], svo_rad, levels)
             a_mps2[cars] = held
             if len(cars) > 1:
                 keep_safe(a_mps2, x_m, v_mps, taken_m, decel, scenario.tau_s)
-            a_mps2[VUT] = answer(inputs, observation.now, rows)
+            a_mps2[VUT] = answer(inputs)
             a_mps2 = np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2)
             v_next = np.maximum(v_mps + a_mps2 * DT_S, 0.0)
             x_before_m, x_m = x_m, x_m + v_mps * DT_S
@@ -141,7 +163,7 @@ class TwinRollout:
                 if not going.any():
                     break
                 if played is None and going.mean() < STILL:
-                    rows, svo_rad = rows[going], svo_rad[going]
+                    rows, levels, svo_rad = rows[going], levels[going], svo_rad[going]
                     x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
                     held = held[:, going]
                     observation.keep(going)
@@ -151,23 +173,27 @@ class TwinRollout:
 
     def _decide(
         self,
+        held_mps2: FloatArray,
         x_m: FloatArray,
         v_mps: FloatArray,
         x_vut_m: FloatArray,
         v_vut_mps: FloatArray,
         svo_rad: FloatArray,
-        level: int,
-    ) -> FloatArray:
-        """Return what the cars of the mainline choose, (C, R)."""
-        network, cars = self._networks[level], len(x_m)
-        seen = features(
-            x_m.ravel(),
-            v_mps.ravel(),
-            np.tile(x_vut_m, cars),
-            np.tile(v_vut_mps, cars),
-            np.tile(svo_rad, cars) if network.sees_svo else None,
-            scenario=self._scenario,
-        )
-        chosen = network.values_at_once(seen).argmax(axis=1)
-        actions: FloatArray = actions_mps2(self._scenario)[chosen].reshape(x_m.shape)
-        return actions
+        levels: NDArray[np.int64],
+    ) -> None:
+        """Write what the cars of the mainline choose, (C, R), by the levels of the rows, (R,)."""
+        cars = len(x_m)
+        for level, network in self._networks.items():
+            of = np.flatnonzero(levels == level)
+            if not len(of):
+                continue
+            seen = features(
+                x_m[:, of].ravel(),
+                v_mps[:, of].ravel(),
+                np.tile(x_vut_m[of], cars),
+                np.tile(v_vut_mps[of], cars),
+                np.tile(svo_rad[of], cars) if network.sees_svo else None,
+                scenario=self._scenario,
+            )
+            chosen = network.values_at_once(seen).argmax(axis=1)
+            held_mps2[:, of] = actions_mps2(self._scenario)[chosen].reshape(cars, -1)

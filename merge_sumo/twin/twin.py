@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.engine.povs import Povs
-from merge_sumo.twin.experts import GROUPS, Expert, Steps
-from merge_sumo.twin.observation import Inputs, Observation
-from merge_sumo.twin.rollout import TwinRollout
+from merge_sumo.samplers.prediction_skill import Query
+from merge_sumo.twin.experts import GROUPS, LABELS, Expert, Forest, Steps
+from merge_sumo.twin.observation import HISTORY, Observation
+from merge_sumo.twin.rollout import Starts, TwinRollout
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
@@ -50,6 +51,7 @@ class Twin:
         `others` are motions, (T + 1, A, 3), of campaigns that are learned from.
         """
         self._pool, self._seed = pool, seed
+        self._now = Observation(pool.scenario, 0).now
         self._rollout = TwinRollout(pool, povs, criterion, lines)
         self._batch: dict[int, int] = {}
         self._steps: dict[int, Steps] = {}
@@ -59,6 +61,8 @@ class Twin:
         self._experts = (*EXPERTS, *TAUGHT) if self._others else EXPERTS
         self._members: dict[tuple[int, int], tuple[tuple[int, ...], Any]] = {}
         """By expert and group: from which cases it has learned, and what."""
+        self._asks: tuple[list[Any], Forest] | None = None
+        """The trees of all members, and the forest of them."""
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
         """Take outcomes and their motions by index; an episode that went wrong teaches nothing."""
@@ -74,58 +78,64 @@ class Twin:
         known = len(self._steps) >= FEWEST or bool(self._others)
         return known and self._rollout.can_predict(level)
 
-    def predict(self, level: int, points: FloatArray, screening: int | None = None) -> FloatArray:
-        """Return gaps at M, (E, G, n), of cases, (n, d), of the unit cube; see `Predictor`."""
-        experts = self._speakers()
-        if screening is None:
-            members = [(e, g) for e in experts for g in range(GROUPS)]
-        else:
-            members = [(experts[screening], self._last_batch() % GROUPS)]
-        everywhere = [np.arange(len(points))] * len(members)
-        gaps_m = np.array(self._played(level, points, members, everywhere))
-        return gaps_m.reshape(-1, 1 if screening is not None else GROUPS, len(points))
+    def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
+        """Return the gaps at M of each query; see `Predictor`.
+
+        All queries together are one rollout: each row is a case and the member that drives in it.
+        """
+        asked = [self._asked(query) for query in queries]
+        starts = []
+        for query, (members, places) in zip(queries, asked, strict=True):
+            labels = np.ones((LABELS, sum(map(len, places))), dtype=np.float32)
+            labels[-1] = np.repeat(members, list(map(len, places)))
+            starts.append(Starts(query.level, query.points[np.concatenate(places)], labels))
+        gaps_m = self._rollout.play(starts, self._forest().answer)
+        return [
+            self._answer(query, places, found)
+            for query, (_, places), found in zip(queries, asked, gaps_m, strict=True)
+        ]
+
+    def _asked(self, query: Query) -> tuple[list[int], list[NDArray[np.int64]]]:
+        """Return the numbers of the members that a query asks, and which of the points each."""
+        everywhere = np.arange(len(query.points))
+        if query.screening is not None:
+            member = query.screening * GROUPS + self._last_batch() % GROUPS
+            return [member], [everywhere]
+        members = list(range(len(self._experts) * GROUPS))
+        if not query.held_out:
+            return members, [everywhere] * len(members)
+        group = np.array(query.held_out) % GROUPS
+        return members, [np.flatnonzero(group == member % GROUPS) for member in members]
+
+    def _answer(
+        self, query: Query, places: Sequence[NDArray[np.int64]], found_m: FloatArray
+    ) -> FloatArray:
+        """Return the gaps that a query asks for by those of its rows."""
+        if not query.held_out:
+            groups = GROUPS if query.screening is None else 1
+            return found_m.reshape(-1, groups, len(query.points))
+        gaps_m = np.empty((len(self._experts), len(query.points)))
+        expert = np.repeat(np.arange(len(places)) // GROUPS, list(map(len, places)))
+        gaps_m[expert, np.concatenate(places)] = found_m
+        return gaps_m
 
     def _speakers(self) -> list[int]:
         """Return who speaks for each expert: who knows nothing of this VUT lets others speak."""
         first = 0 if self._steps else len(EXPERTS)
         return [max(e, e % len(EXPERTS) + first) for e in range(len(self._experts))]
 
-    def _played(
-        self,
-        level: int,
-        points: FloatArray,
-        members: Sequence[tuple[int, int]],
-        places: Sequence[NDArray[np.int64]],
-    ) -> list[FloatArray]:
-        """Return for each member the gaps at M, (n,), of the places among points that it plays."""
-        trees = [self._member(e, g) for e, g in members]
-        cuts = np.cumsum([0, *map(len, places)])
-
-        def answer(inputs: Inputs, now: int, rows: NDArray[np.int64]) -> FloatArray:
-            answers = np.empty(len(rows))
-            first, *ends = np.searchsorted(rows, cuts).tolist()
-            for (e, _), tree, last in zip(members, trees, ends, strict=True):
-                if first < last:
-                    seen = self._experts[e].sees(inputs[first:last], now)
-                    answers[first:last] = tree.predict(seen)[:, 0]
-                first = last
-            return answers
-
-        gaps_m = self._rollout.play(points[np.concatenate(places)], level, answer)
-        return np.split(gaps_m, cuts[1:-1])
-
-    def predict_held_out(
-        self, level: int, indices: Sequence[int], points: FloatArray
-    ) -> FloatArray:
-        """Return gaps at M, (E, n), by members that have not learned from these cases."""
-        group = np.array(indices) % GROUPS
-        members = [(e, g) for e in self._speakers() for g in range(GROUPS)]
-        places = [np.flatnonzero(group == g) for _, g in members]
-        gaps_m = self._played(level, points, members, places)
-        found = np.empty((len(self._experts), len(points)))
-        for number, (place, gaps) in enumerate(zip(places, gaps_m, strict=True)):
-            found[number // GROUPS, place] = gaps
-        return found
+    def _forest(self) -> Forest:
+        """Return the trees of all members, those of an expert together."""
+        speakers = self._speakers()
+        trees = [self._member(e, g) for e in speakers for g in range(GROUPS)]
+        if self._asks is None or any(
+            one is not other for one, other in zip(self._asks[0], trees, strict=True)
+        ):
+            inputs = self._now + HISTORY
+            places = [self._experts[e].places(self._now, inputs) for e in speakers]
+            places = [place for place in places for _ in range(GROUPS)]
+            self._asks = trees, Forest(trees, places, inputs + LABELS)
+        return self._asks[1]
 
     def _last_batch(self) -> int:
         return max(self._batch.values(), default=0)

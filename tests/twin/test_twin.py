@@ -26,7 +26,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.coverage import CoverageSampler
-from merge_sumo.samplers.prediction_skill import PredictionSkill
+from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
 from merge_sumo.studies.expectation import (
     EXPECTED,
     learned_twin,
@@ -37,8 +37,9 @@ from merge_sumo.studies.expectation import (
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.records import decode, to_plain
 from merge_sumo.testing.contracts import bare_measures
+from merge_sumo.twin.experts import GROUPS, Expert, Forest, Steps
 from merge_sumo.twin.observation import NOW, Observation
-from merge_sumo.twin.rollout import TwinRollout
+from merge_sumo.twin.rollout import Starts, TwinRollout
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import MergeCase, Pool, to_unit
 from merge_sumo.values.criterion import Criterion
@@ -90,10 +91,10 @@ class TestGames:
             Pool(levels=(level,), scenario=scenario), Povs(policies=policies_of(scenario))
         )
 
-        def slows(inputs, now, rows):
+        def slows(inputs):
             return np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
 
-        found = games.play(points, level, slows)
+        found = games.play([Starts(level, points)], slows)[0]
         assert np.isfinite(found).any()
         # The POV decides in float32 here: one that has no preference may choose otherwise.
         off = np.abs(found - gaps_of(outcomes)) > 1e-6
@@ -102,8 +103,8 @@ class TestGames:
     def test_go_on_until_the_timeout_for_a_vut_that_stops(self):
         pool = Pool(levels=(0,), scenario=US23)
         found = TwinRollout(pool, POVS).play(
-            np.full((3, 2), 0.5), 0, lambda inputs, now, rows: np.full(len(rows), -4.0)
-        )
+            [Starts(0, np.full((3, 2), 0.5))], lambda inputs: np.full(len(inputs), -4.0)
+        )[0]
         assert np.isnan(found).all()
 
     @pytest.mark.parametrize(
@@ -118,8 +119,8 @@ class TestGames:
         lines = centre_lines(road)
         expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap_m for one in done]
         found = TwinRollout(pool, POVS, criterion, lines).play(
-            points, 0, lambda inputs, now, rows: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
-        )
+            [Starts(0, points)], lambda inputs: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
+        )[0]
         assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)
         assert (np.abs(found) < 6.0).any()
 
@@ -152,13 +153,32 @@ class TestWatching:
         assert again.tolist() == alone.see(x[:, 1:] + 2.0, v[:, 1:], np.ones(1)).tolist()
 
 
+class TestForest:
+    @pytest.mark.parametrize("count", [1, 2, 5, 8])
+    def test_answers_as_each_of_its_trees(self, count):
+        rng = np.random.default_rng(count)
+        cases = [
+            Steps(rng.random((30, 6)).astype(np.float32), 4, rng.random(30), own=bool(index))
+            for index in range(2)
+        ]
+        experts = [Expert(history=bool(k % 2), others=k > 2) for k in range(count)]
+        trees = [expert.learn(cases, seed) for seed, expert in enumerate(experts)]
+        forest = Forest(trees, [expert.places(4, 6) for expert in experts], 8)
+        inputs = rng.random((50, 8)).astype(np.float32)
+        inputs[:, 6] = 1.0
+        for number, (expert, tree) in enumerate(zip(experts, trees, strict=True)):
+            inputs[:, 7] = number
+            alone = tree.predict(expert.sees(inputs[:, :6], 4))[:, 0]
+            assert forest.answer(inputs).tolist() == alone.tolist()
+
+
 class TestTwin:
     def test_predicts_cases_that_it_has_not_seen(self, seen):
         outcomes, motions = seen
         twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0)
         twin.tell(outcomes[:40], motions)
         points = np.random.default_rng(3).random((60, 2))[40:]
-        found = twin.predict(0, points)
+        found = twin.predict([Query(0, points)])[0]
         assert found.shape == (2, 4, 20)
         off = np.abs(np.median(found, axis=(0, 1)) - gaps_of(outcomes[40:]))
         assert np.median(off) < 1.0
@@ -166,12 +186,32 @@ class TestTwin:
     def test_says_the_same_however_it_was_told(self, seen):
         outcomes, motions = seen
         points = np.random.default_rng(4).random((7, 2))
+        query = Query(0, points)
         at_once, in_parts = (Twin(Pool(levels=(0,), scenario=US23), POVS, 5) for _ in range(2))
         at_once.tell(outcomes, motions)
         in_parts.tell(outcomes[30:], motions)
-        in_parts.predict(0, points)
+        in_parts.predict([query])
         in_parts.tell(outcomes[:40], motions)
-        assert (at_once.predict(0, points) == in_parts.predict(0, points)).all()
+        assert (at_once.predict([query])[0] == in_parts.predict([query])[0]).all()
+
+    def test_answers_queries_together_as_alone(self, seen):
+        outcomes, motions = seen
+        twin = Twin(Pool(levels=(0, 2), scenario=US23), POVS, 0)
+        twin.tell(outcomes, motions)
+        rng = np.random.default_rng(5)
+        queries = [
+            Query(0, rng.random((9, 2)), screening=1),
+            Query(2, rng.random((7, 3))),
+            Query(0, np.array([to_unit([o.case], 0, scenario=US23)[0] for o in outcomes[:6]])),
+        ]
+        queries.append(replace(queries[-1], held_out=range(6)))
+        together = twin.predict(queries)
+        assert [found.shape for found in together] == [(1, 1, 9), (2, 4, 7), (2, 4, 6), (2, 6)]
+        for query, found in zip(queries, together, strict=True):
+            assert twin.predict([query])[0] == pytest.approx(found, nan_ok=True)
+        assert together[3] == pytest.approx(
+            together[2][:, np.arange(6) % GROUPS, np.arange(6)], nan_ok=True
+        )
 
     def test_replays_a_case_by_who_has_not_learned_from_it(self, seen):
         outcomes, motions = seen
@@ -181,10 +221,7 @@ class TestTwin:
         plain, taught = (Twin(Pool(levels=(0,), scenario=US23), POVS, 0) for _ in range(2))
         plain.tell(outcomes[:40], motions)
         taught.tell(outcomes[:40], odd)
-        same = [
-            plain.predict_held_out(0, [8], points[8:9]),
-            taught.predict_held_out(0, [8], points[8:9]),
-        ]
+        same = [twin.predict([Query(0, points[8:9], held_out=[8])])[0] for twin in (plain, taught)]
         assert same[0].tolist() == same[1].tolist()
 
     @pytest.mark.parametrize("size", some([60, 20, 7], 7))
@@ -193,7 +230,7 @@ class TestTwin:
         twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0)
         many = [replace(o, index=k, batch=k // size) for k, o in enumerate(outcomes * 3)]
         twin.tell(many, {o.index: motions[o.index % len(outcomes)] for o in many})
-        assert twin.predict(0, np.full((1, 2), 0.5)).shape == (2, 4, 1)
+        assert twin.predict([Query(0, np.full((1, 2), 0.5))])[0].shape == (2, 4, 1)
 
     def test_needs_some_cases_and_learns_nothing_from_errors(self, seen):
         outcomes, motions = seen
@@ -211,10 +248,9 @@ class TestTwin:
         outcomes, motions = seen
         twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0, list(motions.values()))
         assert twin.can_predict(0)
-        off = np.abs(
-            np.median(twin.predict(0, np.random.default_rng(3).random((60, 2))), axis=(0, 1))
-            - gaps_of(outcomes)
-        )
+        points = np.random.default_rng(3).random((60, 2))
+        found = twin.predict([Query(0, points)])[0]
+        off = np.abs(np.median(found, axis=(0, 1)) - gaps_of(outcomes))
         assert np.median(off) < 1.0
 
 
