@@ -229,7 +229,7 @@ class PredictionSkill:
         members = np.array([gaps_m.shape[1] for _, gaps_m in predicted])
         for count in np.unique(members).tolist():
             places = np.flatnonzero(members == count)
-            gaps_m = np.array([predicted[place][1] for place in places])
+            gaps_m = np.array([predicted[place][1] for place in places.tolist()])
             off = (true[places, None, None] - compressed(gaps_m, self._limit_m))[..., None]
             density = np.exp(-0.5 * np.square(off / WIDTHS)) / (WIDTHS * np.sqrt(2.0 * np.pi))
             densities[:, places, :-1] = density.mean(axis=2).transpose(1, 0, 2)
