@@ -39,7 +39,6 @@ class ChildDiedError(Exception):
     """
 
     def __init__(self, how: str, *, killed: bool = False) -> None:
-        """Take how it ended."""
         super().__init__(how)
         self.killed = killed
 
@@ -48,7 +47,6 @@ class Channel:
     """Messages in JSON over one end of a pair of sockets."""
 
     def __init__(self, end: socket.socket) -> None:
-        """Take an end."""
         self.end = end
 
     def send(self, message: Mapping[str, Any]) -> None:
@@ -110,7 +108,6 @@ class SumoChild:
     """
 
     def __init__(self, main: str, folder: Path, settings: Mapping[str, Any]) -> None:
-        """Start it."""
         ours, theirs = socket.socketpair()
         self.channel = Channel(ours)
         self._folder = folder

@@ -72,7 +72,6 @@ class Window:
     """
 
     def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
-        """Look for a display; the window opens with the world."""
         check_display()
         self.TraCIException: type[Exception] = RefusedByWindowError
         self.FatalTraCIError: type[Exception] = _NeverError
@@ -166,11 +165,9 @@ class Window:
         self._opened.close()
 
     def __enter__(self) -> Self:
-        """Return the window."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the window."""
         self.close()
 
     def _colour(self) -> None:

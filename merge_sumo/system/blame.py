@@ -24,7 +24,6 @@ class Blame(Generic[T]):
     """Counts the deaths of items of work, and says of each whose doing it was."""
 
     def __init__(self) -> None:
-        """Nothing has died."""
         self._deaths: Counter[T] = Counter()
 
     def died(

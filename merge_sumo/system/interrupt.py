@@ -23,7 +23,6 @@ class Stopped(BaseException):
     """A signal asked to stop. Not an `Exception`: no VUT that swallows errors swallows this."""
 
     def __init__(self, number: int) -> None:
-        """Take the number of the signal."""
         super().__init__(signal.Signals(number).name)
         self.number = number
 
@@ -58,12 +57,10 @@ class Interrupt:
         os.write(STDERR, self._note)
 
     def __enter__(self) -> Self:
-        """Take over the signals."""
         self._before = [signal.signal(number, self._handle) for number in SIGNALS]
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give the signals back."""
         for number, handler in zip(SIGNALS, self._before, strict=True):
             signal.signal(number, handler)
 

@@ -18,7 +18,6 @@ class Pulse:
     """Ticks in a thread while it is entered; a tick that comes late is a pause."""
 
     def __init__(self) -> None:
-        """Do not tick yet."""
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._tick, daemon=True)
         self._last_s = monotonic()
@@ -29,13 +28,11 @@ class Pulse:
         return self._pauses + (monotonic() - self._last_s > PAUSE_S)
 
     def __enter__(self) -> Self:
-        """Begin to tick."""
         self._last_s = monotonic()
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the thread."""
         self._end.set()
         self._thread.join()
 
@@ -50,7 +47,6 @@ class AwakeClock:
     """Seconds in which this process ran, for a loop that looks at it every `most_s` or sooner."""
 
     def __init__(self, most_s: float) -> None:
-        """Begin at 0."""
         self._most_s, self._last_s, self._awake_s = most_s, monotonic(), 0.0
 
     def restart(self) -> None:

@@ -82,19 +82,15 @@ class Registry(Mapping[str, T], Generic[T]):
         return sorted({package for found in self._entries().values() for package in found})
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names; nothing is imported."""
         return iter(dict.fromkeys((*self._ours, *self._registered, *self._entries())))
 
     def __len__(self) -> int:
-        """Return the number of names."""
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        """Return whether a name is known; nothing is imported."""
         return name in self._ours or name in self._registered or name in self._entries()
 
     def __getitem__(self, name: str) -> T:
-        """Return the object of a name, which is imported if need be."""
         bringers: dict[str, EntryPoint | T] = dict(self._entries().get(name, {}))
         if name in self._ours:
             bringers[OURS] = self._ours[name]

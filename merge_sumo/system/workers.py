@@ -178,7 +178,6 @@ class Workers:
             return future
 
     def __enter__(self) -> Self:
-        """Return the workers."""
         return self
 
     def __exit__(self, *exception: Any) -> None:
@@ -295,7 +294,6 @@ class LocalProcesses(ProcessPoolExecutor):
     """
 
     def __init__(self, workers: int, preload: str | None = None) -> None:
-        """Start a number of workers; they get ready while this process does."""
         spawn = multiprocessing.get_context("spawn")
         with without_cwd():  # its locks have a process of their own
             super().__init__(workers, spawn, _begin_worker, (preload,))

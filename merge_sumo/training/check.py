@@ -197,7 +197,6 @@ class QuickRegret:
     """
 
     def __init__(self, game: Game, *, sees_svo: bool, starts: int = 100) -> None:
-        """Draw the starts."""
         rng = np.random.default_rng(CHECK_SEED + 1)
         self._game = game
         self._start = pool_starts(starts, rng, game.scenario)

@@ -54,7 +54,6 @@ class VutOptions:
     policies: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if not _is_positive(self.deadline_s):
             raise UserError(f"--deadline is {self.deadline_s!r}: give seconds, more than 0")
         if not _is_positive(self.memory_gib):
@@ -89,8 +88,7 @@ class Vut:
 def split_options(argument: str, spec: str) -> tuple[str, dict[str, str]]:
     """Return what stands before "?", and the options NAME=VALUE behind it, joined by "&".
 
-    Raises:
-        UserError: for what is no option, and for one that is given twice.
+    Raises `UserError` for what is no option, and for one that is given twice.
     """
     before, _, text = argument.partition("?")
     options: dict[str, str] = {}
@@ -206,7 +204,6 @@ class Deadline:
     _restore: Callable[[], None] | None = field(default=None, repr=False)
 
     def __enter__(self) -> Self:
-        """Start the timer; what the VUT prints goes to standard error."""
         self._stdout, sys.stdout = sys.stdout, sys.stderr
         if hasattr(signal, "setitimer") and (threading.current_thread() is threading.main_thread()):
             handler = signal.signal(signal.SIGALRM, self._ring)
@@ -220,7 +217,6 @@ class Deadline:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the timer."""
         current_call.note(NO_CORRIDOR)
         if self._restore is not None:
             self._restore()
@@ -249,11 +245,7 @@ class Deadline:
         return answer
 
     def reason(self, error: BaseException) -> str:
-        """Return what a call did wrong, with file and line.
-
-        Raises:
-            BaseException: the error itself, where it is no VUT's: a person wants to stop.
-        """
+        """Return what a call did wrong, with file and line; raise what is no VUT's, such as Ctrl-C."""
         if isinstance(error, (Stopped, KeyboardInterrupt)) and not current_call.shared:
             raise error
         if isinstance(error, DeadlineExceeded):
@@ -306,7 +298,6 @@ class PerCorridor(Driver):
     renewal = "made anew"
 
     def __init__(self, corridors: int, deadline_s: float) -> None:
-        """Prepare for a number of corridors; a subclass makes the controllers."""
         super().__init__(corridors)
         self._deadline = Deadline(deadline_s)
         self._reasons: list[str | None] = [None] * corridors

@@ -23,7 +23,6 @@ class BlameCell:
     FORMAT: Final = struct.Struct("<Qq")
 
     def __init__(self) -> None:
-        """Note it in memory of this process alone."""
         self.shared = False
         self._memory: Any = bytearray(self.FORMAT.size)
         self._count = 0

@@ -46,7 +46,6 @@ class Unit:
     """
 
     def __init__(self, path: Path, names: dict[str, str]) -> None:
-        """Read the description and find the variables."""
         try:
             import fmpy
         except ImportError as error:

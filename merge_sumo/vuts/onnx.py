@@ -43,7 +43,6 @@ class Network:
     """A checked network; `UserError` when the file is missing or is no such network."""
 
     def __init__(self, path: Path, period_s: str | None) -> None:
-        """Load the file with one thread, so that answers do not depend on the machine's cores."""
         try:
             import onnx
             import onnxruntime as ort
@@ -53,6 +52,7 @@ class Network:
             ) from error
         if not path.is_file():
             raise UserError(f"there is no ONNX file {path}")
+        # One thread: answers must not depend on the cores of the machine.
         settings = ort.SessionOptions()
         settings.intra_op_num_threads = settings.inter_op_num_threads = 1
         settings.log_severity_level = 4
@@ -146,7 +146,6 @@ class OnnxVut(PerCorridor):
     """Asks the network when a decision is due, corridor by corridor, and holds in between."""
 
     def __init__(self, corridors: int, network: Network, deadline_s: float) -> None:
-        """Take the network; it remembers nothing, so one serves all corridors."""
         super().__init__(corridors, deadline_s)
         self._network = network
         self._held = [0.0] * corridors

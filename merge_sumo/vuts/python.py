@@ -86,10 +86,8 @@ def vut_of(target: Any, name: str, options: VutOptions) -> Vut | None:
     """Return the VUT that a class, a function or an object makes; None where it makes none.
 
     Each corridor has an object of its own: a new one of a class, a copy of an object. One that acts
-    in all corridors at once is not copied.
-
-    Raises:
-        UserError: where a method or a function cannot be called as VUTs are.
+    in all corridors at once is not copied. Raises `UserError` where a method or a function cannot
+    be called as VUTs are.
     """
     if inspect.isroutine(target):
         check_call(target, ("seen",))
@@ -168,7 +166,6 @@ class BatchedVut(Driver):
     """
 
     def __init__(self, corridors: int, make: Callable[[], Any], deadline_s: float) -> None:
-        """Make the object."""
         super().__init__(corridors)
         self._deadline = Deadline(deadline_s)
         self._make = make
@@ -197,8 +194,7 @@ class BatchedVut(Driver):
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
 
-        Raises:
-            VutLostError: when it fails and several episodes run: the one at fault is unknown.
+        Raises `VutLostError` when it fails and several episodes run: the one at fault is unknown.
         """
         self._raised = None
         try:

@@ -164,7 +164,6 @@ class VutFactory:
     files: Files | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
-        """Look the files up."""
         if self.files is None:
             object.__setattr__(self, "files", hashed(self.vut.files))
 
@@ -180,8 +179,7 @@ class VutFactory:
     def workers(self, requested: int | None) -> int:
         """Return in how many processes it is tested: the requested ones, or one a core for None.
 
-        Raises:
-            UserError: when more are requested than it can serve, or less than one.
+        Raises `UserError` when more are requested than it can serve, or less than one.
         """
         count, most = workers_or_cores(requested), self.vut.max_workers
         if most is None or count <= most:
@@ -193,8 +191,7 @@ class VutFactory:
     def __call__(self, corridors: int, world: World | None = None) -> Driver:
         """Return a driver for corridors 0 to `corridors` - 1 of a world.
 
-        Raises:
-            UserError: where the files of the VUT have changed since this was made.
+        Raises `UserError` where the files of the VUT have changed since this was made.
         """
         then, now = self.files or {}, hashed(self.vut.files)
         if set(then.values()) != set(now.values()):
@@ -259,8 +256,7 @@ def vut_factory(spec: str, options: VutOptions | None = None) -> VutFactory:
 def find_vut(spec: str, options: VutOptions) -> Vut:
     """Return the VUT that a spec names, hosted in a process of its own where its kind says so.
 
-    Raises:
-        UserError: for an unknown name, and for a VUT that cannot be loaded.
+    Raises `UserError` for an unknown name, and for a VUT that cannot be loaded.
     """
     kind = kind_of(spec)
     if options.command is not None and not kind.by_command:

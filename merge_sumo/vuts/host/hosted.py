@@ -119,7 +119,6 @@ class HostDiedError(Exception):
     def __init__(
         self, reason: str, corridor: int | None, *, hung: bool = False, killed: bool = False
     ) -> None:
-        """Take what is known."""
         super().__init__(reason)
         self.reason, self.corridor, self.hung, self.killed = reason, corridor, hung, killed
 

@@ -42,7 +42,6 @@ class _Channel:
     """The frames of the other process."""
 
     def __init__(self) -> None:
-        """Take standard input and output, and put nothing and the log in their places."""
         self._in, self._out = os.dup(0), os.dup(1)
         nothing = os.open(os.devnull, os.O_RDONLY)
         os.dup2(nothing, 0)

@@ -193,7 +193,6 @@ class Stranger:
     """A connection that may still give the token; what it sends is read as far as it came."""
 
     def __init__(self, connection: socket.socket, token: str) -> None:
-        """Take a connection, and the token that it has to give."""
         connection.setblocking(False)
         self.connection, self._token = connection, token
         self._unread, self._received_bytes = bytearray(), 0

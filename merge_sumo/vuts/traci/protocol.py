@@ -77,7 +77,6 @@ class Reader:
     """Reads values from bytes, one after the other."""
 
     def __init__(self, data: bytes) -> None:
-        """Start at the first byte."""
         self._data = data
         self._at = 0
 

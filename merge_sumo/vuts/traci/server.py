@@ -48,7 +48,6 @@ class FaultError(Exception):
     """
 
     def __init__(self, text: str, *, gone: bool = False, late: bool = False) -> None:
-        """Take the sentence, and which kind it is of."""
         super().__init__(text)
         self.gone, self.late = gone, late
 
@@ -128,7 +127,6 @@ class Client:
     """A connected client: its socket, its session, and the commands that it has not been told."""
 
     def __init__(self, connection: socket.socket, session: Session, deadline_s: float) -> None:
-        """Take a connection, and what answers it."""
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket, self.session = connection, session
         self._deadline_s = deadline_s

@@ -71,7 +71,6 @@ class Session:
     """
 
     def __init__(self, sumo: ShadowSumo) -> None:
-        """Begin with the road as it is."""
         self.sumo = sumo
         self.subscriptions = Subscriptions(sumo, self._value)
         self.notes: list[str] = []
