@@ -35,8 +35,7 @@ from build_fmu import build_fmu
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.road.merge import road_of
-from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.world import SUMO_OPTIONS
+from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_program
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.vuts.base import VutOptions

@@ -30,13 +30,12 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
-from merge_sumo.system.hashing import sha256_of
+from merge_sumo.system.hashing import Files, sha256_of
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
-from merge_sumo.vuts.files import Files
 from merge_sumo.vuts.output import LOG
 
 EXPORTED_FAILURES: Final = 10

@@ -16,8 +16,6 @@ from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT, Scenario
 
-CARS: Final = (POV, AHEAD, BEHIND)
-"""Rows of the cars of the mainline."""
 FOLLOWERS: Final = slice(POV, BEHIND + 1, BEHIND - POV)
 LEADERS: Final = slice(AHEAD, None, POV - AHEAD)
 """The POV and the car behind it, and those that they follow: the car ahead and the POV."""

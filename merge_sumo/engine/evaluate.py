@@ -19,13 +19,13 @@ from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.system.blame import MAX_DEATHS
+from merge_sumo.system.hashing import Files, hashed
 from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.workers import InProcess, Workers, open_workers, when_worker_ends
 from merge_sumo.values.case import Case, FloatArray, Pool
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import Measures, Outcome, measure, measure_all
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.files import Files, hashed
 
 R = TypeVar("R")
 

@@ -19,10 +19,10 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.hashing import Files
 from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, level_name
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.files import Files
 from merge_sumo.vuts.registry import VutFactory, kind_of, vut_factory
 from merge_sumo.vuts.sumo_model import SumoVut
 

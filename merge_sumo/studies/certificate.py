@@ -43,13 +43,13 @@ from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import OnCases
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
+from merge_sumo.system.hashing import Files, changed
 from merge_sumo.system.printable import two_digits
 from merge_sumo.system.records import convert, decode
 from merge_sumo.system.signature import signed, user_key, verified
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import Dimension, level_name
-from merge_sumo.vuts.files import Files, changed
 from merge_sumo.vuts.output import LOG
 
 CERTIFICATE: Final = "certificate.json"

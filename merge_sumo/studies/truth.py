@@ -19,6 +19,7 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
+from merge_sumo.system.hashing import Files, changed
 from merge_sumo.system.records import decode
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.signature import CACHE, signed, user_key, verified
@@ -27,7 +28,6 @@ from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import OWN, Scenario
 from merge_sumo.values.score import FAILURE_SCORE
-from merge_sumo.vuts.files import Files, changed
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""

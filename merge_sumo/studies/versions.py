@@ -28,13 +28,13 @@ from merge_sumo.engine.plan import SimulationPlan, versions
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.system.hashing import changed
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import ALL_LEVELS, level_name
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.files import changed
 from merge_sumo.vuts.registry import built_in_vuts
 
 FIRST_LOOKS: Final = 10

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.values.scenario import DT_S
 
 DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
 """Shared libraries that SUMO's wheels load, even without a window."""
@@ -26,6 +27,20 @@ SUMO_VERSION: Final = "1.28.0"
 PROGRAM_LIMIT_S: Final = 15.0
 """Time that SUMO has for an episode, and netconvert for a net; both need a tenth of a second."""
 
+SPEED_MODE_COMMANDED: Final = 32
+"""All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
+SUMO_OPTIONS: Final = (
+    *("--step-length", str(DT_S)),
+    *("--collision.action", "none"),
+    *("--insertion-checks", "none"),
+    *("--time-to-teleport", "-1"),
+    *("--default.speeddev", "0"),
+    *("--xml-validation", "never"),
+    *("--no-step-log", "true"),
+    *("--no-warnings", "true"),
+    *("--duration-log.disable", "true"),
+)
+"""Of every simulation."""
 NOT_A_NAME: Final = re.compile(r"[,:%\ud800-\udfff]|\$\{")
 """To SUMO a comma parts names, a colon parts host and port, and the others stand for something."""
 

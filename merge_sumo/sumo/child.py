@@ -20,8 +20,7 @@ from typing import Any, Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import sumo_environment
-from merge_sumo.system.lifeline import end_with
-from merge_sumo.system.spawning import python_command
+from merge_sumo.system.spawning import end_with, python_command
 
 MESSAGES: Final = "messages"
 """In the folder of a child: what it, and SUMO, write to standard error."""

@@ -20,7 +20,7 @@ from typing import Any, Final, Self
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.binding import load_libsumo, scratch_folder
+from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, load_libsumo, scratch_folder
 from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, channel_of
 from merge_sumo.sumo.replay_folder import WINDOW, view_settings
 from merge_sumo.sumo.replay_labels import COLOURS, TEXT, beside
@@ -37,8 +37,6 @@ BEFORE_S: Final = 1.5
 """For which the start is shown, so that a person finds the cars."""
 LOOK_S: Final = 0.5
 """Between two looks whether the window is still open."""
-SPEED_MODE_COMMANDED: Final = 32
-"""All of SUMO's own checks off."""
 VIEW: Final = "View #0"
 LABEL: Final = "label"
 LINE_AT: Final = 0.86

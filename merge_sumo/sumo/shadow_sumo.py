@@ -18,25 +18,12 @@ from merge_sumo.errors import UserError
 from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
 from merge_sumo.sumo import allowed
-from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
 NET: Final = "road.net.xml"
 TYPES: Final = "types.add.xml"
 SETUP: Final = "setup.json"
-OPTIONS: Final = (
-    *("--step-length", str(DT_S)),
-    *("--collision.action", "none"),
-    *("--insertion-checks", "none"),
-    *("--time-to-teleport", "-1"),
-    *("--default.speeddev", "0"),
-    *("--xml-validation", "never"),
-    *("--no-step-log", "true"),
-    *("--no-warnings", "true"),
-    *("--duration-log.disable", "true"),
-)
-COMMANDED: Final = 32
-"""Speed mode without SUMO's own checks, for vehicles that no client commands."""
 COMMANDED_VUT: Final = 38
 """Speed mode of the VUT as it departs: its limits of acceleration act, SUMO's checks do not."""
 COLOURS: Final = (230, 64, 38, 255), (26, 89, 230, 255)
@@ -88,7 +75,7 @@ class ShadowSumo:
         )
         self.road, self._names = setup.road, setup.names
         files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
-        self._options = [*files, *OPTIONS]
+        self._options = [*files, *SUMO_OPTIONS]
         self._started = False
         self.at_m: dict[str, float] = {}
 
@@ -144,7 +131,9 @@ class ShadowSumo:
         self.step()
         for name in self.at_m:
             vehicle.setLaneChangeMode(name, 0)
-            vehicle.setSpeedMode(name, COMMANDED_VUT if name == NAME_OF_VUT else COMMANDED)
+            vehicle.setSpeedMode(
+                name, COMMANDED_VUT if name == NAME_OF_VUT else SPEED_MODE_COMMANDED
+            )
         if NAME_OF_VUT in self.at_m:
             vehicle.setSpeed(NAME_OF_VUT, states[NAME_OF_VUT][1])
         self.put(states)

@@ -6,13 +6,17 @@ would send.
 
 from __future__ import annotations
 
+import importlib
 import inspect
+import sys
 import warnings
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.sumo.client import load_traci
+from merge_sumo.errors import UserError
+from merge_sumo.sumo.binding import SUMO_VERSION, sumo_program
 
 DUMMIES: Final[tuple[Any, ...]] = ("x", 1.0, 1, [("1", 1.0, 1, 1)], (1, 2, 3, 4), [1.0], ["a"])
 """Arguments that one function or another takes before it sends something."""
@@ -31,6 +35,19 @@ class Named:
     def name(self) -> str:
         """The names in one."""
         return " or ".join(self.functions)
+
+
+def load_traci() -> Any:
+    """Return SUMO's own client, which comes with its programs; `UserError` where there is none."""
+    tools = str(Path(sumo_program("sumo")).parents[1] / "tools")
+    if tools not in sys.path:
+        sys.path.append(tools)
+    try:
+        return importlib.import_module("traci")
+    except ImportError as error:
+        raise UserError(
+            f"SUMO's traci cannot be loaded ({error}): run `pip install traci=={SUMO_VERSION}`"
+        ) from error
 
 
 class _SentError(Exception):

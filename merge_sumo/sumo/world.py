@@ -34,13 +34,16 @@ from lxml import etree
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
-from merge_sumo.sumo.binding import load_libsumo, scratch_folder
+from merge_sumo.sumo.binding import (
+    SPEED_MODE_COMMANDED,
+    SUMO_OPTIONS,
+    load_libsumo,
+    scratch_folder,
+)
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
-SPEED_MODE_COMMANDED: Final = 32
-"""All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
 PARKING_M: Final = 182.0
 """Distance to M at which the vehicles of an idle corridor stand, or where their path begins."""
 EXACT_M: Final = 1e-9
@@ -56,18 +59,6 @@ OWN_CAR: Final = "own"
 and of VUTs and of cars of the mainline that SUMO drives."""
 SLOWEST_MPS: Final = 0.1
 """SUMO has no driver who wants to stand."""
-
-SUMO_OPTIONS: Final = (
-    *("--step-length", str(DT_S)),
-    *("--collision.action", "none"),
-    *("--insertion-checks", "none"),
-    *("--time-to-teleport", "-1"),
-    *("--default.speeddev", "0"),
-    *("--xml-validation", "never"),
-    *("--no-step-log", "true"),
-    *("--no-warnings", "true"),
-    *("--duration-log.disable", "true"),
-)
 
 
 class SimulationError(Exception):

@@ -1,11 +1,30 @@
-"""Hashes of what is in files."""
+"""Hashes of what is in files, by which a change is seen."""
 
 from __future__ import annotations
 
 import hashlib
 import stat
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
+
+Files = dict[str, str | None]
+"""SHA-256 by path, relative to the working folder where it lies below; None of a lost file."""
+
+
+def hashed(paths: Iterable[Path]) -> Files:
+    """Return files with their hashes."""
+    folder = Path.cwd().resolve()
+    files: Files = {}
+    for path in sorted({path.resolve() for path in paths}):
+        name = path.relative_to(folder) if path.is_relative_to(folder) else path
+        files[name.as_posix()] = sha256_of(path)
+    return files
+
+
+def changed(files: Files) -> list[str]:
+    """Return the names of files that are not as they were when they were hashed."""
+    return [name for name, sha256 in files.items() if sha256_of(Path(name)) != sha256]
 
 
 def sha256_of(path: Path) -> str | None:

@@ -1,10 +1,15 @@
-"""Processes that import neither the program that a person runs nor what lies where it is run."""
+"""Processes that import neither the program that a person runs nor what lies where it is run.
+
+They may end with the process that started them, whatever native code they are in.
+"""
 
 from __future__ import annotations
 
 import importlib
 import json
 import os
+import select
+import signal
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -77,3 +82,23 @@ def named(name: str) -> Any:
     """Return the object "MODULE:NAME"."""
     module, _, attribute = name.partition(":")
     return getattr(importlib.import_module(module), attribute)
+
+
+def end_with(lifeline: int) -> None:
+    """Have the system end this process when the other end of a pipe is closed.
+
+    By a signal and not by a thread: native code that never returns would hold a thread up.
+    """
+    import fcntl
+
+    asynchronous = getattr(os, "O_ASYNC", 0o20000)
+    signal.signal(signal.SIGIO, signal.SIG_DFL)
+    if hasattr(fcntl, "F_SETSIG"):  # a signal that nothing here can block or ignore
+        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | asynchronous)
+    # An end that was closed before sends no signal any more.
+    ended = select.poll()
+    ended.register(lifeline, 0)
+    if ended.poll(0):
+        os.kill(os.getpid(), signal.SIGKILL)

@@ -20,7 +20,7 @@ from merge_sumo.system.suggestions import nearest
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.criteria import CRITERIA, PAPER
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
-from merge_sumo.values.measures import MEASURES, OURS
+from merge_sumo.values.measures import MEASURES
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
 from merge_sumo.values.severity import Severity
@@ -31,7 +31,6 @@ from merge_sumo.values.vacuity import Speeds, domain_of, emptiness, idle_parts
 SHORT: Final = 120
 """Characters of a condition in a headline."""
 
-NUMBERS: Final = tuple(measure.name for measure in OURS if measure.missing is not None)
 TEXTS: Final = {
     "end": frozenset(end.value for end in End if not end.is_error),
     "severity": frozenset(severity.value for severity in Severity),

@@ -23,7 +23,7 @@ Further = tuple[tuple[str, float | None], ...]
 """Values of further measures by name."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Measure:
     """A measure of an episode.
 
@@ -58,20 +58,15 @@ class Measure:
 
 
 OURS: Final = (
+    Measure("end", "why the episode ended"),
     Measure(
-        name="end",
-        about="why the episode ended",
+        "severity",
+        "contact, conflict, harsh or safe (`severity.py`); None where the VUT never reached M, "
+        "and after an error",
     ),
     Measure(
-        name="severity",
-        about=(
-            "contact, conflict, harsh or safe (`severity.py`); None where the VUT never "
-            "reached M, and after an error"
-        ),
-    ),
-    Measure(
-        name="score",
-        about="P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)",
+        "score",
+        "P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)",
         label="score P",
         column="score",
         digits=0,
@@ -79,200 +74,155 @@ OURS: Final = (
         worse="low",
     ),
     Measure(
-        name="dx_m",
-        about="x_POV - x_VUT, of the front bumpers",
+        "dx_m",
+        "x_POV - x_VUT, of the front bumpers",
+        unit="m",
         label="front bumpers, x_POV - x_VUT",
         column="Δx at M",
-        unit="m",
         missing=math.inf,
     ),
     Measure(
-        name="bumper_gap_m",
-        about=(
-            "smallest gap at M between the front bumper of the car behind and the rear bumper "
-            "of the car ahead, negative where bodies overlap; None without a merge"
-        ),
+        "bumper_gap_m",
+        "smallest gap at M between the front bumper of the car behind and the rear bumper of the "
+        "car ahead, negative where bodies overlap; None without a merge",
+        unit="m",
         label="bumper gap at M",
         column="bumper gap at M",
-        unit="m",
         missing=math.inf,
         worse="low",
     ),
     Measure(
-        name="clearance_m",
-        about=(
-            "smallest gap between bumpers from M on, to the end of the follow-up, or without "
-            "one for 0.75 s at the speeds of M; 0 or less where bodies touch, None without a "
-            "merge"
-        ),
+        "clearance_m",
+        "smallest gap between bumpers from M on, to the end of the follow-up, or without one for "
+        "0.75 s at the speeds of M; 0 or less where bodies touch, None without a merge",
+        unit="m",
         label="smallest gap, driving on",
         column="clearance",
-        unit="m",
         missing=math.inf,
         worse="low",
     ),
     Measure(
-        name="before_clearance_m",
-        about=(
-            "smallest distance of bodies before M, where the lanes run together; 0 or less "
-            "where they overlap, None where the VUT never came there"
-        ),
+        "before_clearance_m",
+        "smallest distance of bodies before M, where the lanes run together; 0 or less where they "
+        "overlap, None where the VUT never came there",
+        unit="m",
         label="smallest clearance before M",
         column="clearance before M",
-        unit="m",
         missing=math.inf,
         worse="low",
     ),
+    Measure("dv_mps", "v_POV - v_VUT", unit="m/s", label="v_POV - v_VUT", column="dv", missing=0.0),
     Measure(
-        name="dv_mps",
-        about="v_POV - v_VUT",
-        label="v_POV - v_VUT",
-        column="dv",
-        unit="m/s",
-        missing=0.0,
-    ),
-    Measure(
-        name="ttc_s",
-        about="time to collision -dx/dv where dx dv < 0, else None (infinite)",
+        "ttc_s",
+        "time to collision -dx/dv where dx dv < 0, else None (infinite)",
+        unit="s",
         label="time to collision",
         column="TTC",
-        unit="s",
         missing=math.inf,
         worse="low",
     ),
     Measure(
-        name="pet_s",
-        about=(
-            "post-encroachment time: time between the two front bumpers at M (Allen et al., "
-            "1978); where the POV has not arrived by t1, it is taken on at its speed at t1; "
-            "None when it stands"
-        ),
+        "pet_s",
+        "post-encroachment time: time between the two front bumpers at M (Allen et al., 1978); "
+        "where the POV has not arrived by t1, it is taken on at its speed at t1; None when it "
+        "stands",
+        unit="s",
         label="post-encroachment time",
         column="PET",
-        unit="s",
         missing=math.inf,
         worse="low",
     ),
+    Measure("t_end_s", "time at which the episode ended", unit="s", column="time", missing=0.0),
     Measure(
-        name="t_end_s",
-        about="time at which the episode ended",
-        column="time",
-        unit="s",
-        missing=0.0,
-    ),
-    Measure(
-        name="drac_mps2",
-        about=(
-            "deceleration rate to avoid a crash that the follower needs at t1 (Cooper and "
-            "Ferguson, 1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None where |dx| < "
-            "6 m"
-        ),
-        label="deceleration to keep 6 m apart",
+        "drac_mps2",
+        "deceleration rate to avoid a crash that the follower needs at t1 (Cooper and Ferguson, "
+        "1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None where |dx| < 6 m",
         unit="m/s2",
+        label="deceleration to keep 6 m apart",
         missing=0.0,
         worse="high",
     ),
     Measure(
-        name="brake_after_mps2",
-        about=(
-            "deceleration that whoever is behind at M needs, after 0.75 s to react, not to "
-            "touch a car ahead that keeps its speed (`merge.py`); None where none is in time, "
-            "and without a merge"
-        ),
+        "brake_after_mps2",
+        "deceleration that whoever is behind at M needs, after 0.75 s to react, not to touch a "
+        "car ahead that keeps its speed (`merge.py`); None where none is in time, and without a "
+        "merge",
+        unit="m/s2",
         label="braking that M asks of the rear",
         column="braking asked after M",
-        unit="m/s2",
         missing=0.0,
         worse="high",
     ),
     Measure(
-        name="impact_speed_mps",
-        about="relative speed at the first contact; None without one",
+        "impact_speed_mps",
+        "relative speed at the first contact; None without one",
+        unit="m/s",
         label="impact speed",
         column="impact",
-        unit="m/s",
         missing=0.0,
         worse="high",
     ),
     Measure(
-        name="vut_max_brake_mps2",
-        about="hardest braking of the VUT, positive",
+        "vut_max_brake_mps2",
+        "hardest braking of the VUT, positive",
+        unit="m/s2",
         label="hardest braking of the VUT",
         column="VUT brakes",
-        unit="m/s2",
         missing=0.0,
         worse="high",
     ),
     Measure(
-        name="pov_max_brake_mps2",
-        about="hardest braking of the POV, positive",
+        "pov_max_brake_mps2",
+        "hardest braking of the POV, positive",
+        unit="m/s2",
         label="hardest braking of the POV",
         column="POV brakes",
-        unit="m/s2",
         missing=0.0,
         worse="high",
     ),
+    Measure("merged_first", '"VUT" or "POV": whose front bumper is ahead at M'),
     Measure(
-        name="merged_first",
-        about='"VUT" or "POV": whose front bumper is ahead at M',
-    ),
-    Measure(
-        name="last_avoidable_s",
-        about=(
-            "where |dx| < 6 m at M, the last time from which the VUT, at full acceleration or "
-            "full braking, would have kept 6 m against the recorded motion of the POV and the "
-            "other cars (taken on at constant speed); None when there was no such time, and "
-            "where |dx| >= 6 m"
-        ),
-        label="avoidable until",
+        "last_avoidable_s",
+        "where |dx| < 6 m at M, the last time from which the VUT, at full acceleration or full "
+        "braking, would have kept 6 m against the recorded motion of the POV and the other cars "
+        "(taken on at constant speed); None when there was no such time, and where |dx| >= 6 m",
         unit="s",
+        label="avoidable until",
         missing=math.inf,
         worse="low",
     ),
+    Measure("avoidable", "where |dx| < 6 m at M, whether there was such a time; else None"),
     Measure(
-        name="avoidable",
-        about="where |dx| < 6 m at M, whether there was such a time; else None",
-    ),
-    Measure(
-        name="clipped_steps",
-        about="steps in which the VUT asked for more than its limits of acceleration",
+        "clipped_steps",
+        "steps in which the VUT asked for more than its limits of acceleration",
         digits=0,
         missing=0.0,
         worse="high",
     ),
+    Measure("error", "what the VUT or the simulation did wrong, else None"),
+    Measure("nearest", "name of the car that the measures are of; recorded in traffic only"),
     Measure(
-        name="error",
-        about="what the VUT or the simulation did wrong, else None",
-    ),
-    Measure(
-        name="nearest",
-        about="name of the car that the measures are of; recorded in traffic only",
-    ),
-    Measure(
-        name="after_gap_m",
-        about=(
-            "least gap between bumpers in the follow-up, 0 or less where bodies touch; this "
-            "and the next two are None without a merge, and recorded where there is a follow- "
-            "up only"
-        ),
-        label="smallest bumper gap behind M",
+        "after_gap_m",
+        "least gap between bumpers in the follow-up, 0 or less where bodies touch; this and the "
+        "next two are None without a merge, and recorded where there is a follow-up only",
         unit="m",
+        label="smallest bumper gap behind M",
         missing=math.inf,
         worse="low",
     ),
     Measure(
-        name="after_ttc_s",
-        about="lowest time to collision in it, between bumpers; None where no gap closes",
-        label="time to collision behind M",
+        "after_ttc_s",
+        "lowest time to collision in it, between bumpers; None where no gap closes",
         unit="s",
+        label="time to collision behind M",
         missing=math.inf,
         worse="low",
     ),
     Measure(
-        name="after_drac_mps2",
-        about="hardest braking that it needs, dv^2 / (2 gap); None where bodies touch",
-        label="braking needed behind M",
+        "after_drac_mps2",
+        "hardest braking that it needs, dv^2 / (2 gap); None where bodies touch",
         unit="m/s2",
+        label="braking needed behind M",
         missing=0.0,
         worse="high",
     ),

@@ -364,67 +364,32 @@ def _value(node: Any, signals: dict[str, Range]) -> Range:
     if any(math.isnan(end) for part in parts for end in part):
         return ANY
     if kind == "Predicate":
-        return _predicate(node.operator.name, *parts)
+        above, below = parts if node.operator.name in ("GREATER", "GEQ") else reversed(parts)
+        is_order = node.operator.name in ("GREATER", "GEQ", "LESS", "LEQ")
+        return _OF_TWO["Subtraction"](above, below) if is_order else ANY
     # Some kinds of node name their one part, or their two parts, twice.
     if kind in _OF_ONE:
         return _OF_ONE[kind](parts[0])
     return _OF_TWO[kind](parts[0], parts[1]) if kind in _OF_TWO else ANY
 
 
-def _predicate(operator: str, left: Range, right: Range) -> Range:
-    if operator in ("GREATER", "GEQ"):
-        return _minus(left, right)
-    return _minus(right, left) if operator in ("LESS", "LEQ") else ANY
-
-
-def _minus(a: Range, b: Range) -> Range:
-    return _plus(a, Range(-b.high, -b.low))
-
-
-def _plus(a: Range, b: Range) -> Range:
-    low, high = a.low + b.low, a.high + b.high
-    return ANY if math.isnan(low) or math.isnan(high) else Range(low, high)
-
-
-def _absolute(a: Range) -> Range:
-    inside = a.low <= 0.0 <= a.high
-    return Range(0.0 if inside else min(map(abs, a)), max(map(abs, a)))
-
-
-def _times(a: Range, b: Range) -> Range:
-    products = [x * y for x in a for y in b]
-    return ANY if any(map(math.isnan, products)) else Range(min(products), max(products))
-
-
-def _larger(a: Range, b: Range) -> Range:
-    return Range(max(a.low, b.low), max(a.high, b.high))
-
-
-def _smaller(a: Range, b: Range) -> Range:
-    return Range(min(a.low, b.low), min(a.high, b.high))
-
-
-def _not(a: Range) -> Range:
-    return Range(-a.high, -a.low)
-
-
-def _same(a: Range) -> Range:
-    """Return the range of the least, or the largest, of some values that are in a range."""
-    return a
+def _between(*values: float) -> Range:
+    """Return the range of some values; any number where one of them is none (inf - inf)."""
+    return ANY if any(map(math.isnan, values)) else Range(min(values), max(values))
 
 
 _OF_ONE: Final[dict[str, Callable[[Range], Range]]] = {
-    "Abs": _absolute,
-    "Neg": _not,
-    **dict.fromkeys(("Always", "Eventually", "Historically", "Once"), _same),
+    "Abs": lambda a: Range(max(a.low, -a.high, 0.0), max(map(abs, a))),
+    "Neg": lambda a: Range(-a.high, -a.low),
+    **dict.fromkeys(("Always", "Eventually", "Historically", "Once"), lambda a: a),
 }
 """How the range of a node follows from that of its part. Of others nothing is known: windows with
 bounds may be empty near the ends of an episode."""
 _OF_TWO: Final[dict[str, Callable[[Range, Range], Range]]] = {
-    "Addition": _plus,
-    "Subtraction": _minus,
-    "Multiplication": _times,
-    "Conjunction": _smaller,
-    "Disjunction": _larger,
-    "Implies": lambda a, b: _larger(_not(a), b),
+    "Addition": lambda a, b: _between(a.low + b.low, a.high + b.high),
+    "Subtraction": lambda a, b: _between(a.low - b.high, a.high - b.low),
+    "Multiplication": lambda a, b: _between(*(x * y for x in a for y in b)),
+    "Conjunction": lambda a, b: Range(min(a.low, b.low), min(a.high, b.high)),
+    "Disjunction": lambda a, b: Range(max(a.low, b.low), max(a.high, b.high)),
+    "Implies": lambda a, b: Range(max(-a.high, b.low), max(-a.low, b.high)),
 }

@@ -245,7 +245,7 @@ class Deadline:
         return answer
 
     def reason(self, error: BaseException) -> str:
-        """Return what a call did wrong, with file and line; raise what is no VUT's, such as Ctrl-C."""
+        """Return what a call did wrong, with file and line; raise what is no VUT's: Ctrl-C."""
         if isinstance(error, (Stopped, KeyboardInterrupt)) and not current_call.shared:
             raise error
         if isinstance(error, DeadlineExceeded):

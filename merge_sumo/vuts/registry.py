@@ -16,11 +16,11 @@ from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.hashing import Files, hashed
 from merge_sumo.system.registry import Registry
 from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.vuts.base import Vut, VutOptions
-from merge_sumo.vuts.files import Files, hashed
 from merge_sumo.vuts.fmu import fmu_vut
 from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
 from merge_sumo.vuts.in_memory import HERE, here_vut, keep, object_of

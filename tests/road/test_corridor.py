@@ -28,9 +28,9 @@ from merge_sumo.road.corridor import Piece
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import default_net_path
 from merge_sumo.road.netfile import NetFile
-from merge_sumo.sumo.binding import load_libsumo, sumo_program
+from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, load_libsumo, sumo_program
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.sumo.world import SPEED_MODE_COMMANDED, SimulationError, World
+from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, POV, US23, VUT
 from merge_sumo.vuts.registry import vut_factory

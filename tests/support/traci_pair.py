@@ -20,12 +20,11 @@ from traci.storage import Storage
 
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
-from merge_sumo.sumo.binding import sumo_environment, sumo_program
+from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_environment, sumo_program
 from merge_sumo.sumo.shadow_sumo import (
     COLOURS,
     COMMANDED_VUT,
     NET,
-    OPTIONS,
     TYPES,
     ShadowSumo,
     _edges,
@@ -125,7 +124,7 @@ def open_program(folder: Path) -> tuple[subprocess.Popen[bytes], Any]:
     program = sumo_program("sumo")
     read = [Path(program).parents[2], Path("/usr"), Path("/lib"), Path("/lib64"), Path("/etc")]
     process = subprocess.Popen(
-        [program, *files, *OPTIONS, "--remote-port", str(port)],
+        [program, *files, *SUMO_OPTIONS, "--remote-port", str(port)],
         env=sumo_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

@@ -11,7 +11,7 @@ import pytest
 
 TIED = """
 import os, sys
-from merge_sumo.system.lifeline import end_with
+from merge_sumo.system.spawning import end_with
 
 go, lifeline = map(int, sys.argv[1:])
 os.read(go, 1)

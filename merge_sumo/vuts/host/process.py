@@ -18,8 +18,7 @@ import numpy as np
 
 from merge_sumo.drivers.base import Driver, VutLostError
 from merge_sumo.errors import UserError
-from merge_sumo.system.lifeline import end_with
-from merge_sumo.system.spawning import named
+from merge_sumo.system.spawning import end_with, named
 from merge_sumo.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.vuts.blame_cell import BlameCell, current_call
 from merge_sumo.vuts.host import wire
