@@ -18,7 +18,7 @@ from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.env import pool_starts
 from merge_sumo.training.game import Game, IntArray, greedy, of_two
-from merge_sumo.training.reward import Reward, RewardWeights, pov_reward
+from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
 from merge_sumo.values.case import Case, FloatArray, from_unit
 from merge_sumo.values.scenario import SVO, Scenario
 from merge_sumo.values.trajectory import End, Trajectory
@@ -55,12 +55,9 @@ class PolicyCheck:
 
 
 @dataclass(frozen=True, slots=True)
-class Returns:
+class Returns(RewardParts):
     """Returns of n games in parts, (n,) each, and who collided."""
 
-    safe: FloatArray
-    pov_ego: FloatArray
-    vut_ego: FloatArray
     collided: np.ndarray
 
 
@@ -82,7 +79,7 @@ def returns_of(trajectories: list[Trajectory], reward: Reward) -> Returns:
             parts[0, n] = reward.safety(dx, np.array([v_pov_end - v_vut_end]))[0]
             parts[2, n] += reward.vut_end(np.array([v_vut_end]))[0]
             collided[n] = abs(dx[0]) < reward.scenario.dx_crash_m
-    return Returns(parts[0], parts[1], parts[2], collided)
+    return Returns(*parts, collided)
 
 
 def play(
@@ -90,12 +87,11 @@ def play(
 ) -> list[Trajectory]:
     """Play cases of one scenario in SUMO between two drivers; return the trajectories in order."""
     scenario = cases[0].scenario
-    played: list[Trajectory | None] = [None] * len(cases)
+    played: dict[int, Trajectory] = {}
     with World(CORRIDORS, road_for(scenario), scenario=scenario) as world:
         pov, vut = _driver(make_pov), _driver(make_vut)
-        for index, trajectory in rollout(world, pov, vut, cases):
-            played[index] = trajectory
-    return [trajectory for trajectory in played if trajectory is not None]
+        played |= rollout(world, pov, vut, cases)
+    return [played[index] for index in sorted(played)]
 
 
 def _driver(maker: type[Driver] | QNetwork) -> Driver:
@@ -145,20 +141,19 @@ def check_network(
     """Return how near a network is to its best response; `opponent` is None for level 0."""
     cases = check_cases(name, count, scenario=reward.scenario)
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
-    is_pov = name.startswith("pov")
+    role: Role = "pov" if name.startswith("pov") else "vut"
+    is_pov = role == "pov"
     level0 = Level0Pov if is_pov else Level0Vut
     other = opponent or (Level0Vut if is_pov else Level0Pov)
 
     def returns(driver: type[Driver] | QNetwork) -> tuple[FloatArray, np.ndarray]:
         pair = (driver, other) if is_pov else (other, driver)
         got = returns_of(play(cases, *pair), reward)
-        if is_pov:
-            return pov_reward(got.safe, got.pov_ego, got.vut_ego, svo_rad), got.collided
-        return got.safe + got.vut_ego, got.collided
+        return got.of(role, svo_rad), got.collided
 
     reached, collided = returns(network)
     unmoved, _ = returns(level0)
-    best = best_returns(Game("pov" if is_pov else "vut", opponent, reward), network, cases, svo_rad)
+    best = best_returns(Game(role, opponent, reward), network, cases, svo_rad)
     if opponent is not None:
         # The driver's own games are some that a search may find.
         best = np.maximum(best, reached)

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, QNetwork, features
 from merge_sumo.training.env import MergeGame, exploring_starts
+from merge_sumo.training.reward import RewardParts, Role
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import SVO
 
@@ -71,14 +72,21 @@ class DdqnSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class DdqnProgress:
-    """Where training is: told after every thousand updates."""
+class Progress:
+    """Where training is: told after every thousand updates of DDQN, or a round of refinement.
 
-    updates: int
-    transitions: int
+    Attributes:
+        done: updates, or rounds.
+        loss: of DDQN's fit, or the mean loss of return that a choice of the network means.
+        mean_return: of the games that were played lately.
+        crash_share: share of collisions among them; None while refining.
+        network: as it is now.
+    """
+
+    done: int
     loss: float
     mean_return: float
-    crash_share: float
+    crash_share: float | None
     network: QNetwork
 
 
@@ -137,7 +145,7 @@ def train(
     settings: DdqnSettings | None = None,
     *,
     sees_svo: bool = False,
-    on_progress: Callable[[DdqnProgress], None] | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
 ) -> QNetwork:
     """Train the agent of a game and return its network; same seed, same weights."""
     s = settings or DdqnSettings()
@@ -175,17 +183,8 @@ def train(
                 torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), s.polyak)
             update += 1
             if on_progress and update % 1000 == 0:
-                mean_return, crash_share = collector.recent()
-                on_progress(
-                    DdqnProgress(
-                        update,
-                        replay.filled,
-                        float(loss.detach()),
-                        mean_return,
-                        crash_share,
-                        export(target),
-                    )
-                )
+                fit = float(loss.detach())
+                on_progress(Progress(update, fit, *collector.recent(), export(target)))
     return export(target)
 
 
@@ -214,7 +213,7 @@ class _Collector:
     def collect(self, online: nn.Sequential, epsilon: float, replay: Replay) -> None:
         """Take one decision in every game, a random one with probability epsilon."""
         games = self.game.corridors
-        before = _seen(self.state, self.game)
+        before = features(*self.state.T, scenario=self.game.scenario)
         seen = before
         if self.sees_svo:
             seen = np.column_stack([before, *_svo_columns(self.svo_rad)])
@@ -224,7 +223,8 @@ class _Collector:
         action = np.where(self.rng.random(games) < epsilon, random, action)
         state, parts, over = self.game.decide(self.game.actions_mps2[action])
         in_parts = np.stack([parts.safe, parts.pov_ego, parts.vut_ego], axis=1)
-        replay.add(before, action, in_parts, _seen(state, self.game), ~over)
+        after = features(*state.T, scenario=self.game.scenario)
+        replay.add(before, action, in_parts, after, ~over)
         self.returns += parts.of(self.game.role, self.svo_rad)
         self.decisions += 1
         again = np.flatnonzero(over | (self.decisions >= self.game.max_decisions))
@@ -242,16 +242,8 @@ class _Collector:
         last = self.ended = self.ended[-2000:]
         if not last:
             return math.nan, math.nan
-        return (
-            float(np.mean([value for value, _ in last])),
-            float(np.mean([crashed for _, crashed in last])),
-        )
-
-
-def _seen(state: FloatArray, game: MergeGame) -> FloatArray:
-    """Return what a network sees of states, (n, 4), but for psi."""
-    x_pov, v_pov, x_vut, v_vut = state.T
-    return features(x_pov, v_pov, x_vut, v_vut, scenario=game.scenario)
+        mean_return, crash_share = np.mean(last, axis=0).tolist()
+        return mean_return, crash_share
 
 
 def _loss(
@@ -260,22 +252,18 @@ def _loss(
     replay: Replay,
     batch: int,
     rng: np.random.Generator,
-    role: str,
+    role: Role,
     *,
     sees_svo: bool,
 ) -> Tensor:
     rows = rng.integers(0, replay.filled, batch)
     before, after = replay.before[rows], replay.after[rows]
-    safe, pov_ego, vut_ego = replay.parts[rows].T
-    if role == "vut":
-        reward = safe + vut_ego
-    elif sees_svo:
+    svo_rad = np.zeros(batch, dtype=np.float32)
+    if sees_svo:
         svo_rad = rng.uniform(SVO.low, SVO.high, batch).astype(np.float32)
         columns = _svo_columns(svo_rad)
         before, after = np.column_stack([before, *columns]), np.column_stack([after, *columns])
-        reward = safe + pov_ego * np.cos(svo_rad) + vut_ego * np.sin(svo_rad)
-    else:
-        reward = safe + pov_ego
+    reward = RewardParts(*replay.parts[rows].T).of(role, svo_rad)
     with torch.no_grad():
         # Double: the online network picks the action, the target network rates it.
         picked = online(torch.from_numpy(after)).argmax(-1, keepdim=True)

@@ -11,7 +11,6 @@ actions 0 to 6 are accelerations of -4 to +2 m/s2. `scenario=` plays another sce
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import gymnasium
@@ -29,8 +28,8 @@ from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.world import World
-from merge_sumo.training.game import Role, of_two
-from merge_sumo.training.reward import Reward, RewardWeights, pov_reward
+from merge_sumo.training.game import of_two
+from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
 from merge_sumo.values.case import FloatArray, MergeCase
 from merge_sumo.values.scenario import POV, SVO, US23, VUT, Scenario, as_merge
 from merge_sumo.values.scenario_scale import Units
@@ -38,21 +37,6 @@ from merge_sumo.values.scenario_scale import Units
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])
 """Of an observation, in the units of the scenario."""
-
-
-@dataclass(frozen=True, slots=True)
-class RewardParts:
-    """The reward of one decision in its three parts, (K,) each; psi mixes them for the POV."""
-
-    safe: FloatArray
-    pov_ego: FloatArray
-    vut_ego: FloatArray
-
-    def of(self, role: Role, svo_rad: FloatArray) -> FloatArray:
-        """Return the agent's reward, (K,); `svo_rad` is psi of the POV."""
-        if role == "vut":
-            return self.safe + self.vut_ego
-        return pov_reward(self.safe, self.pov_ego, self.vut_ego, svo_rad)
 
 
 class MergeGame:
@@ -78,9 +62,8 @@ class MergeGame:
         x_pov, v_pov, x_vut, v_vut = state.tolist()
         x_pov = max(x_pov, -self.world.road.mainline.before_m)
         self.world.place(corridor, [(x_pov, v_pov), (x_vut, v_vut)])
-        level = 1 if svo_rad is None else 2
         case = MergeCase(
-            level=level,
+            level=1 if svo_rad is None else 2,
             x_pov0_m=self.scenario.x_pov0_m[0],
             v_pov0_mps=self.scenario.v_pov0_mps[0],
             v_vut0_mps=self.scenario.bounds("v_vut0_mps")[0],

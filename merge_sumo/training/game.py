@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +23,10 @@ from merge_sumo.drivers.levelk import (
     actions_mps2,
     features,
 )
-from merge_sumo.training.reward import Reward, pov_reward
+from merge_sumo.training.reward import Reward, RewardParts, Role
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, MergeScenario, Scenario, as_merge
 
-Role = Literal["pov", "vut"]
 IntArray = NDArray[np.int64]
 
 
@@ -93,7 +91,7 @@ class Game:
                 safe += arrived * reward.safety(x_pov - x_vut, v_pov - v_vut)
                 vut_ego += arrived * reward.vut_end(v_vut)
                 live &= ~arrived
-        gained = pov_reward(safe, pov_ego, vut_ego, svo_rad) if of_pov else safe + vut_ego
+        gained = RewardParts(safe, pov_ego, vut_ego).of(self.role, svo_rad)
         return np.stack([x_pov, v_pov, x_vut, v_vut], axis=1), gained, ~live
 
     def play(
@@ -155,6 +153,5 @@ def inputs_of(
     network: QNetwork, state: FloatArray, svo_rad: FloatArray, scenario: Scenario
 ) -> FloatArray:
     """Return what a network sees of states, (n, 4), and of psi, (n,), if it has one."""
-    x_pov, v_pov, x_vut, v_vut = state.T
     psi = svo_rad if network.sees_svo else None
-    return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=scenario)
+    return features(*state.T, psi, scenario=scenario)

@@ -47,11 +47,11 @@ from merge_sumo.system.printable import quoted
 from merge_sumo.system.spawning import forget_safe_path, without_cwd
 from merge_sumo.system.workers import leave_signals_to_parent
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, QuickRegret, check_network
-from merge_sumo.training.ddqn import DdqnProgress, DdqnSettings, train
+from merge_sumo.training.ddqn import DdqnSettings, Progress, train
 from merge_sumo.training.env import MergeGame, make_opponent
-from merge_sumo.training.game import Game, Role, of_two
-from merge_sumo.training.refine import RefineProgress, RefineSettings, refine
-from merge_sumo.training.reward import Reward, RewardWeights
+from merge_sumo.training.game import Game, of_two
+from merge_sumo.training.refine import RefineSettings, refine
+from merge_sumo.training.reward import Reward, RewardWeights, Role
 from merge_sumo.values.scenario import US23, Scenario
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
@@ -67,8 +67,8 @@ LOG: Final = ".training.jsonl"
 WEIGHTS: Final = ".safetensors"
 GAMES: Final = 64
 """Corridors in which transitions are collected."""
-REGRET_EVERY: Final = 5
-"""Reports of DDQN between two measurements of the regret, which costs a second."""
+REGRET_EVERY: Final = 5_000
+"""Updates of DDQN between two measurements of the regret, which costs a second."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -311,22 +311,13 @@ def _train_one(task: _Task) -> _Trained:
     regret = QuickRegret(played_out, sees_svo=sees_svo)
     ddqn, refinement = task.settings.ddqn, task.settings.refine
 
-    def report_ddqn(now: DdqnProgress) -> None:
-        measured = now.updates % (1000 * REGRET_EVERY) == 0
-        bound = regret(now.network) if measured else None
-        values = (now.updates, ddqn.updates, now.loss, now.mean_return, now.crash_share, bound)
-        _reports.put(TrainingProgress(task.name, "ddqn", *values))
+    def reporter(stage: str, total: int, regret_every: int) -> Callable[[Progress], None]:
+        def report(now: Progress) -> None:
+            bound = regret(now.network) if now.done % regret_every == 0 else None
+            values = (now.done, total, now.loss, now.mean_return, now.crash_share, bound)
+            _reports.put(TrainingProgress(task.name, stage, *values))
 
-    def report_refinement(now: RefineProgress) -> None:
-        values = (
-            now.round,
-            refinement.rounds,
-            now.cost,
-            now.mean_return,
-            None,
-            regret(now.network),
-        )
-        _reports.put(TrainingProgress(task.name, "refine", *values))
+        return report
 
     started = time.perf_counter()
     if task.opponent is None:
@@ -335,10 +326,12 @@ def _train_one(task: _Task) -> _Trained:
         opponent = LevelKDriver(GAMES, task.opponent)
     game = MergeGame(task.role, opponent, task.reward, task.road)
     try:
-        network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=report_ddqn)
+        report = reporter("ddqn", ddqn.updates, REGRET_EVERY)
+        network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=report)
     finally:
         game.close()
-    network = refine(played_out, network, task.seed, refinement, report_refinement)
+    report = reporter("refine", refinement.rounds, 1)
+    network = refine(played_out, network, task.seed, refinement, report)
     seconds = time.perf_counter() - started
     check = check_network(task.name, network, task.opponent, task.reward, task.settings.check_cases)
     return task.name, network, check, seconds

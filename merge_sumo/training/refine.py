@@ -28,7 +28,7 @@ from torch import nn
 
 from merge_sumo.drivers.levelk import ACTIONS, QNetwork
 from merge_sumo.training.best_response import beam_search
-from merge_sumo.training.ddqn import as_torch, export, squash
+from merge_sumo.training.ddqn import Progress, as_torch, export, squash
 from merge_sumo.training.env import exploring_starts
 from merge_sumo.training.game import Game, IntArray, greedy, inputs_of
 from merge_sumo.values.case import FloatArray
@@ -72,25 +72,6 @@ class RefineSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class RefineProgress:
-    """Where refinement is: told after every round.
-
-    Attributes:
-        round: rounds done.
-        states: states trained on.
-        cost: mean loss of return that a choice of the network means, in these states.
-        mean_return: of the games of this round, played with the network before it.
-        network: as it is now.
-    """
-
-    round: int
-    states: int
-    cost: float
-    mean_return: float
-    network: QNetwork
-
-
-@dataclass(frozen=True, slots=True)
 class _Labelled:
     """States as the network sees them, (n, features), and what each action is worth, (n, 7)."""
 
@@ -103,7 +84,7 @@ def refine(
     network: QNetwork,
     seed: int,
     settings: RefineSettings | None = None,
-    on_progress: Callable[[RefineProgress], None] | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
 ) -> QNetwork:
     """Return the network, refined for its game; same seed, same weights."""
     from threadpoolctl import threadpool_limits
@@ -123,8 +104,7 @@ def refine(
             cost = _fit(model, optimiser, rounds, rng, s, number)
             network = export(model)
             if on_progress is not None:
-                states = sum(len(r.inputs) for r in rounds)
-                on_progress(RefineProgress(number + 1, states, cost, mean_return, network))
+                on_progress(Progress(number + 1, cost, mean_return, None, network))
     return network
 
 

@@ -11,7 +11,7 @@ Every phi is 0 or negative, but for the reward of a wide gap in `phi_dx`. No dis
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, Scenario
 from merge_sumo.values.scenario_scale import Units
 
+Role = Literal["pov", "vut"]
 FULL_GAP_M: Final = 45.0
 """In the paper's scenario a gap is full when it is this much wider than one that is not critical:
 what a vehicle on the level-0 profile drives in 1.6 s."""
@@ -72,6 +73,21 @@ class RewardWeights:
             vut_v_end=paper.vut_v_end / unit.speed,
             gap_full_m=scenario.dx_critical_m + FULL_GAP_M * unit.speed,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class RewardParts:
+    """Rewards in their three parts, (K,) each; psi, a social value orientation, mixes them."""
+
+    safe: FloatArray
+    pov_ego: FloatArray
+    vut_ego: FloatArray
+
+    def of(self, role: Role, svo_rad: FloatArray) -> FloatArray:
+        """Return the agent's reward, (K,); `svo_rad` is psi of the POV."""
+        if role == "vut":
+            return self.safe + self.vut_ego
+        return pov_reward(self.safe, self.pov_ego, self.vut_ego, svo_rad)
 
 
 @dataclass(frozen=True, slots=True)
