@@ -31,11 +31,7 @@ _LENGTH: Final = struct.Struct("!I")
 
 
 class ChildDiedError(Exception):
-    """The process is gone; the text says how it ended.
-
-    Attributes:
-        killed: whether SIGKILL ended it.
-    """
+    """The process is gone; the text says how it ended, and `killed` whether by SIGKILL."""
 
     def __init__(self, how: str, *, killed: bool = False) -> None:
         super().__init__(how)
@@ -94,16 +90,10 @@ class Channel:
 
 
 class SumoChild:
-    """A process of this package with a SUMO.
+    """A process of this package with a SUMO, in a folder of its own.
 
-    Args:
-        main: function that runs there, "MODULE:FUNCTION"; it is called with `settings`, and begins
-            by `channel_of(settings)`.
-        folder: folder of its own, where it runs.
-        settings: what JSON can hold.
-
-    Raises:
-        UserError: where it cannot be started.
+    `main`, "MODULE:FUNCTION", is called there with settings that JSON can hold, and begins by
+    `channel_of(settings)`. Raises `UserError` where it cannot be started.
     """
 
     def __init__(self, main: str, folder: Path, settings: Mapping[str, Any]) -> None:
@@ -148,16 +138,10 @@ class SumoChild:
         patience_s: float | None = None,
         connection: socket.socket | None = None,
     ) -> dict[str, Any]:
-        """Return the answer to a message.
+        """Return the answer to a message, behind which a connection may be handed over.
 
-        Args:
-            message: what the child is to do.
-            patience_s: time that it has.
-            connection: is handed over behind the message, which says so.
-
-        Raises:
-            ChildDiedError: when the process is gone.
-            TimeoutError: when it does not answer in time.
+        Raises `ChildDiedError` when the process is gone, and TimeoutError when it does not answer
+        within `patience_s`.
         """
         try:
             self.channel.send(message)

@@ -12,18 +12,17 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, load_libsumo, scratch_folder
 from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, channel_of
-from merge_sumo.sumo.replay_folder import WINDOW, view_settings
-from merge_sumo.sumo.replay_labels import COLOURS, TEXT, beside
+from merge_sumo.sumo.replay_folder import COLOURS, TEXT, WINDOW, beside, view_settings
 from merge_sumo.system.interrupt import stopping_in_order
 from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT
 
@@ -63,7 +62,7 @@ ROOM: Final = 1.3
 """The view is wider than what it has to show by this, and moved again where that is too little."""
 
 
-class Window:
+class Window(AbstractContextManager["Window"]):
     """A sumo-gui that a `World` takes for libsumo; steps take as long as what they show.
 
     Raises `UserError` when there is no display, or when the window is closed before its time.
@@ -161,9 +160,6 @@ class Window:
     def close(self) -> None:
         """Close the window."""
         self._opened.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +15,8 @@ from lxml import etree
 from merge_sumo.analysis.result import Result
 from merge_sumo.errors import UserError
 from merge_sumo.road import received
-from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
+from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.road.received import Allowed
 from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.live import check_display
@@ -138,35 +139,27 @@ def _received(folder: Path) -> _Episode:
     for name in (*net_files, TYPES, RECORD):
         if not os.path.lexists(folder / name):
             raise UserError(f"{folder} is not a replay folder: it has no {name}")
-    types, record, net, *surroundings = (
-        received.read_bytes(folder / name, "the file", follow_links=False)
-        for name in (TYPES, RECORD, *net_files)
-    )
-    if surroundings:
-        road = _checked_hosted(net, surroundings[0], folder)
-    else:
-        path = folder / NET
-        content = received.cleaned(net, allowed.NET, f"the net {path}")
-        road = Road(content, corridor_of_shipped(content, path), None)
-    vtypes = _checked_types(types, folder / TYPES)
-    root, rows = _checked_record(record, folder / RECORD, _vehicles(vtypes))
-    x_m = _lane_coordinates(root, road.corridor)
-    return _Episode(road, vtypes, root, _checked_labels(folder), rows, x_m)
+    path, schema, find = folder / NET, allowed.NET, corridor_of_shipped
+    if hosted:
+        path, schema, find = folder / HOSTED_NET, allowed.HOSTED_NET, corridor_of_hosted
+    net = received.cleaned(_bytes(path), schema, f"the net {path}")
+    drawn = _read(folder / SURROUNDINGS, allowed.SURROUNDINGS) if hosted else None
+    road = Road(net, find(net, path), drawn)
+    types = _checked_types(_bytes(folder / TYPES), folder / TYPES)
+    record = _bytes(folder / RECORD)
+    root, rows = _checked_record(record, folder / RECORD, _vehicles(types))
+    # Folders of older versions have no labels.
+    has_labels = os.path.lexists(folder / LABELS)
+    labels = _read(folder / LABELS, allowed.LABELS) if has_labels else None
+    return _Episode(road, types, root, labels, rows, _lane_coordinates(root, road.corridor))
 
 
-def _checked_labels(folder: Path) -> etree._Element | None:
-    """Return the labels of a folder; None of one that has none, as older ones."""
-    if not os.path.lexists(folder / LABELS):
-        return None
-    content = received.read_bytes(folder / LABELS, "the file", follow_links=False)
-    return received.parse(content, allowed.LABELS, f"the file {folder / LABELS}")[0]
+def _bytes(path: Path) -> bytes:
+    return received.read_bytes(path, "the file", follow_links=False)
 
 
-def _checked_hosted(net: bytes, surroundings: bytes, folder: Path) -> Road:
-    content = received.cleaned(net, allowed.HOSTED_NET, f"the net {folder / HOSTED_NET}")
-    name = f"the file {folder / SURROUNDINGS}"
-    drawn, _ = received.parse(surroundings, allowed.SURROUNDINGS, name)
-    return Road(content, corridor_of_hosted(content, folder / HOSTED_NET), drawn)
+def _read(path: Path, schema: Mapping[str, Allowed]) -> etree._Element:
+    return received.parse(_bytes(path), schema, f"the file {path}")[0]
 
 
 def _checked_types(content: bytes, path: Path) -> etree._Element:
@@ -245,7 +238,8 @@ def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
         for who in episode.vehicles:
             x, y, _, speed = rows[time, who]
             x_m = episode.x_m[time, who]
-            if x_m is None or _is_beside(episode.path(who).point(x_m), x, y):
+            lane = None if x_m is None else episode.path(who).point(x_m)
+            if lane is None or not math.hypot(x - lane.x_m, y - lane.y_m) <= LANE_END_M:
                 return (time, f"{who} is recorded beside its lane")
             if after is None:
                 continue
@@ -254,13 +248,9 @@ def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
                     return (after, f"{who} is not held where the episode ended")
                 continue
             to_m = episode.x_m[after, who]
-            if to_m is None or not abs(to_m - x_m - speed * DT_S) <= TOLERANCE:
+            if x_m is None or to_m is None or not abs(to_m - x_m - speed * DT_S) <= TOLERANCE:
                 return (time, f"{who} is recorded as not moving at its speed of {speed}")
     return None
-
-
-def _is_beside(lane: LanePoint, x: float, y: float) -> bool:
-    return not math.hypot(x - lane.x_m, y - lane.y_m) <= LANE_END_M
 
 
 def _lane_coordinates(

@@ -17,7 +17,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, motion_lines
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.live import LABEL, Window
-from merge_sumo.sumo.replay_labels import TEXT, case_line, verdict_line
+from merge_sumo.sumo.replay_folder import TEXT, case_line, verdict_line
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23
 

@@ -21,12 +21,12 @@ import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.store import failures
 from merge_sumo.sumo.replay_folder import (
+    COLOURS,
     LABELS,
     SURROUNDINGS_COLOUR,
     VIEW,
     write_scenario,
 )
-from merge_sumo.sumo.replay_labels import COLOURS
 
 PICTURE_TIMES_S = (2.0, 7.0)
 LABELS_SHARE = 0.2

@@ -19,7 +19,7 @@ from merge_sumo.values.case import Case, MergeCase, from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, POV, US23, VUT
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 EXACT = 1e-9
 
@@ -99,7 +99,7 @@ def test_episodes_are_the_same_in_1_and_in_32_corridors():
     outcomes = []
     for corridors in (1, 32):
         with World(corridors, scenario=US23) as world:
-            vut = vut_factory("design2")(corridors)
+            vut = VutFactory("design2")(corridors)
             outcomes.append(run_all(world, PovLibrary(corridors, POVS), vut, cases))
     for one, many in zip(*outcomes, strict=True):
         assert np.array_equal(one.motion, many.motion)
@@ -110,7 +110,7 @@ def test_episodes_are_the_same_in_1_and_in_32_corridors():
 def test_sumo_holds_the_very_speeds_that_it_was_told(model):
     """They are not read back: to the last bit it would give the same numbers."""
     rng = np.random.default_rng(2)
-    vut_type = None if model is None else vut_factory(model).vut.vut_type
+    vut_type = None if model is None else VutFactory(model).vut.vut_type
     with World(16, vut_type=vut_type, scenario=US23) as world:
         for case in random_cases(200):
             world.place(int(rng.integers(16)), case.starts())

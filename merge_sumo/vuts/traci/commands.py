@@ -118,31 +118,21 @@ class NotFiniteError(Exception):
     """A command on the VUT's speed with a number that is none; the text is the command."""
 
 
-def _check_number(name: str, value: object) -> None:
-    """Raise `RefusedError`, as SUMO's server does, for a number that its models cannot have."""
-    if name not in INVALID or not isinstance(value, float):
-        return
-    if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name == "setMaxSpeed"):
-        raise RefusedError(f"Invalid {INVALID[name]}.")
-
-
 def call_of_command(functions: Sequence[str], object_id: str, reader: Reader) -> Call:
-    """Return the call that carries a command out.
+    """Return the call that carries out what some functions of SUMO's client command of an object.
 
-    Args:
-        functions: functions of SUMO's client that give it.
-        object_id: object that is commanded.
-        reader: the values behind it.
-
-    Raises:
-        RefusedError: for a value that SUMO's models cannot have, and for a device.
-        NotFiniteError: for a speed that is no number: the VUT would drive on as if nothing was
-            commanded.
+    Raises `RefusedError` for a value that SUMO's models cannot have, and for a device, and
+    `NotFiniteError` for a speed that is no number: the VUT would drive on as if nothing was
+    commanded.
     """
     function, arguments = functions[-1], reader.arguments()
     name = function.partition(".")[2]
     for value in arguments:
-        _check_number(name, value)
+        # As SUMO's server does: its models cannot have such a number.
+        if name in INVALID and isinstance(value, float):
+            is_zero_speed = name == "setMaxSpeed" and value == 0.0
+            if not math.isfinite(value) or value < 0.0 or is_zero_speed:
+                raise RefusedError(f"Invalid {INVALID[name]}.")
     if any(isinstance(value, float) and not math.isfinite(value) for value in arguments):
         given = ", ".join(f"{value!r:.40}" for value in arguments)
         if name in SPEEDS:

@@ -40,32 +40,34 @@ STRANGER_S: Final = 10.0
 
 
 class Peer(NamedTuple):
-    """The process whose connections are served.
-
-    Attributes:
-        program: id of the process; None for all processes of this user.
-        token: what shows that another connection is to be served, too; without a program, what
-            every one has to give. None for no token.
-    """
+    """The process whose connections are served."""
 
     program: int | None
+    """Its id; None for all processes of this user."""
     token: str | None
+    """What shows that another connection is to be served, too; without a program, what every one
+    has to give."""
 
 
 class Door:
     """A listening socket on the loopback interface, and connections that may give a token."""
 
     def __init__(self, port: int, note: Callable[[str], None]) -> None:
-        """Listen.
+        """Listen on a port, 0 for any; `note` is told in a sentence of each refused connection.
 
-        Args:
-            port: number of the port; 0 for any.
-            note: is called with a sentence on each connection that is refused.
-
-        Raises:
-            UserError: where the port cannot be listened on.
+        Raises `UserError` where the port cannot be listened on.
         """
-        self._listener = _listen(port)
+        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._listener.bind((HOST, port))
+            self._listener.listen(BACKLOG)
+        except OSError as error:
+            self._listener.close()
+            raise UserError(
+                f"cannot listen on {HOST}:{port} ({error.strerror}): choose another port by "
+                "--vut traci:PORT"
+            ) from error
         self._note = note
         self._strangers: dict[Stranger, float] = {}
         self._selector = selectors.DefaultSelector()
@@ -174,21 +176,6 @@ def _refusal(connection: socket.socket, peer: Peer) -> str | None:
     return None
 
 
-def _listen(port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((HOST, port))
-        listener.listen(BACKLOG)
-    except OSError as error:
-        listener.close()
-        raise UserError(
-            f"cannot listen on {HOST}:{port} ({error.strerror}): choose another port by "
-            "--vut traci:PORT"
-        ) from error
-    return listener
-
-
 class Stranger:
     """A connection that may still give the token; what it sends is read as far as it came."""
 
@@ -249,10 +236,7 @@ class Stranger:
 
 
 def owner_of(connection: socket.socket) -> tuple[int, int] | None:
-    """Return user and inode of the other end of a connection within this machine.
-
-    None where it is gone, or where the system does not say.
-    """
+    """Return user and inode of the other end of a local connection; None where it is unknown."""
     ends = connection.getpeername()[:2], connection.getsockname()[:2]
     hosts = tuple(ip_address(host) for host, _ in ends)
     ports = tuple(f":{port:04X}" for _, port in ends)
@@ -278,10 +262,7 @@ def _host(text: str) -> object:
 
 
 def descends(inode: int, program: int) -> bool:
-    """Return whether a process that a program started, or itself, has a socket.
-
-    That is a process whose ancestor, or the leader of whose session, the program is.
-    """
+    """Return whether a program has a socket, or a process below it or of its session has it."""
     parents, of_session = _processes(program)
     descendants = (process for process in parents if _has_ancestor(process, program, parents))
     # The session first: its processes are few.

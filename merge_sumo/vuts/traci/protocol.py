@@ -24,40 +24,23 @@ GET_VEHICLE, GET_SIMULATION, SET_VEHICLE, SET_SIMULATION = 0xA4, 0xAB, 0xC4, 0xC
 PARAMETER: Final = 0x7E
 """The variable of `getParameter` and `setParameter` in every domain."""
 
-POSITION_LON_LAT: Final = 0x00
-POSITION_2D: Final = 0x01
-POSITION_LON_LAT_ALT: Final = 0x02
-POSITION_ROADMAP: Final = 0x04
-POSITION_3D: Final = 0x03
-TYPE_POLYGON: Final = 0x06
-TYPE_UBYTE: Final = 0x07
-TYPE_BYTE: Final = 0x08
-TYPE_INTEGER: Final = 0x09
-TYPE_DOUBLE: Final = 0x0B
-TYPE_STRING: Final = 0x0C
-TYPE_STRINGLIST: Final = 0x0E
-TYPE_COMPOUND: Final = 0x0F
-TYPE_DOUBLELIST: Final = 0x10
-TYPE_COLOR: Final = 0x11
-
-OK: Final = 0x00
-NOT_IMPLEMENTED: Final = 0x01
-ERROR: Final = 0xFF
+POSITION_LON_LAT, POSITION_2D, POSITION_LON_LAT_ALT, POSITION_3D, POSITION_ROADMAP = range(5)
+TYPE_POLYGON, TYPE_UBYTE, TYPE_BYTE, TYPE_INTEGER, TYPE_DOUBLE = 0x06, 0x07, 0x08, 0x09, 0x0B
+TYPE_STRING, TYPE_STRINGLIST, TYPE_COMPOUND, TYPE_DOUBLELIST, TYPE_COLOR = 0x0C, *range(0x0E, 0x12)
+"""Types of values."""
+OK, NOT_IMPLEMENTED, ERROR = 0x00, 0x01, 0xFF
+"""Results of commands."""
 
 _FIXED: Final = {
-    POSITION_LON_LAT: struct.Struct("!dd"),
-    POSITION_2D: struct.Struct("!dd"),
-    POSITION_LON_LAT_ALT: struct.Struct("!ddd"),
-    POSITION_3D: struct.Struct("!ddd"),
+    **dict.fromkeys((POSITION_LON_LAT, POSITION_2D), struct.Struct("!dd")),
+    **dict.fromkeys((POSITION_LON_LAT_ALT, POSITION_3D), struct.Struct("!ddd")),
     TYPE_UBYTE: struct.Struct("!B"),
     TYPE_BYTE: struct.Struct("!b"),
     TYPE_INTEGER: struct.Struct("!i"),
     TYPE_DOUBLE: struct.Struct("!d"),
     TYPE_COLOR: struct.Struct("!BBBB"),
 }
-POSITIONS: Final = frozenset(
-    {POSITION_LON_LAT, POSITION_2D, POSITION_LON_LAT_ALT, POSITION_3D, POSITION_ROADMAP}
-)
+POSITIONS: Final = range(POSITION_ROADMAP + 1)
 _UBYTE, _INT, _DOUBLE = (_FIXED[t] for t in (TYPE_UBYTE, TYPE_INTEGER, TYPE_DOUBLE))
 _MAX_NESTING: Final = 4
 

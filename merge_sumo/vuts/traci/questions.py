@@ -26,20 +26,14 @@ OF_SHARED_VARIABLES: Final = {
     "person.getRemainingStages": "person.getRemainingStages",
 }
 """Of several functions that read one variable, by the first: the one that SUMO's server calls."""
-WITHOUT_OBJECT: Final = frozenset(
-    {
-        *("getIDList", "getIDCount", "getLoadedIDList", "getTeleportingIDList", "getTaxiFleet"),
-        "getTaxiReservations",
-    }
+WITHOUT_OBJECT: Final = (
+    *("getIDList", "getIDCount", "getLoadedIDList", "getTeleportingIDList", "getTaxiFleet"),
+    "getTaxiReservations",
 )
-NOT_ANSWERED: Final = frozenset(
-    {
-        "trafficlight.getConstraints",
-        "trafficlight.getConstraintsByFoe",
-        "trafficlight.swapConstraints",
-        "simulation.findIntermodalRoute",
-    }
-)
+NOT_ANSWERED: Final = {
+    *("trafficlight.getConstraints", "trafficlight.getConstraintsByFoe"),
+    *("trafficlight.swapConstraints", "simulation.findIntermodalRoute"),
+}
 """Their answers have a layout that no car needs."""
 COMPOUND_HEAD_BYTES: Final = 5
 """Its type, and how many values it has."""
@@ -49,15 +43,9 @@ DRIVING: Final = 1
 
 
 def call_of_question(functions: Sequence[str], object_id: str, reader: Reader) -> Call:
-    """Return the call that answers a question.
+    """Return the call that answers what some functions of SUMO's client ask of an object.
 
-    Args:
-        functions: functions of SUMO's client that ask it.
-        object_id: object that is asked about.
-        reader: the parameters behind it.
-
-    Raises:
-        RefusedError: for a question that is not answered.
+    The reader has the parameters of the question. Raises `RefusedError` where none answers it.
     """
     function = OF_SHARED_VARIABLES.get(functions[0], functions[0])
     domain, _, name = function.partition(".")

@@ -23,6 +23,7 @@ from merge_sumo.sumo.child import Channel, channel_of
 from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, ShadowSumo, State
 from merge_sumo.sumo.traci_names import named
 from merge_sumo.system.landlock import lock_in
+from merge_sumo.system.limits import lower_limits
 from merge_sumo.vuts.process import GRACE_S
 from merge_sumo.vuts.traci import protocol as tp
 from merge_sumo.vuts.traci.commands import NotFiniteError
@@ -42,9 +43,7 @@ MOST_FILE_BYTES: Final = 16 << 20
 class FaultError(Exception):
     """What the client did wrong.
 
-    Attributes:
-        gone: whether its connection is gone, so that its program may say why.
-        late: whether it made no step in time.
+    Its connection may be `gone`, so that its program may say why, or its step `late`.
     """
 
     def __init__(self, text: str, *, gone: bool = False, late: bool = False) -> None:
@@ -59,7 +58,7 @@ class ClosedError(Exception):
 def main(settings: Mapping[str, Any]) -> None:
     """Serve clients, one after the other, until the channel ends."""
     channel, folder = channel_of(settings), Path(settings["folder"])
-    _limit()
+    lower_limits(RLIMIT_DATA=MOST_MEMORY_BYTES, RLIMIT_FSIZE=MOST_FILE_BYTES, RLIMIT_CORE=0)
     try:
         sumo = ShadowSumo(folder)
         sumo.load()
@@ -78,21 +77,6 @@ def _folders_to_read() -> list[Path]:
     modules = {Path(paths[name]) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
     modules |= {Path(folder) for folder in sys.path if Path(folder).name in INSTALLED}
     return [*modules, Path(sumo_program("sumo")).parents[1], PACKAGE]
-
-
-def _limit() -> None:
-    """Let memory and files run out here before they run out for everybody."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    for limit, most in (
-        (resource.RLIMIT_DATA, MOST_MEMORY_BYTES),
-        (resource.RLIMIT_FSIZE, MOST_FILE_BYTES),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        with suppress(ValueError, OSError):  # a limit of the system may be lower
-            resource.setrlimit(limit, (most, most))
 
 
 def _serve(channel: Channel, sumo: ShadowSumo) -> None:
@@ -138,16 +122,10 @@ class Client:
     def show(self, states: Mapping[str, State], *, first: bool) -> float | None:
         """Show the next state, and serve the client until it makes its next step.
 
-        Args:
-            states: the vehicles of the episode.
-            first: whether an episode begins; the vehicles of the one before arrive then.
-
-        Returns:
-            The speed that SUMO gives the VUT in that step; None where it is beyond the net.
-
-        Raises:
-            FaultError: for what the client does wrong.
-            ClosedError: when it says goodbye before the vehicles depart.
+        With the `first` state of an episode the vehicles of the one before arrive. Returns the
+        speed that SUMO gives the VUT in that step; None where it is beyond the net. Raises
+        `FaultError` for what the client does wrong, and `ClosedError` when it says goodbye before
+        the vehicles depart.
         """
         session = self.session
         if first:

@@ -11,31 +11,12 @@ from typing import Final, TypeVar
 
 from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, RefusedError, ShadowSumo, State
 from merge_sumo.sumo.traci_names import name_of, named
+from merge_sumo.vuts.traci import commands
 from merge_sumo.vuts.traci import protocol as tp
-from merge_sumo.vuts.traci.commands import (
-    OF_OTHERS,
-    Effect,
-    call_of_command,
-    effect_of,
-    reason_against,
-)
-from merge_sumo.vuts.traci.protocol import (
-    GET_SIMULATION,
-    GET_VEHICLE,
-    GET_VERSION,
-    SET_ORDER,
-    SET_VEHICLE,
-    Command,
-    Reader,
-    pack,
-)
+from merge_sumo.vuts.traci.commands import Effect
+from merge_sumo.vuts.traci.protocol import GET_SIMULATION, GET_VEHICLE, Command, Reader, pack
 from merge_sumo.vuts.traci.questions import call_of_question, packed
-from merge_sumo.vuts.traci.subscriptions import (
-    CONTEXT,
-    RESPONSE,
-    SUBSCRIBE,
-    Subscriptions,
-)
+from merge_sumo.vuts.traci.subscriptions import CONTEXT, RESPONSE, SUBSCRIBE, Subscriptions
 
 T = TypeVar("T")
 
@@ -61,12 +42,9 @@ class Session:
     """The simulation as one client sees it.
 
     Attributes:
-        sumo: the shadow SUMO.
-        subscriptions: what the client has subscribed to.
         notes: sentences on what a command does less than in SUMO, once each.
         expected: whether more vehicles may come.
-        departed: vehicles that departed since the client was last answered.
-        arrived: vehicles that arrived since then.
+        departed: vehicles that departed since the client was last answered; and `arrived`.
         lane_change_mode: mode of the VUT, which nothing here obeys.
     """
 
@@ -141,9 +119,9 @@ class Session:
             return self.subscriptions.subscribe(identifier - SUBSCRIBE, reader)
         if identifier - CONTEXT in QUESTIONS:
             return self.subscriptions.subscribe_context(identifier - CONTEXT, reader)
-        if identifier == GET_VERSION:
+        if identifier == tp.GET_VERSION:
             return tp.version_answer()
-        if identifier == SET_ORDER:
+        if identifier == tp.SET_ORDER:
             reader.integer()
             return b""
         reason = REASONS.get(identifier, "it is made for SUMO as a program")
@@ -165,21 +143,21 @@ class Session:
         variable, object_id = reader.ubyte(), reader.string()
         known = named().get((command, variable))
         functions = () if known is None else known.functions
-        name, effect = name_of(command, variable), effect_of(functions)
+        name, effect = name_of(command, variable), commands.effect_of(functions)
         if effect is Effect.REFUSED:
-            reason = reason_against(functions)
+            reason = commands.reason_against(functions)
             raise RefusedError(f"merge-sumo does not carry out {name}: {reason}")
-        if command == SET_VEHICLE and object_id not in self.sumo.at_m:
+        if command == tp.SET_VEHICLE and object_id not in self.sumo.at_m:
             raise RefusedError(f"Vehicle '{object_id}' is not known.")
         mine = object_id in (NAME_OF_VUT, OWN_TYPE)
         if effect is Effect.CARRIED_OUT and mine:
-            function, arguments = call_of_command(functions, object_id, reader)
+            function, arguments = commands.call_of_command(functions, object_id, reader)
             self.sumo.call(function, *arguments)
             return
-        if effect is Effect.CARRIED_OUT and OF_OTHERS.isdisjoint(functions):
-            what = "vehicle" if command == SET_VEHICLE else "type"
+        if effect is Effect.CARRIED_OUT and commands.OF_OTHERS.isdisjoint(functions):
+            what = "vehicle" if command == tp.SET_VEHICLE else "type"
             raise RefusedError(f"the {what} '{object_id}' is not the controller's to command")
-        if command == SET_VEHICLE and mine and variable == LANE_CHANGE_MODE:
+        if command == tp.SET_VEHICLE and mine and variable == LANE_CHANGE_MODE:
             mode = reader.typed()
             if not isinstance(mode, int):
                 raise RefusedError("a mode is an integer")

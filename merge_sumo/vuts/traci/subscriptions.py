@@ -30,15 +30,13 @@ WITH_PARAMETER: Final = {(GET_VEHICLE, 0x68), (GET_VEHICLE, 0x78), (GET_VEHICLE,
 
 @dataclass(frozen=True, slots=True)
 class Subscription:
-    """Variables of an object, or of the objects of a domain around it.
+    """Variables of an object, or of the objects of a domain around it, sent from begin to end.
 
     Attributes:
         getter: identifier of the questions of the object's domain.
         variables: numbers of the variables, each with its parameter as it was sent.
-        begin_s: simulation time from which on they are sent.
-        end_s: simulation time up to which they are sent.
-        domain: identifier of the questions of the domain around the object; None for the object.
-        range_m: how far that reaches.
+        domain: identifier of the questions of the domain around the object, as far as `range_m`;
+            None for the object.
     """
 
     getter: int
@@ -110,11 +108,8 @@ class Subscriptions:
 
     def end_of_vehicles(self) -> None:
         """End what was subscribed of the vehicles of an episode."""
-        self.all = [
-            kept
-            for kept in self.all
-            if kept.getter != GET_VEHICLE or kept.object_id not in VEHICLES
-        ]
+        ended = [s for s in self.all if s.getter == GET_VEHICLE and s.object_id in VEHICLES]
+        self.all = [kept for kept in self.all if kept not in ended]
 
     def results(self, now_s: float) -> bytes:
         """Return the values of all subscriptions: the answer to a step behind its status."""

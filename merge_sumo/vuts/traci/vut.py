@@ -58,14 +58,9 @@ def traci_vut(argument: str, options: VutOptions) -> Vut:
             raise UserError("--vut traci drives in a SUMO world only")
         return TraciVut(corridors, world.road, world.scenario, port, command, options)
 
-    files = [Path(word) for word in command or () if Path(word).is_file()]
-    return Vut(
-        make=make,
-        max_corridors=1,
-        max_workers=None if port == 0 else 1,
-        files=tuple(files),
-        named_only=True,
-    )
+    files = tuple(Path(word) for word in command or () if Path(word).is_file())
+    workers = None if port == 0 else 1
+    return Vut(make=make, max_corridors=1, max_workers=workers, files=files, named_only=True)
 
 
 class TraciVut(Driver):
@@ -327,10 +322,8 @@ class Shadow:
     def serve(self, connection: socket.socket, deadline_s: float) -> None:
         """Hand a connection over to it.
 
-        Raises:
-            UserError: where SUMO cannot use the net.
-            ChildDiedError: when the process has ended twice.
-            TimeoutError: when it does not answer.
+        Raises `UserError` where SUMO cannot use the net, `ChildDiedError` when the process has
+        ended twice, and TimeoutError when it does not answer.
         """
         if not self._ready:
             try:
