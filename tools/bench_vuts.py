@@ -40,7 +40,7 @@ from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.onnx_export import export_onnx
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 STEPS = 80
 """Of an episode."""
@@ -184,7 +184,7 @@ def main() -> None:
         world: Any = SimpleNamespace(road=road_of(), scenario=US23)
 
         def driver(spec: str, corridors: int = 1, given: VutOptions | None = None) -> Driver:
-            return vut_factory(spec, given)(corridors, world)
+            return VutFactory(spec, given)(corridors, world)
 
         drivers = {
             "python": driver(f"{folder / 'law.py'}:Vut"),

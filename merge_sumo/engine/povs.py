@@ -23,7 +23,7 @@ from merge_sumo.system.hashing import Files
 from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, level_name
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory, kind_of, vut_factory
+from merge_sumo.vuts.registry import VutFactory, kind_of
 from merge_sumo.vuts.sumo_model import SumoVut
 
 POLICIES: Final = {1: "pov1", 2: "pov2"}
@@ -132,7 +132,7 @@ def own_pov(spec: str, options: VutOptions) -> VutFactory:
     if why := kind_of(spec).no_pov:
         raise UserError(f"--pov {spec}: {why}")
     try:
-        return vut_factory(spec, replace(options, command=None))
+        return VutFactory(spec, replace(options, command=None))
     except UserError as error:
         raise UserError(f"--pov {spec}: {error}") from error
 

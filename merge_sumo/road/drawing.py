@@ -66,5 +66,5 @@ def _line(
     root: etree._Element, points: Sequence[tuple[float, ...]], colour: str, width_m: float
 ) -> None:
     text = " ".join(f"{x:.2f},{-y:.2f}" for x, y, *_ in points)
-    attributes = {"points": text, "fill": "none", "stroke": colour}
-    etree.SubElement(root, "polyline", {**attributes, "stroke-width": f"{width_m:g}"})
+    style = {"fill": "none", "stroke": colour, "stroke-width": f"{width_m:g}"}
+    etree.SubElement(root, "polyline", {"points": text, **style})

@@ -112,10 +112,7 @@ def check_text(content: bytes, name: str) -> None:
 
 
 def parse(
-    content: bytes,
-    allowed: Mapping[str, Allowed],
-    name: str,
-    max_elements: int = MAX_ELEMENTS,
+    content: bytes, allowed: Mapping[str, Allowed], name: str, max_elements: int = MAX_ELEMENTS
 ) -> tuple[etree._Element, bool]:
     """Return what is allowed of an XML file as a tree, and whether that is all of it.
 
@@ -148,10 +145,7 @@ def parse(
 
 
 def cleaned(
-    content: bytes,
-    allowed: Mapping[str, Allowed],
-    name: str,
-    max_elements: int = MAX_ELEMENTS,
+    content: bytes, allowed: Mapping[str, Allowed], name: str, max_elements: int = MAX_ELEMENTS
 ) -> bytes:
     """Return an XML file, or what is allowed of it where that is not all; raises as `parse`."""
     root, intact = parse(content, allowed, name, max_elements)
@@ -200,11 +194,10 @@ class _Cleaner:
         for name in allowed.required:
             if name not in kept:
                 raise UserError(f"{self._name} has an element {tag} without {name}")
-        element = etree.Element(tag) if parent is None else etree.SubElement(parent, tag)
-        for name, text in kept.items():
-            element.set(name, text)
         if parent is None:
-            self._root = element
+            element = self._root = etree.Element(tag, kept)
+        else:
+            element = etree.SubElement(parent, tag, kept)
         self._open.append((element, allowed.children))
 
     def end(self, tag: str) -> None:

@@ -53,7 +53,7 @@ from merge_sumo.values.scenario import DT_S, EpisodeTime
 from merge_sumo.values.score import Outcome, is_close
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.output import LOG
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 AVOIDANCE: Final = "avoidance.jsonl"
 CAREFUL: Final = "careful"
@@ -203,7 +203,7 @@ def avoidance(
     if not failing:
         return []
     # No code of the VUT: a driver of the package is in its place.
-    plan = replace(plan, vut=vut_factory(CAREFUL)).with_log(run.folder.resolve() / LOG)
+    plan = replace(plan, vut=VutFactory(CAREFUL)).with_log(run.folder.resolve() / LOG)
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as processes:
         on_part(done := 0, len(failing))

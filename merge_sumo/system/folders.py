@@ -63,8 +63,7 @@ def check_new(path: Path, option: str = "--out") -> None:
 def _try(folder: Path) -> None:
     """Raise OSError where a folder cannot be written, with the reason."""
     # On Linux the file never has a name: nothing changes in the folder.
-    with tempfile.TemporaryFile(dir=folder):
-        pass
+    tempfile.TemporaryFile(dir=folder).close()
 
 
 def _is_there(path: Path) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import threading
+from contextlib import suppress
 from typing import Final
 
 from merge_sumo.errors import UserError
@@ -58,6 +59,17 @@ def check_threads(count: int) -> None:
         end.set()
         for thread in started:
             thread.join()
+
+
+def lower_limits(**most: int) -> None:
+    """Let something run out in this process before it runs out for everybody: `RLIMIT_DATA=...`."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    for name, limit in most.items():
+        with suppress(ValueError, OSError):  # a limit of the system may be lower
+            resource.setrlimit(getattr(resource, name), (limit, limit))
 
 
 def _check_address_space() -> None:

@@ -11,13 +11,11 @@ from unicodedata import category
 def printable(text: str) -> str:
     """Return a text with control characters, line ends and invalid characters escaped."""
     return "".join(
-        letter if letter.isprintable() or category(letter) == "Zs" else _escaped(letter)
+        letter
+        if letter.isprintable() or category(letter) == "Zs"
+        else letter.encode("unicode_escape").decode()
         for letter in text
     )
-
-
-def _escaped(letter: str) -> str:
-    return letter.encode("unicode_escape").decode()
 
 
 def two_digits(value: float) -> str:

@@ -28,10 +28,6 @@ class Registry(Mapping[str, T], Generic[T]):
 
     It is read like a dictionary, but an unknown name, a name that two packages bring, and an
     object that cannot be loaded or is of another kind raise `UserError`.
-
-    Attributes:
-        group: group of entry points by which installed packages add to it.
-        noun: what it holds, in the singular, for sentences.
     """
 
     def __init__(

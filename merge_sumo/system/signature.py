@@ -37,7 +37,9 @@ def user_key() -> bytes:
     folder = cache_folder()
     path = folder / KEY
     if not os.path.lexists(path):
-        _make_cache(folder)
+        if not folder.is_dir():
+            make_place(folder, CACHE)
+            folder.chmod(stat.S_IRWXU)
         check_private(folder)
         _make_key(path)
     check_private(folder)
@@ -94,14 +96,6 @@ def _name_of(user: int) -> str:
         return pwd.getpwuid(user).pw_name
     except KeyError:
         return f"the user {user}"
-
-
-def _make_cache(folder: Path) -> None:
-    """Make the cache folder, for this user alone, unless it is there."""
-    if folder.is_dir():
-        return
-    make_place(folder, CACHE)
-    folder.chmod(stat.S_IRWXU)
 
 
 def _make_key(path: Path) -> None:

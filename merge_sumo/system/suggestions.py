@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 from typing import Final
 
 ALIKE: Final = 0.6
@@ -16,18 +16,10 @@ def nearest(name: str, known: Iterable[str], alike: float = ALIKE) -> list[str]:
 
     Upper and lower case are the same; a name that differs in that alone is the only one.
     """
-    folded = name.casefold()
-    found: list[tuple[float, int, str]] = []
-    matcher = SequenceMatcher(None, "", folded)
-    for other in known:
-        if other.casefold() == folded:
-            return [other]
-        matcher.set_seq1(other.casefold())
-        # The first two are quick and never below the third: nets have thousands of names.
-        ratios = (matcher.real_quick_ratio, matcher.quick_ratio, matcher.ratio)
-        if all((ratio := of()) >= alike for of in ratios):
-            found.append((-ratio, len(found), other))
-    return [other for _, _, other in sorted(found)[:MOST]]
+    by_folded = {other.casefold(): other for other in known}
+    if name.casefold() in by_folded:
+        return [by_folded[name.casefold()]]
+    return [by_folded[near] for near in get_close_matches(name.casefold(), by_folded, MOST, alike)]
 
 
 def either(names: Iterable[str]) -> str:

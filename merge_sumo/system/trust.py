@@ -38,50 +38,34 @@ MOST_BYTES: Final = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """What is run from a folder.
-
-    Attributes:
-        named: what names it: the VUT, its command, the POV; None where there is none.
-        files: the files that it is known to be made of, by absolute path, with their SHA-256.
-        here: the working folder, in which relative names of it are looked for; empty where it has
-            none.
-    """
+    """What is run from a folder."""
 
     named: tuple[str | None, ...]
+    """What names it: the VUT, its command, the POV; None where there is none."""
     files: Mapping[str, str | None]
+    """The files that it is known to be made of, by absolute path, with their SHA-256."""
     here: str
+    """The working folder, in which its relative names are looked for; empty where it has none."""
 
 
 @dataclass(frozen=True, slots=True)
 class _OwnRun:
-    """What the cache keeps of a folder.
-
-    Attributes:
-        folder: its real path.
-        inode: its inode. The device is left out: its number may change when a disk is mounted
-            again.
-        record: inode and time of change, ns, of the file in it that names the code.
-        begun: whether the campaign was begun there by this user, and not only gone on with.
-        code: what was run.
-    """
+    """What the cache keeps of a folder, by its real path, and of the code that was run."""
 
     folder: str
     inode: int
+    """Without the device, whose number may change when a disk is mounted again."""
     record: tuple[int, int]
+    """Inode and time of change, ns, of the file in it that names the code."""
     begun: bool
+    """Whether the campaign was begun there by this user, and not only gone on with."""
     code: Code
 
 
 def note_own(folder: Path, at: Path, record: str, code: Code, *, begun: bool) -> None:
-    """Remember that this user runs code from a folder that is, or is about to be, `at` a path.
+    """Remember that this user runs code from a folder that will be `at` a path.
 
-    Args:
-        folder: where it is now.
-        at: where it will be.
-        record: name of the file in it that names the code.
-        code: what is run.
-        begun: whether the campaign was begun there by this user.
-
+    `record` is the file in it that names the code, `begun` whether this user began the campaign.
     Where nothing can be kept, nothing is: then a person is asked later on.
     """
     with suppress(UserError, OSError):
@@ -165,13 +149,16 @@ def _known(folder: Path) -> _OwnRun | None:
     return known
 
 
+def _hash(folder: Path) -> str:
+    return hashlib.sha256(os.fsencode(os.path.realpath(folder))).hexdigest()
+
+
 def _path(folder: Path) -> Path:
-    name = hashlib.sha256(os.fsencode(os.path.realpath(folder))).hexdigest()[:32]
-    return cache_folder() / RUNS / f"{name}.json"
+    return cache_folder() / RUNS / f"{_hash(folder)[:32]}.json"
 
 
 def _what(folder: Path) -> str:
-    return f"run {hashlib.sha256(os.fsencode(os.path.realpath(folder))).hexdigest()}"
+    return f"run {_hash(folder)}"
 
 
 def _identity(folder: Path, record: str) -> tuple[int, tuple[int, int]]:

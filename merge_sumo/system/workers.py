@@ -25,11 +25,11 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from numbers import Integral
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.blame import Blame
@@ -50,7 +50,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-class Workers:
+class Workers(AbstractContextManager["Workers"]):
     """Runs functions on chunks of items through an executor; to be closed, or used in `with`.
 
     A chunk whose worker dies runs again, alone and then item by item, so that the one item that
@@ -94,14 +94,12 @@ class Workers:
 
         Args:
             function: gives one result for each item of a chunk. It goes to other processes, so it
-                is found by its name there, and it must be safe to run twice.
+                is found by its name there, and it must be safe to run twice; what it raises, this
+                raises, and `UserError` when the executor goes away.
             items: what to work on.
             lost: gives the result of an item that is to blame for the deaths of its workers.
-            chunk: items in a chunk; by default as many as give every worker one chunk, up to
-                `MAX_CHUNK`.
+            chunk: items in a chunk; by default `chunk_size`.
             ran_again: marks the result of an item that ran again because a worker had died.
-
-        Raises what `function` raises, and `UserError` when the executor goes away.
         """
         size = chunk or self.chunk_size(len(items))
         chunks = (items[first : first + size] for first in range(0, len(items), size))
@@ -176,9 +174,6 @@ class Workers:
             future: Future[R] = Future()
             future.set_exception(error)
             return future
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: Any) -> None:
         """Close the executor; only where work was left behind does it hear of an exception."""

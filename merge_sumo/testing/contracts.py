@@ -36,7 +36,7 @@ from merge_sumo.values.scenario import DT_S, US23, VUT
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 HALF_WIDTH: Final = 0.03
 """Of the band of failures in the unit square; about 7 % of the square."""
@@ -117,7 +117,6 @@ class SamplerContract:
         assert int(colour.removeprefix("#"), 16) >= 0
 
     def test_proposes_as_many_cases_as_asked_for(self) -> None:
-        """Before and after it was told something."""
         for n in (1, 3, 20):
             assert len(self.fresh(1).ask(n)) == n
             assert len(self.played()[0].ask(n)) == n
@@ -136,13 +135,11 @@ class SamplerContract:
                 assert dimension.low <= value <= dimension.high
 
     def test_proposes_no_case_twice(self) -> None:
-        """Not even one of the history."""
         _, outcomes, proposed = self.played()
         cases = [outcome.case for outcome in outcomes] + proposed
         assert len(set(cases)) == len(cases)
 
     def test_answers_the_same_question_with_the_same_cases(self) -> None:
-        """Asking changes nothing."""
         sampler, _, proposed = self.played()
         sampler.ask(2)
         assert sampler.ask(9) == proposed
@@ -195,7 +192,6 @@ class SamplerContract:
                 )
 
     def test_goes_on_from_a_journal_as_if_it_had_never_stopped(self) -> None:
-        """Also from the records of the outcomes."""
         _, outcomes, proposed = self.played()
         for batches in range(3):
             resumed = self.fresh()
@@ -208,7 +204,6 @@ class SamplerContract:
         assert resumed.ask(9) == proposed
 
     def test_proposes_other_cases_for_another_seed(self) -> None:
-        """With a history and without."""
         _, outcomes, proposed = self.played()
         other = self.fresh(6)
         assert not set(other.ask(9)) & set(self.fresh().ask(9))
@@ -216,7 +211,6 @@ class SamplerContract:
         assert other.ask(9) != proposed
 
     def test_proposes_cases_at_every_level(self) -> None:
-        """In every batch that is large enough, case by case, and where every case errs."""
         sampler, outcomes, _ = self.played()
         levels = set(self.pool.levels)
         for batch in range(3):
@@ -266,7 +260,6 @@ class MeasureContract:
         return [self.measure.of(episode(case), None) for case in cases]
 
     def test_says_what_it_is(self) -> None:
-        """A name that a condition can use, and a sentence."""
         assert self.measure.name.isidentifier()
         assert self.measure.about
         assert "\n" not in self.measure.about
@@ -322,7 +315,6 @@ class VutContract:
     vut: str
 
     def test_answers_in_every_step(self) -> None:
-        """No case ends in an error."""
         ends = {outcome.measures.end for outcome in campaign_of(self.vut).outcomes}
         assert not {end for end in ends if end.is_error}
 
@@ -335,7 +327,7 @@ class VutContract:
 
     def test_is_found_again_by_its_name(self) -> None:
         """A worker is told the name and makes it anew."""
-        first, second = (vut_factory(self.vut, VutOptions()) for _ in range(2))
+        first, second = (VutFactory(self.vut, VutOptions()) for _ in range(2))
         assert first == second
         assert first.files == second.files
 
@@ -358,20 +350,17 @@ class ExportContract:
         return export_format.write_case(run, 3, folder, road_of())
 
     def test_writes_below_the_folder_that_it_is_told(self) -> None:
-        """The path that it returns can be opened."""
         with tempfile.TemporaryDirectory() as scratch:
             path = self.written(Path(scratch) / "new")
             assert path.is_relative_to(Path(scratch) / "new")
             assert path.stat().st_size
 
     def test_writes_the_same_bytes_again(self) -> None:
-        """A case has one export."""
         with tempfile.TemporaryDirectory() as scratch:
             paths = [self.written(Path(scratch) / name) for name in ("a", "b")]
             assert paths[0].read_bytes() == paths[1].read_bytes()
 
     def test_replaces_nothing(self) -> None:
-        """What a person has written stays."""
         with tempfile.TemporaryDirectory() as scratch:
             path = self.written(Path(scratch) / "new")
             before = path.read_bytes()
@@ -398,7 +387,6 @@ class ReportSectionContract:
         return self.section.html(model, shared_words(model)) or ""
 
     def test_is_one_section_or_nothing(self) -> None:
-        """It begins and ends itself."""
         html = self.html().strip()
         assert not html or html.count("<section") == html.count("</section>") == 1
 
@@ -408,5 +396,4 @@ class ReportSectionContract:
         assert not [word for word in ("<script", "<style", " src=", "javascript:") if word in html]
 
     def test_is_the_same_again(self) -> None:
-        """A report of the same run has the same bytes."""
         assert self.html() == self.html()

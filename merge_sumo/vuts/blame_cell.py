@@ -1,4 +1,4 @@
-"""The corridor whose controller is being called, for the process that watches that of a VUT."""
+"""The corridor whose controller is being called, told to another process in shared memory."""
 
 from __future__ import annotations
 
@@ -11,13 +11,9 @@ ALL_CORRIDORS: Final = -2
 
 
 class BlameCell:
-    """The corridor whose controller is being called, in memory that outlives the process.
+    """Notes who is called in memory that outlives this process, which may die or hang.
 
-    The process that watches reads from it which controller was at work when the process died or
-    hung.
-
-    Attributes:
-        shared: whether another process reads it: then this process is there for a VUT alone.
+    It is `shared` where another process reads it; then this one is there for a VUT alone.
     """
 
     FORMAT: Final = struct.Struct("<Qq")

@@ -18,7 +18,7 @@ from typing import Any, Final, Protocol, SupportsFloat
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.vuts.base import Seen, Vut, VutOptions, text_of
-from merge_sumo.vuts.python import SeenBatch, vut_of
+from merge_sumo.vuts.python import SeenBatch, is_code, vut_of
 
 
 class Acts(Protocol):
@@ -52,7 +52,7 @@ def spec_of(vut: Any) -> str:
     """
     if isinstance(vut, str):
         return vut
-    if isinstance(vut, type) or inspect.isroutine(vut):
+    if is_code(vut):
         importable = _importable(vut)
         if importable is not None:
             return importable
@@ -162,9 +162,7 @@ def _importable(target: Any) -> str | None:
 
 def _files(vut: Any) -> tuple[Path, ...]:
     try:
-        file = inspect.getsourcefile(
-            vut if isinstance(vut, type) or inspect.isroutine(vut) else type(vut)
-        )
+        file = inspect.getsourcefile(vut if is_code(vut) else type(vut))
     except (TypeError, OSError):
         return ()
     return (Path(file),) if file is not None and Path(file).is_file() else ()

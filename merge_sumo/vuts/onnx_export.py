@@ -118,8 +118,7 @@ class _Graph:
         **attributes: Any,
     ) -> list[str]:
         names = names or [f"n{len(self.nodes)}_{i}" for i in range(outputs)]
-        given = {key: value for key, value in attributes.items() if value is not None}
-        self.nodes.append(self._helper.make_node(operator, inputs, names, **given))
+        self.nodes.append(self._helper.make_node(operator, inputs, names, **attributes))
         return names
 
 

@@ -93,7 +93,10 @@ def append(log: Path, content: bytes) -> None:
     with os.fdopen(descriptor, "r+b", buffering=0) as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             return
-        _lock(descriptor)
+        if sys.platform != "win32":  # several processes may write
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
         file.write(content)
         size = file.seek(0, os.SEEK_END)
         if size > MOST_BYTES:
@@ -101,10 +104,3 @@ def append(log: Path, content: bytes) -> None:
             end = file.read(KEPT_BYTES)
             file.truncate(0)
             file.write(b"[what was printed before is gone]\n" + end)
-
-
-def _lock(descriptor: int) -> None:
-    if sys.platform != "win32":
-        import fcntl
-
-        fcntl.flock(descriptor, fcntl.LOCK_EX)

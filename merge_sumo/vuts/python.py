@@ -67,7 +67,7 @@ def python_vut(spec: str, options: VutOptions) -> Vut:
 
 
 def _named_vut(target: Any, spec: str, module: ModuleType | None, options: VutOptions) -> Vut:
-    vut = vut_of(target, spec, options) if _is_code(target) else None
+    vut = vut_of(target, spec, options) if is_code(target) else None
     if vut is None:
         raise UserError(
             f"{spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)`, a "
@@ -77,7 +77,7 @@ def _named_vut(target: Any, spec: str, module: ModuleType | None, options: VutOp
     return replace(vut, files=(Path(file),) if file else ())
 
 
-def _is_code(target: Any) -> bool:
+def is_code(target: Any) -> bool:
     """Return whether something is a class or a function, and no other object."""
     return isinstance(target, type) or inspect.isroutine(target)
 
@@ -137,7 +137,7 @@ class PythonVut(PerCorridor):
     def reset(self, corridor: int, seen: Seen) -> None:
         """Call `reset`; an object without is replaced before the next episode."""
         vut = self._objects[corridor]
-        if _has(vut, "reset"):
+        if getattr(vut, "reset", None) is not None:
             vut.reset(seen)
         elif not inspect.isroutine(vut):
             self.renewal = "made anew for this episode, as it has no `reset`"
@@ -274,10 +274,6 @@ def _copied(target: Any, name: str) -> Any:
         ) from error
 
 
-def _has(vut: Any, name: str) -> bool:
-    return getattr(vut, name, None) is not None
-
-
 def _close(vut: Any, deadline_s: float) -> None:
     """Call `close`, if there is one; what it raises comes too late to matter, and is printed."""
     if vut is None:
@@ -285,7 +281,7 @@ def _close(vut: Any, deadline_s: float) -> None:
     deadline = Deadline(deadline_s)  # of its own: this may be part of another call
     try:
         with deadline:
-            if _has(vut, "close"):
+            if getattr(vut, "close", None) is not None:
                 deadline.call(NO_CORRIDOR, vut.close)
     except BaseException as error:
         sys.stderr.write(f"closing the VUT: {deadline.reason(error)}\n")

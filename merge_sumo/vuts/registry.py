@@ -149,18 +149,13 @@ def built_in_vuts(policies: Path | None = None) -> dict[str, Callable[[int], Dri
 class VutFactory:
     """Makes the driver that `spec` names; plain values, which travel to other processes.
 
-    Attributes:
-        spec: names the VUT, as after `--vut`.
-        options: how it is hosted.
-        files: the user's files that the VUT is made of, with their hashes, as far as they are
-            known before it drives; looked up unless they are given.
-
-    Raises:
-        UserError: for a spec that names no VUT, or one that cannot be loaded.
+    `files` are those of the user's that the VUT is made of, with their hashes, as far as they are
+    known before it drives; they are looked up unless they are given. Raises `UserError` for a spec
+    that names no VUT, or one that cannot be loaded.
     """
 
     spec: str
-    options: VutOptions
+    options: VutOptions = field(default_factory=VutOptions)
     files: Files | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
@@ -202,10 +197,7 @@ class VutFactory:
         return self.vut.make(corridors, world)
 
     def __reduce__(self) -> tuple[Callable[..., VutFactory], tuple[Any, ...]]:
-        """Travel as plain values; the VUT is looked up again on arrival.
-
-        An object of this process goes along.
-        """
+        """Travel as plain values, with an object of this process; look the VUT up on arrival."""
         return (_arrived, (self.spec, self.options, self.files, object_of(self.spec)))
 
 
@@ -246,11 +238,6 @@ def file_named(spec: str) -> str:
 def _argument(spec: str) -> str:
     prefix, _, argument = spec.partition(":")
     return argument if prefix in KINDS else spec
-
-
-def vut_factory(spec: str, options: VutOptions | None = None) -> VutFactory:
-    """Return what makes the VUT that `spec` names; `UserError` for an unknown name."""
-    return VutFactory(spec, options or VutOptions())
 
 
 def find_vut(spec: str, options: VutOptions) -> Vut:

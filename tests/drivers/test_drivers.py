@@ -11,7 +11,7 @@ from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedDesign, RuleBasedVut
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23
-from merge_sumo.vuts.registry import built_in_vuts, vut_factory
+from merge_sumo.vuts.registry import VutFactory, built_in_vuts
 
 CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 DESIGN = RuleBasedDesign(x1_m=100.0, x2_m=40.0, gap_m=15.0, target_m=15.0, kp=0.2, ki=0.1, kd=0.05)
@@ -153,9 +153,9 @@ def test_a_design_with_a_parameter_that_is_no_positive_number_is_refused(value):
 def test_every_built_in_vut_makes_a_driver_and_unknown_names_are_refused():
     assert set(DESIGNS) <= set(built_in_vuts())
     for name in built_in_vuts():
-        driver = vut_factory(name)(4)
+        driver = VutFactory(name)(4)
         for k in range(4):
             driver.begin(k, CASE)
         assert driver.act(scene(x_pov=[-300.0, -250.0, -200.0, -180.0])).shape == (4,)
     with pytest.raises(UserError, match="no VUT 'design9': did you mean design1 or design2"):
-        vut_factory("design9")
+        VutFactory("design9")

@@ -29,7 +29,7 @@ from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 REWARD = Reward(RewardWeights(), scenario=US23)
 REGRET_BOUNDS = {
@@ -50,7 +50,7 @@ def uniform_cases(level, count, seed=0):
 def played(vut, cases, corridors=32):
     """Return the measures of cases, in order, and the trajectories."""
     with World(corridors, scenario=US23) as world:
-        driver = vut_factory(vut)(corridors)
+        driver = VutFactory(vut)(corridors)
         got = dict(rollout(world, PovLibrary(corridors, POVS), driver, cases))
     trajectories = [got[index] for index in range(len(cases))]
     return [measure(t) for t in trajectories], trajectories

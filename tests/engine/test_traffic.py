@@ -27,7 +27,7 @@ from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, VUT, Scen
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions, seen_at_start, seen_in
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 TRAFFIC = replace(
     US23, name="us23-traffic", headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 4.0)
@@ -42,7 +42,7 @@ def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) ->
 
 
 def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
-    factory = vut_factory(vut, VutOptions(**options))
+    factory = VutFactory(vut, VutOptions(**options))
     with Simulator(plan_for(factory, scenario=cases[0].scenario, corridors=corridors)) as ground:
         ran = dict(ground.run(cases))
     return [ran[place] for place in range(len(cases))]

@@ -33,7 +33,7 @@ from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, POV, US23, VUT
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 EXACT = 1e-9
 
@@ -267,7 +267,7 @@ def test_a_straight_foreign_net_with_the_lengths_of_us23_gives_its_very_outcomes
     assert (road.mainline.before_m, road.ramp.before_m) == (1000.0, 425.0)
     assert road.lane_point(-10.0, on_ramp=False)[2:] == pytest.approx((7000.0, -310.0, 0.0))
     cases = from_unit(np.random.default_rng(4).random((100, 2)), level=0, scenario=US23)
-    factory = vut_factory(vut)
+    factory = VutFactory(vut)
     motions = []
     for where in (None, road):
         with World(16, where, factory.vut.vut_type, scenario=US23) as world:
@@ -279,7 +279,7 @@ def test_a_straight_foreign_net_with_the_lengths_of_us23_gives_its_very_outcomes
 
 @pytest.mark.parametrize("name", ["priority", "lane drop"])
 def test_sumos_own_driver_is_put_where_eq_4_has_it(corridor, name):
-    factory = vut_factory("sumo:Krauss")
+    factory = VutFactory("sumo:Krauss")
     cases = from_unit(np.random.default_rng(0).random((20, 2)), level=0, scenario=US23)
     with World(4, corridor(name), factory.vut.vut_type, scenario=US23) as world:
         ran = dict(rollout(world, PovLibrary(4, POVS), factory(4, world), cases))

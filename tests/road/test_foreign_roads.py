@@ -53,7 +53,7 @@ from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 from merge_sumo.vuts.traci.vut import TraciVut
 
 FILES = {CONFIG, HOSTED_NET, SURROUNDINGS, TYPES, LABELS, RECORD, VIEW, CASE}
@@ -84,7 +84,7 @@ def folder(folder_of, tmp_path) -> Path:
 
 def driven(road, count: int) -> list[Trajectory]:
     """Return what SUMO drove in cases of level 0 on a road."""
-    factory = vut_factory("design1")
+    factory = VutFactory("design1")
     cases = from_unit(np.random.default_rng(3).random((count, 2)), level=0, scenario=US23)
     with World(4, road, scenario=US23) as world:
         ran = dict(rollout(world, PovLibrary(4, POVS), factory(4, world), cases))

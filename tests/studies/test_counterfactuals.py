@@ -40,7 +40,7 @@ from merge_sumo.studies.counterfactuals import (
 from merge_sumo.system.workers import InProcess, Workers, open_workers
 from merge_sumo.values.scenario import OWN, US23
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 LONG = pytest.mark.long
 
@@ -149,7 +149,7 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_le
     run = run_campaign(settings, tmp_path / "run")
     failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
     assert len(failing) >= at_least
-    plan = replace(resolve(settings), vut=vut_factory("careful"))
+    plan = replace(resolve(settings), vut=VutFactory("careful"))
     with opened_simulator(plan) as ground:
         in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
     assert run_counterfactuals(plan, failing) == in_sumo

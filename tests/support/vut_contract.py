@@ -12,7 +12,7 @@ from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory, vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 LEVEL0_CLASS = """
 class Level0:
@@ -26,7 +26,7 @@ def cases_of(count: int, seed: int = 0) -> list[Case]:
 
 
 def factory(spec: object, **options: Any) -> VutFactory:
-    return vut_factory(str(spec), VutOptions(**options))
+    return VutFactory(str(spec), VutOptions(**options))
 
 
 def in_process(spec: object, **options: Any) -> VutFactory:

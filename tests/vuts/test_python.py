@@ -24,7 +24,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import MAX_STEPS, US23
 from merge_sumo.values.trajectory import End
-from merge_sumo.vuts.registry import vut_factory
+from merge_sumo.vuts.registry import VutFactory
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
 
@@ -305,7 +305,7 @@ def test_what_cannot_be_found_or_made_is_refused_in_a_sentence(vut, tmp_path):
 
 
 def test_built_in_names_still_work():
-    assert np.isfinite(run_cases(vut_factory("design2"), cases_of(2))[0].motion).all()
+    assert np.isfinite(run_cases(VutFactory("design2"), cases_of(2))[0].motion).all()
 
 
 def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):

@@ -24,7 +24,7 @@ import numpy as np
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
-from merge_sumo.system.blame import how_it_ended
+from merge_sumo.system.blame import Blame, how_it_ended
 from merge_sumo.system.pulse import AwakeClock
 from merge_sumo.system.spawning import python_command
 from merge_sumo.values.case import Case, FloatArray
@@ -49,15 +49,9 @@ ENDING_S: Final = 2.0
 
 
 def hosted_vut(finder: str, spec: str, options: VutOptions) -> Vut:
-    """Return a VUT whose code runs in a process of its own.
+    """Return a VUT whose code runs in a process of its own; `UserError` where it cannot be opened.
 
-    Args:
-        finder: "MODULE:FUNCTION" that prepares the VUT there, from a spec and options.
-        spec: names the VUT.
-        options: how it is hosted.
-
-    Raises:
-        UserError: for a VUT that cannot be opened.
+    `finder` is the "MODULE:FUNCTION" that prepares it there, from spec and options.
     """
     facts, stamps = _facts(finder, spec, options)
 
@@ -90,11 +84,15 @@ def _facts(finder: str, spec: str, options: VutOptions) -> tuple[Mapping[str, An
 
 
 def _first(opened: Callable[[], Host]) -> Host:
-    """Return what opens a VUT for the first time; where its process dies, it is opened again."""
-    try:
-        return opened()
-    except OpeningDiedError:
-        return opened()
+    """Open a VUT for the first time; where its process dies, again, until the VUT is to blame."""
+    blame = Blame[None]()
+    while True:
+        try:
+            return opened()
+        except OpeningDiedError as error:
+            died = error.death
+            if blame.died(None, alone=True, repeatable=died.hung, killed=died.killed):
+                raise
 
 
 def _stamps(files: Iterable[str]) -> Stamps:
@@ -124,7 +122,11 @@ class HostDiedError(Exception):
 
 
 class OpeningDiedError(UserError):
-    """The process died while the VUT was opened; its cause is a `HostDiedError`."""
+    """The process died while the VUT was opened: how, is in `death`."""
+
+    def __init__(self, sentence: str, death: HostDiedError) -> None:
+        super().__init__(sentence)
+        self.death = death
 
 
 class Host:
@@ -163,7 +165,6 @@ class Host:
         if patience_s is None:
             patience_s = GRACE * self._options.deadline_s + GRACE_S
         self._number += 1
-        self._waits = True
         try:
             rest = memoryview(wire.frame(self._number, about, content))
             while rest:
@@ -251,9 +252,8 @@ class Host:
         except HostDiedError as died:
             line = self._output.last_line()
             printed = f" (it printed: {line})" if line else ""
-            raise OpeningDiedError(
-                f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
-            ) from died
+            sentence = f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
+            raise OpeningDiedError(sentence, died) from died
         if answer.about is About.REFUSED:
             self.kill()
             raise UserError(wire.from_json(answer.content, str))
@@ -331,9 +331,7 @@ class HostedVut(Driver):
             try:
                 self._host = self._started()
             except OpeningDiedError as error:
-                died = error.__cause__
-                killed = isinstance(died, HostDiedError) and died.killed
-                raise VutLostError(str(error), killed=killed) from error
+                raise VutLostError(str(error), killed=error.death.killed) from error
             except UserError as error:
                 self._begun.clear()
                 self._reasons = dict.fromkeys(range(self.corridors), f"started anew: {error}")
@@ -352,7 +350,8 @@ class HostedVut(Driver):
             answers = wire.unpack_answers(answer.content, self.corridors)
             self._reasons, self._signals = answers.reasons, answers.signals
         except HostDiedError as died:
-            own, how = self._own(died.corridor), {"final": died.hung, "killed": died.killed}
+            own = died.corridor if (died.corridor or 0) < self.corridors else None
+            how = {"final": died.hung, "killed": died.killed}
             raise VutLostError(died.reason, own, **how) from None
         except (WireError, KeyError, ValueError, AttributeError):
             self._host.kill()
@@ -384,6 +383,3 @@ class HostedVut(Driver):
         self._files |= {Path(file) for file in host.facts["files"]}
         host.make(self._spec, self.corridors)
         return host
-
-    def _own(self, corridor: int | None) -> int | None:
-        return corridor if corridor is not None and corridor < self.corridors else None

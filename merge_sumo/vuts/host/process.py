@@ -11,13 +11,13 @@ import os
 import signal
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, VutLostError
 from merge_sumo.errors import UserError
+from merge_sumo.system.limits import lower_limits
 from merge_sumo.system.spawning import end_with, named
 from merge_sumo.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.vuts.blame_cell import BlameCell, current_call
@@ -31,7 +31,7 @@ def main(settings: Mapping[str, Any]) -> None:
     sys.argv[1:] = []
     channel = _Channel()
     _hear_signals()
-    _limit(settings["memory_gib"])
+    lower_limits(RLIMIT_DATA=int(settings["memory_gib"] * 2**30), RLIMIT_CORE=0)
     end_with(settings["lifeline"])
     current_call.share(mmap.mmap(settings["blame_cell"], BlameCell.FORMAT.size))
     _Hosting(channel).serve()
@@ -145,16 +145,3 @@ def _hear_signals() -> None:
     for number in signal.valid_signals() - {signal.SIGPIPE, signal.SIGXFSZ}:
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)
-
-
-def _limit(memory_gib: float) -> None:
-    """Let memory run out here before it runs out for everybody, and leave no core dump behind."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    most = int(memory_gib * 2**30)
-    with suppress(ValueError, OSError):  # a limit of the system may be lower
-        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
-    with suppress(ValueError, OSError):
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

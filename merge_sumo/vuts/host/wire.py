@@ -88,8 +88,10 @@ def from_json(content: bytes, kind: type[Any]) -> Any:
     return value
 
 
-_BEGIN: Final = struct.Struct("<I5d")
-"""Corridor, and what a VUT is told of its scenario; position and speed of each vehicle follow."""
+_TOLD: Final = ("x_vut0_m", "level0_a_mps2", "level0_v_mps", "a_min_mps2", "a_max_mps2")
+"""What a VUT is told of its scenario."""
+_BEGIN: Final = struct.Struct(f"<I{len(_TOLD)}d")
+"""Corridor, and what is told; position and speed of each vehicle follow."""
 _HEAD: Final = struct.Struct("<IIII")
 """Episodes that begin, corridors, vehicles, and whether the cars that are met are told."""
 
@@ -102,10 +104,8 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
     vehicles, corridors = scene.x_m.shape
     parts = [_HEAD.pack(len(begun), corridors, vehicles, scene.facing is not None)]
     for corridor, case in begun:
-        scenario = case.scenario
-        profile = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
-        limits = scenario.a_min_mps2, scenario.a_max_mps2
-        parts.append(_BEGIN.pack(corridor, *profile, *limits))
+        told = (getattr(case.scenario, name) for name in _TOLD)
+        parts.append(_BEGIN.pack(corridor, *told))
         parts.append(np.array(case.starts(), dtype=np.float64).tobytes())
     arrays = [scene.active, scene.step, scene.x_m, scene.v_mps]
     if scene.facing is not None:
@@ -115,23 +115,10 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
 
 
 @lru_cache(maxsize=8)
-def _any_scenario(
-    x_vut0_m: float,
-    level0_a_mps2: float,
-    level0_v_mps: float,
-    a_min_mps2: float,
-    a_max_mps2: float,
-) -> Scenario:
+def _any_scenario(*told: float) -> Scenario:
     """Return a scenario with what a VUT is told of its own; of the rest it is told nothing."""
-    return replace(
-        US23,
-        x_vut0_m=x_vut0_m,
-        level0_a_mps2=level0_a_mps2,
-        level0_v_mps=level0_v_mps,
-        a_min_mps2=a_min_mps2,
-        a_max_mps2=a_max_mps2,
-        reach_m=RANGES["reach_m"][1],
-    )
+    known: dict[str, Any] = dict(zip(_TOLD, told, strict=True))
+    return replace(US23, **known, reach_m=RANGES["reach_m"][1])
 
 
 def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
@@ -140,13 +127,12 @@ def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     at = _HEAD.size
     begun: list[tuple[int, Case]] = []
     for _ in range(count):
-        corridor, *of_scenario = _BEGIN.unpack_from(content, at)
+        corridor, *told = _BEGIN.unpack_from(content, at)
         at += _BEGIN.size
         starts = np.frombuffer(content, np.float64, 2 * vehicles, at).reshape(vehicles, 2)
         at += starts.nbytes
-        told = tuple((x_m, v_mps) for x_m, v_mps in starts.tolist())
-        case = ToldCase(level=0, scenario=_any_scenario(*of_scenario), told=told)
-        begun.append((corridor, case))
+        rows = tuple((x_m, v_mps) for x_m, v_mps in starts.tolist())
+        begun.append((corridor, ToldCase(level=0, scenario=_any_scenario(*told), told=rows)))
     active = np.frombuffer(content, np.bool_, k, at)
     step = np.frombuffer(content, np.int64, k, at + k)
     at += 9 * k
