@@ -64,7 +64,7 @@ _EDGE: Final = Allowed(
 )
 _JUNCTION: Final = Allowed(
     {
-        **dict.fromkeys(("id",), _ID),
+        "id": _ID,
         **dict.fromkeys(("type", "rightOfWay", "fringe", "roundabout"), _WORD),
         **dict.fromkeys(("x", "y", "z"), _PLACE),
         **dict.fromkeys(("incLanes", "intLanes"), _IDS),
@@ -95,7 +95,7 @@ NET: Final = {
             "limitTurnSpeed": number(-1, 1000),
             **dict.fromkeys(("lefthand", "rectangularLaneCut", "avoidOverlap"), _SWITCH),
             **dict.fromkeys(("walkingareas", "checkLaneFoes.all"), _SWITCH),
-            **dict.fromkeys(("checkLaneFoes.roundabout",), _SWITCH),
+            "checkLaneFoes.roundabout": _SWITCH,
             "spreadType": _WORD,
             # A reader that validates fetches what stands here.
             "{http://www.w3.org/2001/XMLSchema-instance}noNamespaceSchemaLocation": matching(
@@ -222,13 +222,7 @@ LABELS: Final = {
 }
 """What is written beside the road."""
 
-_MOTION: Final = {
-    "id": _WHO,
-    "x": _PLACE,
-    "y": _PLACE,
-    "pos": _METRES,
-    "speed": _SPEED,
-}
+_MOTION: Final = {"id": _WHO, "x": _PLACE, "y": _PLACE, "pos": _METRES, "speed": _SPEED}
 _RECORDED: Final = {
     **_MOTION,
     "angle": number(-360, 360),

@@ -76,7 +76,7 @@ class Criterion:
         """Raise `UserError` where it speaks of what an episode of a scenario does not have.
 
         Also where it is no formula, or what evaluates one is missing, and where no case could fail
-        or every case would (`soundness.py`).
+        or every case would (`vacuity.py`).
         """
         if self.require is not None:
             try_formula(self.require)
@@ -167,11 +167,7 @@ class Criterion:
         return self._outcome(0, 0, trajectory, measures)
 
     def _outcome(
-        self,
-        index: int,
-        batch: int,
-        trajectory: Trajectory,
-        measures: Measures,
+        self, index: int, batch: int, trajectory: Trajectory, measures: Measures
     ) -> Outcome:
         margin = self.margin(trajectory, measures)
         return Outcome(index, batch, trajectory.case, measures, margin=margin)

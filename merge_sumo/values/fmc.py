@@ -100,9 +100,9 @@ def fmc_and_error(points: ArrayLike, radius: float | None = None) -> tuple[float
     dimension = cases.shape[1]
     unit = radius_for(dimension) if radius is None else radius
     centres = _in_radii(cases, unit)
-    error = 0.0
     if len(centres) == 0:
         return 0.0, 0.0
+    error = 0.0
     if dimension == 1:
         volume = 2.0 + float(np.minimum(np.diff(centres[:, 0]), 2.0).sum())
     elif dimension == 2:
@@ -160,12 +160,8 @@ def _linked(places: FloatArray, limit: float) -> IntArray:
     distance, neighbour = cKDTree(places).query(places, k=np.arange(1, near + 1))
     point, column = np.nonzero(distance <= limit)
     all_looked_at = (distance[:, -1] > limit) | (near == n)
-    _, first, cell = np.unique(
-        np.floor(places / (limit / np.sqrt(dimension))).astype(np.int64),
-        axis=0,
-        return_index=True,
-        return_inverse=True,
-    )
+    grid = np.floor(places / (limit / np.sqrt(dimension))).astype(np.int64)
+    _, first, cell = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     cell = cell.reshape(-1)
     links = [
         np.column_stack([point, neighbour[point, column]]),

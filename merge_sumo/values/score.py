@@ -273,10 +273,8 @@ def measure_merges(
     """Return the verdict and the measures of merges: see `measure`."""
     never_m = [math.inf] * len(trajectories)
     before_m = never_m if lines is None else closest_before_m(trajectories, lines)
-    return [
-        _measure(*pair, avoidability=avoidability)
-        for pair in zip(trajectories, before_m, strict=True)
-    ]
+    pairs = zip(trajectories, before_m, strict=True)
+    return [_measure(*pair, avoidability=avoidability) for pair in pairs]
 
 
 def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> Measures:

@@ -35,7 +35,8 @@ def fmu_vut(argument: str, options: VutOptions) -> Vut:
     def make(corridors: int, _world: World | None) -> Driver:
         return FmuVut(corridors, unit, options.deadline_s)
 
-    return Vut(make=make, max_corridors=1 if unit.only_once else None, files=(Path(file),))
+    once = str(unit.description.coSimulation.canBeInstantiatedOnlyOncePerProcess) == "True"
+    return Vut(make=make, max_corridors=1 if once else None, files=(Path(file),))
 
 
 class Unit:
@@ -100,11 +101,6 @@ class Unit:
                 "or Float64"
             )
         return variable
-
-    @property
-    def only_once(self) -> bool:
-        """Whether one process can have one instance only."""
-        return str(self.description.coSimulation.canBeInstantiatedOnlyOncePerProcess) == "True"
 
     @cached_property
     def folder(self) -> str:

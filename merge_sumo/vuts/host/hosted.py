@@ -14,7 +14,7 @@ import select
 import signal
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +25,7 @@ from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.blame import Blame, how_it_ended
+from merge_sumo.system.hashing import Files, changed, hashed
 from merge_sumo.system.pulse import AwakeClock
 from merge_sumo.system.spawning import python_command
 from merge_sumo.values.case import Case, FloatArray
@@ -53,7 +54,7 @@ def hosted_vut(finder: str, spec: str, options: VutOptions) -> Vut:
 
     `finder` is the "MODULE:FUNCTION" that prepares it there, from spec and options.
     """
-    facts, stamps = _facts(finder, spec, options)
+    facts = _facts(finder, spec, options)
 
     def make(corridors: int, _world: World | None) -> Driver:
         return HostedVut(corridors, finder, spec, options)
@@ -62,25 +63,22 @@ def hosted_vut(finder: str, spec: str, options: VutOptions) -> Vut:
         make=make,
         max_corridors=facts["max_corridors"],
         max_workers=facts["max_workers"],
-        files=tuple(map(Path, stamps)),
+        files=tuple(map(Path, facts["files"])),
     )
 
 
-Stamps = dict[str, tuple[int, int] | None]
-"""Time of the last change, ns, and size of files by their paths; None for a lost file."""
-
-_known: dict[tuple[str, str, float], tuple[Mapping[str, Any], Stamps]] = {}
+_known: dict[tuple[str, str, float], tuple[Mapping[str, Any], Files]] = {}
 """Facts by spec, working folder and memory: no process is started where no file has changed."""
 
 
-def _facts(finder: str, spec: str, options: VutOptions) -> tuple[Mapping[str, Any], Stamps]:
-    """Return the facts of a VUT, and the state of its files."""
+def _facts(finder: str, spec: str, options: VutOptions) -> Mapping[str, Any]:
+    """Return the facts of a VUT."""
     key = spec, str(Path.cwd()), options.memory_gib
-    if key not in _known or _stamps(_known[key][1]) != _known[key][1]:
+    if key not in _known or changed(_known[key][1]):
         host = _first(lambda: Host(finder, spec, options))
         host.kill()
-        _known[key] = host.facts, _stamps(host.facts["files"])
-    return _known[key]
+        _known[key] = host.facts, hashed(map(Path, host.facts["files"]))
+    return _known[key][0]
 
 
 def _first(opened: Callable[[], Host]) -> Host:
@@ -95,23 +93,11 @@ def _first(opened: Callable[[], Host]) -> Host:
                 raise
 
 
-def _stamps(files: Iterable[str]) -> Stamps:
-    stamps: Stamps = dict.fromkeys(files)
-    for file in stamps:
-        with suppress(OSError):
-            status = Path(file).stat()
-            stamps[file] = status.st_mtime_ns, status.st_size
-    return stamps
-
-
 class HostDiedError(Exception):
-    """The process is gone, or was killed because it hung.
+    """The process is gone, or was killed because it hung, for a reason.
 
-    Attributes:
-        reason: how that happened.
-        corridor: that of the controller that was being called; None where it is unknown.
-        hung: whether it was killed because it hung.
-        killed: whether SIGKILL ended it, from outside or from within.
+    `corridor` is that of the controller that was being called, None where it is unknown; `killed`
+    says whether SIGKILL ended it, from outside or from within.
     """
 
     def __init__(
