@@ -154,4 +154,5 @@ def inputs_of(
 ) -> FloatArray:
     """Return what a network sees of states, (n, 4), and of psi, (n,), if it has one."""
     psi = svo_rad if network.sees_svo else None
-    return features(*state.T, psi, scenario=scenario)
+    x_pov, v_pov, x_vut, v_vut = state.T
+    return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=scenario)
