@@ -118,7 +118,7 @@ def learn_surface(
     failing = history.points[history.failed]
     if len(failing) < FEWEST_FAILURES or len(history.failed) - len(failing) < JUDGED_FROM:
         return None
-    if workers is not None and workers.count > 1:
+    if workers is not None and workers.count > 1 and not workers.here:
         return Surface(failing, partial(_on_workers, workers, history))
     with threadpool_limits(1):
         return Surface(failing, partial(_on_cores, _learned(history)))

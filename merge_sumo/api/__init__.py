@@ -690,7 +690,7 @@ def _study(settings: CampaignSettings, runner: Runner) -> Iterator[benchmark.Stu
     plan = resolve(settings)
     passing = is_here(settings.vut) or is_here(settings.pov or "")
     with (
-        runner.open(plan) as opened,
+        runner.open(plan, at_once=True) as opened,
         tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder,
         Bars(shown=runner.progress) as bars,
     ):
@@ -787,7 +787,10 @@ def certify(
         check_new(folder)
     plan = resolve(settings, _path(net))
     total = sum(map(len, lattices.values()))
-    with runner.open(plan) as opened, runner.counter(_title(settings), total) as counter:
+    with (
+        runner.open(plan, at_once=True) as opened,
+        runner.counter(_title(settings), total) as counter,
+    ):
         done = certificate.certify(
             settings,
             radius,

@@ -16,7 +16,7 @@ from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports.progress import Counter
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.workers import HERE_S, Workers
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
 
@@ -106,7 +106,9 @@ class Running(TypedDict, total=False):
     """Where the cases of a verb run; the outcomes are the same everywhere.
 
     Attributes:
-        workers: processes that run cases, 1 by default; None is one a core.
+        workers: processes that run cases, 1 by default. None is one a core, where a campaign, a
+            rerun or fresh cases begin in this process and go on in those once cases have taken some
+            seconds.
         dask: address of a Dask scheduler whose workers run the cases instead.
         progress: show progress; by default in a notebook and on a terminal.
     """
@@ -160,9 +162,13 @@ class Runner:
         if self.check is not None:
             self.check()
 
-    def open(self, plan: SimulationPlan) -> Workers:
-        """Return the workers that run the cases of a plan, to be used in `with`."""
-        return evaluation_workers(plan.workers(self.workers), self.dask)
+    def open(self, plan: SimulationPlan, *, at_once: bool = False) -> Workers:
+        """Return the workers that run the cases of a plan, to be used in `with`.
+
+        Where nobody says how many, processes are started `at_once`, or as soon as they pay.
+        """
+        here_s = HERE_S if self.workers is None and not at_once else None
+        return evaluation_workers(plan.workers(self.workers), self.dask, here_s)
 
     def counter(self, title: str, total: int) -> Counter:
         """Return a bar that counts cases, to be used in `with`."""
@@ -230,7 +236,7 @@ def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSetting
     settings = CampaignSettings(vut=spec, levels=levels, **fields)
     for note in settings.criterion.notes(settings.scenario):
         warnings.warn(f"note: {note}", Notice, stacklevel=3)
-    return settings, replace(runner, workers=workers)
+    return settings, replace(runner, workers=_within_reach(workers, given))
 
 
 def given_again(
@@ -252,4 +258,10 @@ def given_again(
         drivers["vut"], drivers["pov"], runner.workers, stacklevel=4
     )
     specs = {"vut": spec, "pov": pov_spec}
-    return recordable({**given, **{n: specs[n] for n in named}}), replace(runner, workers=workers)
+    fields = recordable({**given, **{n: specs[n] for n in named}})
+    return fields, replace(runner, workers=_within_reach(workers, given))
+
+
+def _within_reach(workers: int | None, given: Mapping[str, Any]) -> int | None:
+    """Return the number of workers: this process alone for a VUT that a debugger is to reach."""
+    return 1 if workers is None and given.get("in_process") else workers

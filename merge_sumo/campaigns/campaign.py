@@ -254,7 +254,8 @@ def _run(
     noted, ended = _Noted(record), list(history)
     run_chunks = partial(evaluate_chunks, plan, workers=workers)
     missing = settings.cases - len(history)
-    with Prefetch(run_chunks, workers.count, proposed, missing) as prefetch:
+    chunk_size = workers.chunk_size
+    with Prefetch(run_chunks, workers.count, proposed, missing, chunk_size) as prefetch:
         batches = conduct(
             sampler,
             lambda cases: noted.noting(prefetch.run(cases)),

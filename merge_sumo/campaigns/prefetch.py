@@ -58,11 +58,14 @@ class Prefetch:
         workers: int,
         proposed: Iterable[Sequence[Case]],
         cases: float = math.inf,
+        chunk_size: Callable[[int], int] | None = None,
     ) -> None:
         """Take what runs chunks on a number of workers, and the batches that will be requested.
 
-        `cases` is how many cases they are. Without such batches, each runs when it is requested.
+        `cases` is how many cases they are. Without such batches, each runs when it is requested, in
+        chunks of a size that follows from its number of cases: by default one for each worker.
         """
+        self._chunk_size = chunk_size or (lambda n: min(MAX_CHUNK, math.ceil(n / workers)))
         self._run_chunks, self._workers = run_chunks, workers
         self._cases = cases
         self._chunks = run_chunks(self._cut(chain.from_iterable(proposed)))
@@ -89,7 +92,7 @@ class Prefetch:
             yield place, self._ran.pop(first + place)
 
     def _run_now(self, cases: Sequence[Case]) -> Iterator[tuple[int, CaseResult]]:
-        size = min(MAX_CHUNK, math.ceil(len(cases) / self._workers))
+        size = self._chunk_size(len(cases))
         chunks = (cases[first : first + size] for first in range(0, len(cases), size))
         for first, results in self._run_chunks(chunks):
             yield from enumerate(results, start=first)

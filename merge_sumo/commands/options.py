@@ -184,7 +184,12 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "regression.",
         callback=_checked_tolerance,
     ),
-    "workers": _option(int, 1, "Processes that run cases; the outcomes are the same."),
+    "workers": _option(
+        int | None,
+        None,
+        "Processes that run cases; the outcomes are the same. By default one a core, as soon as "
+        "cases take longer than starting processes.",
+    ),
     "dask": _option(
         str | None,
         None,

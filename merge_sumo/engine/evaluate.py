@@ -143,14 +143,16 @@ def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
         pov = "" if own is None else f" or the POV {own.spec}"
         raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
 
-    everywhere = [None] * min(workers.count, plan.corridors)
+    everywhere = [None] * (1 if workers.here else min(workers.count, plan.corridors))
     for _ in workers.run(partial(_open_simulator, plan), everywhere, died, chunk=1):
         pass
 
 
-def evaluation_workers(workers: int | None = None, dask: str | None = None) -> Workers:
+def evaluation_workers(
+    workers: int | None = None, dask: str | None = None, here_s: float | None = None
+) -> Workers:
     """Return workers that load what it takes to run cases as they start: see `open_workers`."""
-    return open_workers(workers, dask, preload=__name__)
+    return open_workers(workers, dask, preload=__name__, here_s=here_s)
 
 
 @contextmanager

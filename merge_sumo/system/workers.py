@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
@@ -45,6 +46,11 @@ POOL_THREADS: Final = 4
 WORKER_THREADS: Final = 4
 """Those of a worker and of the process of a VUT, besides one for each core in NumPy."""
 DASK_TIMEOUT_S: Final = 30.0
+HERE_S: Final = 3.0
+"""Seconds of work in this process before worker processes are started, where they may be: about
+what starting them takes on a busy machine, so that work takes at most twice the least time."""
+TRIED: Final = 8
+"""Items of a chunk in this process before it is known how long they take."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -65,18 +71,23 @@ class Workers(AbstractContextManager["Workers"]):
         died: tuple[type[Exception], ...] = (BrokenExecutor,),
         recycle_after: int | None = None,
         on_close: Callable[[], None] | None = None,
+        here_s: float | None = None,
     ) -> None:
         """Open an executor with `count` workers.
 
         `died` is what a future raises when its worker is dead. The executor is closed and opened
-        anew after a death, and after `recycle_after` chunks per worker.
+        anew after a death, and after `recycle_after` chunks per worker. With `here_s` it is opened
+        only when work in this process has taken so many seconds.
         """
         self.count = count
         self._open = open_executor
+        self._here_s, self._here_items = here_s, 0
+        """Seconds that this process goes on for, and items that it has begun; None for no more."""
+        self._limit_s = here_s or 0.0
         self._died = died
         self._recycle_after = recycle_after
         self._on_close = on_close
-        self._executor = open_executor()
+        self._executor = open_executor() if here_s is None else InProcess()
         self._submitted = 0
         self._broken = False
         self._left: list[Future[Any]] = []
@@ -106,9 +117,20 @@ class Workers(AbstractContextManager["Workers"]):
         for first, results in self.run_chunks(function, chunks, lost, ran_again=ran_again):
             yield from enumerate(results, start=first)
 
+    @property
+    def here(self) -> bool:
+        """Whether the work is done in this process, by now."""
+        return isinstance(self._executor, InProcess)
+
     def chunk_size(self, items: int) -> int:
         """Return how many of so many items a worker takes at a time."""
-        return max(1, min(MAX_CHUNK, math.ceil(items / self.count)))
+        share = math.ceil(items / self.count)
+        if self._here_s is not None:
+            # As many as there is time for here.
+            item_s = (self._limit_s - self._here_s) / max(self._here_items, 1)
+            most = int(self._here_s / item_s) if self._here_items and item_s > 0.0 else TRIED
+            share = min(items, max(most, TRIED))
+        return max(1, min(MAX_CHUNK, share))
 
     def run_chunks(
         self,
@@ -156,24 +178,33 @@ class Workers(AbstractContextManager["Workers"]):
     def _ready(self, running: dict[Future[Any], Any]) -> bool:
         """Return whether the executor takes work; reopen it where that is due and possible."""
         most = math.inf if self._recycle_after is None else self._recycle_after * self.count
-        if self._submitted < most and not self._broken:
+        if self._here_s is not None:
+            stays = self._here_s > 0.0
+        else:
+            stays = self._submitted < most and not self._broken
+        if stays:
             return True
         if running:
             return False
         self._executor.shutdown(wait=True)
         self._executor = self._open()
-        self._submitted, self._broken = 0, False
+        self._submitted, self._broken, self._here_s = 0, False, None
         return True
 
-    def _submit(self, function: Callable[..., R], *arguments: Any) -> Future[R]:
+    def _submit(self, function: Callable[[Sequence[T]], R], items: Sequence[T]) -> Future[R]:
         self._submitted += 1
+        start_s = time.perf_counter()
         try:
-            return self._executor.submit(function, *arguments)
+            return self._executor.submit(function, items)
         except self._died as error:
             # It broke between two submissions: as if it had broken a moment later.
             future: Future[R] = Future()
             future.set_exception(error)
             return future
+        finally:
+            if self._here_s is not None:
+                self._here_s -= time.perf_counter() - start_s
+                self._here_items += len(items)
 
     def __exit__(self, *exception: Any) -> None:
         """Close the executor; only where work was left behind does it hear of an exception."""
@@ -227,20 +258,36 @@ def workers_or_cores(workers: int | None) -> int:
 
 
 def open_workers(
-    workers: int | None = None, dask: str | None = None, *, preload: str | None = None
+    workers: int | None = None,
+    dask: str | None = None,
+    *,
+    preload: str | None = None,
+    here_s: float | None = None,
 ) -> Workers:
     """Return the workers of a cluster at the address `dask`, or else local ones.
 
     One local worker is this process itself; more are processes of their own, which import the
-    module `preload` as they start. None is one a core.
+    module `preload` as they start. None is one a core. With `here_s` they are started only when
+    work in this process has taken so many seconds, and where the system lets them.
     """
     if dask is not None:
         return dask_workers(dask)
     count = workers_or_cores(workers)
     if count == 1:
         return Workers(InProcess, 1)
-    check_threads(POOL_THREADS + count * ((os.cpu_count() or 1) + WORKER_THREADS))
-    return Workers(lambda: LocalProcesses(count, preload), count, recycle_after=RECYCLE_AFTER)
+    threads = POOL_THREADS + count * ((os.cpu_count() or 1) + WORKER_THREADS)
+    if here_s is None:
+        check_threads(threads)
+
+    def processes() -> Executor:
+        if here_s is not None:
+            try:
+                check_threads(threads)
+            except UserError:
+                return InProcess()
+        return LocalProcesses(count, preload)
+
+    return Workers(processes, count, recycle_after=RECYCLE_AFTER, here_s=here_s)
 
 
 def dask_workers(address: str) -> Workers:

@@ -26,6 +26,7 @@ from merge_sumo.engine.evaluate import _lost, open_simulators, run_cases
 from merge_sumo.engine.plan import versions
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import (
+    TRIED,
     InProcess,
     LocalProcesses,
     Workers,
@@ -219,7 +220,41 @@ def running(process: int) -> bool:
     return status.rpartition(")")[2].split()[0] != "Z"
 
 
+class TestWorkersThatBeginHere:
+    def test_go_on_in_processes_once_work_has_taken_its_time(self):
+        with open_workers(2, here_s=1e-9) as workers:
+            assert workers.here
+            assert list(workers.run(process_ids, [0], no_loss)) == [(0, os.getpid())]
+            found = dict(workers.run(process_ids, range(4), no_loss))
+            assert not workers.here
+        assert sorted(found) == [0, 1, 2, 3]
+        assert os.getpid() not in found.values()
+
+    def test_start_no_process_while_there_is_time(self):
+        with open_workers(2, here_s=60.0) as workers:
+            assert workers.chunk_size(20) == TRIED
+            found = dict(workers.run(process_ids, range(1000), no_loss))
+            assert set(found.values()) == {os.getpid()}
+            # All of them are known to take no time.
+            assert workers.chunk_size(20) == 20
+
+    def test_stay_here_where_the_system_starts_no_more_threads(self, monkeypatch):
+        def refuses(count):
+            raise UserError("no more")
+
+        monkeypatch.setattr("merge_sumo.system.workers.check_threads", refuses)
+        with open_workers(2, here_s=1e-9) as workers:
+            found = dict(workers.run(process_ids, range(40), no_loss, chunk=5))
+        assert set(found.values()) == {os.getpid()}
+
+
 class TestACampaign:
+    def test_has_the_same_outcomes_where_it_goes_on_in_processes(self, expected, tmp_path):
+        with open_workers(2, here_s=1e-9) as workers:
+            run_campaign(SETTINGS, tmp_path / "run", workers=workers)
+            assert not workers.here
+        assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
+
     def test_has_the_same_outcomes_on_two_workers(self, two, expected, tmp_path):
         run_campaign(SETTINGS, tmp_path / "run", workers=two)
         assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
