@@ -19,6 +19,7 @@ from accounts import Account, second_account
 from calling import Said
 from campaigning import run_campaign
 from foreign_nets import corridor_of
+from threadpoolctl import threadpool_limits
 
 from merge_sumo import cli
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -28,6 +29,13 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.values.scenario import US23
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
+
+
+def pytest_configure() -> None:
+    """Let linear algebra have one thread in each process: several are as many as the cores."""
+    for library in ("OMP", "OPENBLAS", "MKL"):  # of those that are loaded later, and of children
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    threadpool_limits(1)
 
 
 @pytest.hookimpl(optionalhook=True)

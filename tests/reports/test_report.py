@@ -88,6 +88,7 @@ class TestThePage:
             assert f"'sha256-{base64.b64encode(digest).decode()}'" in policy
         assert root.xpath("//@style") == []
 
+    @pytest.mark.long
     def test_is_small(self, tmp_path):
         run = write_run(tmp_path / "run", per_level=267)
         assert len(run.outcomes) > 800

@@ -33,7 +33,7 @@ FIGURES = {
     "gpr-surface-level1.png",
     "allocation.png",
 }
-TINY = Scale(seeds=1, truth_cases=(300, 300, 300), batches=2, batch=10)
+TINY = Scale(seeds=1, truth_cases=(100, 100, 100), batches=2, batch=6)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ class TestATinyReproduction:
         last = {title: (done, total) for title, done, total, *_ in said}
         assert last["design1 v level 0"] == (5, 5)
         assert last["design2 v level 0/1/2"] == (2, 2)
-        assert last["truth of design2 at level 2"] == (300, 300)
+        assert last["truth of design2 at level 2"] == (100, 100)
 
     def test_is_drawn_again_from_its_file_alone(self, tiny, tmp_path):
         index, _ = tiny

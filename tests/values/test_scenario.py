@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from calling import invoke
 from campaigning import run_campaign
-from foreign_nets import FOREIGN
+from conftest import some
+from foreign_nets import FOREIGN, SIX
 from merges import SMALLER
 
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
@@ -214,7 +215,7 @@ def test_a_campaign_of_the_paper_is_recorded_with_all_numbers(run):
     assert run.scenario == US23
 
 
-@pytest.mark.parametrize("name", ["curved", "priority", "zipper", "lane drop", "OSM", "OpenDRIVE"])
+@pytest.mark.parametrize("name", some(SIX, "curved", "OpenDRIVE"))
 def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
     build, mainline, ramp = FOREIGN[name]
     net, file = build(tmp_path), tmp_path / "mine.toml"
@@ -228,7 +229,7 @@ def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
     assert isinstance(again.exception, UserError)
     assert "exists" in str(again.exception)
     assert invoke("scenario", "check", file).exit_code == 0
-    options = ("--vut", "level0", "--level", "0", "--cases", "24", "--batch", "24")
+    options = ("--vut", "level0", "--level", "0", "--cases", "24", "--sampler", "uniform")
     ended = invoke("campaign", *options, "--scenario", file, "--out", tmp_path / "run", "--quiet")
     assert ended.exit_code == 0, ended.output
     run = Run(tmp_path / "run")

@@ -162,7 +162,8 @@ def test_workers_need_no_main_guard_and_no_file(way, tmp_path):
     """Without a guard, a worker that imported the script would run the campaign again."""
     script = (
         "import merge_sumo as ms\n"
-        "run = ms.campaign('design2', level=0, cases=4, batch=4, workers=2, out='run')\n"
+        "run = ms.campaign('design2', level=0, cases=4, batch=2, sampler='uniform',\n"
+        "    workers=2, out='run')\n"
         "print(repr(run))\n"
     )
     (tmp_path / "script.py").write_text(script)

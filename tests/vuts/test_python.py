@@ -65,7 +65,7 @@ def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
     lines: list = []
     for spec in ("level0", vut(source, name)):
         settings = CampaignSettings(
-            vut=spec, levels=(0, 2), cases=60, batch=20, seed=3, sampler="gpr", scenario=US23
+            vut=spec, levels=(0, 2), cases=20, batch=10, seed=3, sampler="gpr", scenario=US23
         )
         folder = tmp_path / f"run{len(lines)}"
         run_campaign(settings, folder)

@@ -467,7 +467,7 @@ for _ in range({episodes}):
 """
 
 
-@pytest.mark.parametrize("episodes", [1, 2, 10])
+@pytest.mark.parametrize("episodes", some([1, 2, 10], 2))
 def test_a_program_may_connect_for_every_episode_and_is_started_again_when_it_has_ended(
     tmp_path, episodes
 ):
@@ -500,8 +500,8 @@ def children() -> set[str]:
         ("exits", "the controller closed the connection; the controller ended with exit code 0"),
         ("crashes", "ended with exit code 1: ZeroDivisionError: division by zero"),
         LONG("is killed", "the controller was ended by signal 9"),
-        LONG("hangs", "the controller made no step within the deadline of 0.5 s"),
-        ("will not be stopped", "made no step within the deadline of 0.5 s"),
+        ("hangs", "the controller made no step within the deadline of 0.5 s"),
+        LONG("will not be stopped", "made no step within the deadline of 0.5 s"),
         ("says goodbye", "the controller closed the connection during the episode"),
         LONG("half a message", "sent half a message and no more within the deadline of 0.5 s"),
         ("a huge message", "bytes that are no TraCI: a message of 2147483647 bytes was announced"),
@@ -609,7 +609,7 @@ class Monkey:
         self.thread.join()
 
 
-@pytest.mark.parametrize("count", [50, pytest.param(1000, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [25, pytest.param(1000, marks=pytest.mark.long)])
 def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count):
     before, port, deadline_s = descriptors(), free_port(), 0.2
     monkey = Monkey(port, count)
@@ -689,7 +689,7 @@ def mutated(message: bytes, rng: random.Random) -> bytes:
     return bytes(content)
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(2000, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [30, pytest.param(2000, marks=pytest.mark.long)])
 def test_of_mutated_messages_of_a_session_every_case_has_its_verdict_or_its_reason(count):
     session = recorded_session()
     assert len(session) > 10
