@@ -62,10 +62,6 @@ class TestARun:
     def test_has_a_line_for_a_terminal(self, opened, made):
         assert repr(opened).startswith(f"<campaign {made.folder}: ")
 
-    def test_of_a_folder_that_is_none_is_refused(self, tmp_path):
-        with pytest.raises(ms.UserError, match="not a campaign"):
-            ms.open_run(tmp_path)
-
 
 class TestACampaign:
     def test_is_the_one_of_the_command_line(self, tmp_path, run):
@@ -77,12 +73,6 @@ class TestACampaign:
         first, second = (folder / "outcomes.jsonl" for folder in (run.folder, again.folder))
         assert first.read_bytes() == second.read_bytes()
         assert (again.folder / "report.html").is_file()
-
-    def test_goes_into_a_folder_named_after_the_vut(self, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        made = ms.campaign("level0", level=0, cases=2)
-        assert made.folder.parts[0] == "runs"
-        assert made.folder.name.startswith("level0-")
 
     def test_with_values_that_make_none_is_refused(self, tmp_path):
         with pytest.raises(ms.UserError, match="--cases"):

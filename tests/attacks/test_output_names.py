@@ -258,13 +258,6 @@ class TestAHundredNames:
         appeared = assert_nothing_was_touched(world, write, named)
         assert {"a b.svg", "-rf.html", "日本.svg"} <= set(appeared)
 
-    def test_of_a_figure_are_refused_before_anything_runs(self, world, call, monkeypatch):
-        monkeypatch.setattr("merge_sumo.studies.truth.ground_truth", lambda *_, **__: 1 / 0)
-        options = ("compare", "--vut", "design1", "--level", 0, "--workers", 1)
-        for name in ("", ".", "..", "full/..", "figure.svg", "loop.svg/x.svg", "x" * 300 + ".svg"):
-            code, said = call(*options, f"--figure={name}")
-            assert (code, said.count("\n")) == (2, 1), name
-
     def test_of_a_probability_touch_nothing(self, world, call, run, monkeypatch, names):
         def ran(_settings, _net, _stated, draws, lines, _on_case, _workers):
             chosen = run.outcomes[: len(draws.level)]

@@ -162,11 +162,6 @@ class TestResuming:
         names = {path.relative_to(folder) for path in folder.rglob("*")}
         assert names >= {path.relative_to(run.folder) for path in run.folder.rglob("*")}
 
-    def test_tells_of_every_case_also_of_those_before(self, folder):
-        seen = []
-        resume_campaign(folder, on_case=lambda outcome: seen.append(outcome.index))
-        assert sorted(seen) == list(range(28))
-
     def test_of_no_campaign_is_refused(self, tmp_path):
         for name in ("nowhere", "."):
             with pytest.raises(UserError, match="not a campaign"):

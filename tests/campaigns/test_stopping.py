@@ -12,6 +12,7 @@ from campaigning import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import PATIENCE, StoppingRule, covered_balls, gained
 from merge_sumo.errors import UserError
+from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import MergeCase, Pool
@@ -104,28 +105,17 @@ class TestTheRule:
         assert gained(outcomes(0, 1), 0) == math.inf
 
 
-class TestWhatIsRefused:
-    @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, math.nan])
-    def test_a_share_that_is_none(self, share):
-        with pytest.raises(UserError, match="--stop-after-converged is"):
-            CampaignSettings(
-                vut="design1",
-                levels=(0,),
-                sampler="coverage",
-                stop_after_converged=share,
-                scenario=US23,
-            )
-
-    @pytest.mark.parametrize("sampler", ["uniform", "annealing", "subset", "gpr"])
-    def test_a_sampler_that_cannot_tell(self, sampler):
-        with pytest.raises(UserError, match="choose --sampler coverage"):
-            CampaignSettings(
-                vut="design1",
-                levels=(0,),
-                sampler=sampler,
-                stop_after_converged=0.01,
-                scenario=US23,
-            )
+@pytest.mark.parametrize(
+    ("sampler", "share", "said"),
+    [
+        *(("coverage", share, "--stop-after-converged is") for share in (0.0, 1.0, -0.1, math.nan)),
+        *((name, 0.01, "choose --sampler coverage") for name in SAMPLERS if name != "coverage"),
+    ],
+)
+def test_a_share_that_is_none_and_a_sampler_that_cannot_tell_are_refused(sampler, share, said):
+    asked: dict[str, Any] = {"sampler": sampler, "stop_after_converged": share}
+    with pytest.raises(UserError, match=said):
+        CampaignSettings(vut="design1", levels=(0,), scenario=US23, **asked)
 
 
 def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(tmp_path):

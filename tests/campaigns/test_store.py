@@ -8,12 +8,10 @@ import json
 import math
 import os
 import resource
-import shutil
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from calling import contents
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -145,12 +143,6 @@ class TestARecord:
         infinite = replace(outcome, measures=replace(outcome.measures, ttc_s=math.inf))
         with pytest.raises(ValueError, match="JSON"):
             to_line(infinite)
-
-    @pytest.mark.parametrize("end", End)
-    def test_names_the_end_of_the_episode(self, end):
-        outcome, _ = episode(0)
-        outcome = replace(outcome, measures=replace(outcome.measures, end=end))
-        assert f'"end": "{end.name}"' in to_line(outcome)
 
 
 class TestReading:
@@ -303,42 +295,6 @@ class TestAJournal:
         outcomes = tmp_path / "run" / "outcomes.jsonl"
         files = [trajectories, trajectories.parent, outcomes]
         assert synced == [file.stat().st_ino for file in files]
-
-    @pytest.mark.parametrize("kept", [(), ("notes.txt",), ("campaign.json", "outcomes.jsonl")])
-    def test_refuses_a_folder_that_exists_and_leaves_it_alone(self, tmp_path, kept):
-        folder = tmp_path / "run"
-        folder.mkdir()
-        for name in kept:
-            (folder / name).write_text("mine")
-        before = contents(tmp_path)
-        with pytest.raises(UserError) as error:
-            Journal.create(folder, {"vut": "design1"})
-        assert_sentence(error, "run exists", "--out")
-        assert contents(tmp_path) == before
-        assert sorted(path.name for path in folder.iterdir()) == sorted(kept)
-
-    def test_refuses_a_file_in_place_of_the_folder(self, tmp_path):
-        (tmp_path / "run").write_text("mine")
-        with pytest.raises(UserError) as error:
-            Journal.create(tmp_path / "run", {})
-        assert_sentence(error, "run exists")
-        assert (tmp_path / "run").read_text() == "mine"
-
-    def test_says_when_the_folder_cannot_be_made(self, tmp_path):
-        (tmp_path / "runs").write_text("mine")
-        with pytest.raises(UserError) as error:
-            Journal.create(tmp_path / "runs" / "first", {})
-        assert_sentence(error, "cannot write")
-        assert (tmp_path / "runs").read_text() == "mine"
-
-    def test_says_when_the_folder_cannot_be_written_any_more(self, tmp_path):
-        journal = Journal.create(tmp_path / "run", {})
-        journal.append([episode(0, 0)])
-        shutil.rmtree(tmp_path / "run" / "trajectories")
-        with pytest.raises(UserError) as error:
-            journal.append([episode(1, 1)])
-        assert_sentence(error, "cannot write")
-        assert len(Run(tmp_path / "run").outcomes) == 1, "no outcome without its trajectory"
 
     @pytest.mark.parametrize("most", [1_000, 12_000], ids=["trajectories", "outcomes"])
     def test_takes_back_what_it_wrote_when_the_rest_does_not_fit(self, tmp_path, most):

@@ -119,17 +119,3 @@ class TestProbability:
         assert out.startswith("P(fail) under the stated distribution: ")
         assert "90 % interval" in out
         assert "written: p.json" in out
-
-    def test_refuses_a_folder_that_is_no_campaign(self, call, tmp_path):
-        assert_refused(call("probability", tmp_path), "not a campaign")
-
-
-@pytest.mark.long
-def test_a_campaign_that_converged_says_so(call):
-    plan = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "coverage", "--seed", 1)
-    share = ("--stop-after-converged", 0.95)
-    code, out, err = call(*plan, "--cases", 300, "--batch", 20, *share, "--out", "run")
-    assert code == 0, err
-    assert out.startswith("stopped after ")
-    assert "of 300 cases" in out
-    assert_refused(call(*plan[:5], "--sampler", "gpr", *share), "--sampler coverage")

@@ -23,7 +23,7 @@ from vut_contract import cases_of, factory
 
 import merge_sumo as ms
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import CHECKSUM, OUTCOMES, SETTINGS, Run
+from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.povs import PovAdapter, Povs, own_pov
@@ -33,7 +33,7 @@ from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import Case, MergeCase, from_unit
-from merge_sumo.values.scenario import LEVELS, OWN, US23, MergeScenario
+from merge_sumo.values.scenario import LEVELS, OWN, US23
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions, seen_at_start
@@ -290,12 +290,6 @@ class TestSumosOwnPov:
         assert motion.a_pov_mps2.min() < -1.0
         assert measure(motion).end is End.MERGED
 
-    def test_is_moved_exactly_by_the_equations_of_motion(self):
-        for motion in run("sumo:IDM", own(cases_of(8))):
-            x, v, a = motion.x_pov_m, motion.v_pov_mps, motion.a_pov_mps2
-            assert x[1:] == pytest.approx(x[:-1] + 0.1 * v[:-1], abs=1e-9)
-            assert v[1:] == pytest.approx(np.maximum(v[:-1] + 0.1 * a[:-1], 0.0), abs=1e-9)
-
     def test_drives_all_cars_of_a_queue(self):
         points = np.random.default_rng(1).random((6, 4))
         cases = from_unit(points, OWN, scenario=named_scenario("us23-traffic"))
@@ -465,10 +459,6 @@ class TestResuming:
             (folder / "trajectories" / f"{batch:05d}.npz").unlink()
         return folder
 
-    def test_goes_on_as_if_nothing_had_been(self, stopped, tmp_path):
-        resume_campaign(stopped)
-        assert outcomes(stopped) == (tmp_path / "whole").read_bytes()
-
     def test_is_refused_by_name_when_its_file_has_changed(self, stopped, call):
         Path("my_pov.py").write_text(KEEPS)
         code, _, err = call("campaign", "--resume", stopped)
@@ -532,30 +522,6 @@ class TestTrust:
         resume_campaign(theirs, given={"pov": "my_pov.py:Pov"})
         assert Path("it-ran").exists()
 
-    @pytest.mark.parametrize("forged", ["my_pov.py:Pov", "onnx:x.onnx", "an_installed_name"])
-    def test_a_pov_that_somebody_put_into_a_folder_of_ones_own_is_a_strangers(
-        self, tmp_path, forged
-    ):
-        pov(TELLTALE)
-        values: dict[str, Any] = {**SMALL, "levels": (0,)}
-        folder = run_campaign(
-            CampaignSettings(**{"scenario": US23, **values}), tmp_path / "run"
-        ).folder
-        record = json.loads((folder / SETTINGS).read_text())
-        record.pop(CHECKSUM)
-        (folder / SETTINGS).write_text(json.dumps(record | {"pov": forged, "levels": [3]}))
-        with pytest.raises(UserError, match="--trust-vut"):
-            resume_campaign(folder)
-        assert not Path("it-ran").exists()
-
-    @pytest.mark.parametrize("spec", ["design1", "sumo:IDM"])
-    def test_what_is_of_this_package_or_of_sumo_runs_from_any_folder(
-        self, tmp_path, monkeypatch, spec
-    ):
-        folder = run_campaign(settings(spec, cases=2, batch=2), tmp_path / "run").folder
-        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
-        assert len(resume_campaign(folder).outcomes) == 2
-
 
 class TestOtherCommands:
     def test_a_truth_is_of_the_files_of_its_pov(self, call):
@@ -609,14 +575,3 @@ class TestOtherCommands:
         run_campaign(settings(pov(YIELDS)), tmp_path / "run")
         assert call("export", tmp_path / "run", 3, "--out", "out")[0] == 0
         assert "identical" in call("replay", "out/case-00003")[1]
-
-
-def test_settings_know_a_scenario_with_its_own_speeds():
-    slow: dict[str, Any] = {
-        "v_vut0_mps": 9.0,
-        "v_pov0_mps": (5.0, 12.0),
-        "x_pov0_m": (-80.0, -20.0),
-    }
-    scenario = MergeScenario(name="slow", **slow)
-    cases = from_unit(np.random.default_rng(1).random((3, 2)), OWN, scenario=scenario)
-    assert all(motion.error is None for motion in run("sumo:IDM", cases))

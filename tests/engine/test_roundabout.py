@@ -25,7 +25,6 @@ from merge_sumo.analysis.diagnosis import Kind, diagnose
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
-from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.policies import (
     NETWORKS,
@@ -35,11 +34,9 @@ from merge_sumo.drivers.policies import (
     read_manifest,
     scenario_of,
 )
-from merge_sumo.engine.rollout import rollout
 from merge_sumo.engine.simulator import Simulator, road_for
 from merge_sumo.reports.report import write_report
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
-from merge_sumo.sumo.world import World
 from merge_sumo.training import check as checking
 from merge_sumo.training.env import MergeGame
 from merge_sumo.training.reward import Reward, RewardWeights
@@ -123,30 +120,6 @@ class TestItsPool:
             np.array(11.2), np.array(0.0), ROUNDABOUT.level0_a_mps2, ROUNDABOUT.level0_v_mps
         )
         assert waits_s + float(from_a_stand) < ROUNDABOUT.timeout_s
-
-
-class Haphazard(Driver):
-    """Accelerates at random, now and then to a stand."""
-
-    def __init__(self, corridors: int, seed: int) -> None:
-        super().__init__(corridors)
-        self._rng = np.random.default_rng(seed)
-
-    def act(self, scene):
-        return self._rng.uniform(-4.0, 2.0, self.corridors) + 0.9
-
-
-def test_random_episodes_follow_the_equations_of_motion_to_the_digit(road):
-    with World(32, road, scenario=US23) as world:
-        played = list(rollout(world, Haphazard(32, 1), Haphazard(32, 2), uniform_cases(200)))
-    assert len(played) == 200
-    for _, trajectory in played:
-        for x, v, a in (
-            (trajectory.x_pov_m, trajectory.v_pov_mps, trajectory.a_pov_mps2),
-            (trajectory.x_vut_m, trajectory.v_vut_mps, trajectory.a_vut_mps2),
-        ):
-            assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
-            assert v[1:] == pytest.approx(np.maximum(v[:-1] + a[:-1] * 0.1, 0.0), abs=1e-9)
 
 
 class TestItsDrivers:

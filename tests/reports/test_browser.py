@@ -632,17 +632,6 @@ def test_the_command_is_copied(browser, made):
         assert page.evaluate("navigator.clipboard.readText()") == page.inner_text("#command")
 
 
-def test_what_is_drawn_is_where_the_case_is(page, made):
-    outcome = failures(made.outcomes)[0]
-    mark = page.locator(f"[data-case='{outcome.index}'].mark")
-    frame = page.locator(f".map[data-level='{outcome.case.level}'] .frame").bounding_box()
-    box = mark.bounding_box()
-    x = (box["x"] + box["width"] / 2 - frame["x"]) / frame["width"]
-    y = 1.0 - (box["y"] + box["height"] / 2 - frame["y"]) / frame["height"]
-    assert x == pytest.approx((outcome.case.x_pov0_m + 340.0) / 160.0, abs=0.01)
-    assert y == pytest.approx((outcome.case.v_pov0_mps - 25.0) / 10.0, abs=0.01)
-
-
 def test_print_leaves_out_what_cannot_be_pressed(page):
     page.emulate_media(media="print")
     assert not page.locator("#play").is_visible()

@@ -222,12 +222,6 @@ class TestATable:
             assert row["svo_rad"] == case.svo_rad
             assert row["x_behind_m"] == case.starts()[BEHIND][0]
 
-    def test_is_not_written_over(self, made, tmp_path):
-        (tmp_path / "trajectories.csv").write_text("mine")
-        with pytest.raises(UserError, match="exists"):
-            write_table(made, [0], tmp_path, "csv")
-        assert (tmp_path / "trajectories.csv").read_text() == "mine"
-
 
 class TestTheCommand:
     def test_writes_all_cases_as_a_table_when_none_is_named(self, made, tmp_path):
@@ -242,11 +236,6 @@ class TestTheCommand:
         assert said.exit_code == 0, said.output
         names = ("case-00001", "case-00002")
         assert said.stdout.split() == [str(tmp_path / n / f"{n}.xosc") for n in names]
-
-    def test_writes_nothing_when_one_of_the_cases_is_not_there(self, made, tmp_path):
-        said = invoke("export", made.folder, 1, 999, "--format", "openscenario", "--out", tmp_path)
-        assert isinstance(said.exception, UserError)
-        assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.parametrize("file_format", ["sumo", "openscenario"])
     def test_asks_for_cases_where_it_needs_them(self, made, file_format):

@@ -277,19 +277,6 @@ def test_a_straight_foreign_net_with_the_lengths_of_us23_gives_its_very_outcomes
         assert np.array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize("name", ["priority", "lane drop"])
-def test_sumos_own_driver_is_put_where_eq_4_has_it(corridor, name):
-    factory = VutFactory("sumo:Krauss")
-    cases = from_unit(np.random.default_rng(0).random((20, 2)), level=0, scenario=US23)
-    with World(4, corridor(name), factory.vut.vut_type, scenario=US23) as world:
-        ran = dict(rollout(world, PovLibrary(4, POVS), factory(4, world), cases))
-    for trajectory in ran.values():
-        assert trajectory.x_vut_m[-1] >= 0.0
-        x, v, a = trajectory.motion[:, VUT].T
-        assert x[1:] == pytest.approx(x[:-1] + v[:-1] * DT_S, abs=EXACT)
-        assert v[1:] == pytest.approx(v[:-1] + a[:-1] * DT_S, abs=EXACT)
-
-
 def test_a_corridor_travels_to_other_processes(corridor):
     road = corridor("curved")
     assert pickle.loads(pickle.dumps(road)) == road  # noqa: S301 (our own bytes)
@@ -400,17 +387,6 @@ def test_a_broken_net_is_refused_in_one_sentence(straight_net, tmp_path, edit, s
 def test_a_net_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(UserError, match="cannot read the net"):
         NetFile(tmp_path / "nowhere.net.xml")
-
-
-def test_no_file_that_an_external_entity_names_is_read(tmp_path, straight_net):
-    secret, path = tmp_path / "secret.xml", tmp_path / "entity.net.xml"
-    text = straight_net.content.decode()
-    (ramp,) = re.findall(r'<edge id="r1".*?</edge>', text, re.DOTALL)
-    secret.write_text(ramp)
-    doctype = f'<!DOCTYPE net [<!ENTITY ramp SYSTEM "{secret.as_uri()}">]>\n<net '
-    path.write_text(text.replace(ramp, "&ramp;").replace("<net ", doctype, 1))
-    with pytest.raises(UserError, match="has no edge r1"):
-        find_corridor(NetFile(path), ["in", "out"], ["r1", "out"])
 
 
 def test_netconvert_reads_the_hosted_net_too(corridor, tmp_path):

@@ -10,16 +10,11 @@ import os
 import re
 import shutil
 import socket
-import subprocess
-import threading
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import traci
-from conftest import some
 from foreign_nets import ALL, FOREIGN, OTHERS, SIX, corridor_of
 from handmade import write_run
 from lxml import etree
@@ -32,7 +27,7 @@ from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.reports.report_data import _road
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.sumo import replay as replay_module
-from merge_sumo.sumo.binding import run_program, sumo_program
+from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.replay_folder import (
@@ -52,9 +47,7 @@ from merge_sumo.values.case import MergeCase, from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import VutFactory
-from merge_sumo.vuts.traci.vut import TraciVut
 
 FILES = {CONFIG, HOSTED_NET, SURROUNDINGS, TYPES, LABELS, RECORD, VIEW, CASE}
 LANE_WIDTH_M = 3.2
@@ -142,30 +135,6 @@ class TestAReplay:
         assert trajectory.x_vut_m[-1] > 0.0
 
     @pytest.mark.parametrize("name", SIX)
-    def test_needs_nothing_but_sumo(self, folder_of, tmp_path, name):
-        folder = folder_of(name)
-        out = tmp_path / "fcd.xml"
-        command = [sumo_program("sumo"), "-c", folder / CONFIG, "--fcd-output", out]
-        done = subprocess.run(
-            [*command, "--precision", "9"],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        assert done.stderr == ""
-        places = [
-            [
-                (v.get("id"), round(float(v.get("x")), 6), round(float(v.get("y")), 6))
-                for v in etree.parse(path).iter("vehicle")
-            ]
-            for path in (folder / RECORD, out)
-        ]
-        assert places[0] == places[1]
-        assert len(places[0]) > 100
-
-    @pytest.mark.parametrize("name", SIX)
     def test_has_the_places_of_the_net_that_was_driven_in(self, corridor, folder_of, name):
         road = corridor(name)
         (trajectory,) = driven(road, 1)
@@ -177,31 +146,6 @@ class TestAReplay:
                 assert seen == pytest.approx(
                     [at.x_m, at.y_m, at.angle_deg, at.position_m], abs=1e-6
                 )
-
-    @pytest.mark.parametrize("by", [0.5, pytest.param(-0.5, marks=pytest.mark.long)])
-    @pytest.mark.parametrize("column", some(["x", "y", "pos", "speed"], "y", "speed"))
-    @pytest.mark.parametrize("who", ["pov", "vut"])
-    def test_is_not_identical_when_a_number_was_changed(self, folder, who, column, by):
-        record = etree.parse(folder / RECORD)
-        for row in (5, 40, -15):
-            vehicle = [v for v in record.iter("vehicle") if v.get("id") == who][row]
-            was = vehicle.get(column)
-            vehicle.set(column, f"{float(was) + by:.9f}")
-            record.write(folder / RECORD)
-            assert replay(folder).diverged_at_s is not None
-            vehicle.set(column, was)
-        record.write(folder / RECORD)
-        assert replay(folder).diverged_at_s is None
-
-    def test_is_not_identical_on_the_lanes_of_the_other_vehicle(self, folder):
-        record = etree.parse(folder / RECORD)
-        for timestep in record.getroot():
-            pov, vut = timestep
-            for key in ("x", "y", "pos", "speed", "angle", "lane"):
-                vut.set(key, pov.get(key))
-        record.write(folder / RECORD)
-        result = replay(folder)
-        assert result.diverged_at_s == 0.0
 
     def test_of_the_shipped_road_has_its_own_net_as_ever(self, tmp_path):
         trajectory = commanded(RANDOM, road_of())
@@ -385,83 +329,6 @@ class TestAnExport:
 def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as server:
         return server.getsockname()[1]
-
-
-@pytest.mark.parametrize("name", ["curved", "lane drop"])
-def test_a_traci_client_drives_an_episode_and_sees_the_ids_and_places_of_the_net(corridor, name):
-    road, port, seen = corridor(name), free_port(), list[Any]()
-
-    def drive() -> None:
-        c = traci.connect(port, numRetries=200, waitBetweenRetries=0.02)
-        try:
-            seen.append((c.junction.getIDList(), c.edge.getIDList(), c.vehicle.getIDList()))
-            while c.simulation.getMinExpectedNumber() > 0:
-                c.simulationStep()
-                for who in c.vehicle.getIDList():
-                    v, lane = c.vehicle, c.vehicle.getLaneID(who)
-                    seen.append(
-                        {
-                            "who": who,
-                            "lane": lane,
-                            "edge": (v.getRoadID(who), c.lane.getEdgeID(lane)),
-                            "index": v.getLaneIndex(who),
-                            "at": (v.getLanePosition(who), *v.getPosition(who), v.getAngle(who)),
-                            "length": c.lane.getLength(lane),
-                            "limit": (v.getAllowedSpeed(who), c.lane.getMaxSpeed(lane)),
-                            "shape": c.lane.getShape(lane),
-                            "on": who in c.lane.getLastStepVehicleIDs(lane),
-                            "on edge": who in c.edge.getLastStepVehicleIDs(v.getRoadID(who)),
-                            "next": v.getRoute(who)[v.getRouteIndex(who)],
-                        }
-                    )
-                if "vut" in c.vehicle.getIDList():
-                    c.vehicle.setSpeed("vut", c.vehicle.getSpeed("vut") + 0.05)
-        finally:
-            c.close()
-
-    client = threading.Thread(target=drive)
-    client.start()
-    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
-    with World(1, road, scenario=US23) as world:
-        vut = TraciVut(
-            1, world.road, world.scenario, port, None, VutOptions(deadline_s=5.0, connect_s=10.0)
-        )
-        try:
-            ((_, trajectory),) = rollout(world, PovLibrary(1, POVS), vut, [case])
-        finally:
-            vut.close()
-            client.join()
-    assert trajectory.end is not End.VUT_ERROR, trajectory.error
-    assert trajectory.x_vut_m[-1] >= 0.0
-    (junctions, edges, vehicles), *rows = seen
-    pieces = {p.lane: p for path in (road.mainline, road.ramp) for p in path.pieces}
-    assert road.junction_id in junctions
-    assert (set(edges), vehicles) == ({lane.rpartition("_")[0] for lane in pieces}, ())
-    paths = {"pov": (road.mainline, 0), "vut": (road.ramp, 1)}
-    assert len(rows) >= 2 * (len(trajectory.motion) - 1)
-    for number, row in enumerate(rows):
-        path, column = paths[row["who"]]
-        at = path.point(float(trajectory.motion[number // 2, column, 0]))
-        edge, _, index = at.lane.rpartition("_")
-        piece = path.piece(float(trajectory.motion[number // 2, column, 0]))
-        assert (row["lane"], row["edge"], row["index"]) == (at.lane, (edge, edge), int(index))
-        assert row["at"] == pytest.approx((at.position_m, at.x_m, at.y_m, at.angle_deg), abs=1e-9)
-        # The client sees the net of the file: there the last lane is not continued.
-        sizes = (
-            min(piece.length_m, road.drawn_after_m - piece.start_m),
-            piece.speed_limit_mps,
-            piece.speed_limit_mps,
-        )
-        assert (row["length"], *row["limit"]) == pytest.approx(sizes, abs=1e-9)
-        assert (row["on"], row["on edge"]) == (True, True)
-        if not piece.is_internal:
-            shape = tuple((x, y) for x, y, _ in pieces[at.lane].shape)
-            assert row["shape"] == shape[: len(shape) - (piece is path.pieces[-1])]
-            assert row["next"] == edge
-    driven_on = list(dict.fromkeys(row["lane"] for row in rows if row["who"] == "vut"))
-    at = [p.lane for p in road.ramp.pieces].index(driven_on[0])
-    assert driven_on == [p.lane for p in road.ramp.pieces[at : at + len(driven_on)]]
-    assert len(driven_on) >= 2
 
 
 @pytest.mark.parametrize("name", ["curved", "zipper", "OSM"])

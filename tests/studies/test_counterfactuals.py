@@ -14,7 +14,6 @@ import pytest
 from campaigning import run_campaign
 from plans import plan_for
 
-import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.store import Run, failures
@@ -271,8 +270,3 @@ class TestItIsShown:
         a = tmp_path / "a"
         code, out, err = command_line("compare-runs", a, a, "--no-rerun")
         assert out.count("would have been avoided by a careful and competent driver") == 2
-
-    def test_by_python(self, tmp_path):
-        made = ms.campaign("design1", level=0, cases=40, batch=20, seed=1, out=tmp_path / "run")
-        assert read_avoidance(Run(tmp_path / "run"))
-        assert 'id="avoided-by"' in made.report().read_text()

@@ -207,15 +207,6 @@ class TestTheCommand:
         assert [v["levels"]["0"]["failures"] for v in record["versions"]] == [1, 0]
         assert other.read_bytes() == out.read_bytes()
 
-    def test_replaces_nothing(self, command_line, tmp_path, monkeypatch):
-        a = write(tmp_path / "a", (0.5, 0.5, "fails"))
-        monkeypatch.chdir(tmp_path)
-        (tmp_path / "history.html").write_text("mine")
-        code, _, err = command_line("history", a.folder, a.folder)
-        assert code == 2
-        assert "exists" in err
-        assert (tmp_path / "history.html").read_text() == "mine"
-
 
 class TestFromPython:
     def test_is_what_the_command_prints_and_writes(self, command_line, tmp_path):

@@ -22,7 +22,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
-from merge_sumo.sumo.replay import MAX_TIMESTEPS, open_gui, replay
+from merge_sumo.sumo.replay import MAX_TIMESTEPS, replay
 from merge_sumo.sumo.replay_folder import (
     CASE,
     CONFIG,
@@ -176,21 +176,18 @@ class TestAnExport:
         replay(folder)
         assert contents(folder) == before
 
-    @pytest.mark.parametrize("kept", [(), ("notes.txt",), (CONFIG, RECORD)])
-    def test_refuses_a_folder_that_exists_and_leaves_it_alone(self, run, tmp_path, kept):
-        target = tmp_path / "case"
-        target.mkdir()
-        for name in kept:
-            (target / name).write_text("mine")
-        with pytest.raises(UserError, match="case exists"):
-            export_case(run, 0, target)
-        assert contents(tmp_path) == {target / name: b"mine" for name in kept}
 
-    def test_says_when_its_folder_cannot_be_made(self, run, tmp_path):
-        (tmp_path / "file").write_text("mine")
-        with pytest.raises(UserError, match="cannot write"):
-            export_case(run, 0, tmp_path / "file" / "case")
-        assert contents(tmp_path) == {tmp_path / "file": b"mine"}
+OF_LEVEL_2 = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
+MOTIONS: dict[str, tuple[Case, Command, Command, int, End]] = {
+    "a timeout": (at_level_0(-250.0, 30.0), constant, lambda _: -4.0, 300, End.TIMEOUT),
+    "a stand": (at_level_0(-200.0, 0.0, 0.0), lambda _: 1.0, lambda _: 2.0, 136, End.MERGED),
+    "bodies that overlap": (at_level_0(-182.0, 18.0), constant, constant, 102, End.MERGED),
+    "a fast POV": (at_level_0(-180.0, 35.0), lambda _: 2.0, lambda _: -4.0, 300, End.TIMEOUT),
+    "no step": (at_level_0(-250.0, 30.0), constant, constant, 0, End.VUT_ERROR),
+    "level 2": (OF_LEVEL_2, lambda s: (s // 5) % 7 - 4.0, lambda _: 1.0, 83, End.MERGED),
+    "a fast VUT": (at_level_0(-300.0, 30.0, V_VUT0_MAX_MPS), constant, constant, 41, End.MERGED),
+}
+"""Case, acceleration of the POV and of the VUT, steps and end."""
 
 
 class TestAnHonestRecordReplaysIdentically:
@@ -216,37 +213,11 @@ class TestAnHonestRecordReplaysIdentically:
         assert trajectory.x_vut_m[-1] >= 0.0
         assert_identical(write(tmp_path / "case", trajectory), 245)
 
-    def test_of_a_timeout(self, tmp_path):
-        trajectory = drive(at_level_0(-250.0, 30.0), constant, lambda _: -4.0, 300, End.TIMEOUT)
-        assert_identical(write(tmp_path / "case", trajectory), 300)
-
-    def test_of_vehicles_that_start_from_a_stand(self, tmp_path):
-        case = at_level_0(-200.0, 0.0, v_vut0_mps=0.0)
-        trajectory = drive(case, lambda _: 1.0, lambda _: 2.0, 136, End.MERGED)
-        assert_identical(write(tmp_path / "case", trajectory), 136)
-
-    def test_of_vehicles_that_overlap_all_the_way(self, tmp_path):
-        trajectory = drive(at_level_0(-182.0, 18.0), constant, constant, 102, End.MERGED)
-        assert_identical(write(tmp_path / "case", trajectory), 102)
-
-    def test_of_a_pov_that_accelerates_until_the_timeout(self, tmp_path):
-        case = at_level_0(-180.0, 35.0)
-        trajectory = drive(case, lambda _: 2.0, lambda _: -4.0, 300, End.TIMEOUT)
-        assert_identical(write(tmp_path / "case", trajectory), 300)
-
-    def test_of_an_episode_that_ended_before_its_first_step(self, tmp_path):
-        trajectory = drive(at_level_0(-250.0, 30.0), constant, constant, 0, End.VUT_ERROR)
-        assert_identical(write(tmp_path / "case", trajectory), 0)
-
-    def test_of_a_case_at_level_2(self, tmp_path):
-        case = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
-        trajectory = drive(case, lambda s: (s // 5) % 7 - 4.0, lambda _: 1.0, 83, End.MERGED)
-        assert_identical(write(tmp_path / "case", trajectory), 83)
-
-    def test_of_the_fastest_vut_that_a_campaign_may_have(self, tmp_path):
-        case = at_level_0(-300.0, 30.0, v_vut0_mps=V_VUT0_MAX_MPS)
-        trajectory = drive(case, constant, constant, 41, End.MERGED)
-        assert_identical(write(tmp_path / "case", trajectory), 41)
+    @pytest.mark.parametrize("name", MOTIONS)
+    def test_of_any_motion(self, tmp_path, name):
+        case, pov, vut, steps, end = MOTIONS[name]
+        trajectory = drive(case, pov, vut, steps, end)
+        assert_identical(write(tmp_path / "case", trajectory), steps)
 
     @pytest.mark.parametrize("beyond_m", [-0.0005, 0.0, 0.0005])
     def test_of_a_pov_that_is_at_the_merge_point_at_a_step(self, tmp_path, beyond_m):
@@ -323,12 +294,11 @@ class TestAReplayThatIsNotTheRecord:
 class TestARecordThatSumoPlays:
     """The record itself is changed, and so what SUMO plays and what the replay compares."""
 
-    @pytest.mark.parametrize("by", [0.5, -0.5])
     @pytest.mark.parametrize("column", ["x", "y", "pos", "speed"])
     @pytest.mark.parametrize("who", ["pov", "vut"])
-    def test_is_not_identical_when_a_number_of_it_was_changed(self, folder, who, column, by):
-        edit_number(folder / RECORD, who, column, by)
-        assert_not_identical(folder)
+    def test_is_not_identical_when_a_number_of_it_was_changed(self, folder, who, column):
+        edit_number(folder / RECORD, who, column, 0.5)
+        assert replay(folder).diverged_at_s is not None
 
     @pytest.mark.parametrize("steps", [0, HOLD_STEPS, MAX_TIMESTEPS + 1])
     def test_is_refused_when_it_is_too_short_or_too_long_for_an_episode(self, folder, steps):
@@ -383,23 +353,6 @@ class TestARecordThatSumoPlays:
         record.write(folder / RECORD)
         assert "must have every vehicle in every timestep" in refusal(folder)
 
-    def test_is_not_identical_when_its_end_is_missing(self, folder):
-        record = etree.parse(folder / RECORD)
-        for timestep in record.findall("timestep")[ROW:]:
-            record.getroot().remove(timestep)
-        record.write(folder / RECORD)
-        assert_not_identical(folder)
-
-
-def assert_not_identical(folder: Path) -> None:
-    """The replay diverges, or the folder is refused with a sentence."""
-    try:
-        result = replay(folder)
-    except UserError as error:
-        assert "\n" not in str(error)  # noqa: PT017 (either answer is honest)
-    else:
-        assert result.diverged_at_s is not None
-
 
 class TestAFolderThatCannotBeReplayed:
     @pytest.mark.parametrize("name", [NET, TYPES, RECORD])
@@ -412,17 +365,6 @@ class TestAFolderThatCannotBeReplayed:
         assert "is not a replay folder" in refusal(tmp_path / "nowhere")
         (tmp_path / name).mkdir()
         assert "is not a replay folder" in refusal(tmp_path)
-
-    @pytest.mark.parametrize("text", [b"", b"\x00\x01", b"<fcd-export><timestep", b"not XML"])
-    @pytest.mark.parametrize("name", [NET, TYPES, RECORD])
-    def test_has_a_file_that_is_no_xml(self, folder, name, text):
-        (folder / name).write_bytes(text)
-        assert refusal(folder)
-
-    def test_has_a_record_that_is_cut_off(self, folder):
-        text = (folder / RECORD).read_bytes()
-        (folder / RECORD).write_bytes(text[: len(text) // 2])
-        assert RECORD in refusal(folder)
 
     @pytest.mark.parametrize(
         ("old", "new"),
@@ -461,7 +403,7 @@ class TestAConfigurationThatCameAlong:
         assert_identical(folder)
 
 
-@pytest.mark.parametrize("folder", SHIPPED[:1], ids=lambda folder: folder.name)
+@pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
 def test_plain_sumo_replays_a_folder_that_is_shipped(folder, tmp_path):
     assert_plain_sumo_replays(folder, tmp_path)
 
@@ -486,26 +428,6 @@ def assert_plain_sumo_replays(folder: Path, tmp_path: Path) -> None:
     assert len(recorded) > 100
     assert [row[:2] for row in played] == [row[:2] for row in recorded]
     assert np.allclose([row[2:] for row in played], [row[2:] for row in recorded], 0.0, 1e-6)
-
-
-def test_a_record_shows_no_file_that_an_external_entity_names(folder, tmp_path):
-    secret = tmp_path / "secret.xml"
-    secret.write_text(
-        '<timestep time="999"><vehicle id="vut" x="1" y="2" pos="3" speed="4"/></timestep>'
-    )
-    text = (folder / RECORD).read_text()
-    doctype = f'<!DOCTYPE fcd-export [<!ENTITY e SYSTEM "{secret.as_uri()}">]>\n<fcd-export>&e;'
-    assert "<fcd-export>" in text
-    (folder / RECORD).write_text(text.replace("<fcd-export>", doctype))
-    assert "declares a document type" in refusal(folder)
-
-
-def test_the_gui_needs_a_display(folder, monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(UserError, match="DISPLAY") as error:
-        open_gui(folder)
-    assert "\n" not in str(error.value)
 
 
 def test_in_sumo_gui_it_takes_its_own_time_and_halts_before_sumo_ends_with_a_dialog(tmp_path):

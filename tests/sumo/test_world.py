@@ -16,7 +16,7 @@ from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.values.case import Case, MergeCase, from_unit
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, POV, US23, VUT
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, US23
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.registry import VutFactory
@@ -139,15 +139,6 @@ def test_sumo_reports_the_acceleration_that_was_commanded():
         command = np.array([[0.0, 1.0, -4.0], [2.0, -1.5, 0.0]])
         world.step(command)
         assert world.acceleration_mps2() == pytest.approx(command, abs=EXACT)
-
-
-def test_a_constant_speed_pov_covers_33_m_in_a_second():
-    with World(1, scenario=US23) as world:
-        world.place(0, [(-273.0, 33.0), (-182.0, 18.0)])
-        for _ in range(10):
-            world.step(np.zeros((2, 1)))
-        assert world.x_m[POV, 0] == pytest.approx(-240.0, abs=EXACT)
-        assert world.x_m[VUT, 0] == pytest.approx(-164.0, abs=EXACT)
 
 
 def test_lane_coordinates_go_on_behind_the_merge_point():

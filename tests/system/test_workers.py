@@ -259,13 +259,6 @@ class TestACampaign:
         run_campaign(SETTINGS, tmp_path / "run", workers=two)
         assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
 
-    @pytest.mark.long
-    @pytest.mark.parametrize("count", [3, 5])
-    def test_has_the_same_outcomes_on_more(self, expected, tmp_path, count):
-        with open_workers(count) as workers:
-            run_campaign(SETTINGS, tmp_path / "run", workers=workers)
-        assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
-
     def test_closes_its_simulation_in_this_process(self, tmp_path):
         for name in ("first", "second"):
             settings = CampaignSettings(

@@ -59,11 +59,9 @@ def env():
 
 
 class TestEnvironments:
-    def test_the_single_environment_passes_gymnasiums_checker(self, env):
-        check_env(env.unwrapped, skip_render_check=True)
-
-    def test_a_vut_environment_passes_it_too(self):
-        made = gymnasium.make(ENV_ID, role="vut", opponent="level0")
+    @pytest.mark.parametrize("role", ["pov", "vut"])
+    def test_the_single_environment_passes_gymnasiums_checker(self, role):
+        made = gymnasium.make(ENV_ID, role=role, opponent="level0")
         try:
             check_env(made.unwrapped, skip_render_check=True)
         finally:

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigning import resume_campaign, run_campaign
+from campaigning import run_campaign
 from conftest import some
 from plans import POVS, plan_for
 
 from merge_sumo.analysis.predictions import prediction_error_m, prediction_in_words, surprises
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import OUTCOMES, Run
+from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.engine.povs import Povs
@@ -34,7 +34,6 @@ from merge_sumo.studies.expectation import (
     note_expectation,
     read_expectation,
 )
-from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.records import decode, to_plain
 from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.twin.experts import GROUPS, Expert, Forest, Steps
@@ -348,19 +347,6 @@ class TestACampaign:
     def test_asks_for_few_cases_while_it_is_young(self, whole):
         sizes = np.bincount([o.batch for o in whole.outcomes])
         assert sizes.tolist() == [10] * 6
-
-    def test_goes_on_as_if_it_had_not_been_stopped(self, whole, tmp_path):
-        batches = iter(range(3))
-
-        def stop():
-            if next(batches) == 2:
-                raise Stopped(2)
-
-        with pytest.raises(Stopped):
-            run_campaign(SETTINGS, tmp_path / "run", check=stop)
-        resume_campaign(tmp_path / "run")
-        outcomes = [(folder / OUTCOMES).read_bytes() for folder in (whole.folder, tmp_path / "run")]
-        assert outcomes[0] == outcomes[1]
 
     def test_learns_from_another_and_records_what(self, whole, tmp_path):
         settings = replace(SETTINGS, cases=10, learn_from=(str(whole.folder),))

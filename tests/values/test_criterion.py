@@ -403,12 +403,6 @@ class TestBodiesBeforeM:
 
 
 class TestOutcomes:
-    def test_come_back_from_their_records(self):
-        outcome = Criterion("ttc_s < 4").outcome(7, 2, ending(-21.0, v_pov=32.0))
-        record = json.loads(json.dumps(outcome.to_record()))
-        assert list(record)[-1] == "margin"
-        assert Outcome.from_json(json.dumps(record), scenario=US23) == outcome
-
     @pytest.mark.parametrize("margin", [True, "1", math.nan, [3]])
     def test_with_a_margin_that_is_none_are_refused(self, margin):
         record = Criterion("ttc_s < 4").outcome(0, 0, ending(9.0)).to_record()

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -147,15 +146,6 @@ class TestClosedForms:
         expected = count * (BALL[2] - lens(step, 2))
         assert fmc(points) == pytest.approx(expected, rel=1e-12)
 
-    def test_the_cavity_of_a_shell_does_not_count(self):
-        normals = np.random.default_rng(5).normal(size=(300, 3))
-        points = 0.5 + 0.12 * normals / np.linalg.norm(normals, axis=1)[:, None]
-        shell = fmc(points)
-        cavity_and_shell = fmc(np.vstack([points, 0.5 + lattice(5, 0.035, 3) - 0.07]))
-        expected, error = monte_carlo(points, seed=6)
-        assert abs(shell - expected) < 4 * error
-        assert cavity_and_shell > shell + 0.5 * 4 / 3 * math.pi * 0.07**3
-
 
 class TestLattices:
     """Many circles through one point, arcs that end where others begin, tangents."""
@@ -189,18 +179,6 @@ class TestLattices:
 
 
 class TestReferences:
-    @pytest.mark.parametrize(
-        ("count", "width"), [(10, 0.2), (100, 1.0), (400, 1.0), (400, 0.3), (1500, 0.4)]
-    )
-    def test_between_inner_and_outer_polygons(self, count, width):
-        points = np.random.default_rng(count).random((count, 2)) * width
-        discs = shapely.points(points)
-        outer = RADIUS / math.cos(math.pi / 256)  # its 256-gon contains the disc
-        inside = shapely.union_all(shapely.buffer(discs, RADIUS, quad_segs=64)).area
-        outside = shapely.union_all(shapely.buffer(discs, outer, quad_segs=64)).area
-        assert inside < fmc(points) < outside
-        assert outside / inside - 1 < 3e-4  # so the check above says something
-
     @pytest.mark.parametrize("dimension", [2, 3])
     @pytest.mark.parametrize(("count", "width"), [(3, 0.08), (60, 0.3), (400, 0.2), (2000, 1.0)])
     def test_monte_carlo_of_the_definition(self, dimension, count, width):
@@ -257,12 +235,6 @@ class TestWhatMustNotMatter:
         random.shuffle(rows)
         assert fmc(points[rows]) == result
 
-    @examples
-    @given(point_sets(), st.floats(-1e-15, 1e-15))
-    def test_the_same_points_with_other_rounding(self, points, shift):
-        twice = np.vstack([points, points + shift])
-        assert fmc(twice) == pytest.approx(fmc(points), rel=1e-10)
-
     @DIMENSIONS
     def test_nearly_equal_points_are_one(self, dimension):
         noise = np.random.default_rng(11).normal(size=(400, dimension))
@@ -272,27 +244,6 @@ class TestWhatMustNotMatter:
             grown = 8 * dimension * size / RADIUS  # in volume; the noise reaches 4 size
             low, high = BALL[dimension] * (1 - 2e-5), BALL[dimension] * (1 + 2e-5 + grown)
             assert low <= fmc(heap) <= high
-
-    @examples
-    @given(point_sets(), st.floats(-3.0, 3.0))
-    def test_translation(self, points, shift):
-        tolerance = max(TOLERANCE[points.shape[1]], 1e-9)
-        assert fmc(points + shift) == pytest.approx(fmc(points), rel=tolerance)
-
-    @examples
-    @given(point_sets(), st.integers(0, 2))
-    def test_reflection_and_swapped_axes(self, points, axis):
-        tolerance = max(TOLERANCE[points.shape[1]], 1e-9)
-        mirrored = points.copy()
-        mirrored[:, axis % points.shape[1]] *= -1.0
-        assert fmc(mirrored) == pytest.approx(fmc(points), rel=tolerance)
-        assert fmc(points[:, ::-1]) == pytest.approx(fmc(points), rel=tolerance)
-
-    @examples
-    @given(point_sets(dimensions=[2]), st.floats(0.0, 2 * math.pi))
-    def test_rotation(self, points, angle):
-        c, s = math.cos(angle), math.sin(angle)
-        assert fmc(points @ np.array([[c, s], [-s, c]])) == pytest.approx(fmc(points), rel=1e-9)
 
     def test_the_direction_of_a_lattice_in_space(self):
         # Face-centred cubic: each pole of a ball lies on five others, and all at the same heights.

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigning import resume_campaign, run_campaign
+from campaigning import run_campaign
 from misbehaviours import STUBBORN
 from processes import none_left, wait_for
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
@@ -83,34 +83,6 @@ def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
     assert parent.returncode == 130
     assert b"Traceback" not in said
     assert b"go on with" in said
-
-
-def test_a_campaign_that_was_interrupted_goes_on_to_the_same_bytes(spec, tmp_path):
-    vut = spec(LEVEL0_CLASS.replace("Level0", "Vut"))
-    settings = CampaignSettings(
-        vut=vut, levels=(0,), cases=8, batch=4, sampler="uniform", scenario=US23
-    )
-    whole = run_campaign(settings, tmp_path / "whole")
-
-    def stop():
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_campaign(settings, tmp_path / "run", check=stop)
-    again = resume_campaign(tmp_path / "run")
-    outcomes = (again.folder / "outcomes.jsonl").read_bytes()
-    assert outcomes == (whole.folder / "outcomes.jsonl").read_bytes()
-
-
-def test_a_vut_that_changed_is_not_gone_on_with(spec, tmp_path):
-    source = LEVEL0_CLASS.replace("Level0", "Vut")
-    settings = CampaignSettings(
-        vut=spec(source), levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
-    )
-    run_campaign(settings, tmp_path / "run")
-    spec(source + "# changed\n")
-    with pytest.raises(UserError, match=r"vut_files\..*my_vut.py differs"):
-        resume_campaign(tmp_path / "run")
 
 
 def test_once_killed_its_descriptors_are_nobodys_business(spec, tmp_path):

@@ -11,7 +11,6 @@ import sys
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 from campaigning import run_campaign
 from conftest import some
@@ -24,7 +23,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import MAX_STEPS, US23
 from merge_sumo.values.trajectory import End
-from merge_sumo.vuts.registry import VutFactory
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
 
@@ -302,10 +300,6 @@ def test_what_cannot_be_found_or_made_is_refused_in_a_sentence(vut, tmp_path):
             in_process("level0", deadline_s=deadline)
     with pytest.raises(UserError, match="--vut-command goes with --vut traci"):
         in_process("level0", command="python x.py")
-
-
-def test_built_in_names_still_work():
-    assert np.isfinite(run_cases(VutFactory("design2"), cases_of(2))[0].motion).all()
 
 
 def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):

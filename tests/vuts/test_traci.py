@@ -131,62 +131,6 @@ class TestAStockClient:
             round(0.1 * (i + 1), 6) for i in range(8)
         ]
 
-    def test_reads_both_vehicles(self):
-        def read(c):
-            c.simulationStep()
-            c.simulationStep()
-            v = c.vehicle
-            ramp = c.lane.getLength("ramp_0")
-            return {
-                "speeds": (v.getSpeed("pov"), v.getSpeed("vut")),
-                "x_vut": v.getLanePosition("vut") - ramp,
-                "x_pov": v.getLanePosition("pov") - c.lane.getLength("main_in_0"),
-                "lanes": (v.getLaneID("pov"), v.getLaneID("vut"), v.getRoadID("vut")),
-                "route": (v.getRoute("vut"), v.getRouteIndex("vut"), v.getRouteID("vut")),
-                "type": (v.getTypeID("vut"), v.getVehicleClass("vut"), v.getLength("vut")),
-                "distance": np.hypot(*v.getPosition("vut")),
-                "height": v.getPosition3D("vut")[2],
-                "lane": (v.getLaneIndex("vut"), v.getLateralLanePosition("vut")),
-                "limits": (v.getAccel("vut"), v.getDecel("vut"), v.getMaxSpeed("vut")),
-                "acceleration": v.getAcceleration("vut"),
-                "colour": v.getColor("vut"),
-                "leader": v.getLeader("vut", 100.0),
-                "junction": c.junction.getPosition("M"),
-                "on lane": c.lane.getLastStepVehicleIDs("ramp_0"),
-                "lanes of the net": c.lane.getIDList(),
-                "shape": c.lane.getShape("main_out_0")[0],
-                "times": (c.simulation.getTime(), c.simulation.getDeltaT()),
-                "version": c.getVersion(),
-                "gui": c.hasGUI(),
-                "angle": v.getAngle("pov"),
-            }
-
-        seen = Played(stock(read), steps=2).result
-        assert seen["speeds"] == (30.0, 18.0)
-        assert seen["x_vut"] == pytest.approx(-180.2, abs=1e-9)
-        assert seen["x_pov"] == pytest.approx(-247.0, abs=1e-9)
-        assert seen["lanes"] == ("main_in_0", "ramp_0", "ramp")
-        assert seen["route"] == (("ramp", "main_out"), 0, "route.vut")
-        assert seen["type"] == ("vut", "passenger", 5.0)
-        assert seen["distance"] == pytest.approx(180.2, abs=1e-6)
-        assert seen["height"] == 0.0
-        assert seen["lane"] == (0, 0.0)
-        assert seen["limits"] == (2.0, 4.0, 45.0)
-        assert seen["acceleration"] == 0.0
-        assert seen["colour"] == (26, 89, 230, 255)
-        assert seen["leader"] is None
-        assert seen["junction"] == (0.0, 1.6)
-        assert seen["on lane"] == ("vut",)
-        assert seen["lanes of the net"] == (
-            *("main_in_0", "main_in_1", "main_out_0", "main_out_1", "ramp_0"),
-        )
-        assert seen["shape"] == pytest.approx((0.0, 0.0), abs=1e-6)
-        assert seen["times"] == (0.2, 0.1)
-        assert seen["version"][0] == traci.constants.TRACI_VERSION
-        assert "1.28.0" in seen["version"][1]
-        assert seen["gui"] is False
-        assert seen["angle"] == pytest.approx(90.0, abs=1e-6)
-
     def test_holds_the_speed_it_set_until_it_sets_another(self):
         def drive(c):
             c.simulationStep()
@@ -264,46 +208,6 @@ class TestAStockClient:
         assert seen[4] >= {"vut"}
         assert seen[5] == {}
         assert seen[6] == seen[7] == {}
-
-    def test_is_refused_what_is_not_its_own_and_goes_on(self):
-        def refused(call, *arguments):
-            with pytest.raises(traci.TraCIException) as error:
-                call(*arguments)
-            return str(error.value)
-
-        def drive(c):
-            said = [refused(c.vehicle.getSpeed, "vut")]
-            c.simulationStep()
-            said += [
-                refused(c.vehicle.setSpeed, "pov", 10.0),
-                refused(c.vehicle.slowDown, "pov", 10.0, 2.0),
-                refused(c.vehicle.setSpeed, "nobody", 10.0),
-                refused(c.vehicle.moveTo, "vut", "main_out_0", 5.0),
-                refused(c.vehicle.setPreviousSpeed, "vut", 50.0),
-                refused(c.vehicle.getCO2Emission, "nobody"),
-                refused(c.lane.getLength, "lane_0"),
-                refused(c.vehicle.subscribe, "nobody", [0x40]),
-                refused(c.load, ["-c", "x.sumocfg"]),
-                refused(c.trafficlight.getPhase, "none"),
-            ]
-            c.vehicle.setSpeed("vut", 18.1)
-            c.simulationStep()
-            return said
-
-        played = Played(stock(drive), steps=1)
-        said = played.result
-        assert played.speeds == pytest.approx([18.1])
-        assert said[0] == "Vehicle 'vut' is not known."
-        assert "'pov' is not the controller's" in said[1]
-        assert "'pov' is not the controller's" in said[2]
-        assert "'nobody' is not known" in said[3]
-        assert "does not carry out" in said[4]
-        assert "does not carry out" in said[5]
-        assert "'nobody' is not known" in said[6]
-        assert "'lane_0' is not known" in said[7]
-        assert "'nobody' is not known" in said[8]
-        assert said[9].startswith("merge-sumo does not carry out CMD_LOAD: the campaign")
-        assert "'none' is not known" in said[10]
 
     def test_may_close_when_the_vehicle_has_arrived_and_another_come(self):
         def once(c):

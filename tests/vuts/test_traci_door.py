@@ -186,16 +186,6 @@ class TestWithoutACommand:
         assert [t.error for t in trajectories] == [None, None]
         assert not any(served)
 
-    def test_no_other_is_served_then(self, monkeypatch):
-        monkeypatch.setenv(TOKEN_VARIABLE, "mine alone")
-        port = free_port()
-        with (
-            strangers(port, STRANGERS["guesses a token"]) as served,
-            pytest.raises(UserError, match="no TraCI client connected"),
-        ):
-            run_cases(factory(f"traci:{port}", connect_s=1.0), cases_of(1))
-        assert not any(served)
-
 
 class TestAnotherUser:
     """A second account of this machine; it needs root to become one."""
