@@ -74,7 +74,7 @@ from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers
-from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import ONE, one_level, parse_levels, policies_folder
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
@@ -639,6 +639,7 @@ def truth(
     *,
     cases: int | None = None,
     seed: int = 0,
+    engine: str | None = None,
     **given: Unpack[StudyKeywords],
 ) -> Truth:
     """Return the ground truth of a VUT at one level; see `truths`, whose arguments these are."""
@@ -646,7 +647,7 @@ def truth(
     if str(level) == "all":
         raise UserError(f"--level all does not go here: choose {ONE}")
     settings, runner = settings_for(vut, {**given, "level": level})
-    with _study(settings, runner) as study:
+    with _study(settings, runner, engine) as study:
         return study.truth(settings.levels[0], cases, seed)
 
 
@@ -656,6 +657,7 @@ def truths(
     *,
     cases: int | None = None,
     seed: int = 0,
+    engine: str | None = None,
     **given: Unpack[StudyKeywords],
 ) -> TruthResult:
     """Find the ground truth of a VUT by uniform cases; the same as `merge-sumo truth`.
@@ -665,6 +667,8 @@ def truths(
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         cases: uniform cases of a level; by default 10,000, and 20,000 at level 2.
         seed: same seed, same cases.
+        engine: "sumo", or "kinematic" for the equations of motion alone, with SUMO for at least one
+            case of a hundred; by default "kinematic" where VUT and POV are of this package.
         given: how a case is run and judged, and where: see `StudyKeywords`.
 
     A cached truth is used again. The truth of an object of this process is not kept: its name does
@@ -672,7 +676,7 @@ def truths(
     """
     check_keywords("truths", given, StudyKeywords)
     settings, runner = settings_for(vut, {**given, "level": level})
-    with _study(settings, runner) as study:
+    with _study(settings, runner, engine) as study:
         by_level = {number: study.truth(number, cases, seed) for number in settings.levels}
     if study.plan.vut.vut.named_only and not is_here(settings.vut):
         warnings.warn(
@@ -685,16 +689,24 @@ def truths(
 
 
 @contextmanager
-def _study(settings: CampaignSettings, runner: Runner) -> Iterator[benchmark.Study]:
-    """Open a study; the cache of objects of this process is a passing one."""
+def _study(
+    settings: CampaignSettings, runner: Runner, engine: str | None = None
+) -> Iterator[benchmark.Study]:
+    """Open a study; the cache of objects of this process is a passing one.
+
+    Raises `UserError` for an engine that a level does not allow.
+    """
     plan = resolve(settings)
+    for level in settings.levels:
+        plan.at_level(level).with_engine(engine)
     passing = is_here(settings.vut) or is_here(settings.pov or "")
     with (
         runner.open(plan, at_once=True) as opened,
         tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder,
         Bars(shown=runner.progress) as bars,
     ):
-        yield benchmark.Study(plan, opened, Path(folder) if passing else None, bars.counted)
+        cache = Path(folder) if passing else None
+        yield benchmark.Study(plan, opened, cache, bars.counted, engine)
 
 
 def compare(
@@ -760,6 +772,7 @@ def certify(
     net: AnyPath | None = None,
     out: AnyPath | None = None,
     resume: bool = False,
+    engine: str = Engine.SUMO,
     check: Callable[[], None] = lambda: None,
     **given: Unpack[StudyKeywords],
 ) -> CertificateResult:
@@ -772,6 +785,7 @@ def certify(
         net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/certify-<vut>-<date>` by default.
         resume: go on with the certificate in `out`.
+        engine: "sumo", or "kinematic": see `truths`.
         check: called after every block of cases; may raise to stop there.
         given: how a case is run and judged, and where: see `StudyKeywords`.
 
@@ -785,7 +799,7 @@ def certify(
     folder = dated(f"certify-{settings.vut}") if out is None else Path(out)
     if not resume:
         check_new(folder)
-    plan = resolve(settings, _path(net))
+    plan = resolve(settings, _path(net)).with_engine(engine)
     total = sum(map(len, lattices.values()))
     with (
         runner.open(plan, at_once=True) as opened,
@@ -814,6 +828,7 @@ def probability(
     net: AnyPath | None = None,
     out: AnyPath | None = None,
     trust_vut: bool = False,
+    engine: str = Engine.SUMO,
     **given: Unpack[RerunKeywords],
 ) -> ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail; as `merge-sumo probability`.
@@ -827,6 +842,7 @@ def probability(
         net: net for that; must be the one of the campaign.
         out: new file to write; `probability.json` in the folder of the campaign by default.
         trust_vut: run the controller that a folder names although it was not made here.
+        engine: "sumo", or "kinematic": see `truths`.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
 
@@ -837,7 +853,7 @@ def probability(
     target = before.folder / estimates.RESULT if out is None else Path(out)
     fields, runner = given_again(None, given, {"vut": before.vut})
     settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
-    plan = resolve(settings, _path(net))
+    plan = resolve(settings, _path(net)).with_engine(engine)
     with runner.open(plan) as opened, runner.counter("fresh cases", cases) as counter:
         estimate = estimates.failure_probability(
             before,

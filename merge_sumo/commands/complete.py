@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 LEVELS: Final = (("0", "keeps its speed"), ("1", "learned"), ("2", "learned, with psi"))
+ENGINES: Final = (("kinematic", "eq. (4), a share of the cases in SUMO"), ("sumo", "SUMO alone"))
 RUNS: Final = "runs"
 """Folder in which campaigns are, unless a person says otherwise."""
 MOST_RUNS: Final = 50
@@ -79,6 +80,11 @@ def levels(incomplete: str) -> Completions:
 def one_level(incomplete: str) -> Completions:
     """Return the POV levels."""
     return _matching(incomplete, [*LEVELS, ("own", "a POV of your own: --pov")])
+
+
+def engines(incomplete: str) -> Completions:
+    """Return what may move the vehicles of a study."""
+    return _matching(incomplete, ENGINES)
 
 
 def samplers(incomplete: str) -> Completions:

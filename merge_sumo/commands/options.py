@@ -28,7 +28,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "Verdict": ("fail_when", "require", "gate", "tolerance", "rerun", "confidence"),
     "Where it runs, and what it writes": (
-        *("out", "resume", "force", "workers", "dask", "junit", "figure", "file_format"),
+        *("out", "resume", "force", "engine", "workers", "dask", "junit", "figure", "file_format"),
         *("gui", "debug", "quiet", "as_json"),
     ),
     "Trust and limits": ("trust_vut", "deadline", "vut_memory", "in_process"),
@@ -183,6 +183,14 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Growth of FMC, or of the share of cases without a verdict, at a level that is still no "
         "regression.",
         callback=_checked_tolerance,
+    ),
+    "engine": _option(
+        str,
+        "sumo",
+        "sumo, or kinematic: the equations of motion alone, and SUMO for at least one case of a "
+        "hundred. For VUTs and POVs of this package.",
+        metavar="NAME",
+        autocompletion=complete.engines,
     ),
     "workers": _option(
         int | None,

@@ -23,6 +23,16 @@ def truth(
         typer.Option(help="Uniform cases of a level.", show_default="10000, at level 2 20000"),
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
+    engine: Annotated[
+        str | None,
+        typer.Option(
+            help="kinematic: the equations of motion alone, and SUMO for at least one case of a "
+            "hundred. Or sumo for all.",
+            metavar="NAME",
+            show_default="kinematic where VUT and POV are of this package",
+            autocompletion=complete.engines,
+        ),
+    ] = None,
     workers: CoresOption = None,
 ) -> None:
     """Find the ground truth of a VUT at each level, by uniform cases on all cores.
@@ -34,7 +44,9 @@ def truth(
     """
     from merge_sumo import api
 
-    given.print(api.truths(vut, cases=cases, seed=seed, workers=workers, **given.keywords))
+    given.print(
+        api.truths(vut, cases=cases, seed=seed, engine=engine, workers=workers, **given.keywords)
+    )
 
 
 @app.verb(options=("level", "dense", *SETUP, "dask", "quiet"))
@@ -93,7 +105,7 @@ def compare(
     given.print(result)
 
 
-@app.verb(options=("level", *SETUP, "net", "dask", "quiet"))
+@app.verb(options=("level", *SETUP, "net", "engine", "dask", "quiet"))
 def certify(
     given: Given,
     vut: VutOption,
@@ -147,7 +159,7 @@ def certify(
     raise typer.Exit(0 if result.certain else 1)
 
 
-@app.verb(options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"))
+@app.verb(options=("net", "policies", "pov", *HOSTING, "engine", *RUNNING, "trust_vut"))
 def probability(
     given: Given,
     run: RunArgument,

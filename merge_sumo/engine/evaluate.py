@@ -5,16 +5,17 @@ Whatever runs cases does it here. A worker keeps its simulator open from one chu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from threading import RLock
 from typing import Any, Final, TypeVar, overload
 
 import numpy as np
 
-from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.kinematic_simulator import CHUNK, KinematicSimulator
+from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
@@ -24,7 +25,7 @@ from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.workers import InProcess, Workers, open_workers, when_worker_ends
 from merge_sumo.values.case import Case, FloatArray, Pool
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import Measures, Outcome, measure, measure_all
+from merge_sumo.values.score import Measures, Outcome, Verdict, measure_all
 from merge_sumo.values.trajectory import End, Trajectory
 
 R = TypeVar("R")
@@ -42,6 +43,7 @@ class CaseResult:
         pov_files: those that a POV of the user's own has loaded.
         margin: that of the plan's criterion; None where it needs none.
         again: whether it ran again, because a process had died or had been stopped.
+        in_sumo: whether SUMO ran it; the engine of the plan may be another.
     """
 
     measures: Measures
@@ -50,11 +52,71 @@ class CaseResult:
     pov_files: Files = field(default_factory=dict)
     margin: float | None = None
     again: bool = False
+    in_sumo: bool = True
 
     def outcome(self, index: int, batch: int = 0, prediction: Prediction | None = None) -> Outcome:
         """Return the outcome of the case with its place in a campaign."""
         case, margin = self.trajectory.case, self.margin
         return Outcome(index, batch, case, self.measures, prediction, margin)
+
+
+class CaseResults(Sequence[CaseResult]):
+    """The results of a chunk of cases; they are measured when one of them is asked for.
+
+    Attributes:
+        trajectories: what happened in each case.
+        files: files of the VUT, as of a `CaseResult`.
+        pov_files: those of a POV.
+        in_sumo: places of the cases that SUMO ran.
+    """
+
+    def __init__(
+        self,
+        plan: SimulationPlan,
+        trajectories: Sequence[Trajectory],
+        *,
+        files: Files,
+        pov_files: Files,
+        ran_again: Collection[int] = (),
+        in_sumo: Collection[int],
+    ) -> None:
+        """Take the plan, and what became of its cases; `ran_again` are places."""
+        self.trajectories, self.files, self.pov_files = trajectories, files, pov_files
+        self.in_sumo = in_sumo
+        self._plan, self._ran_again = plan, ran_again
+
+    def verdicts(self) -> list[Verdict]:
+        """Return the verdict on each case, which takes less time than its measures."""
+        criterion, lines = self._plan.criterion, centre_lines(self._plan.road)
+        return [criterion.verdict(trajectory, lines) for trajectory in self.trajectories]
+
+    @cached_property
+    def _measured(self) -> list[CaseResult]:
+        criterion = self._plan.criterion
+        measured = measure_all(self.trajectories, centre_lines(self._plan.road))
+        return [
+            CaseResult(
+                *(measures, trajectory, self.files, self.pov_files),
+                criterion.margin(trajectory, measures),
+                again=place in self._ran_again,
+                in_sumo=place in self.in_sumo,
+            )
+            for place, (measures, trajectory) in enumerate(
+                zip(measured, self.trajectories, strict=True)
+            )
+        ]
+
+    def __len__(self) -> int:
+        """Return the number of cases."""
+        return len(self.trajectories)
+
+    @overload
+    def __getitem__(self, place: int) -> CaseResult: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[CaseResult]: ...
+    def __getitem__(self, place: int | slice) -> CaseResult | list[CaseResult]:
+        """Return a result, or some of them."""
+        return self._measured[place]
 
 
 class CasesAt(Sequence[Case]):
@@ -83,7 +145,7 @@ class CasesAt(Sequence[Case]):
         return iter(self.pool.cases(self.points, self.level))
 
 
-Keep = Callable[[Sequence[CaseResult]], Sequence[R]]
+Keep = Callable[[CaseResults], Sequence[R]]
 """What is kept of the results of a chunk; it runs where they are, and only that travels."""
 
 
@@ -112,7 +174,8 @@ def evaluate(
     Raises `UserError` where the plan cannot be carried out.
     """
     with workers_or_here(workers) as available:
-        size = available.chunk_size(len(cases))
+        kinematic = plan.engine is Engine.KINEMATIC
+        size = CHUNK if kinematic else available.chunk_size(len(cases))
         chunks = (cases[first : first + size] for first in range(0, len(cases), size))
         for first, results in evaluate_chunks(plan, chunks, available, keep):
             yield from enumerate(results, start=first)
@@ -126,9 +189,10 @@ def evaluate_chunks(
 ) -> Generator[tuple[int, Sequence[Any]], None, None]:
     """Run chunks of cases as workers want them; yield (place of the first case, results)."""
     if keep is None:
-        return workers.run_chunks(partial(run_cases, plan), chunks, _lost, ran_again=_again)
+        lost = partial(_lost_result, plan)
+        return workers.run_chunks(partial(_run_all, plan), chunks, lost, ran_again=_again)
     return workers.run_chunks(
-        partial(_run_and_keep, plan, keep), chunks, lambda case: keep([_lost(case)])[0]
+        partial(_run_and_keep, plan, keep), chunks, lambda case: keep(_lost(plan, case))[0]
     )
 
 
@@ -169,22 +233,24 @@ THIS_PROCESS: Final = Workers(InProcess, 1)
 """This process, which keeps its simulator between evaluations: for a loop within a worker."""
 
 
-def run_cases(plan: SimulationPlan, cases: Iterable[Case]) -> list[CaseResult]:
+def run_cases(plan: SimulationPlan, cases: Iterable[Case]) -> CaseResults:
     """Run cases in the simulator that this process keeps; return the results in their order."""
     cases = list(cases)
     with opened_simulator(plan) as simulator:
         ran_again: set[int] = set()
         ran = dict(simulator.run(cases, ran_again))
-        files = hashed(simulator.vut.files()), hashed(simulator.pov.files())
-    trajectories = [ran[place] for place in range(len(cases))]
-    measured = measure_all(trajectories, centre_lines(plan.road))
-    return [
-        CaseResult(
-            *(measures, trajectory, *files, plan.criterion.margin(trajectory, measures)),
-            place in ran_again,
+        return CaseResults(
+            plan,
+            [ran[place] for place in range(len(cases))],
+            files=hashed(simulator.vut.files()),
+            pov_files=hashed(simulator.pov.files()),
+            ran_again=ran_again,
+            in_sumo=simulator.in_sumo,
         )
-        for place, (measures, trajectory) in enumerate(zip(measured, trajectories, strict=True))
-    ]
+
+
+def _run_all(plan: SimulationPlan, cases: Iterable[Case]) -> list[CaseResult]:
+    return list(run_cases(plan, cases))
 
 
 def _run_and_keep(plan: SimulationPlan, keep: Keep[R], cases: Iterable[Case]) -> Sequence[R]:
@@ -206,13 +272,14 @@ _one_at_a_time = RLock()
 def opened_simulator(plan: SimulationPlan) -> Iterator[Simulator]:
     """Give the simulator of this process, which stays open for the next chunk of the same plan."""
     global _kept  # noqa: PLW0603 (one SUMO per process)
-    key = plan.key(), plan.vut, plan.povs, plan.corridors
+    key = plan.key(), plan.vut, plan.povs, plan.engine, plan.corridors
     with _one_at_a_time:
         try:
             if _kept is None or _kept[0] != key:
                 close_simulator()
                 plan.check_software()
-                _kept = key, Simulator(plan)
+                kinematic = plan.engine is Engine.KINEMATIC
+                _kept = key, KinematicSimulator(plan) if kinematic else Simulator(plan)
                 when_worker_ends(close_simulator)
             yield _kept[1]
         except BaseException:
@@ -229,12 +296,16 @@ def close_simulator() -> None:
             simulator.close()
 
 
-def _lost(case: Case) -> CaseResult:
+def _lost(plan: SimulationPlan, case: Case) -> CaseResults:
     """Return what is recorded of a case that ended every worker that ran it."""
     start = [[(x, v, 0.0) for x, v in case.starts()]]
     reason = f"its worker process died {MAX_DEATHS} times"
     trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, reason)
-    return CaseResult(measure(trajectory), trajectory)
+    return CaseResults(plan, [trajectory], files={}, pov_files={}, in_sumo=(0,))
+
+
+def _lost_result(plan: SimulationPlan, case: Case) -> CaseResult:
+    return _lost(plan, case)[0]
 
 
 def _again(result: CaseResult) -> CaseResult:

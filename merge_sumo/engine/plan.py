@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +21,14 @@ from merge_sumo.vuts.registry import VutFactory, runs_code
 
 MAX_CORRIDORS: Final = 32
 """Episodes that one process runs at a time."""
+
+
+class Engine(StrEnum):
+    """What moves the vehicles of a case."""
+
+    SUMO = "sumo"
+    KINEMATIC = "kinematic"
+    """Eq. (4) alone, with a share of the cases in SUMO, too (`kinematic_simulator.py`)."""
 
 
 def versions() -> dict[str, str]:
@@ -42,7 +51,8 @@ class SimulationPlan:
         vut: makes the VUT.
         povs: the drivers of the POV at each level.
         criterion: what counts as a failure.
-        corridors: the most episodes at a time; decides no outcome.
+        engine: what moves the vehicles; campaigns take SUMO.
+        corridors: the most episodes at a time in SUMO; decides no outcome.
         versions: those of the software that gives the outcomes; by default of this process.
         policies_sha256: hashes of the learned drivers; by default of those that this process finds.
     """
@@ -52,6 +62,7 @@ class SimulationPlan:
     vut: VutFactory
     povs: Povs
     criterion: Criterion
+    engine: Engine = Engine.SUMO
     corridors: int = MAX_CORRIDORS
     versions: Mapping[str, str] = field(default_factory=versions)
     policies_sha256: Mapping[str, str] = field(default_factory=dict)
@@ -75,6 +86,35 @@ class SimulationPlan:
             criterion=self.criterion,
             versions=self.versions,
         )
+
+    def at_level(self, level: int) -> SimulationPlan:
+        """Return the plan for the cases of a level, which a POV of another level does not meet."""
+        if level == OWN:
+            return self
+        return replace(self, povs=replace(self.povs, own=None))
+
+    def with_engine(self, engine: str | None) -> SimulationPlan:
+        """Return the plan with an engine; None is the kinematic one where the drivers allow it.
+
+        Raises `UserError` for an unknown name, and where the drivers do not allow it.
+        """
+        if engine is None:
+            kinematic = self.needs_sumo is None
+            return replace(self, engine=Engine.KINEMATIC if kinematic else Engine.SUMO)
+        if engine not in list(Engine):
+            raise UserError(f"there is no engine {engine!r}: choose {' or '.join(Engine)}")
+        if engine == Engine.KINEMATIC and self.needs_sumo is not None:
+            raise UserError(f"--engine kinematic: {self.needs_sumo}; choose --engine sumo")
+        return replace(self, engine=Engine(engine))
+
+    @property
+    def needs_sumo(self) -> str | None:
+        """Why cases run in SUMO alone, in a clause; None where eq. (4) moves vehicles as well."""
+        if self.povs.own is not None:
+            return f"the POV {self.povs.own.spec} is none of this package"
+        if not self.vut.vut.by_arrays:
+            return f"the VUT {self.vut.spec} is none of this package"
+        return None
 
     def workers(self, requested: int | None) -> int:
         """Return the number of processes that run cases: as many as VUT and POV can serve.

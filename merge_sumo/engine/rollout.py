@@ -123,13 +123,13 @@ class _Rollout:
         self.timeout_at = np.full(corridors, NEVER)
         """Rows of the record at which episodes time out."""
         self.next_timeout = NEVER
-        # One row per step of the world, shared by all corridors: x, v, a of every vehicle.
+        # One row per step of the world: x, v, a of every vehicle. An episode lies in one piece.
         self.ends_as = End(world.scenario.ends_as)
         self.follow_steps = round(world.scenario.follow_up_s / DT_S)
         self.ring = RING_ROWS + self.follow_steps
-        self.record = np.zeros((self.ring, vehicles, 3, corridors))
+        self.record = np.zeros((corridors, self.ring, vehicles, 3))
         self.row = 0
-        self.now = self.record[0]
+        self.now = self.record[:, 0]
         """The row of this step."""
 
     def run(self) -> Iterator[tuple[int, Trajectory]]:
@@ -291,8 +291,8 @@ class _Rollout:
 
     def observe(self) -> None:
         """Write the state into the next row of the record."""
-        self.now = self.record[self.row % self.ring]
-        self.now[:, 0], self.now[:, 1] = self.world.x_m, self.world.v_mps
+        self.now = self.record[:, self.row % self.ring]
+        self.now[..., 0], self.now[..., 1] = self.world.x_m.T, self.world.v_mps.T
         self.row += 1
 
     def ask_drivers(self) -> FloatArray:
@@ -312,7 +312,7 @@ class _Rollout:
         if self.follow_steps:
             keep_behind_vut(answer, x_m, v_mps, self.world.scenario)
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
-        self.now[:, 2] = acceleration
+        self.now[..., 2] = acceleration.T
         off = answer - acceleration
         # In most steps nobody asks for more than it may.
         if np.vdot(off, off) > (0.5 * ROUNDING_MPS2) ** 2:
@@ -364,7 +364,7 @@ class _Rollout:
         assert episode is not None, "only running episodes end"  # noqa: S101
         length = self.row - episode.first_row + (error is None)
         first = episode.first_row % self.ring
-        rows = self.record[..., corridor]
+        rows = self.record[corridor]
         # In two parts, of which the second is empty where the ring does not close.
         parts = rows[first : first + length], rows[: max(first + length - self.ring, 0)]
         motion = np.concatenate(parts)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
+from merge_sumo.drivers.base import Driver
+from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
@@ -20,7 +22,19 @@ from merge_sumo.values.trajectory import Trajectory
 
 
 class Simulator:
-    """A VUT and the POVs in a SUMO world: takes cases, gives trajectories; to be used in `with`."""
+    """A VUT and the POVs in a world: takes cases, gives trajectories; to be used in `with`.
+
+    Attributes:
+        world: that of SUMO, or of a subclass's engine.
+        vut: the driver of the VUT.
+        pov: the drivers of the mainline.
+        in_sumo: places of the cases of the last `run` that SUMO ran.
+    """
+
+    world: World | EquationWorld
+    vut: Driver
+    pov: Driver
+    in_sumo: Collection[int] = ()
 
     def __init__(self, plan: SimulationPlan, binding: Any = None) -> None:
         """Start SUMO and the drivers, with fewer corridors where one cannot serve as many.
@@ -28,32 +42,43 @@ class Simulator:
         `binding` takes the place of libsumo: see `World`.
         """
         povs, scenario = plan.povs, plan.scenario
-        cars = scenario.vehicles - 1
         corridors = min(plan.corridors, plan.vut.vut.max_corridors or plan.corridors)
-        corridors = povs.corridors(corridors, cars)
+        corridors = povs.corridors(corridors, scenario.vehicles - 1)
+        car_type = None if povs.own is None else povs.own.vut.vut_type
+        vut_type = plan.vut.vut.vut_type
         with ExitStack() as opened:
-            car_type = None if povs.own is None else povs.own.vut.vut_type
-            vut_type = plan.vut.vut.vut_type
-            self.world = World(
+            world = World(
                 *(corridors, plan.road, vut_type),
                 scenario=scenario,
                 car_type=car_type,
                 binding=binding,
             )
-            opened.callback(self.world.close)
-            self.vut = plan.vut(corridors, self.world)
-            opened.callback(self.vut.close)
-            self.pov = PovLibrary(corridors * cars, povs, self.world)
-            opened.callback(self.pov.close)
-            self._opened = opened.pop_all()
+            opened.callback(world.close)
+            self._open_drivers(plan, world, world, opened)
+
+    def _open_drivers(
+        self,
+        plan: SimulationPlan,
+        world: World | EquationWorld,
+        sumo: World | None,
+        opened: ExitStack,
+    ) -> None:
+        """Start the drivers of a world, which are told of SUMO's; `opened` closes all."""
+        self.world = world
+        self.vut = plan.vut(world.corridors, sumo)
+        opened.callback(self.vut.close)
+        self.pov = PovLibrary(world.corridors * (world.vehicles - 1), plan.povs, sumo)
+        opened.callback(self.pov.close)
+        self._opened = opened.pop_all()
 
     def run(
-        self, cases: Iterable[Case], ran_again: set[int] | None = None
+        self, cases: Sequence[Case], ran_again: set[int] | None = None
     ) -> Iterator[tuple[int, Trajectory]]:
         """Run cases; yield (place in `cases`, trajectory) as they end.
 
         `ran_again` gets the places of those that ran again: see `rollout`.
         """
+        self.in_sumo = range(len(cases))
         return rollout(self.world, self.pov, self.vut, cases, ran_again)
 
     def close(self) -> None:

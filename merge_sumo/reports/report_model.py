@@ -21,7 +21,7 @@ from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.analysis.verdict import Trouble, judge
 from merge_sumo.campaigns.repeats import read_repeats
 from merge_sumo.campaigns.store import SETTINGS, Run, failures, regions_of, spread_failures
-from merge_sumo.engine.plan import plan_key, versions
+from merge_sumo.engine.plan import Engine, plan_key, versions
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report_maps import GRID
@@ -29,7 +29,7 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.studies.counterfactuals import read_avoidance
 from merge_sumo.studies.expectation import read_expectation
-from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey, read_truth
+from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, LEVELS, OWN
 from merge_sumo.values.score import Outcome
@@ -200,5 +200,4 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         criterion=run.criterion,
         versions=versions(),
     )
-    kept = TruthKey(plan, level, TRUTH_CASES[level], seed=0)
-    return read_truth(kept.path(), level, kept.cases, run.scenario)
+    return TruthKey(plan, level, TRUTH_CASES[level], 0, Engine.KINEMATIC).read(run.scenario)

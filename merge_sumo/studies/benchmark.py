@@ -366,12 +366,14 @@ class Study:
         workers: where they run; by default in this process.
         cache: folder of the truths, by default the user's.
         on_part: told how far each truth is, and all searches together.
+        engine: what moves the vehicles of truths: see `SimulationPlan.with_engine`.
     """
 
     plan: SimulationPlan
     workers: Workers | None = None
     cache: Path | None = None
     on_part: OnPart = lambda *_: None
+    engine: str | None = None
 
     def truth(self, level: int, cases: int | None = None, seed: int = 0) -> Truth:
         """Return the truth at a level, from the cache where it is kept."""
@@ -384,8 +386,9 @@ class Study:
             ended += more
             self.on_part(title, ended, total, "cases", "")
 
+        plan = self.plan.at_level(level).with_engine(self.engine)
         return ground_truth(
-            self.plan, level, total, seed, workers=self.workers, cache=self.cache, on_cases=ran
+            plan, level, total, seed, workers=self.workers, cache=self.cache, on_cases=ran
         )
 
     def dense_truths(self, levels: Sequence[int], wanted: bool | None) -> dict[int, Truth]:

@@ -37,8 +37,9 @@ from numpy.typing import NDArray
 
 from merge_sumo.campaigns.repeats import spread_places
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
-from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate
-from merge_sumo.engine.plan import SimulationPlan, differences
+from merge_sumo.engine.evaluate import CaseResults, CasesAt, evaluate
+from merge_sumo.engine.kinematic_simulator import CHECKED_SHARE
+from merge_sumo.engine.plan import Engine, SimulationPlan, differences
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import OnCases
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
@@ -221,14 +222,14 @@ def runs_points_on(
     return run
 
 
-def _checked(results: Sequence[CaseResult]) -> list[CheckedCase]:
+def _checked(results: CaseResults) -> list[CheckedCase]:
     # One dictionary for a chunk: it travels once.
-    files = results[0].files | results[0].pov_files
+    files = results.files | results.pov_files
     checked = []
-    for outcome in (result.outcome(0) for result in results):
-        case, score = outcome.case, math.nan if outcome.score is None else outcome.score
+    for trajectory, verdict in zip(results.trajectories, results.verdicts(), strict=True):
+        case, score = trajectory.case, math.nan if verdict.score is None else verdict.score
         values = tuple(getattr(case, d.field) for d in case.scenario.dimensions(case.level))
-        checked.append(CheckedCase(values, score, outcome.failed, outcome.is_tested, files))
+        checked.append(CheckedCase(values, score, verdict.failed, verdict.is_tested, files))
     return checked
 
 
@@ -453,7 +454,7 @@ def certify(
         same = blocks.run_twice(partial(run, level))
         found[level] = _level_result(blocks, settings.scenario.dimensions(level), same)
         check()
-    done = Certificate(radius, found, _sentence(radius, found, settings))
+    done = Certificate(radius, found, _sentence(radius, found, settings, plan.engine))
     summary = {
         "certain": done.certain,
         "sentence": done.sentence,
@@ -484,6 +485,7 @@ def _subject(
         "radius": radius,
         "levels": levels,
         "block": BLOCK,
+        "engine": plan.engine,
         "settings": {name: v for name, v in record.items() if name not in OF_A_SEARCH},
     }
 
@@ -559,7 +561,12 @@ def _level_result(blocks: Blocks, dims: Sequence[Dimension], same: Sequence[bool
     )
 
 
-def _sentence(radius: float, found: Mapping[int, LevelResult], settings: CampaignSettings) -> str:
+def _sentence(
+    radius: float,
+    found: Mapping[int, LevelResult],
+    settings: CampaignSettings,
+    engine: Engine,
+) -> str:
     """Return the result of all levels in a sentence."""
     most = max((settings.scenario.dimensions(level) for level in found), key=len)
     units = [next(unit for end, unit in UNITS.items() if d.field.endswith(end)) for d in most]
@@ -574,6 +581,8 @@ def _sentence(radius: float, found: Mapping[int, LevelResult], settings: Campaig
     )
     levels = "/".join(level_name(level) for level in found)
     tested = f"{settings.vut} v level {levels}, {cases:,} cases"
+    if engine is Engine.KINEMATIC:
+        tested += f" by the equations of motion, at least {CHECKED_SHARE:.0%} of them in SUMO, too,"
     if not settings.criterion.is_papers:
         tested += f" that may fail by {settings.criterion.in_short}"
     if otherwise:

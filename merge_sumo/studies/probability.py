@@ -61,7 +61,7 @@ def failure_probability(
     workers: Workers | None = None,
     on_case: OnCase | None = None,
 ) -> Estimate:
-    """Estimate how likely the VUT of a campaign is to fail, with fresh cases in SUMO.
+    """Estimate how likely the VUT of a campaign is to fail, with fresh cases.
 
     Writes the estimate with all that decides it to `out`, and the fresh outcomes, each with its
     weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
@@ -108,6 +108,7 @@ def failure_probability(
         "distribution": stated.record(),
         "defensive_share": DEFENSIVE,
         "seed": seed,
+        "engine": plan.engine,
         "campaign": record_of(settings, plan),
     }
     write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())

@@ -6,7 +6,7 @@ import errno
 import hashlib
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from numbers import Integral
 from pathlib import Path
@@ -14,8 +14,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate
-from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.evaluate import CaseResults, CasesAt, evaluate
+from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
@@ -33,6 +33,8 @@ TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
 DENSE_CASES: Final = 1_000_000
 """Uniform cases of a dense truth: of what the paper's number of them has missed, it shows most."""
+COLUMNS: Final = ("points", "score", "in_sumo")
+"""Arrays of a truth in the cache."""
 MOST_FILES_BYTES: Final = 1 << 26
 """Of a truth, besides its numbers: names and hashes of files."""
 PROGRESS_CASES: Final = 100
@@ -48,10 +50,17 @@ class Truth:
     Attributes:
         points: cases in the unit cube, (n, d).
         score: that of the criterion, P for the paper's, (n,), NaN without a verdict.
+        in_sumo: number of cases that SUMO ran; by default all.
     """
 
     points: FloatArray
     score: FloatArray
+    in_sumo: int = -1
+
+    def __post_init__(self) -> None:
+        """Count the cases."""
+        if self.in_sumo < 0:
+            object.__setattr__(self, "in_sumo", len(self.score))
 
     @property
     def failures(self) -> FloatArray:
@@ -92,11 +101,12 @@ def ground_truth(
 
     Memory grows by 40 bytes a case and no more, whatever the number of cases.
 
-    The cache's key is a hash of level, cases, seed and of what decides outcomes by the plan, with
-    the versions of the software: after a change in the sources of this package that gives it no
-    other version, the cache is to be removed. What the VUT itself loaded while it drove is kept
-    with the truth, and a truth is only used while those files are the same. It is signed: what
-    somebody else has put into the cache is not believed.
+    The cache's key is a hash of level, cases, seed, engine and of what decides outcomes by the
+    plan, with the versions of the software: after a change in the sources of this package that
+    gives it no other version, the cache is to be removed. What the VUT itself loaded while it drove
+    is kept with the truth, and a truth is only used while those files are the same. It is signed:
+    what somebody else has put into the cache is not believed. A plan for the kinematic engine also
+    takes the truth that SUMO gave.
 
     Args:
         plan: how cases run.
@@ -115,18 +125,19 @@ def ground_truth(
         if not isinstance(number, Integral) or number < least:
             raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
-    path = TruthKey(plan.key(level), level, count, seed).path(cache)
-    known = read_truth(path, level, count, plan.scenario)
+    kept = TruthKey(plan.key(level), level, count, seed, plan.engine)
+    known = kept.read(plan.scenario, cache)
     if known is not None:
         return known
+    path = kept.path(cache)
     check_place(path.parent, CACHE)
     check_own(path)
     key = user_key()
     dims = len(plan.scenario.dimensions(level))
     points = np.random.default_rng([seed, level]).random((count, dims))
     truth, files = _run(plan, level, points, workers, on_cases)
-    arrays = io.BytesIO()
-    np.savez(arrays, points=truth.points, score=truth.score, files=json.dumps(files), of=path.stem)
+    arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in COLUMNS}
+    np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)  # type: ignore[arg-type]
     make_place(path.parent, CACHE)
     replace_own(path, signed(arrays.getvalue(), path.stem, key))
     return truth
@@ -142,25 +153,26 @@ def _run(
     """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
     pool, count = Pool(levels=(level,), scenario=plan.scenario), len(points)
     scores = np.full(count, np.nan)
-    if level != OWN:  # no case meets it
-        plan = replace(plan, povs=replace(plan.povs, own=None))
+    plan = plan.at_level(level)
     files = (plan.vut.files or {}) | plan.povs.files
     scored = evaluate(plan, CasesAt(pool, level, points), workers, _scores)
-    for ended, (place, (score, loaded)) in enumerate(scored, start=1):
+    in_sumo = 0
+    for ended, (place, (score, by_sumo, loaded)) in enumerate(scored, start=1):
         scores[place] = score
+        in_sumo += by_sumo
         for name, sha256 in loaded.items():
             files.setdefault(name, sha256)
         if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
             on_cases((ended - 1) % PROGRESS_CASES + 1)
-    return Truth(points, scores), files
+    return Truth(points, scores, in_sumo), files
 
 
 def known_truth(
     plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
-    """Return what `ground_truth` would find in the cache; None where it would have to run cases."""
-    path = TruthKey(plan.key(level), level, cases, seed).path(cache)
-    return read_truth(path, level, cases, plan.scenario)
+    """Return the truth that the cache has, by whichever engine; None where it has none."""
+    key = TruthKey(plan.key(level), level, cases, seed, Engine.KINEMATIC)
+    return key.read(plan.scenario, cache)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,17 +184,28 @@ class TruthKey:
         level: level of the POV.
         cases: number of cases.
         seed: seed of their points.
+        engine: what moved the vehicles.
     """
 
     plan: Mapping[str, Any]
     level: int
     cases: int
     seed: int
+    engine: Engine = Engine.SUMO
 
     def path(self, cache: Path | None = None) -> Path:
         """Return the file of the cache that such a truth is in."""
         key = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
         return (cache or cache_folder()) / f"truth-{key}.npz"
+
+    def read(self, scenario: Scenario, cache: Path | None = None) -> Truth | None:
+        """Return the truth that is kept, by this engine or else by SUMO; None where none is."""
+        for engine in dict.fromkeys((self.engine, Engine.SUMO)):
+            path = replace(self, engine=engine).path(cache)
+            truth = read_truth(path, self.level, self.cases, scenario)
+            if truth is not None:
+                return truth
+        return None
 
 
 def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth | None:
@@ -196,8 +219,8 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
         content = _signed_content(path, most_bytes=8 * cases * (dims + 1) + MOST_FILES_BYTES)
         if content is None:
             return None
-        data = read_arrays(io.BytesIO(content), "points", "score", "files", "of")
-        points, score = data["points"], data["score"]
+        data = read_arrays(io.BytesIO(content), *COLUMNS, "files", "of")
+        points, score, in_sumo = (data[name] for name in COLUMNS)
         files = decode(str(data["files"]), dict[str, str | None])
         if str(data["of"]) != path.stem or changed(files):
             return None
@@ -205,11 +228,12 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
         return None
     fits = points.shape == (cases, dims) and score.shape == (cases,)
     numbers = points.dtype == score.dtype == np.float64
-    if not (fits and numbers):
+    counted = in_sumo.shape == () and in_sumo.dtype == np.int64 and 0 <= in_sumo <= cases
+    if not (fits and numbers and counted):
         return None
     inside = bool(((points >= 0.0) & (points <= 1.0)).all())
     scores = not (np.isinf(score) | (score > 0.0)).any()
-    return Truth(points, score) if inside and scores else None
+    return Truth(points, score, int(in_sumo)) if inside and scores else None
 
 
 def _signed_content(path: Path, most_bytes: int) -> bytes | None:
@@ -225,8 +249,10 @@ def _signed_content(path: Path, most_bytes: int) -> bytes | None:
         return None
 
 
-def _scores(results: Sequence[CaseResult]) -> list[tuple[float, Files]]:
-    """Return the score of each case, NaN without a verdict, and the files that were loaded."""
-    outcomes = [result.outcome(0) for result in results]
-    scores = [np.nan if outcome.score is None else outcome.score for outcome in outcomes]
-    return [(s, r.files | r.pov_files) for s, r in zip(scores, results, strict=True)]
+def _scores(results: CaseResults) -> list[tuple[float, bool, Files]]:
+    """Return of each case the score, NaN without a verdict, whether SUMO ran it, and the files."""
+    files = results.files | results.pov_files
+    return [
+        (np.nan if verdict.score is None else verdict.score, place in results.in_sumo, files)
+        for place, verdict in enumerate(results.verdicts())
+    ]

@@ -22,7 +22,7 @@ from merge_sumo.values.criteria import CRITERIA, PAPER
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
 from merge_sumo.values.measures import MEASURES
 from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
-from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
+from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, Verdict, measure
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.temporal import check_formula, formula_range, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
@@ -165,6 +165,24 @@ class Criterion:
             trajectory, seen, avoidability="last_avoidable_s" in spoken, further=spoken
         )
         return self._outcome(0, 0, trajectory, measures)
+
+    def verdict(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Verdict:
+        """Return the verdict on an episode, the same as that of its outcome."""
+        score = trajectory.case.scenario.score
+        if self.is_papers and score is not None:
+            found = Verdict(score(trajectory), trajectory.end.is_tested)
+            return found._replace(is_tested=found.is_tested or found.failed)
+        return self.judged(trajectory, lines).verdict
+
+    def is_close_call(
+        self, trajectory: Trajectory, rounding: float, lines: CentreLines | None = None
+    ) -> bool:
+        """Return whether another motion, by a rounding error in m, could have another verdict."""
+        if self.is_papers:
+            last, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
+            return abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding
+        margin = self.judged(trajectory, lines).margin
+        return margin is not None and abs(margin) <= rounding
 
     def _outcome(
         self, index: int, batch: int, trajectory: Trajectory, measures: Measures

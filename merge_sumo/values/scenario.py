@@ -164,6 +164,9 @@ class Scenario:
     """Gives the `Measures` of episodes of the kind, in a list, by their trajectories, the centre
     lines of the road (None: nothing is measured before M), and whether the last way out is searched
     for."""
+    score: ClassVar[Callable[..., Any] | None] = None
+    """Gives the score of the paper's criterion by a trajectory, the same as `measures`, in less
+    time; None where a kind has no such function."""
     levels: ClassVar[tuple[int, ...]] = ALL_LEVELS
     """POV levels that the kind has."""
     notation: ClassVar[Mapping[str, Notation]]

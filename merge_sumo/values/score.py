@@ -12,7 +12,7 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Final, Literal, get_type_hints
+from typing import Any, Final, Literal, NamedTuple, get_type_hints
 
 import numpy as np
 
@@ -111,6 +111,23 @@ class Measures:
         return self.score is not None and self.score < FAILURE_SCORE
 
 
+class Verdict(NamedTuple):
+    """The verdict on an episode, without its measures.
+
+    Attributes:
+        score: the score under the criterion; None after an error.
+        is_tested: whether the episode says something of the VUT: see `Outcome.is_tested`.
+    """
+
+    score: float | None
+    is_tested: bool
+
+    @property
+    def failed(self) -> bool:
+        """Whether the score is below lambda."""
+        return self.score is not None and self.score < FAILURE_SCORE
+
+
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """A case that was run: its place in the campaign, its measures, and what was predicted of it.
@@ -146,6 +163,11 @@ class Outcome:
     def is_tested(self) -> bool:
         """Whether this case says something of the VUT: it reached the merge point, or failed."""
         return self.measures.end.is_tested or self.failed
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict alone."""
+        return Verdict(self.score, self.is_tested)
 
     @property
     def signed_gap_m(self) -> float | None:
@@ -265,6 +287,18 @@ def _with_further(
 ) -> Measures:
     further = further_of(trajectory, lines, names)
     return replace(measures, further=further) if further else measures
+
+
+def merge_score(trajectory: Trajectory) -> float | None:
+    """Return the score P of a merge; None after an error."""
+    if trajectory.error is not None:
+        return None
+    dx = ttc = None
+    if trajectory.end.is_tested:
+        pov, vut = trajectory.motion[-1, [trajectory.nearest, VUT], :2].tolist()
+        dx = pov[0] - vut[0]
+        ttc = time_to_collision(dx, pov[1] - vut[1])
+    return _score(trajectory, dx, ttc, close=is_close(trajectory))
 
 
 def measure_merges(
@@ -388,3 +422,4 @@ def _post_encroachment_time(trajectory: Trajectory) -> float | None:
 
 
 MergeScenario.measures = staticmethod(measure_merges)
+MergeScenario.score = staticmethod(merge_score)

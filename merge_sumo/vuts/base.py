@@ -75,6 +75,8 @@ class Vut:
         vut_type: attributes of the SUMO vType with which SUMO itself drives; None if it does not.
         files: files of the user's that it is made of, as far as they are known.
         named_only: whether it may be made of unknown files besides `files`.
+        by_arrays: whether it is a driver of this package, which needs nothing of SUMO and takes any
+            number of corridors.
     """
 
     make: Callable[[int, World | None], Driver]
@@ -83,6 +85,7 @@ class Vut:
     vut_type: Mapping[str, str] | None = None
     files: tuple[Path, ...] = ()
     named_only: bool = False
+    by_arrays: bool = False
 
 
 def split_options(argument: str, spec: str) -> tuple[str, dict[str, str]]:

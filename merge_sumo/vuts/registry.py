@@ -70,7 +70,7 @@ def _file_before_options(argument: str) -> str:
 
 def _built_in_vut(name: str, options: VutOptions) -> Vut:
     make = built_in_vuts(options.policies)[name]
-    return Vut(make=lambda corridors, _world: make(corridors))
+    return Vut(make=lambda corridors, _world: make(corridors), by_arrays=True)
 
 
 PYTHON: Final = VutKind(

@@ -252,6 +252,7 @@ def saved(**changes: Any) -> bytes:
     arrays = {
         "points": rng.random((CASES, 2)),
         "score": -1000.0 * rng.random(CASES),
+        "in_sumo": CASES,
         "files": "{}",
         "of": KEPT.path().stem,
         **changes,
@@ -271,7 +272,7 @@ def claiming(shape: tuple[int, ...]) -> bytes:
     """Return an archive whose array says that it has a shape, and has no data."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for name in ("points", "score", "files", "of"):
+        for name in ("points", "score", "in_sumo", "files", "of"):
             header = io.BytesIO()
             np.lib.format.write_array_header_1_0(
                 header, {"descr": "<f8", "fortran_order": False, "shape": shape}
@@ -316,6 +317,11 @@ SPOILT = {
     "scores in two columns": saved(score=np.zeros((CASES, 2))),
     "scores that are too few": saved(score=np.zeros(CASES - 1)),
     "scores above 0": saved(score=np.full(CASES, 1.0)),
+    "no number of cases in SUMO": saved(in_sumo=None),
+    "more cases in SUMO than there are": saved(in_sumo=CASES + 1),
+    "fewer cases in SUMO than none": saved(in_sumo=-1),
+    "halves of cases in SUMO": saved(in_sumo=0.5),
+    "several numbers of cases in SUMO": saved(in_sumo=np.ones(2, dtype=np.int64)),
     "infinite scores": saved(score=np.full(CASES, -np.inf)),
     "records": saved(points=np.zeros(CASES, dtype=[("x", "f8"), ("y", "f8")])),
     "compressed": compressed(10),

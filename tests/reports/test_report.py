@@ -324,7 +324,7 @@ class TestTheTruth:
             points = np.random.default_rng(1).random((2000, len(scenario.dimensions(level))))
             return Truth(points, np.where(points[:, 0] < 0.5, -900.0, -10.0))
 
-        monkeypatch.setattr(report_facts, "read_truth", truth)
+        monkeypatch.setattr("merge_sumo.studies.truth.read_truth", truth)
         return truth
 
     def test_is_drawn_where_it_is_cached(self, tmp_path, cached):

@@ -1,0 +1,137 @@
+"""The kinematic engine: vehicles are moved by eq. (4) alone, and SUMO checks a share of the cases.
+
+SUMO holds the state that eq. (4) gives, to rounding errors (`sumo/world.py` checks that in every
+step). Where the VUT and the POVs are drivers of this package, which need nothing of SUMO, an
+episode therefore ends without it as it ends in it, and takes a tenth of the time. That is never
+taken on trust: at least one case of a hundred, drawn at random, runs in SUMO as well, and the two
+must agree. A case that a rounding error could decide otherwise runs in SUMO, and that counts.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.engine.kinematic_world import EquationWorld
+from merge_sumo.engine.plan import Engine, SimulationPlan
+from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.simulator import Simulator
+from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import VUT
+from merge_sumo.values.trajectory import Trajectory
+
+CHECKED_SHARE: Final = 0.01
+"""Least share of the cases that run in SUMO as well."""
+CHUNK: Final = 2500
+"""Cases that a worker takes at a time. A number of its own, whatever the workers, so that the same
+cases are checked."""
+CORRIDORS: Final = 512
+"""Episodes at a time: enough for the calls of numpy to cost little, and their record fits into the
+cache."""
+ROUNDING: Final = 1e-6
+"""What the engines may differ in, in m and m/s. Measured: 1e-11."""
+
+
+class KinematicSimulator(Simulator):
+    """A VUT and the POVs as arrays, without SUMO but for the cases that it checks."""
+
+    def __init__(self, plan: SimulationPlan) -> None:
+        """Start the drivers; SUMO starts with the first case that it checks."""
+        self._plan = plan
+        self._sumo: Simulator | None = None
+        with ExitStack() as opened:
+            opened.callback(self._close_sumo)
+            world = EquationWorld(CORRIDORS, plan.road, plan.scenario)
+            self._open_drivers(plan, world, None, opened)
+
+    def run(
+        self, cases: Sequence[Case], ran_again: set[int] | None = None
+    ) -> Iterator[tuple[int, Trajectory]]:
+        """Run cases; yield (place in `cases`, trajectory).
+
+        Raises `UserError` where a case ends otherwise in SUMO.
+        """
+        ended = dict(rollout(self.world, self.pov, self.vut, cases, ran_again))
+        close = {place for place, trajectory in ended.items() if self._is_close_call(trajectory)}
+        places = sorted(close | drawn(cases))
+        in_sumo = self._in_sumo([cases[place] for place in places])
+        for place, trajectory in zip(places, in_sumo, strict=True):
+            if place not in close:
+                self._compare(ended[place], trajectory)
+            ended[place] = trajectory if place in close else ended[place]
+        self.in_sumo = frozenset(places)
+        yield from ended.items()
+
+    def _is_close_call(self, trajectory: Trajectory) -> bool:
+        """Return whether a rounding error could end an episode in another step or turn its verdict.
+
+        The VUT is put forward and back by one, at the end and a step before it.
+        """
+        x_m, v_mps = trajectory.motion[-2:, :, 0].T, trajectory.motion[-2:, :, 1].T
+        scenario, ahead_m, behind_m = trajectory.case.scenario, x_m.copy(), x_m.copy()
+        ahead_m[VUT] += ROUNDING
+        behind_m[VUT] -= ROUNDING
+        ended = scenario.has_ended(ahead_m, v_mps), scenario.has_ended(behind_m, v_mps)
+        criterion = self._plan.criterion
+        return bool((ended[0] != ended[1]).any()) or criterion.is_close_call(
+            trajectory, ROUNDING, centre_lines(self._plan.road)
+        )
+
+    def _in_sumo(self, cases: Sequence[Case]) -> list[Trajectory]:
+        """Return what becomes of cases in SUMO."""
+        if not cases:
+            return []
+        if self._sumo is None:
+            self._sumo = Simulator(replace(self._plan, engine=Engine.SUMO))
+        ran = dict(self._sumo.run(cases))
+        return [ran[place] for place in range(len(cases))]
+
+    def _compare(self, kinematic: Trajectory, sumo: Trajectory) -> None:
+        """Raise `UserError` where a case ended otherwise in SUMO."""
+        lines = centre_lines(self._plan.road)
+        verdicts = [self._plan.criterion.verdict(one, lines) for one in (kinematic, sumo)]
+        if (
+            kinematic.end is sumo.end
+            and kinematic.error == sumo.error
+            and kinematic.motion.shape == sumo.motion.shape
+            and np.abs(kinematic.motion - sumo.motion)[..., :2].max() <= ROUNDING
+            and verdicts[0].failed == verdicts[1].failed
+        ):
+            return
+        case = kinematic.case
+        fields = (d.field for d in case.scenario.dimensions(case.level))
+        where = ", ".join(f"{name} {getattr(case, name)!r}" for name in fields)
+        raise UserError(
+            f"the case {where} at level {case.level} ends otherwise in SUMO ({_said(sumo)}) than "
+            f"by the equations of motion alone ({_said(kinematic)}): choose --engine sumo"
+        )
+
+    def _close_sumo(self) -> None:
+        if self._sumo is not None:
+            self._sumo.close()
+
+
+def drawn(cases: Sequence[Case]) -> set[int]:
+    """Return the places of the cases that are drawn at random to be checked.
+
+    The cases decide, so that the same are drawn whatever worker has them.
+    """
+    if not cases:
+        return set()
+    seed = zlib.crc32(repr((cases[0].level, cases[0].starts())).encode())
+    count = math.ceil(CHECKED_SHARE * len(cases))
+    return set(np.random.default_rng(seed).choice(len(cases), count, replace=False).tolist())
+
+
+def _said(trajectory: Trajectory) -> str:
+    """Return how an episode ended, in short."""
+    x_m = ", ".join(f"{x:.6f}" for x in trajectory.motion[-1, :, 0].tolist())
+    return f"{trajectory.end} after {trajectory.t_end_s} s at {x_m} m"

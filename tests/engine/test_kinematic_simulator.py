@@ -1,0 +1,211 @@
+"""The kinematic engine: what it says of a case is what SUMO says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plans import POVS, key_of, plan_for
+
+from merge_sumo.drivers.levelk import MANY_ROWS, features
+from merge_sumo.drivers.policies import load_network
+from merge_sumo.engine.evaluate import CaseResults, CasesAt, evaluate, run_cases
+from merge_sumo.engine.kinematic_simulator import CHECKED_SHARE, drawn
+from merge_sumo.engine.kinematic_world import EquationWorld
+from merge_sumo.engine.plan import Engine, SimulationPlan
+from merge_sumo.engine.povs import own_pov
+from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.studies.truth import ground_truth, known_truth
+from merge_sumo.system.workers import open_workers
+from merge_sumo.values.case import Case, MergeCase, Pool, from_unit
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.scenario import OWN, US23, VUT, Scenario
+from merge_sumo.values.score import FAILURE_SCORE
+from merge_sumo.vuts.base import VutOptions
+
+
+def uniform(count: int, level: int, scenario: Scenario = US23) -> list[Case]:
+    points = np.random.default_rng([5, level]).random((count, len(scenario.dimensions(level))))
+    return from_unit(points, level, scenario=scenario)
+
+
+def by_both(plan: SimulationPlan, cases: list[Case]) -> tuple[CaseResults, CaseResults]:
+    """Return the results of SUMO and of the kinematic engine."""
+    return run_cases(plan, cases), run_cases(plan.with_engine("kinematic"), cases)
+
+
+def assert_alike(sumo: CaseResults, kinematic: CaseResults) -> None:
+    for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
+        assert one.end is other.end
+        np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
+    for one, other in zip(sumo.verdicts(), kinematic.verdicts(), strict=True):
+        assert (one.failed, one.is_tested) == (other.failed, other.is_tested)
+        assert one.score == pytest.approx(other.score, abs=1e-7)
+
+
+class TestACase:
+    @pytest.mark.parametrize(
+        ("scenario", "vut", "level"),
+        [("us23", "design1", 0), ("us23", "level2", 1), ("us23-traffic", "design2", 2)],
+    )
+    def test_ends_as_in_sumo(self, scenario, vut, level):
+        road = named_scenario(scenario)
+        assert_alike(*by_both(plan_for(vut, scenario=road), uniform(400, level, road)))
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("level", [0, 1, 2])
+    @pytest.mark.parametrize(
+        ("scenario", "vut"),
+        [
+            *(("us23", vut) for vut in ("design1", "design2", "level0", "level1", "level2")),
+            *(("us23-traffic", vut) for vut in ("design1", "level2", "careful")),
+            *(("roundabout", vut) for vut in ("roundabout", "fsm", "rss")),
+        ],
+    )
+    def test_ends_as_in_sumo_by_thousands(self, scenario, vut, level):
+        road = named_scenario(scenario)
+        assert_alike(*by_both(plan_for(vut, scenario=road), uniform(3000, level, road)))
+
+    @pytest.mark.parametrize("fail_when", ["unsafe", "brake_after_mps2 > 2", "after_gap_m < 3"])
+    def test_is_judged_by_any_criterion(self, fail_when):
+        scenario = replace(US23, follow_up_s=2.0)
+        plan = plan_for("design2", scenario=scenario, criterion=Criterion(fail_when))
+        sumo, kinematic = by_both(plan, uniform(200, 1, scenario))
+        assert_alike(sumo, kinematic)
+        assert any(verdict.failed for verdict in sumo.verdicts())
+
+    def test_has_the_verdict_of_its_outcome(self):
+        results = run_cases(plan_for("design1"), uniform(200, 0))
+        assert results.verdicts() == [result.outcome(0).verdict for result in results]
+
+
+class TestACloseCall:
+    def test_is_what_sumo_says(self):
+        """The front bumpers are 6 m apart at M, to rounding errors."""
+        plan = plan_for("level0")
+        case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+        (found,) = run_cases(plan, [case])
+        x_m = case.x_pov0_m + US23.dx_crash_m - found.measures.dx_m
+        cases = [replace(case, x_pov0_m=x_m + k * 1e-13) for k in range(-200, 200, 4)]
+        sumo, kinematic = by_both(plan, cases)
+        assert len(kinematic.in_sumo) == len(cases)
+        assert {verdict.failed for verdict in sumo.verdicts()} == {True, False}
+        for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
+            assert one.motion.tobytes() == other.motion.tobytes()
+
+    def test_is_one_of_the_step_in_which_the_episode_ends(self):
+        scenario = replace(US23, x_vut0_m=-180.0, v_vut0_mps=20.0, level0_v_mps=20.0)
+        cases = uniform(20, 0, scenario)
+        sumo, kinematic = by_both(plan_for("level0", scenario=scenario), cases)
+        assert len(kinematic.in_sumo) == len(cases)
+        assert_alike(sumo, kinematic)
+
+    def test_is_rare(self):
+        results = run_cases(plan_for("design2").with_engine("kinematic"), uniform(400, 2))
+        assert len(results.in_sumo) == 4
+
+
+class TestTheCheck:
+    @pytest.mark.parametrize("count", [1, 7, 100, 101, 2500])
+    def test_is_of_at_least_one_case_of_a_hundred(self, count):
+        places = drawn(uniform(count, 0))
+        assert CHECKED_SHARE * count <= len(places) <= CHECKED_SHARE * count + 1
+        assert places <= set(range(count))
+
+    def test_is_of_other_places_in_other_chunks(self):
+        assert len({frozenset(drawn(uniform(1000, 0)[k:][:500])) for k in range(20)}) == 20
+
+    @pytest.mark.parametrize("off_m", [2e-6, 1e-3, 5.0])
+    def test_stops_in_a_sentence_where_sumo_says_otherwise(self, monkeypatch, off_m):
+        command = EquationWorld.command
+
+        def drift(world: EquationWorld, a_mps2: np.ndarray) -> None:
+            command(world, a_mps2)
+            world.x_m[VUT] += off_m / 80.0
+
+        monkeypatch.setattr(EquationWorld, "command", drift)
+        with pytest.raises(UserError, match=r"ends otherwise in SUMO .*: choose --engine sumo"):
+            run_cases(plan_for("design1").with_engine("kinematic"), uniform(20, 0))
+
+
+class TestThePlan:
+    @pytest.mark.parametrize("vut", ["sumo:Krauss", "traci"])
+    def test_needs_sumo_for_a_vut_of_others(self, vut):
+        plan = plan_for(vut)
+        assert plan.with_engine(None).engine is Engine.SUMO
+        with pytest.raises(UserError, match=f"the VUT {vut} is none of this package"):
+            plan.with_engine("kinematic")
+
+    def test_needs_sumo_for_a_pov_of_ones_own(self):
+        povs = replace(POVS, own=own_pov("design1", VutOptions()))
+        plan = plan_for("design1", povs=povs)
+        assert plan.with_engine(None).engine is Engine.SUMO
+        assert plan.at_level(OWN).with_engine(None).engine is Engine.SUMO
+        assert plan.at_level(1).with_engine(None).engine is Engine.KINEMATIC
+        with pytest.raises(UserError, match="the POV design1 is none of this package"):
+            plan.with_engine("kinematic")
+
+    def test_has_no_other_engine(self):
+        with pytest.raises(UserError, match="no engine 'gazebo': choose sumo or kinematic"):
+            plan_for("design1").with_engine("gazebo")
+
+
+class TestATruth:
+    PLAN = plan_for("design2").with_engine(None)
+
+    def test_is_that_of_sumo(self, tmp_path):
+        ours = ground_truth(self.PLAN, 1, 3000, cache=tmp_path)
+        sumos = ground_truth(plan_for("design2"), 1, 3000, cache=tmp_path)
+        assert (ours.score < FAILURE_SCORE).tolist() == (sumos.score < FAILURE_SCORE).tolist()
+        np.testing.assert_allclose(ours.score, sumos.score, rtol=0.0, atol=1e-7)
+        assert (ours.in_sumo, sumos.in_sumo) == (30, 3000)
+
+    def test_is_the_same_on_workers(self, tmp_path):
+        folders = tmp_path / "one", tmp_path / "two"
+        ground_truth(self.PLAN, 0, 2600, cache=folders[0])
+        with open_workers(2) as workers:
+            ground_truth(self.PLAN, 0, 2600, workers=workers, cache=folders[1])
+        one, two = (next(folder.iterdir()) for folder in folders)
+        assert (one.name, one.read_bytes()) == (two.name, two.read_bytes())
+
+    def test_of_sumo_is_taken_and_not_the_other_way_round(self, tmp_path):
+        counted: list[int] = []
+        ground_truth(self.PLAN, 0, 50, cache=tmp_path, on_cases=counted.append)
+        ground_truth(plan_for("design2"), 0, 50, cache=tmp_path, on_cases=counted.append)
+        assert sum(counted) == 100
+        key_of(vut="design2", cases=50).path(tmp_path).replace(tmp_path / "kept.npz")
+        again = known_truth(self.PLAN, 0, 50, cache=tmp_path)
+        assert again is not None
+        assert again.in_sumo == 1
+        (tmp_path / "kept.npz").replace(key_of(vut="design2", cases=50).path(tmp_path))
+        replace(key_of(vut="design2", cases=50), engine=Engine.KINEMATIC).path(tmp_path).unlink()
+        kept = ground_truth(self.PLAN, 0, 50, cache=tmp_path, on_cases=counted.append)
+        assert kept.in_sumo == 50
+        assert sum(counted) == 100
+
+
+def test_cases_are_evaluated_in_their_order():
+    points = np.random.default_rng(0).random((700, 2))
+    cases = CasesAt(Pool(levels=(0,), scenario=US23), 0, points)
+    found = dict(evaluate(plan_for("design1").with_engine("kinematic"), cases))
+    assert sorted(found) == list(range(700))
+    assert all(found[place].trajectory.case == case for place, case in enumerate(cases))
+    assert sum(ran.in_sumo for ran in found.values()) == 7
+
+
+@pytest.mark.parametrize("name", ["pov1", "pov2", "vut1", "vut2"])
+def test_greedy_actions_of_many_rows_are_those_of_one_row(name):
+    rng, n = np.random.default_rng(1), 4000
+    network = load_network(name)
+    state = rng.uniform([-340, 0, -182, 0], [200, 60, 0, 45], (n, 4)).T
+    svo_rad = rng.uniform(0.0, 1.5, n) if network.sees_svo else None
+    inputs = features(*state, svo_rad, scenario=US23)
+    inputs[7] = np.inf
+    values = network.values(inputs)
+    expected = np.where(np.isfinite(values).all(axis=1), values.argmax(axis=1), -1)
+    assert expected[7] == -1
+    assert network.greedy(inputs).tolist() == expected.tolist()
+    few = inputs[: MANY_ROWS - 1]
+    assert network.greedy(few).tolist() == expected[: MANY_ROWS - 1].tolist()
