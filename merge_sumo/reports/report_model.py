@@ -21,7 +21,7 @@ from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.analysis.verdict import Trouble, judge
 from merge_sumo.campaigns.repeats import read_repeats
 from merge_sumo.campaigns.store import SETTINGS, Run, failures, regions_of, spread_failures
-from merge_sumo.engine.plan import Engine, plan_key, versions
+from merge_sumo.engine.plan import plan_key, versions
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report_maps import GRID
@@ -200,4 +200,4 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         criterion=run.criterion,
         versions=versions(),
     )
-    return TruthKey(plan, level, TRUTH_CASES[level], 0, Engine.KINEMATIC).read(run.scenario)
+    return TruthKey(plan, level, TRUTH_CASES[level], seed=0).read(run.scenario)

@@ -6,7 +6,7 @@ import errno
 import hashlib
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from numbers import Integral
 from pathlib import Path
@@ -126,7 +126,7 @@ def ground_truth(
             raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
     kept = TruthKey(plan.key(level), level, count, seed, plan.engine)
-    known = kept.read(plan.scenario, cache)
+    known = kept.read(plan.scenario, cache, (Engine.SUMO, plan.engine))
     if known is not None:
         return known
     path = kept.path(cache)
@@ -171,8 +171,7 @@ def known_truth(
     plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
     """Return the truth that the cache has, by whichever engine; None where it has none."""
-    key = TruthKey(plan.key(level), level, cases, seed, Engine.KINEMATIC)
-    return key.read(plan.scenario, cache)
+    return TruthKey(plan.key(level), level, cases, seed).read(plan.scenario, cache)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,9 +197,14 @@ class TruthKey:
         key = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
         return (cache or cache_folder()) / f"truth-{key}.npz"
 
-    def read(self, scenario: Scenario, cache: Path | None = None) -> Truth | None:
-        """Return the truth that is kept, by this engine or else by SUMO; None where none is."""
-        for engine in dict.fromkeys((self.engine, Engine.SUMO)):
+    def read(
+        self,
+        scenario: Scenario,
+        cache: Path | None = None,
+        engines: Iterable[Engine] = (Engine.SUMO, Engine.KINEMATIC),
+    ) -> Truth | None:
+        """Return the truth that is kept, by the first of some engines; None where none is."""
+        for engine in engines:
             path = replace(self, engine=engine).path(cache)
             truth = read_truth(path, self.level, self.cases, scenario)
             if truth is not None:
