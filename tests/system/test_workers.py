@@ -22,7 +22,7 @@ from processes import wait_for
 
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES
-from merge_sumo.engine.evaluate import _lost, open_simulators, run_cases
+from merge_sumo.engine.evaluate import _lost_result, open_simulators, run_cases
 from merge_sumo.engine.plan import versions
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import (
