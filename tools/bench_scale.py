@@ -42,7 +42,7 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES, Journal, Run, failures, read_outcomes, to_line
-from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate, run_cases
+from merge_sumo.engine.evaluate import CaseResult, CaseResults, CasesAt, evaluate, run_cases
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.studies.truth import _scores
@@ -65,9 +65,9 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def scores_and_memory(results: Sequence[CaseResult]) -> list[tuple[Any, ...]]:
+def scores_and_memory(results: CaseResults) -> list[tuple[Any, ...]]:
     """Return what `truth` keeps of cases, which process ran them, and how large it is."""
-    return [(score, os.getpid(), memory_mb()) for score in _scores(results)]
+    return [(score, os.getpid(), memory_mb()) for score, _, _ in _scores(results)]
 
 
 def compute(seconds: Sequence[float]) -> list[int]:

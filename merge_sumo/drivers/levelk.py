@@ -206,7 +206,7 @@ class QNetwork:
             quick = self.values_at_once(inputs)
             second, first = np.partition(quick, -2, axis=1)[:, -2:].T
             sure = first - second > SINGLE_ERROR * (1.0 + np.abs(quick).max(axis=1))
-        actions = quick.argmax(axis=1)
+        actions: NDArray[np.int64] = quick.argmax(axis=1)
         unsure = np.flatnonzero(~sure)
         actions[unsure] = _highest(self.values(inputs[unsure]))
         return actions
@@ -218,7 +218,9 @@ class QNetwork:
 
 def _highest(values: FloatArray) -> NDArray[np.int64]:
     """Return the columns of the highest values, (n,), of (n, m); -1 where one is not finite."""
-    return np.where(np.isfinite(values).all(axis=1), values.argmax(axis=1), -1)
+    highest: NDArray[np.int64] = values.argmax(axis=1)
+    highest[~np.isfinite(values).all(axis=1)] = -1
+    return highest
 
 
 class LevelKDriver(Driver):

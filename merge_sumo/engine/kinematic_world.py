@@ -22,6 +22,9 @@ class EquationWorld:
     `x_m` and `v_mps` have shape (A, corridors), as those of a `World`.
     """
 
+    vut_type: None = None
+    """SUMO drives none of its vehicles."""
+
     def __init__(self, corridors: int, road: Corridor, scenario: Scenario) -> None:
         """Park the vehicles of a scenario on a road."""
         self.corridors, self.road, self.scenario = corridors, road, scenario

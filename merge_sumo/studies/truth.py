@@ -137,7 +137,7 @@ def ground_truth(
     points = np.random.default_rng([seed, level]).random((count, dims))
     truth, files = _run(plan, level, points, workers, on_cases)
     arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in COLUMNS}
-    np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)  # type: ignore[arg-type]
+    np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)
     make_place(path.parent, CACHE)
     replace_own(path, signed(arrays.getvalue(), path.stem, key))
     return truth

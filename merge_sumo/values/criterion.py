@@ -180,7 +180,7 @@ class Criterion:
         """Return whether another motion, by a rounding error in m, could have another verdict."""
         if self.is_papers:
             last, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
-            return abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding
+            return bool(abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding)
         margin = self.judged(trajectory, lines).margin
         return margin is not None and abs(margin) <= rounding
 

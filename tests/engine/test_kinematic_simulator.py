@@ -40,9 +40,9 @@ def assert_alike(sumo: CaseResults, kinematic: CaseResults) -> None:
     for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
         assert one.end is other.end
         np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
-    for one, other in zip(sumo.verdicts(), kinematic.verdicts(), strict=True):
-        assert (one.failed, one.is_tested) == (other.failed, other.is_tested)
-        assert one.score == pytest.approx(other.score, abs=1e-7)
+    for verdict, ours in zip(sumo.verdicts(), kinematic.verdicts(), strict=True):
+        assert (verdict.failed, verdict.is_tested) == (ours.failed, ours.is_tested)
+        assert verdict.score == pytest.approx(ours.score, abs=1e-7)
 
 
 class TestACase:
@@ -87,8 +87,9 @@ class TestACloseCall:
         plan = plan_for("level0")
         case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
         (found,) = run_cases(plan, [case])
+        assert found.measures.dx_m is not None
         x_m = case.x_pov0_m + US23.dx_crash_m - found.measures.dx_m
-        cases = [replace(case, x_pov0_m=x_m + k * 1e-13) for k in range(-200, 200, 4)]
+        cases: list[Case] = [replace(case, x_pov0_m=x_m + k * 1e-13) for k in range(-200, 200, 4)]
         sumo, kinematic = by_both(plan, cases)
         assert len(kinematic.in_sumo) == len(cases)
         assert {verdict.failed for verdict in sumo.verdicts()} == {True, False}
@@ -199,9 +200,9 @@ def test_cases_are_evaluated_in_their_order():
 def test_greedy_actions_of_many_rows_are_those_of_one_row(name):
     rng, n = np.random.default_rng(1), 4000
     network = load_network(name)
-    state = rng.uniform([-340, 0, -182, 0], [200, 60, 0, 45], (n, 4)).T
+    x_pov, v_pov, x_vut, v_vut = rng.uniform([-340, 0, -182, 0], [200, 60, 0, 45], (n, 4)).T
     svo_rad = rng.uniform(0.0, 1.5, n) if network.sees_svo else None
-    inputs = features(*state, svo_rad, scenario=US23)
+    inputs = features(x_pov, v_pov, x_vut, v_vut, svo_rad, scenario=US23)
     inputs[7] = np.inf
     values = network.values(inputs)
     expected = np.where(np.isfinite(values).all(axis=1), values.argmax(axis=1), -1)

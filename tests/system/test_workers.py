@@ -152,7 +152,7 @@ class TestAWorkerThatDies:
         cases = from_unit(np.random.default_rng(0).random((4, 2)), 0, scenario=US23)
         plan = plan_for("design1", corridors=4)
         work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
-        ran = dict(two.run(work, cases, _lost, chunk=1))
+        ran = dict(two.run(work, cases, partial(_lost_result, plan), chunk=1))
         ends = [ran[place].measures.end for place in range(4)]
         assert ends[2] is End.SIM_ERROR
         assert "worker process died 2 times" in ran[2].measures.error
