@@ -68,11 +68,10 @@ class Window(AbstractContextManager["Window"]):
     Raises `UserError` when there is no display, or when the window is closed before its time.
     """
 
-    def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
+    def __init__(self) -> None:
         check_display()
         self.TraCIException: type[Exception] = RefusedByWindowError
         self.FatalTraCIError: type[Exception] = _NeverError
-        self._sleep = sleep
         self._opened = ExitStack()
         self._due_s: float | None = None
         self._shown = 0
@@ -136,7 +135,7 @@ class Window(AbstractContextManager["Window"]):
             now_s = time.monotonic()
             first = self._due_s is None
             self._due_s = now_s + BEFORE_S if first else self._due_s + DT_S  # type: ignore[operator]
-            self._sleep(max(self._due_s - now_s, 0.0))
+            time.sleep(max(self._due_s - now_s, 0.0))
         self._call("simulation.step")
         self._shown += 1
         if self._shown == 1:
@@ -155,7 +154,7 @@ class Window(AbstractContextManager["Window"]):
                 self.vehicle.setSpeed(name, 0.0)
             while True:
                 self._call("simulation.step")
-                self._sleep(LOOK_S)
+                time.sleep(LOOK_S)
 
     def close(self) -> None:
         """Close the window."""

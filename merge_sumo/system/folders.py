@@ -119,7 +119,7 @@ def check_own(*paths: Path) -> None:
 
 
 @contextmanager
-def new_folder(path: Path, option: str = "--out") -> Iterator[Path]:
+def new_folder(path: Path) -> Iterator[Path]:
     """Give an empty folder to fill; it is at `path` in the end, or nowhere.
 
     What is given leads to the folder whatever somebody puts into its place meanwhile.
@@ -127,7 +127,7 @@ def new_folder(path: Path, option: str = "--out") -> Iterator[Path]:
     Raises `UserError` where `path` exists, or when something cannot be written. Then what was made
     here is gone again, folders above `path` included.
     """
-    check_new(path, option)
+    check_new(path)
     with ExitStack() as held, ExitStack() as undo:
         try:
             _make_above(path, undo)
@@ -139,7 +139,7 @@ def new_folder(path: Path, option: str = "--out") -> Iterator[Path]:
             undo.callback(_remove_if_empty, parent.path / name)
             undo.callback(_remove_all_in, new.path)
             yield new.path
-            _take_name(parent.path / name, parent.path / path.name, path, option)
+            _take_name(parent.path / name, parent.path / path.name, path)
             sync_folder(parent.path)
         except OSError as error:
             raise cannot_write(path, error) from error
@@ -198,7 +198,7 @@ def _remove_all_in(folder: Path) -> None:
                 path.unlink(missing_ok=True)
 
 
-def _take_name(new: Path, path: Path, shown: Path, option: str) -> None:
+def _take_name(new: Path, path: Path, shown: Path) -> None:
     """Rename a folder, and never over another one: a rename replaces one that is empty."""
     if sys.platform == "win32":  # a rename replaces nothing there
         new.rename(path)
@@ -206,7 +206,7 @@ def _take_name(new: Path, path: Path, shown: Path, option: str) -> None:
     try:
         path.mkdir()
     except FileExistsError as error:
-        raise _exists(shown, option) from error
+        raise _exists(shown) from error
     try:
         new.replace(path)
     except BaseException:
@@ -262,9 +262,9 @@ def _temporary(path: Path, mode: int = 0o666) -> Iterator[tuple[Path, BinaryIO]]
             new.unlink(missing_ok=True)
 
 
-def write_new(path: Path, content: bytes, option: str = "--out", mode: int = 0o666) -> None:
+def write_new(path: Path, content: bytes, option: str = "--out") -> None:
     """Write a new file; `UserError` where something is there or it cannot be written."""
-    with new_file(path, option, mode) as file:
+    with new_file(path, option) as file:
         file.write(content)
 
 
@@ -355,5 +355,5 @@ def cannot_write(path: Path, error: OSError) -> UserError:
     return UserError(f"cannot write {path}: {error.strerror or error}")
 
 
-def _exists(path: Path, option: str) -> UserError:
+def _exists(path: Path, option: str = "--out") -> UserError:
     return UserError(f"{path} exists: choose another name with {option}, or remove it first")

@@ -18,7 +18,7 @@ from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.env import pool_starts
 from merge_sumo.training.game import Game, IntArray, greedy, of_two
-from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
+from merge_sumo.training.reward import Reward, RewardParts, Role
 from merge_sumo.values.case import Case, FloatArray, from_unit
 from merge_sumo.values.scenario import SVO, Scenario
 from merge_sumo.values.trajectory import End, Trajectory
@@ -26,6 +26,8 @@ from merge_sumo.values.trajectory import End, Trajectory
 CHECK_CASES: Final = 300
 CHECK_SEED: Final = 20_201
 CORRIDORS: Final = 32
+STARTS: Final = 100
+"""Of the quick measurement of regret."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +121,6 @@ def opponents(name: str, folder: Path | None) -> type[Driver] | QNetwork:
 def check_policy(
     name: str,
     folder: Path | None = None,
-    weights: RewardWeights | None = None,
     count: int = CHECK_CASES,
     *,
     scenario: Scenario,
@@ -130,7 +131,7 @@ def check_policy(
         name,
         load_network(name, folder),
         opponent if isinstance(opponent, QNetwork) else None,
-        Reward(weights or RewardWeights.of(scenario), scenario),
+        Reward.of(scenario),
         count,
     )
 
@@ -191,11 +192,11 @@ class QuickRegret:
     it is chosen, from some starts of the pool.
     """
 
-    def __init__(self, game: Game, *, sees_svo: bool, starts: int = 100) -> None:
+    def __init__(self, game: Game, *, sees_svo: bool) -> None:
         rng = np.random.default_rng(CHECK_SEED + 1)
         self._game = game
-        self._start = pool_starts(starts, rng, game.scenario)
-        self._svo_rad = rng.uniform(SVO.low, SVO.high, starts) * sees_svo
+        self._start = pool_starts(STARTS, rng, game.scenario)
+        self._svo_rad = rng.uniform(SVO.low, SVO.high, STARTS) * sees_svo
         profile = game.scenario.level0_a_mps2, game.scenario.level0_v_mps
 
         def level0(state: FloatArray, _: FloatArray) -> IntArray:

@@ -33,61 +33,37 @@ SQUASH_BELOW: Final = -2.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DdqnSettings:
-    """What `train` does.
+    """What `train` does."""
 
-    Attributes:
-        transitions: size of the replay; every transition is kept.
-        updates: gradient steps; the transitions are all in after `collecting` of them.
-        collecting: share of the updates during which transitions are collected.
-        warm_up: transitions before the first update.
-        batch: transitions per update.
-        width: units of each of the two hidden layers.
-        learning_rate: at the start; falls to `last_learning_rate` along a cosine.
-        last_learning_rate: at the end.
-        polyak: share of the network that the target network takes over per update.
-        exploration: share of random actions at the start; falls linearly to `last_exploration`
-            when half of the transitions are in.
-        last_exploration: share of random actions from then on.
-        gradient_norm: bound to which the gradient is clipped.
-        midway: share of games that begin mid-way at the start; falls linearly to `last_midway`
-            when half of the transitions are in. Coverage first, then precision where a pool case
-            leads.
-        last_midway: share of games that begin mid-way from then on.
-    """
-
-    transitions: int = 400_000
-    updates: int = 40_000
-    collecting: float = 0.6
-    warm_up: int = 20_000
-    batch: int = 512
-    width: int = 128
-    learning_rate: float = 1e-3
-    last_learning_rate: float = 1e-5
-    polyak: float = 0.005
+    transitions: int = 400_000  # size of the replay; every transition is kept
+    updates: int = 40_000  # gradient steps; the transitions are all in after `collecting` of them
+    collecting: float = 0.6  # share of the updates during which transitions are collected
+    warm_up: int = 20_000  # transitions before the first update
+    batch: int = 512  # transitions per update
+    width: int = 128  # units of each of the two hidden layers
+    learning_rate: float = 1e-3  # at the start; falls to `last_learning_rate` along a cosine
+    last_learning_rate: float = 1e-5  # at the end
+    polyak: float = 0.005  # share of the network that the target network takes over per update
     exploration: float = 1.0
-    last_exploration: float = 0.1
-    gradient_norm: float = 10.0
+    """Share of random actions at the start; falls linearly to `last_exploration` when half of
+    the transitions are in."""
+    last_exploration: float = 0.1  # share of random actions from then on
+    gradient_norm: float = 10.0  # bound to which the gradient is clipped
     midway: float = 0.6
-    last_midway: float = 0.6
+    """Share of games that begin mid-way at the start; falls linearly to `last_midway` when half
+    of the transitions are in. Coverage first, then precision where a pool case leads."""
+    last_midway: float = 0.6  # share of games that begin mid-way from then on
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where training is: told after every thousand updates of DDQN, or a round of refinement.
+    """Where training is: told after every thousand updates of DDQN, or a round of refinement."""
 
-    Attributes:
-        done: updates, or rounds.
-        loss: of DDQN's fit, or the mean loss of return that a choice of the network means.
-        mean_return: of the games that were played lately.
-        crash_share: share of collisions among them; None while refining.
-        network: as it is now.
-    """
-
-    done: int
-    loss: float
-    mean_return: float
-    crash_share: float | None
-    network: QNetwork
+    done: int  # updates, or rounds
+    loss: float  # of DDQN's fit, or the mean loss of return that a choice of the network means
+    mean_return: float  # of the games that were played lately
+    crash_share: float | None  # share of collisions among them; None while refining
+    network: QNetwork  # as it is now
 
 
 def squash(q: Tensor) -> Tensor:

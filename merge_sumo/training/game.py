@@ -41,17 +41,11 @@ Policy = Callable[[FloatArray, FloatArray], IntArray]
 
 @dataclass(frozen=True, slots=True)
 class Game:
-    """What an agent plays: its role, the opponent that it knows, and the reward.
+    """What an agent plays: its role, the opponent that it knows, and the reward."""
 
-    Attributes:
-        role: "pov" or "vut".
-        opponent: the network of level k-1, or None for the level-0 driver.
-        reward: of the scenario that is played.
-    """
-
-    role: Role
-    opponent: QNetwork | None
-    reward: Reward
+    role: Role  # "pov" or "vut"
+    opponent: QNetwork | None  # the network of level k-1, or None for the level-0 driver
+    reward: Reward  # of the scenario that is played
 
     @property
     def scenario(self) -> Scenario:

@@ -96,27 +96,16 @@ Level 1 is refined less: with more refinement, level 2 stayed farther from its o
 
 @dataclass(frozen=True, slots=True)
 class TrainingProgress:
-    """The progress of the training of a network: a line of its log.
+    """The progress of the training of a network: a line of its log."""
 
-    Attributes:
-        network: name of the network.
-        stage: "ddqn" or "refine".
-        done: updates or rounds done in this stage.
-        total: updates or rounds of this stage.
-        loss: of DDQN's fit, or the mean cost of a choice.
-        mean_return: of the games played lately, from exploring starts.
-        crash_share: share of collisions among them; None while refining.
-        regret: a lower bound, `check.QuickRegret`; None where it was not measured.
-    """
-
-    network: str
-    stage: str
-    done: int
-    total: int
-    loss: float
-    mean_return: float
-    crash_share: float | None
-    regret: float | None
+    network: str  # name of the network
+    stage: str  # "ddqn" or "refine"
+    done: int  # updates or rounds done in this stage
+    total: int  # updates or rounds of this stage
+    loss: float  # of DDQN's fit, or the mean cost of a choice
+    mean_return: float  # of the games played lately, from exploring starts
+    crash_share: float | None  # share of collisions among them; None while refining
+    regret: float | None  # a lower bound, `check.QuickRegret`; None where it was not measured
 
 
 @dataclass(frozen=True, slots=True)

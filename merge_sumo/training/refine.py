@@ -40,35 +40,20 @@ COST_CAP: Final = 1.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RefineSettings:
-    """What `refine` does.
+    """What `refine` does."""
 
-    Attributes:
-        rounds: of policy iteration.
-        starts: games per round.
-        midway: share of them that begin mid-way (`env.exploring_starts`).
-        searched: starts from which a better game is searched for.
-        beam: width of that search.
-        exploration: share of random actions in a second game from every second start.
-        kept_rounds: rounds whose states are trained on.
-        updates: gradient steps per round.
-        batch: states per update.
-        learning_rate: at the start; falls to 2 % of it along a cosine.
-        temperature: of the softmax by which the cost of a choice is made differentiable.
-        value_share: weight of the fit of Q beside the cost of the choice.
-    """
-
-    rounds: int = 16
-    starts: int = 1_500
-    midway: float = 0.25
-    searched: int = 300
-    beam: int = 32
-    exploration: float = 0.2
-    kept_rounds: int = 16
-    updates: int = 2_500
-    batch: int = 1_024
-    learning_rate: float = 5e-4
-    temperature: float = 0.01
-    value_share: float = 0.1
+    rounds: int = 16  # of policy iteration
+    starts: int = 1_500  # games per round
+    midway: float = 0.25  # share of them that begin mid-way (`env.exploring_starts`)
+    searched: int = 300  # starts from which a better game is searched for
+    beam: int = 32  # width of that search
+    exploration: float = 0.2  # share of random actions in a second game from every second start
+    kept_rounds: int = 16  # rounds whose states are trained on
+    updates: int = 2_500  # gradient steps per round
+    batch: int = 1_024  # states per update
+    learning_rate: float = 5e-4  # at the start; falls to 2 % of it along a cosine
+    temperature: float = 0.01  # of the softmax by which the cost of a choice is made differentiable
+    value_share: float = 0.1  # weight of the fit of Q beside the cost of the choice
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,31 +28,19 @@ what a vehicle on the level-0 profile drives in 1.6 s."""
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RewardWeights:
-    """Weights W, by default of the paper's scenario; `policies/README.md` says how they were found.
+    """Weights W, by default of the paper's scenario; `policies/README.md` tells of their origin."""
 
-    Attributes:
-        pov_acc: per s and (m/s2)^2.
-        pov_v_hw: per s and m/s outside the speeds that the mainline drives at.
-        vut_acc: per s and (m/s2)^2.
-        vut_v_min: per s and m/s below the speed at which the VUT is slow.
-        vut_v_end: once, per m/s outside the mainline's speeds at t1.
-        ttc: once, for TTC = 0; falls linearly to 0 where it is no longer short.
-        gap: once, the reward of |dx| >= `gap_full_m`; grows linearly from 0 at dx = 0.
-        gap_full_m: |dx| from which the reward of a gap is full.
-        critical: once, for dx = 0; falls linearly to 0 where the gap is no longer critical.
-        crash: once, for a collision.
-    """
-
-    pov_acc: float = 0.1
-    pov_v_hw: float = 0.1
-    vut_acc: float = 0.15
-    vut_v_min: float = 0.1
-    vut_v_end: float = 1.5
-    ttc: float = 0.2
-    gap: float = 1.0
-    gap_full_m: float = 60.0
+    pov_acc: float = 0.1  # per s and (m/s2)^2
+    pov_v_hw: float = 0.1  # per s and m/s outside the speeds that the mainline drives at
+    vut_acc: float = 0.15  # per s and (m/s2)^2
+    vut_v_min: float = 0.1  # per s and m/s below the speed at which the VUT is slow
+    vut_v_end: float = 1.5  # once, per m/s outside the mainline's speeds at t1
+    ttc: float = 0.2  # once, for TTC = 0; falls linearly to 0 where it is no longer short
+    gap: float = 1.0  # once, the reward of |dx| >= `gap_full_m`; grows linearly from 0 at dx = 0
+    gap_full_m: float = 60.0  # |dx| from which the reward of a gap is full
     critical: float = 0.5
-    crash: float = 20.0
+    """Once, for dx = 0; falls linearly to 0 where the gap is no longer critical."""
+    crash: float = 20.0  # once, for a collision
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:

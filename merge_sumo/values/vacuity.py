@@ -55,19 +55,12 @@ NOT_NEGATIVE: Final = Range(0.0, math.inf)
 
 @dataclass(frozen=True, slots=True)
 class Speeds:
-    """The highest speeds in m/s.
+    """The highest speeds in m/s."""
 
-    Attributes:
-        vut_mps: of the VUT, up to M.
-        car_mps: of a car of the mainline, until the VUT is at M.
-        impact_mps: of one body towards another where they touch; lanes may meet at an angle.
-        added_behind_mps: what the follow-up may add to the speed of any.
-    """
-
-    vut_mps: float
-    car_mps: float
-    impact_mps: float
-    added_behind_mps: float
+    vut_mps: float  # of the VUT, up to M
+    car_mps: float  # of a car of the mainline, until the VUT is at M
+    impact_mps: float  # of one body towards another where they touch; lanes may meet at an angle
+    added_behind_mps: float  # what the follow-up may add to the speed of any
 
     @classmethod
     def possible(cls, scenario: Scenario) -> Speeds:

@@ -24,6 +24,8 @@ PENDING_BYTES: Final = 1 << 16
 """What is kept of what is printed before the folder of the log is there."""
 SUMO_ENDS: Final = ("Error: ", "Quitting (on error).")
 LINE_BYTES: Final = 200
+PATIENCE_S: Final = 1.0
+"""Time that the end of what is printed has to come."""
 _CAREFUL: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 """Whatever stands in the place of a log is neither followed nor waited for."""
 
@@ -38,9 +40,9 @@ class Output:
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
-    def last_line(self, patience_s: float = 1.0) -> str:
+    def last_line(self) -> str:
         """Return the last line that was printed, after a little wait for the end; "" for none."""
-        self._thread.join(patience_s)
+        self.close()
         lines = self._tail.decode("utf-8", errors="replace").strip().splitlines()
         # A SUMO that a controller starts itself may end behind it, and is not why it ended.
         said = list(lines)
@@ -48,9 +50,9 @@ class Output:
             said.pop()
         return as_reason((said or lines)[-1]) if lines else ""
 
-    def close(self, patience_s: float = 1.0) -> None:
+    def close(self) -> None:
         """Take what is left; what a process that was left behind prints later is lost."""
-        self._thread.join(patience_s)
+        self._thread.join(PATIENCE_S)
 
     def _read(self) -> None:
         with self._pipe as pipe:

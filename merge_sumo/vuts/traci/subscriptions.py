@@ -30,21 +30,17 @@ WITH_PARAMETER: Final = {(GET_VEHICLE, 0x68), (GET_VEHICLE, 0x78), (GET_VEHICLE,
 
 @dataclass(frozen=True, slots=True)
 class Subscription:
-    """Variables of an object, or of the objects of a domain around it, sent from begin to end.
+    """Variables of an object, or of the objects of a domain around it, sent from begin to end."""
 
-    Attributes:
-        getter: identifier of the questions of the object's domain.
-        variables: numbers of the variables, each with its parameter as it was sent.
-        domain: identifier of the questions of the domain around the object, as far as `range_m`;
-            None for the object.
-    """
-
-    getter: int
+    getter: int  # identifier of the questions of the object's domain
     object_id: str
     variables: tuple[tuple[int, bytes], ...]
+    """Numbers of the variables, each with its parameter as it was sent."""
     begin_s: float
     end_s: float
     domain: int | None = None
+    """Identifier of the questions of the domain around the object, as far as `range_m`; None for
+    the object."""
     range_m: float = 0.0
 
     @property
