@@ -161,5 +161,7 @@ def installed_entries(
             continue
         packages.add(name)
         for entry in selected:
-            entries.setdefault(entry.name, {})[name] = entry
+            # Where the backport of importlib.metadata is imported, as by Dask, entries are its own.
+            plain = EntryPoint(entry.name, entry.value, group)
+            entries.setdefault(entry.name, {})[name] = plain
     return entries

@@ -45,6 +45,12 @@ def test_what_this_package_brings_comes_first_in_its_order(install):
     assert tools["theirs"].__module__ == "brought"
 
 
+def test_entries_of_the_backport_of_importlib_metadata_are_loaded_too(install):
+    pytest.importorskip("importlib_metadata")  # once imported, it finds packages for all
+    install("brought_later", "theirs = brought_later:Tool")
+    assert registry()["theirs"].__module__ == "brought_later"
+
+
 def test_names_are_known_without_an_import(install):
     install("never_imported", "theirs = never_imported:Tool", source="raise SystemExit(1)")
     assert "theirs" in registry()
