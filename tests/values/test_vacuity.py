@@ -372,7 +372,7 @@ class TestAfterTheRun:
             "--sampler",
             "uniform",
         )
-        code, out, err = command_line(*asked, "--out", "run", "--sampler", "uniform")
+        code, out, err = command_line(*asked, "--out", "run")
         assert code == 0, err
         (line,) = (line for line in out.splitlines() if "note: in " in line)
         assert "outside -4 to 2 m/s2" in line
