@@ -377,7 +377,7 @@ class TestAfterTheRun:
         (line,) = (line for line in out.splitlines() if "note: in " in line)
         assert "outside -4 to 2 m/s2" in line
         assert line.strip().removeprefix("note: ") in Path("run/report.html").read_text()
-        _, out, _ = command_line(*asked, "--out", "json", "--sampler", "uniform", "--json")
+        _, out, _ = command_line(*asked, "--out", "json", "--json")
         assert json.loads(out)["notes"] == [line.strip().removeprefix("note: ")]
 
 
