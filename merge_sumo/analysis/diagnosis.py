@@ -18,16 +18,7 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import (
-    AHEAD,
-    BEHIND,
-    DT_S,
-    POV,
-    VEHICLES,
-    VUT,
-    Scenario,
-    level_name,
-)
+from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VEHICLES, VUT, Scenario, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -58,14 +49,9 @@ MEANING: Final[dict[Kind, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Which vehicle braked in an episode and, of a failure under the paper's rule, its kind.
+    """When VUT and POV began to brake, if they did, and otherwise whether they gained speed.
 
-    Attributes:
-        vut_brakes_s: when the VUT began to brake; None if it did not.
-        pov_brakes_s: when the POV began to brake; None if it did not.
-        vut_accelerates: whether the VUT did not brake and gained speed.
-        pov_accelerates: whether the POV did not brake and gained speed.
-        kind: of a failure under the paper's rule; None for every other episode.
+    A failure under the paper's rule has a kind; no other episode has one.
     """
 
     vut_brakes_s: float | None
@@ -115,14 +101,7 @@ def _kind(vut_s: float | None, pov_s: float | None, way_out_until_s: float | Non
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """What a sentence says of a case: a coordinate of the pool, or the time it makes for.
-
-    Attributes:
-        name: as it is written.
-        unit: of the value.
-        decimals: with which it is written.
-        value: gives it for a case.
-    """
+    """What a sentence says of a case: a coordinate of the pool, or the time it makes for."""
 
     name: str
     unit: str
@@ -179,8 +158,7 @@ class FailureBox:
     Attributes:
         level: POV level.
         bounds: (feature, low, high), rounded as it is written; None where nothing bounds it.
-        cases: cases of the run inside, by the bounds as written.
-        failures: failures among them.
+        cases: cases of the run inside, by the bounds as written, and the failures among them.
         kinds: kinds of these failures, the most frequent first.
         indices: the cases.
     """
@@ -220,12 +198,8 @@ def failure_boxes(
 
     A small decision tree (scikit-learn, Gini, balanced classes) tells failing cases from the
     others; its leaves with at least as many failures as other cases are the boxes, joined where
-    siblings are. The shares are of cases that a sampler chose: they are no probabilities.
-
-    Args:
-        outcomes: outcomes of a run, of any level.
-        level: POV level.
-        kinds: kind of failure by index of the case, as far as known.
+    siblings are. The shares are of cases that a sampler chose: they are no probabilities. `kinds`
+    are the kinds of failures by index, as far as known.
     """
     from sklearn.tree import DecisionTreeClassifier
 

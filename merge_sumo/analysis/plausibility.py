@@ -8,14 +8,7 @@ from typing import Final
 from merge_sumo.analysis.verdict import counted
 from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.criterion import Criterion, condition_of, values_of
-from merge_sumo.values.expression import (
-    AllOf,
-    AnyOf,
-    Comparison,
-    Condition,
-    Negation,
-    names_of,
-)
+from merge_sumo.values.expression import AllOf, AnyOf, Comparison, Condition, Negation, names_of
 from merge_sumo.values.scenario import DT_S
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.vacuity import KMH_PER_MPS, comparisons_in, text_of

@@ -31,10 +31,9 @@ def prediction_error_m(outcome: Outcome) -> float | None:
 
 
 def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:
-    """Return the cases with a prediction, the largest surprise first.
+    """Return the cases with a prediction, the largest surprise first: gaps on a logarithmic scale.
 
-    Gaps compare on a logarithmic scale, as a failure is a small gap. A case in which the VUT never
-    arrived, or was predicted not to, counts as one with a large gap.
+    A case in which the VUT never arrived, or was predicted not to, is one with a large gap.
     """
 
     def surprise(outcome: Outcome) -> float:

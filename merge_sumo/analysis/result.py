@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -10,7 +11,10 @@ from merge_sumo.system.printable import printable
 
 
 class Result:
-    """A result: `print` and a notebook show its lines, `repr` the first of them."""
+    """A result: `print` and a notebook show its lines, `repr` the first of them.
+
+    Control characters are escaped.
+    """
 
     __slots__ = ()
 
@@ -23,13 +27,27 @@ class Result:
         """Return what a command prints."""
 
     def __str__(self) -> str:
-        """Return the lines as a text; control characters are escaped."""
         return "\n".join(map(printable, self.lines()))
 
     def __repr__(self) -> str:
-        """Return the first line."""
         first = " ".join(self.lines()[0].split())
         return f"<{type(self).__name__}: {printable(first)}>"
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Shown(Result):
+    """A result that is only shown: what `--json` prints, and the lines."""
+
+    record: dict[str, Any]
+    text: list[str]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the record."""
+        return self.record
+
+    def lines(self) -> list[str]:
+        """Return the lines."""
+        return self.text

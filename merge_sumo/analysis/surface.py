@@ -106,8 +106,7 @@ def learn_surface(
 ) -> Surface | None:
     """Return the surrogate of a level, or None where too few cases failed to learn from.
 
-    It is asked on the cores of this process, or on several `workers`, which learn it each for
-    themselves.
+    It is asked on the cores of this process, or on `workers`, which learn it each for themselves.
     """
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
     if not at_level:

@@ -7,22 +7,27 @@ run.failures        # rows for pandas.DataFrame(run.failures); a table in a note
 run.report()        # path of the HTML report
 
 A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
+Every verb raises `UserError`, with one sentence, for values and files that do not fit, and where
+something stands in the place of what it would write, before it runs anything.
 Results print as the command prints them, and `to_record()` is what the command's `--json` prints.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from merge_sumo.analysis.coordinates import outside_of_the_pool
+from merge_sumo.analysis.result import Shown
 from merge_sumo.analysis.verdict import parse_gates
 from merge_sumo.api.keywords import (
     CampaignKeywords,
@@ -46,12 +51,7 @@ from merge_sumo.api.results import (
     CertificateResult,
     PolicyChecks,
     ProbabilityResult,
-    Reproduction,
-    ScenarioCheck,
-    ScenarioFile,
-    ScenarioList,
     TruthResult,
-    VutList,
 )
 from merge_sumo.campaigns.campaign import (
     SCENARIOS,
@@ -63,9 +63,10 @@ from merge_sumo.campaigns.campaign import (
 from merge_sumo.campaigns.one_case import (
     DEBUG_DEADLINE_S,
     FIELDS,
+    ONE,
     Ended,
+    case_of,
     run_one,
-    settings_and_case,
 )
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.scenario_suggestion import about, suggested, unseen
@@ -75,17 +76,20 @@ from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policie
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import Engine, SimulationPlan
-from merge_sumo.engine.povs import ONE, one_level, parse_levels, policies_folder
+from merge_sumo.engine.povs import ONE as ONE_LEVEL
+from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
-from merge_sumo.reports.campaign_panel import CampaignPanel, panel_of
+from merge_sumo.reports.campaign_panel import CampaignPanel
+from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import Bars, TrainingBars, is_watched
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction_page
+from merge_sumo.reports.running_page import RunningPage
 from merge_sumo.reports.version_pages import comparison_page, history_page, write_page
 from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.finder import find_corridor
@@ -164,8 +168,7 @@ def campaign(
             `vut_memory_gib`, `in_process`), where it runs (`workers`, `dask`), and who is told
             (`progress`, `on_case`, `check`, `gates`, `junit`); see `CampaignKeywords`.
 
-    An interrupted campaign goes on with `resume`. Raises `UserError` for values that make no
-    campaign, or when the folder exists.
+    An interrupted campaign goes on with `resume`.
     """
     check_keywords("campaign", given, CampaignKeywords)
     settings, runner = settings_for(vut, given)
@@ -198,8 +201,6 @@ def resume(
         force: go on although something differs that decides outcomes.
         trust_vut: run the controller that a folder names although it was not made here.
         given: as of `campaign`. The settings must be those of the campaign: `cases` may be more.
-
-    Raises `UserError` for a folder that is no campaign, or something that differs.
     """
     check_keywords("resume", given, CampaignKeywords)
     folder = run.folder if isinstance(run, CampaignRun) else Path(run)
@@ -248,12 +249,13 @@ def _concluded(
     if junit is not None:
         check_junit(junit, folder)
     quiet = not (is_watched() if runner.progress is None else runner.progress)
-    title, cases, levels = _title(settings), settings.cases, settings.levels
+    progress = CampaignProgress(_title(settings), settings.cases, settings.levels)
     try:
         with (
             runner.open(plan) as opened,
-            panel_of(title, cases, levels, folder, workers=opened.count, quiet=quiet) as panel,
+            CampaignPanel(progress, RunningPage(folder), quiet=quiet) as panel,
         ):
+            progress.workers = opened.count
 
             def case_ended(outcome: Outcome) -> None:
                 panel.case_ended(outcome)
@@ -274,20 +276,17 @@ def _concluded(
 
 
 def _write_findings(
-    result: CampaignRun,
-    plan: SimulationPlan,
-    opened: Workers,
-    panel: CampaignPanel,
-    runner: Runner,
+    result: CampaignRun, plan: SimulationPlan, opened: Workers, panel: CampaignPanel, runner: Runner
 ) -> None:
     """Write what follows the cases into the folder: counterfactuals, expectation, report."""
-    done = result.run
-    note_avoidance(done, plan, workers=opened, check=runner.checks, on_part=panel.driven_again)
+    done, checks = result.run, runner.checks
+    careful, page = (partial(panel.advance, phase) for phase in (Phase.CAREFUL, Phase.REPORT))
+    note_avoidance(done, plan, workers=opened, check=checks, on_part=careful)
     link_latest(done.folder)
     # Learned on another machine, surrogates may differ in a last bit.
     local = opened if runner.dask is None else None
     note_expectation(done)
-    write_report(done, result.summary, local, panel.report_part)
+    write_report(done, result.summary, local, page)
 
 
 def _title(settings: CampaignSettings) -> str:
@@ -365,8 +364,6 @@ def run_case(
         given: coordinates `x_pov0_m`, `v_pov0_mps`, at level 2 `svo_rad`, and others that the
             scenario has: `v_vut0_mps`, `headway_ahead_s`, `headway_behind_s`; and the keywords of
             `Setup`, as of `campaign`.
-
-    Raises `UserError` for values that make no case, or when the folder exists.
     """
     values = {name: value for name, value in given.items() if name in FIELDS and value is not None}
     setup = {name: value for name, value in given.items() if name not in FIELDS}
@@ -407,12 +404,16 @@ def _recorded_case(
 ) -> tuple[CampaignSettings, Case]:
     """Return a case of a campaign with other settings and coordinates, and how it is run."""
     fields, _ = given_again(vut, setup, {})
-    run, index = _opened(recorded[0]).run, recorded[1]
-    number = run.outcome(index).case.level
+    run = _opened(recorded[0]).run
+    before = run.outcome(recorded[1]).case
+    number = before.level
     if level is not None:
         policies = policies_folder(setup.get("policies"), run.scenario)
         number = one_level(str(level), policies, own=fields.get("pov") is not None)
-    return settings_and_case((run, index), number, values, fields, trust=trust)
+    settings = settings_today(run, {**fields, **ONE, "levels": (number,)}, trust=trust)
+    names = ("v_vut0_mps", *(d.field for d in settings.scenario.dimensions(number)))
+    kept = {name: getattr(before, name) for name in names}
+    return settings, case_of(settings.scenario, number, {**kept, **values})
 
 
 def _given_case(
@@ -428,7 +429,8 @@ def _given_case(
     name = level_name(int(row.get("level", 0))) if level is None else str(level)
     policies = policies_folder(setup.get("policies"), fields["scenario"])
     number = one_level(name, policies, own=fields.get("pov") is not None)
-    return settings_and_case(None, number, {**coordinates, **values}, fields)
+    settings = CampaignSettings(**fields, **ONE, levels=(number,))
+    return settings, case_of(settings.scenario, number, {**coordinates, **values})
 
 
 def rerun(
@@ -452,8 +454,6 @@ def rerun(
         trust_vut: run the controller that a folder names although it was not made here.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
-
-    Raises `UserError` for a case that does not exist, and for another net or POV than recorded.
     """
     check_keywords("rerun", given, RerunKeywords)
     before = _opened(run).run
@@ -616,9 +616,6 @@ def history(runs: Iterable[AnyRun], *, out: AnyPath | None = None) -> History:
     Args:
         runs: the campaigns, or their folders, the oldest first.
         out: page to write; nothing may be there. None is written when left out.
-
-    Raises `UserError` for fewer than two campaigns, and where scenario, criterion, initial speed
-    of the VUT or POV differ.
     """
     if isinstance(runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
@@ -645,7 +642,7 @@ def truth(
     """Return the ground truth of a VUT at one level; see `truths`, whose arguments these are."""
     check_keywords("truth", given, StudyKeywords)
     if str(level) == "all":
-        raise UserError(f"--level all does not go here: choose {ONE}")
+        raise UserError(f"--level all does not go here: choose {ONE_LEVEL}")
     settings, runner = settings_for(vut, {**given, "level": level})
     with _study(settings, runner, engine) as study:
         return study.truth(settings.levels[0], cases, seed)
@@ -735,8 +732,6 @@ def compare(
         dense: make the dense truths of 1,000,000 cases, or go without; by default those kept.
         figure: new file for FMC against cases: .png, .svg or .html.
         given: how a case is run and judged, and where: see `StudyKeywords`.
-
-    Raises `UserError` for values that make no comparison.
     """
     check_keywords("compare", given, StudyKeywords)
     picture = _path(figure)
@@ -788,8 +783,6 @@ def certify(
         engine: "sumo", or "kinematic": see `truths`.
         check: called after every block of cases; may raise to stop there.
         given: how a case is run and judged, and where: see `StudyKeywords`.
-
-    Raises `UserError` for values that make no certificate, and when the folder exists.
     """
     check_keywords("certify", given, StudyKeywords)
     settings, runner = settings_for(vut, {**given, "level": level})
@@ -845,8 +838,6 @@ def probability(
         engine: "sumo", or "kinematic": see `truths`.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
-
-    Raises `UserError` for another net or POV than recorded, and when the file exists.
     """
     check_keywords("probability", given, RerunKeywords)
     before = _opened(run).run
@@ -878,7 +869,7 @@ def reproduce(
     dense: bool | None = None,
     policies: AnyPath | None = None,
     **given: Unpack[Running],
-) -> Reproduction:
+) -> Shown:
     """Reproduce Table II and the figures of the paper; the same as `merge-sumo reproduce`.
 
     Args:
@@ -888,8 +879,6 @@ def reproduce(
         dense: make the dense truths of 1,000,000 cases, or go without; by default those kept.
         policies: folder of learned drivers instead of the shipped ones.
         given: where the cases run: see `Running`.
-
-    Raises `UserError` for no seeds, and when the folder exists.
     """
     check_keywords("reproduce", given, Running)
     runner, _ = runner_of(given)
@@ -907,13 +896,16 @@ def reproduce(
         reproduction.reproduce(
             folder, scale, policies=trained, workers=opened, on_part=bars.counted
         )
-    return Reproduction(write_reproduction_page(folder))
+    index = write_reproduction_page(folder)
+    record = json.loads((folder / reproduction.TABLE_JSON).read_text(encoding="utf-8"))
+    table = (folder / reproduction.TABLE_MARKDOWN).read_text(encoding="utf-8")
+    return Shown(record, [*table.splitlines(), f"all of it: {index}"])
 
 
 # What a person brings: VUTs, scenarios, learned drivers
 
 
-def vuts(policies: AnyPath | None = None) -> VutList:
+def vuts(policies: AnyPath | None = None) -> Shown:
     """Return the VUTs that can be tested, and the kinds that a person can bring.
 
     `policies` is the folder of learned drivers instead of the shipped ones.
@@ -921,7 +913,12 @@ def vuts(policies: AnyPath | None = None) -> VutList:
     trained = read_manifest(policies_of(US23) if policies is None else policies_in(policies))
     built_in = [name for name in built_in_vuts() if LEARNED.get(name, name) in (name, *trained)]
     kinds = [kind for kind in (PYTHON, *KINDS.values()) if kind.form]
-    return VutList(built_in, list(installed_vuts()), kinds)
+    names = {"built in": built_in, "installed": list(installed_vuts())}
+    listed = [{"form": kind.form, "what": kind.what, "example": kind.example} for kind in kinds]
+    lines = [f"{title}: {', '.join(known)}" for title, known in names.items() if known]
+    for kind in kinds:
+        lines += [kind.form, f"    {kind.what}", f"    {kind.example}"]
+    return Shown({**names, "kinds": listed}, lines)
 
 
 def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> VutCheck:
@@ -939,12 +936,18 @@ def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> VutCheck:
     return vut_check.check_vut(resolve(settings))
 
 
-def scenarios() -> ScenarioList:
+def scenarios() -> Shown:
     """Return the scenarios that the package brings, by name; as `merge-sumo scenario list`."""
-    return ScenarioList({name: named_scenario(name) for name in shipped_scenarios()})
+    shipped = {name: named_scenario(name) for name in shipped_scenarios()}
+    ranges = {name: scenario.dimensions(0)[:2] for name, scenario in shipped.items()}
+    lines = [
+        f"{name}: POV from {x.low:g} to {x.high:g} m at {v.low:g} to {v.high:g} m/s"
+        for name, (x, v) in ranges.items()
+    ]
+    return Shown({name: scenario.to_record() for name, scenario in shipped.items()}, lines)
 
 
-def new_scenario(file: AnyPath, *, net: AnyPath, mainline: str, ramp: str) -> ScenarioFile:
+def new_scenario(file: AnyPath, *, net: AnyPath, mainline: str, ramp: str) -> Shown:
     """Write a scenario for a merge in a net, and a picture of the road; as `scenario new`.
 
     Args:
@@ -952,8 +955,6 @@ def new_scenario(file: AnyPath, *, net: AnyPath, mainline: str, ramp: str) -> Sc
         net: SUMO net, or a map of which netconvert makes one beside `file`: .osm, .xodr.
         mainline: edges of the mainline, past M: "e1 e2".
         ramp: edges of the ramp, past M.
-
-    Raises `UserError` for edges that make no merge, and when a file exists.
     """
     file, net = Path(file), Path(net)
     if file.suffix != SUFFIX:
@@ -979,10 +980,12 @@ def new_scenario(file: AnyPath, *, net: AnyPath, mainline: str, ramp: str) -> Sc
     write_new(picture, road_svg(road, scenario), "FILE")
     text = to_toml(replace(scenario, net=relative), about(road))
     write_new(file, text.encode(), "FILE")
-    return ScenarioFile(about(road), written, map_file)
+    made_of = "" if map_file is None else f", and its net {net}, made of {map_file}"
+    lines = [*about(road), f"written: {file}, and its picture {picture}{made_of}"]
+    return Shown({"about": about(road), "written": list(map(str, written))}, lines)
 
 
-def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None) -> ScenarioCheck:
+def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None) -> Shown:
     """Say whether a scenario can be hosted, and whether the learned drivers were trained on it.
 
     Args:
@@ -992,11 +995,21 @@ def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None
     folder = None if policies is None else policies_in(policies)
     checked = scenario_of(scenario)
     name = checked.name if isinstance(scenario, Scenario) else str(scenario)
-    return ScenarioCheck(name, checked, about(road_for(checked)), list(unseen(checked, folder)))
+    road, differing = about(road_for(checked)), unseen(checked, folder)
+    lines = ["the learned drivers (levels 1 and 2) were trained on such starts, or on like ones"]
+    if differing:
+        made = quoted(f"{checked.name}-policies")
+        lines = [
+            "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",
+            *(f"  {sentence}" for sentence in differing),
+            f"train them: merge-sumo train --scenario {quoted(name)} --out {made}",
+            f"then add to a campaign: --policies {made}",
+        ]
+    return Shown({"about": road, "unseen": differing}, [*road, *lines])
 
 
 def train(
-    only: Iterable[str] = (),
+    only: Iterable[str] | None = None,
     *,
     seed: int = 0,
     scenario: Scenario | AnyPath | None = None,
@@ -1019,8 +1032,7 @@ def train(
     Returns:
         A `PolicyCheck` by the name of the network.
 
-    An interrupted training goes on with what is not finished. Raises `UserError` without the extra
-    `train`, for a network that does not exist, and for a folder of another scenario.
+    An interrupted training goes on with what is not finished.
     """
     played = US23 if scenario is None else scenario_of(scenario)
     folder = Path(out) if out is not None else policies_of(played)
@@ -1054,9 +1066,9 @@ def train(
     return PolicyChecks({n: PolicyCheck(**manifest[n]["check"]) for n in names})
 
 
-def _networks(only: Iterable[str]) -> tuple[str, ...]:
+def _networks(only: Iterable[str] | None) -> tuple[str, ...]:
     """Return the names of networks in their order, all for none; `UserError` for an unknown one."""
-    wanted = set(only) or set(NETWORKS)
+    wanted = set(only or ()) or set(NETWORKS)
     unknown = wanted - set(NETWORKS)
     if unknown:
         raise UserError(f"there is no network {min(unknown)!r}: choose {', '.join(NETWORKS)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -27,21 +26,18 @@ from merge_sumo.analysis.verdict import (
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
-from merge_sumo.campaigns.store import SETTINGS, Run, failures
-from merge_sumo.errors import UserError
+from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.importance import Estimate
-from merge_sumo.studies.reproduction import TABLE_JSON, TABLE_MARKDOWN
 from merge_sumo.studies.truth import REAL_REGION, Truth
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
-from merge_sumo.values.scenario import US23, Scenario, level_name
+from merge_sumo.values.scenario import US23, level_name
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.registry import VutKind
 
 if TYPE_CHECKING:
     from merge_sumo.training.check import PolicyCheck
@@ -81,16 +77,12 @@ def _cell(value: object) -> str:
 
 
 class CampaignRun(Result):
-    """A campaign that was run: its folder, read, and the gates that apply to it.
-
-    Raises `UserError` for a folder that is no campaign.
-    """
+    """A campaign that was run: its folder, read, and its gates; `UserError` for another folder."""
 
     def __init__(self, folder: Path | str | Run, gates: Iterable[str] = ()) -> None:
         self._gates = parse_gates(gates)
         self._run = folder if isinstance(folder, Run) else Run(Path(folder))
-        if not isinstance(self._run.settings.get("levels"), list):
-            raise UserError(f"{self.folder / SETTINGS} is no campaign's: it has no levels")
+        _ = self._run.levels  # A folder without levels is no campaign's.
 
     @property
     def run(self) -> Run:
@@ -140,7 +132,7 @@ class CampaignRun(Result):
     @cached_property
     def summary(self) -> Summary:
         """Cases, failures, regions and failure mode coverage by POV level."""
-        return summarise(self._run.outcomes, self.settings["levels"])
+        return summarise(self._run.outcomes, self._run.levels)
 
     @cached_property
     def careful(self) -> str | None:
@@ -236,7 +228,6 @@ class CampaignRun(Result):
         )
 
     def __repr__(self) -> str:
-        """Return folder and result in a line."""
         return f"<campaign {self.folder}: {self.verdict.counts}>"
 
     def _repr_html_(self) -> str:
@@ -295,7 +286,6 @@ class CaseRun(Result):
         return verdict_of(self.outcome, self.trajectory)
 
     def __repr__(self) -> str:
-        """Return the verdict in a line."""
         return f"<case: {self.verdict}>"
 
     def to_record(self) -> dict[str, Any]:
@@ -475,130 +465,6 @@ class ProbabilityResult(Result):
             f"  for comparison, the {arm.cases} plain cases among them alone: {arm.failures} "
             f"failures, [{arm.low:.3g}, {arm.high:.3g}]",
             f"written: {self.file}",
-        ]
-
-
-@dataclass(frozen=True, repr=False)
-class Reproduction(Result):
-    """The table and the figures of the paper, reproduced; `index` is the page that shows them."""
-
-    index: Path
-
-    def to_record(self) -> dict[str, Any]:
-        """Return Table II as its JSON file has it."""
-        text = (self.index.parent / TABLE_JSON).read_text(encoding="utf-8")
-        record: dict[str, Any] = json.loads(text)
-        return record
-
-    def lines(self) -> list[str]:
-        """Return Table II, and the path of the page."""
-        table = (self.index.parent / TABLE_MARKDOWN).read_text(encoding="utf-8")
-        return [*table.splitlines(), f"all of it: {self.index}"]
-
-
-@dataclass(frozen=True, repr=False)
-class VutList(Result):
-    """The VUTs that can be tested.
-
-    Attributes:
-        built_in: names of those of the package.
-        installed: names of those of installed packages.
-        kinds: the kinds that a person can bring.
-    """
-
-    built_in: list[str]
-    installed: list[str]
-    kinds: list[VutKind]
-
-    def to_record(self) -> dict[str, Any]:
-        """Return names and kinds."""
-        kinds = [{"form": k.form, "what": k.what, "example": k.example} for k in self.kinds]
-        return {"built in": self.built_in, "installed": self.installed, "kinds": kinds}
-
-    def lines(self) -> list[str]:
-        """Return the names, and form, meaning and example of each kind."""
-        names = {"built in": self.built_in, "installed": self.installed}
-        lines = [f"{title}: {', '.join(vuts)}" for title, vuts in names.items() if vuts]
-        for kind in self.kinds:
-            lines += [kind.form, f"    {kind.what}", f"    {kind.example}"]
-        return lines
-
-
-class ScenarioList(Result, dict[str, Scenario]):
-    """Scenarios by name."""
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the numbers of each scenario."""
-        return {name: scenario.to_record() for name, scenario in self.items()}
-
-    def lines(self) -> list[str]:
-        """Return the initial states of the POV in each scenario."""
-        ranges = {name: scenario.dimensions(0)[:2] for name, scenario in self.items()}
-        return [
-            f"{name}: POV from {x.low:g} to {x.high:g} m at {v.low:g} to {v.high:g} m/s"
-            for name, (x, v) in ranges.items()
-        ]
-
-
-@dataclass(frozen=True, repr=False)
-class ScenarioFile(Result):
-    """A scenario that was written.
-
-    Attributes:
-        about: description of the road, in lines.
-        written: the scenario, its picture, and its net where it was made of a map.
-        map_file: that map.
-    """
-
-    about: list[str]
-    written: list[Path]
-    map_file: Path | None
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the description, and the paths."""
-        return {"about": self.about, "written": list(map(str, self.written))}
-
-    def lines(self) -> list[str]:
-        """Return the description, and the paths."""
-        file, picture, *nets = self.written
-        made_of = "".join(f", and its net {net}, made of {self.map_file}" for net in nets)
-        return [*self.about, f"written: {file}, and its picture {picture}{made_of}"]
-
-
-@dataclass(frozen=True, repr=False)
-class ScenarioCheck(Result):
-    """Whether a scenario can be hosted, and whether the learned drivers were trained on it.
-
-    Attributes:
-        name: name or file of the scenario, as it was given.
-        scenario: the scenario.
-        about: description of the road, in lines.
-        unseen: in what the scenario is unlike those of the training, in sentences.
-    """
-
-    name: str
-    scenario: Scenario
-    about: list[str]
-    unseen: list[str]
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the description, and the sentences."""
-        return {"about": self.about, "unseen": self.unseen}
-
-    def lines(self) -> list[str]:
-        """Return the description, and how to train where the learned drivers extrapolate."""
-        if not self.unseen:
-            last = (
-                "the learned drivers (levels 1 and 2) were trained on such starts, or on like ones"
-            )
-            return [*self.about, last]
-        folder = quoted(f"{self.scenario.name}-policies")
-        return [
-            *self.about,
-            "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",
-            *(f"  {sentence}" for sentence in self.unseen),
-            f"train them: merge-sumo train --scenario {quoted(self.name)} --out {folder}",
-            f"then add to a campaign: --policies {folder}",
         ]
 
 

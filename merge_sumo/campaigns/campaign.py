@@ -138,17 +138,16 @@ def resume_campaign(
     The result is the same to the last byte as if it had never been stopped; also where the settings
     have more cases than it had, if those ended with a whole batch. Raises `UserError` with the name
     of the field where something differs that decides outcomes: settings, versions, net, policies.
-    With `force` it goes on and records that they did.
 
     Args:
         settings: those of the folder, and what a person named again (`settings_of`).
-        plan: how the cases run: that of the settings (`resolve`).
+        plan: as of `run_campaign`, and so are `on_case`, `workers` and `check`.
         folder: where the campaign is.
-        on_case: called with every outcome, also of cases that ran before without `on_before`.
+        on_case: called with the cases that ran before, too, without `on_before`.
         on_before: called with the outcomes of cases that ran before.
-        force: go on although something differs.
-        workers: where cases run, by default in this process.
-        check: called after every batch; may raise to stop there.
+        force: go on although something differs; that is recorded.
+        workers: where cases run.
+        check: called after every batch.
         warn: called with a sentence on what was dropped.
     """
     check_own(folder / SCENARIOS)

@@ -7,8 +7,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Final
 
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
@@ -20,6 +18,13 @@ from merge_sumo.values.scenario import Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
+ONE: Final[dict[str, Any]] = {
+    "cases": 1,
+    "batch": 1,
+    "sampler": "uniform",
+    "stop_after_converged": None,
+}
+"""Settings of a campaign that is one case."""
 DEBUG_DEADLINE_S: Final = 86_400.0
 """A person at a breakpoint takes their time."""
 FIELDS: Final = {
@@ -44,8 +49,7 @@ class Ended:
 def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     """Return the case of a scenario with values by the names of its fields.
 
-    Raises `UserError` for a coordinate of the pool that is missing, for one that the pool at this
-    level does not have, and for values with which the scenario cannot be set up.
+    Raises `UserError` for a coordinate that is missing or unknown, and for values out of range.
     """
     given: dict[str, float] = {}
     for name, value in values.items():
@@ -73,40 +77,6 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     return case
 
 
-def settings_and_case(
-    recorded: tuple[Run, int] | None,
-    level: int,
-    values: Mapping[str, Any],
-    given: Mapping[str, Any],
-    *,
-    trust: bool = False,
-) -> tuple[CampaignSettings, Case]:
-    """Return how a case is to be run, and the case.
-
-    Args:
-        recorded: a case of a campaign, (run, index): what is not given is as there.
-        level: its POV level.
-        values: coordinates of the case, by the names of their fields.
-        given: settings, by their names in `CampaignSettings`.
-        trust: run the controller that a folder names although it may be a stranger's.
-
-    Raises `UserError` as `case_of` and `CampaignSettings` do.
-    """
-    given = {**given, "levels": (level,), "cases": 1, "batch": 1, "sampler": "uniform"}
-    if recorded is None:
-        settings = CampaignSettings(**given)
-        return settings, case_of(settings.scenario, level, values)
-    run, index = recorded
-    before = run.outcome(index).case
-    if "vut" in given:
-        given.setdefault("vut_command", None)  # the command was that of the VUT that was
-    given.setdefault("stop_after_converged", None)
-    settings = settings_of(run.folder, run.settings, given, trust=trust)
-    dimensions = settings.scenario.dimensions(level)
-    kept = {name: getattr(before, name) for name in ("v_vut0_mps", *(d.field for d in dimensions))}
-    return settings, case_of(settings.scenario, level, {**kept, **values})
-
-
 def run_one(
     plan: SimulationPlan,
     case: Case,
@@ -116,9 +86,8 @@ def run_one(
 ) -> Ended:
     """Run one case in SUMO; its outcome is that of the same case in a campaign.
 
-    With `live` sumo-gui shows it while it runs, in real time, and its last picture stays until a
-    person closes the window; `on_end` is told before that. Raises `UserError` when the window is
-    closed while the case runs.
+    With `live` sumo-gui shows it in real time until a person closes the window; `on_end` is told
+    before that. Raises `UserError` when the window is closed while the case runs.
     """
     with (
         Window() if live else nullcontext() as window,

@@ -21,13 +21,10 @@ FILES: Final = ("vut_files", "pov_files")
 
 
 def note_run(folder: Path, at: Path, record: Mapping[str, Any], *, begun: bool) -> None:
-    """Remember that this user runs the code of a campaign from its folder, if it has any.
+    """Remember that this user runs the code that a campaign's `record` names, if it does.
 
-    Args:
-        folder: the folder, as far as it is written.
-        at: the path that it has or will take.
-        record: what its `campaign.json` says.
-        begun: whether the campaign was begun there by this user.
+    `folder` is the folder as far as it is written, `at` the path that it has or will take, `begun`
+    whether this user began the campaign there.
     """
     vut, command, pov = _named(record)
     if runs_code(vut, command) or (pov is not None and runs_code(pov, None)):

@@ -12,17 +12,10 @@ from merge_sumo.vuts.registry import VutFactory
 
 
 def resolve(settings: CampaignSettings, net: Path | None = None) -> SimulationPlan:
-    """Return the plan of what settings name: road, drivers, criterion.
+    """Return the plan of what settings name: road, drivers, criterion; `net` replaces the road's.
 
-    A verb calls it once: it reads files, and it asks a VUT of the user's what it is, for which
-    that is loaded for the first time.
-
-    Args:
-        settings: those of a campaign; the plan is of one of its cases, whichever sampler chooses.
-        net: SUMO net to use instead of the scenario's.
-
-    Raises:
-        UserError: for drivers, policies or a road that are missing or cannot be loaded.
+    A verb calls it once: it reads files, and loads a VUT of the user's to ask what it is. Raises
+    `UserError` for drivers, policies or a road that are missing or cannot be loaded.
     """
     policies = policies_folder(settings.policies, settings.scenario)
     options = settings.vut_options(policies)

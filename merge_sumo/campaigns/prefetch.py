@@ -124,7 +124,6 @@ class Prefetch:
             yield chunk
 
     def __enter__(self) -> Self:
-        """Return this object."""
         return self
 
     def __exit__(self, *_: object) -> None:

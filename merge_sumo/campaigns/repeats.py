@@ -76,9 +76,7 @@ def repeat(
 ) -> list[Repeat]:
     """Run some cases of a campaign again; return what became of them, in the order of the cases.
 
-    None run again where the package brings all that drives, nor of a TraCI client that nobody
-    starts: it may have gone. Cases whose trajectory is lost, and those that end in an error now,
-    are left out.
+    Cases whose trajectory is lost, and those that end in an error now, are left out.
     """
     chosen = chosen_again(run.outcomes, settings)
     recorded = {o.index: motion for o in chosen if (motion := _trajectory(run, o)) is not None}
@@ -93,9 +91,9 @@ def repeat(
 def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
     """Return the outcomes of the cases that are to run again, in that order.
 
-    Half of them are the first ones, which ran when the controller was new; the others are spread
-    over the campaign, and run before those. What ended in an error is left out: that may have been
-    a slow machine's doing.
+    None where the package brings all that drives, nor of a TraCI client that nobody starts: it may
+    have gone. Half of them are the first ones, which ran when the controller was new; the others
+    are spread over the campaign, and run before those. Errors may be a slow machine's doing.
     """
     built_in = built_in_vuts()
     if waits_for_client(settings.vut, settings.vut_command):
@@ -160,19 +158,13 @@ def write_repeats(run: Run, found: Iterable[Repeat]) -> None:
 
 
 def read_repeats(run: Run) -> list[Repeat]:
-    """Return what the folder of a campaign says of cases that ran twice; empty where it is silent.
-
-    Raises `UserError` for a line that is of no case of the campaign.
-    """
+    """Return what a folder says of cases that ran twice; `UserError` for a wrong line."""
     known = read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
     return list(known.values())
 
 
 def unrepeatable(found: Iterable[Repeat]) -> str | None:
-    """Return how many cases did not repeat, and what that means; None where all did, or none ran.
-
-    Which of the reasons it is, two runs of a case cannot tell.
-    """
+    """Return how many cases did not repeat, and what that means; None where each did."""
     known = list(found)
     differing = [one for one in known if not one.same]
     if not differing:

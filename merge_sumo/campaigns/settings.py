@@ -21,13 +21,7 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.system.records import RecordError, check_fields
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.scenario import (
-    DEADLINE_S,
-    MEMORY_GIB,
-    OWN,
-    US23,
-    Scenario,
-)
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, OWN, US23, Scenario
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import VutOptions
 
@@ -58,7 +52,6 @@ class CampaignSettings:
     require: str | None = None
 
     def __post_init__(self) -> None:
-        """Check numbers and names; `resolve` looks for what they name."""
         check_fields(self)
         self._check_texts()
         self._take_speed()
@@ -198,9 +191,8 @@ def settings_of(
 ) -> CampaignSettings:
     """Return the settings of a campaign, as its folder records them or as they are given anew.
 
-    They say whose code is run. Raises `UserError` where one is missing or something else, and where
-    the folder may be a stranger's and names a controller that nobody named here, unless we `trust`
-    it.
+    Raises `UserError` where one is missing or something else, and, without `trust`, where a folder
+    that may be a stranger's names a controller that nobody named here.
     """
     record = {**recorded, **(given or {})}
     _check_begun_here(folder, record, given or {})
@@ -224,10 +216,7 @@ def settings_of(
 
 
 def _check_begun_here(folder: Path, record: Mapping[str, Any], given: Mapping[str, object]) -> None:
-    """Raise `UserError` where a controller is to run whose files lie where somebody else stands.
-
-    Their names are relative to where the campaign was begun.
-    """
+    """Refuse to run a controller whose files have names that are relative to another folder."""
     vut = "vut_command" if record.get("vut_command") else "vut"
     for spec, files in ((vut, "vut_files"), ("pov", "pov_files")):
         who, names = str(record.get(spec)), record.get(files)

@@ -41,7 +41,7 @@ from merge_sumo.system.trust import begun_here
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.fmc import regions
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.values.scenario import ALL_LEVELS, US23, Scenario
 from merge_sumo.values.scenario_kinds import scenario_of_record
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.signals import SignalRuns, Signals, from_runs, to_record
@@ -72,10 +72,7 @@ class Run:
     """
 
     def __init__(self, folder: Path, outcomes: list[Outcome] | None = None) -> None:
-        """Read settings and outcomes; trajectories are read when they are asked for.
-
-        `outcomes` are those of the folder, where its writer has them in memory.
-        """
+        """Read settings and outcomes, where the writer of the folder has none in memory."""
         self.folder = folder
         self.settings = read_settings(folder)
         self.scenario = scenario_of(self.settings, folder / SETTINGS)
@@ -111,6 +108,14 @@ class Run:
                     f"that {SETTINGS} names, {self.criterion.text}"
                 )
         _check_lines(folder, text, self.outcomes)
+
+    @property
+    def levels(self) -> list[int]:
+        """The POV levels that the settings name; `UserError` for none."""
+        levels = self.settings.get("levels")
+        if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
+            raise UserError(f"{self.folder / SETTINGS} is no campaign's: it has no list of levels")
+        return levels
 
     @property
     def vut(self) -> str:
@@ -223,10 +228,7 @@ def to_line(outcome: Outcome) -> str:
 
 
 def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
-    """Return the scenario of a campaign; `UserError` where its settings say something else.
-
-    A campaign that names none was of the paper's.
-    """
+    """Return the scenario of a campaign, the paper's where it names none."""
     recorded = settings.get("scenario")
     try:
         return US23 if recorded is None else scenario_of_record(recorded)
@@ -289,10 +291,7 @@ def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
 
 
 def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:
-    """Return the region of each failure within its level, the largest is 0, by index of the case.
-
-    A region is a group of failures that are linked at the radius of the coverage (`fmc.regions`).
-    """
+    """Return the region (`fmc.regions`) of each failure within its level, by index of the case."""
     failing = failures(outcomes)
     region: dict[int, int] = {}
     for level in sorted({outcome.case.level for outcome in failing}):
@@ -303,10 +302,7 @@ def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:
 
 
 def spread_failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Return the failing outcomes: the worst of every region, then the second of each, and so on.
-
-    Neighbours fail alike: who looks at the first ten sees ten regions, where there are as many.
-    """
+    """Return the failing outcomes: the worst of every region, then the second of each, ..."""
     worst_first = failures(outcomes)
     region = regions_of(worst_first)
     before: Counter[tuple[int, int]] = Counter()
@@ -339,10 +335,7 @@ def _is_whole(line: bytes) -> bool:
 def _motion_by_case(
     vehicles: int, index: NDArray[np.int64], rows: NDArray[np.int64], motion: FloatArray
 ) -> dict[int, FloatArray]:
-    """Return the motion of each case, (T + 1, A, 3), which is kept as (T + 1, 3 A).
-
-    Raises ValueError or TypeError where the arrays do not fit.
-    """
+    """Return the motion of each case, (T + 1, A, 3); ValueError or TypeError for a misfit."""
     if motion.dtype != np.float64 or motion.ndim != 2 or motion.shape[1] != 3 * vehicles:
         raise ValueError(f"the motion is {motion.dtype} of shape {motion.shape}")
     if rows.dtype.kind != "i" or rows.ndim != 1 or (rows < 1).any() or rows.sum() != len(motion):
@@ -464,11 +457,10 @@ class Journal:
         return journal, run, dropped
 
     def append(self, *batches: Batch) -> None:
-        """Write the outcomes of batches and their trajectories, and sync them to the disk.
+        """Write batches and sync them to the disk: several at once take little more time than one.
 
         The trajectories go first, so that every outcome on disk has its trajectory there. Raises
-        `UserError` when they cannot be written; what was there before stays. A disk syncs several
-        batches at once in little more time than one.
+        `UserError` when they cannot be written; what was there before stays.
         """
         paths = [batch_file(self._place.path, batch[0][0].batch) for batch in batches]
         lines, arrays = zip(*map(_encoded, batches), strict=True)
@@ -497,11 +489,9 @@ class Journal:
         note_run(self.folder, self.folder, settings, begun=self._begun)
 
     def __enter__(self) -> Self:
-        """Return the journal."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the folder; another process may write it."""
         self._threads.shutdown()
         self._outcomes.close()
         self._place.close()

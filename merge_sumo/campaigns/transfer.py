@@ -22,8 +22,7 @@ MOST_CASES: Final = 400
 def lessons(folders: Sequence[str], scenario: Scenario) -> dict[str, list[FloatArray]]:
     """Return the motions, (T + 1, A, 3), that are learned from, of each campaign by its folder.
 
-    Half of a campaign's are those of its worst cases, the others spread over the rest. Nothing of a
-    folder is run. Raises `UserError` where one is no campaign, or of another scenario.
+    Half are those of its worst cases, the others spread over the rest. Nothing of a folder is run.
     """
     if not folders:
         return {}

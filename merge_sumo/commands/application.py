@@ -5,14 +5,14 @@ from __future__ import annotations
 import inspect
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from typer.core import TyperCommand, TyperOption
 
-from merge_sumo.commands.options import GROUP_OF, GROUPS, KEYWORDS, OPTIONS
+from merge_sumo.commands.options import GROUP_OF, GROUPS, KEYWORDS, OPTIONS, Shared
 from merge_sumo.commands.printing import notices_printed, print_result, say
 from merge_sumo.errors import UserError
 from merge_sumo.system.spawning import named
@@ -81,7 +81,7 @@ class GroupedCommand(TyperCommand):
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """The shared options of a command, as keywords of the API.
+    """The options of a command that it passes on, as keywords of the API.
 
     Attributes:
         keywords: all of them, written or by default.
@@ -110,26 +110,31 @@ class Commands(typer.Typer):
         super().__init__(help=unwrapped(help), **options)
 
     def verb(
-        self, name: str | None = None, *, options: Sequence[str] = ()
+        self,
+        name: str | None = None,
+        *,
+        options: Sequence[str] = (),
+        own: Mapping[str, Shared] | None = None,
     ) -> Callable[[Callable[..., None]], Callable[..., None]]:
         """Register a function as a command; its docstring is the help.
 
-        Its first parameter is `Given`, which has the shared `options`; the others are its own.
+        Its first parameter is `Given`, which has the options that are passed on to the API: shared
+        `options`, and its `own`. The other parameters are options that the function reads.
         """
+        passed = {**(own or {}), **{option: OPTIONS[option] for option in options}}
+        keywords = {option: KEYWORDS.get(option, option) for option in passed}
 
         def register(function: Callable[..., None]) -> Callable[..., None]:
-            _, *own = inspect.signature(function, eval_str=True).parameters.values()
-            shared = [_parameter(option, *OPTIONS[option]) for option in options]
-            keywords = {option: KEYWORDS.get(option, option) for option in options}
+            _, *read = inspect.signature(function, eval_str=True).parameters.values()
 
             def command(context: typer.Context, as_json: bool, **values: Any) -> None:
                 written = {
                     name
-                    for name in options
+                    for name in passed
                     if (source := context.get_parameter_source(name)) is not None
                     and source.name == "COMMANDLINE"
                 }
-                given = {keywords[name]: values.pop(name) for name in options}
+                given = {keywords[name]: values.pop(name) for name in passed}
                 named = {keywords[name]: given[keywords[name]] for name in written}
                 if "quiet" in given:
                     given["progress"] = named["progress"] = not given.pop("quiet")
@@ -138,8 +143,8 @@ class Commands(typer.Typer):
 
             parameters = [
                 _parameter("context", typer.Context),
-                *(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own),
-                *shared,
+                *(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in read),
+                *(_parameter(name, *shared) for name, shared in passed.items()),
                 _parameter("as_json", JSON, default=False),
             ]
             command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

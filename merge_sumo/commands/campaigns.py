@@ -203,7 +203,7 @@ def rerun(
         given.print(result)
         for one in result.changed[:1]:
             show(
-                f"look at one: merge-sumo run --case {quoted(run)} {one.before.index} "
+                f"look at one: merge-sumo run --case {quoted(run)} {one.index} "
                 f"--vut {quoted(result.vut)} --gui"
             )
         show(f"it is {'worse' if why else 'not worse'}, with a tolerance of {tolerance:g}")
@@ -301,8 +301,7 @@ def report(given: Given, run: RunArgument) -> None:
 def compare_runs(
     given: Given,
     a: Annotated[
-        Path,
-        typer.Argument(help="Folder of the campaign before.", autocompletion=complete.runs),
+        Path, typer.Argument(help="Folder of the campaign before.", autocompletion=complete.runs)
     ],
     b: Annotated[
         Path, typer.Argument(help="Folder of the campaign after.", autocompletion=complete.runs)

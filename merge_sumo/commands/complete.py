@@ -1,4 +1,4 @@
-"""Values that a shell completes: VUTs, levels, samplers, scenarios, criteria and run folders.
+"""Values that a shell completes: VUTs, levels, samplers, scenarios and run folders.
 
 A shell asks for them in a process of its own; nothing is imported before it asks.
 """
@@ -102,13 +102,6 @@ def scenarios(incomplete: str) -> Completions:
 
     shipped = [(name, "shipped") for name in shipped_scenarios()]
     return _matching(incomplete, [*shipped, *_files(incomplete, (".toml",))])
-
-
-def criteria(incomplete: str) -> Completions:
-    """Return the names of criteria."""
-    from merge_sumo.values.criteria import CRITERIA
-
-    return _matching(incomplete, [(name, "") for name in CRITERIA])
 
 
 def formats(incomplete: str) -> Completions:

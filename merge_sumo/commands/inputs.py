@@ -9,13 +9,24 @@ import typer
 
 from merge_sumo.commands import complete
 from merge_sumo.commands.application import Commands, Given, app
-from merge_sumo.commands.options import HOSTING
+from merge_sumo.commands.options import HOSTING, Shared, option
 from merge_sumo.commands.printing import print_json, show
 
 scenario = Commands(help="The road and the numbers of a merge.", no_args_is_help=True)
 policies = Commands(help="The learned drivers as files for others.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario")
 app.add_typer(policies, name="policies")
+
+
+def _scenario_option(help: str, show_default: str) -> Shared:
+    return option(
+        str | None,
+        None,
+        help,
+        metavar="NAME|FILE",
+        show_default=show_default,
+        autocompletion=complete.scenarios,
+    )
 
 
 @app.verb(options=["policies"])
@@ -61,18 +72,18 @@ def list_scenarios(given: Given) -> None:
     given.print(api.scenarios())
 
 
-@scenario.verb("new")
-def new_scenario(
-    given: Given,
-    file: Annotated[Path, typer.Argument(help="New TOML file to write.")],
-    net: Annotated[
-        Path,
-        typer.Option(
-            help="SUMO net, or a map of which netconvert makes one beside FILE: .osm, .xodr."
+@scenario.verb(
+    "new",
+    own={
+        "net": option(
+            Path, ..., "SUMO net, or a map of which netconvert makes one beside FILE: .osm, .xodr."
         ),
-    ],
-    mainline: Annotated[str, typer.Option(help='Edges of the mainline, past M: "e1 e2".')],
-    ramp: Annotated[str, typer.Option(help='Edges of the ramp, past M: "r1 e2".')],
+        "mainline": option(str, ..., 'Edges of the mainline, past M: "e1 e2".'),
+        "ramp": option(str, ..., 'Edges of the ramp, past M: "r1 e2".'),
+    },
+)
+def new_scenario(
+    given: Given, file: Annotated[Path, typer.Argument(help="New TOML file to write.")]
 ) -> None:
     """Write a scenario for a merge in a net of your own, with a suggested pool.
 
@@ -82,7 +93,7 @@ def new_scenario(
     """
     from merge_sumo import api
 
-    given.print(api.new_scenario(file, net=net, mainline=mainline, ramp=ramp))
+    given.print(api.new_scenario(file, **given.keywords))
 
 
 @scenario.verb("check", options=["policies"])
@@ -104,37 +115,33 @@ def check_scenario(
     given.print(api.check_scenario(name, **given.keywords))
 
 
-@app.verb(options=["quiet"])
-def train(
-    given: Given,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Network to train: pov1, vut1, pov2 or vut2.", autocompletion=complete.networks
+@app.verb(
+    options=["quiet"],
+    own={
+        "only": option(
+            list[str] | None,
+            None,
+            "Network to train: pov1, vut1, pov2 or vut2.",
+            autocompletion=complete.networks,
         ),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same weights on one machine.")] = 0,
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="Scenario, or a file of one.",
-            show_default="us23",
-            autocompletion=complete.scenarios,
+        "seed": option(int, 0, "Same seed, same weights on one machine."),
+        "scenario": _scenario_option("Scenario, or a file of one.", "us23"),
+        "out": option(
+            Path | None,
+            None,
+            "Folder to write.",
+            show_default="the shipped policies, for us23 only",
         ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder to write.", show_default="the shipped policies, for us23 only"),
-    ] = None,
-    check: Annotated[
-        bool,
-        typer.Option(
-            "--check", help="Train nothing: measure the regret of the networks in the folder."
+        "check": option(
+            bool,
+            False,
+            "Train nothing: measure the regret of the networks in the folder.",
+            "--check",
         ),
-    ] = False,
-    cases: Annotated[int, typer.Option(help="Random cases of a check.")] = 300,
-) -> None:
+        "cases": option(int, 300, "Random cases of a check."),
+    },
+)
+def train(given: Given) -> None:
     """Train the learned drivers in SUMO, level by level, and measure their regret.
 
     The regret is the loss of a driver against its best response, as a share of the gain of the best
@@ -144,34 +151,24 @@ def train(
     """
     from merge_sumo import api
 
-    result = api.train(
-        only or (),
-        seed=seed,
-        scenario=scenario,
-        out=out,
-        check=check,
-        cases=cases,
-        **given.keywords,
-    )
-    given.print(result)
+    given.print(api.train(**given.keywords))
 
 
-@policies.verb("export", options=["policies"])
+@policies.verb(
+    "export",
+    options=["policies"],
+    own={
+        "out": option(Path, ..., "ONNX file to write."),
+        "scenario": _scenario_option(
+            "Scenario that it is to drive in.", "the one it was trained for"
+        ),
+    },
+)
 def export_policy(
     given: Given,
     name: Annotated[
         str, typer.Argument(help="pov1, vut1, pov2 or vut2.", autocompletion=complete.networks)
     ],
-    out: Annotated[Path, typer.Option(help="ONNX file to write.")],
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="Scenario that it is to drive in.",
-            show_default="the one it was trained for",
-            autocompletion=complete.scenarios,
-        ),
-    ] = None,
 ) -> None:
     """Write a learned driver as an ONNX network, from the state to the action values.
 
@@ -179,7 +176,7 @@ def export_policy(
     """
     from merge_sumo import api
 
-    path = api.export_policy(name, out, scenario=scenario, **given.keywords)
+    path = api.export_policy(name, **given.keywords)
     if given.as_json:
         print_json({"written": [str(path)]})
     else:

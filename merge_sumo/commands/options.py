@@ -54,7 +54,8 @@ Shared = tuple[Any, object]
 """The annotation of an option, and its default."""
 
 
-def _option(kind: Any, default: object, help: str, *flags: str, **others: Any) -> Shared:
+def option(kind: Any, default: object, help: str, *flags: str, **others: Any) -> Shared:
+    """Return an option of this type, default and help; the rest is of `typer.Option`."""
     return Annotated[kind, typer.Option(*flags, help=help, **others)], default
 
 
@@ -65,12 +66,6 @@ VutOption = Annotated[
         help="Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
         "`merge-sumo vuts` lists the kinds.",
         autocompletion=complete.vuts,
-    ),
-]
-CoresOption = Annotated[
-    int | None,
-    typer.Option(
-        help="Processes that run cases; the outcomes are the same.", show_default="one a core"
     ),
 ]
 RunArgument = Annotated[
@@ -84,23 +79,30 @@ def _checked_tolerance(tolerance: float) -> float:
     return tolerance
 
 
+CORES: Final = option(
+    int | None,
+    None,
+    "Processes that run cases; the outcomes are the same.",
+    show_default="one a core",
+)
+SEED: Final = option(int, 0, "Same seed, same cases.")
 OPTIONS: Final[Mapping[str, Shared]] = {
     "vut": (VutOption, ""),
-    "level": _option(str, "all", "POV level: 0, 1, 2, own or all.", autocompletion=complete.levels),
-    "pov": _option(
+    "level": option(str, "all", "POV level: 0, 1, 2, own or all.", autocompletion=complete.levels),
+    "pov": option(
         str | None,
         None,
         "A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
         metavar="SPEC",
         autocompletion=complete.vuts,
     ),
-    "policies": _option(
+    "policies": option(
         Path | None,
         None,
         "Folder of learned drivers, as `train --out DIR` makes it, instead of the shipped ones.",
         metavar="DIR",
     ),
-    "scenario": _option(
+    "scenario": option(
         str,
         "us23",
         "Scenario that `merge-sumo scenario list` names, or a TOML file of your own: "
@@ -108,40 +110,40 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="NAME|FILE",
         autocompletion=complete.scenarios,
     ),
-    "net": _option(Path | None, None, "SUMO net to use instead of the shipped US-23 ramp."),
-    "follow_up": _option(
+    "net": option(Path | None, None, "SUMO net to use instead of the shipped US-23 ramp."),
+    "follow_up": option(
         float | None,
         None,
         "Time for which both drive on after M, with measures of its own.",
         metavar="SECONDS",
         show_default="the scenario's, 0",
     ),
-    "x": _option(float | None, None, "Initial position of the POV in m; M is 0.", "--x"),
-    "v": _option(float | None, None, "Initial speed of the POV in m/s.", "--v"),
-    "psi": _option(float | None, None, "Social value orientation of the POV in rad, at level 2."),
-    "v_vut0": _option(
+    "x": option(float | None, None, "Initial position of the POV in m; M is 0.", "--x"),
+    "v": option(float | None, None, "Initial speed of the POV in m/s.", "--v"),
+    "psi": option(float | None, None, "Social value orientation of the POV in rad, at level 2."),
+    "v_vut0": option(
         float | None,
         None,
         "Initial speed of the VUT in m/s.",
         show_default="the scenario's, 18 in us23",
     ),
-    "headway_ahead": _option(float | None, None, "Headway to the car ahead in s, in traffic."),
-    "headway_behind": _option(float | None, None, "Headway of the car behind in s, in traffic."),
-    "sampler": _option(
+    "headway_ahead": option(float | None, None, "Headway to the car ahead in s, in traffic."),
+    "headway_behind": option(float | None, None, "Headway of the car behind in s, in traffic."),
+    "sampler": option(
         str,
         DEFAULT_SAMPLER,
         "What chooses the cases: {samplers}.",
         autocompletion=complete.samplers,
     ),
-    "cases": _option(int, 800, "Number of test cases."),
-    "batch": _option(
+    "cases": option(int, 800, "Number of test cases."),
+    "batch": option(
         int | None,
         None,
         "Cases per batch.",
         show_default="few, later more, for coverage; 40 for others",
     ),
-    "seed": _option(int, 0, "Same seed, same outcomes."),
-    "learn_from": _option(
+    "seed": option(int, 0, "Same seed, same outcomes."),
+    "learn_from": option(
         list[Path] | None,
         None,
         "An earlier campaign, of another version or at other levels, to learn the VUT from. May be "
@@ -149,42 +151,42 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="RUN",
         autocompletion=complete.runs,
     ),
-    "stop_after_converged": _option(
+    "stop_after_converged": option(
         float | None,
         None,
         "Stop early when, three batches in a row, the next batch is expected to add less than this "
         "share to the coverage. Needs a sampler that can tell: coverage.",
         metavar="SHARE",
     ),
-    "dense": _option(
+    "dense": option(
         bool | None,
         None,
         "Make the dense truths, of 1,000,000 cases, or go without.",
         "--dense/--no-dense",
         show_default="those kept",
     ),
-    "fail_when": _option(
+    "fail_when": option(
         str,
         "paper",
         "What counts as a failure: {criteria} (paper: front bumpers within 6 m at M), or a "
         "condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
         metavar="EXPR",
     ),
-    "require": _option(
+    "require": option(
         str | None,
         None,
         "Requirement over time, instead of --fail-when, in signal temporal logic: "
         "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
         metavar="STL",
     ),
-    "tolerance": _option(
+    "tolerance": option(
         float,
         0.0,
         "Growth of FMC, or of the share of cases without a verdict, at a level that is still no "
         "regression.",
         callback=_checked_tolerance,
     ),
-    "engine": _option(
+    "engine": option(
         str,
         "sumo",
         "sumo, or kinematic: the equations of motion alone, and SUMO for at least one case of a "
@@ -192,36 +194,36 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="NAME",
         autocompletion=complete.engines,
     ),
-    "workers": _option(
+    "workers": option(
         int | None,
         None,
         "Processes that run cases; the outcomes are the same. By default one a core, as soon as "
         "cases take longer than starting processes.",
     ),
-    "dask": _option(
+    "dask": option(
         str | None,
         None,
         "Address of a Dask scheduler whose workers run the cases: tcp://HOST:PORT.",
     ),
-    "quiet": _option(bool, False, "Show no progress.", "--quiet", "-q"),
-    "trust_vut": _option(
+    "quiet": option(bool, False, "Show no progress.", "--quiet", "-q"),
+    "trust_vut": option(
         bool,
         False,
         "Run the controller that a folder names although it is not known to be yours.",
         "--trust-vut",
     ),
-    "vut_command": _option(
+    "vut_command": option(
         str | None,
         None,
         "Command that starts the controller of --vut traci; {port} stands for the port.",
     ),
-    "deadline": _option(
+    "deadline": option(
         float, DEADLINE_S, "Seconds that a VUT may take for a step before it is a VUT_ERROR."
     ),
-    "vut_memory": _option(
+    "vut_memory": option(
         float, MEMORY_GIB, "GiB of memory that the process of a VUT of your own may take."
     ),
-    "in_process": _option(
+    "in_process": option(
         bool,
         False,
         "Run a VUT of your own in this process, within reach of a debugger, instead of in one of "

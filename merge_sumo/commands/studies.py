@@ -3,38 +3,46 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from merge_sumo.commands import complete
 from merge_sumo.commands.application import Given, app
-from merge_sumo.commands.options import HOSTING, RUNNING, SETUP, CoresOption, RunArgument, VutOption
+from merge_sumo.commands.options import (
+    CORES,
+    HOSTING,
+    RUNNING,
+    SEED,
+    SETUP,
+    RunArgument,
+    VutOption,
+    option,
+)
 from merge_sumo.commands.printing import quoted, say, stoppable
 from merge_sumo.errors import UserError
 
+TRUTH_CASES: Final = "10000, at level 2 20000"
 
-@app.verb(options=("level", *SETUP, "dask", "quiet"))
-def truth(
-    given: Given,
-    vut: VutOption,
-    cases: Annotated[
-        int | None,
-        typer.Option(help="Uniform cases of a level.", show_default="10000, at level 2 20000"),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
-    engine: Annotated[
-        str | None,
-        typer.Option(
-            help="kinematic: the equations of motion alone, and SUMO for at least one case of a "
+
+@app.verb(
+    options=("level", *SETUP, "dask", "quiet"),
+    own={
+        "cases": option(int | None, None, "Uniform cases of a level.", show_default=TRUTH_CASES),
+        "seed": SEED,
+        "engine": option(
+            str | None,
+            None,
+            "kinematic: the equations of motion alone, and SUMO for at least one case of a "
             "hundred. Or sumo for all.",
             metavar="NAME",
             show_default="kinematic where VUT and POV are of this package",
             autocompletion=complete.engines,
         ),
-    ] = None,
-    workers: CoresOption = None,
-) -> None:
+        "workers": CORES,
+    },
+)
+def truth(given: Given, vut: VutOption) -> None:
     """Find the ground truth of a VUT at each level, by uniform cases on all cores.
 
     It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of all inputs,
@@ -44,12 +52,30 @@ def truth(
     """
     from merge_sumo import api
 
-    given.print(
-        api.truths(vut, cases=cases, seed=seed, engine=engine, workers=workers, **given.keywords)
-    )
+    given.print(api.truths(vut, **given.keywords))
 
 
-@app.verb(options=("level", "dense", *SETUP, "dask", "quiet"))
+@app.verb(
+    options=("level", "dense", *SETUP, "dask", "quiet"),
+    own={
+        "seeds": option(int, 10, "Runs of each sampler."),
+        "cases": option(int, 400, "Cases of each run."),
+        "batch": option(
+            int | None,
+            None,
+            "Cases per batch.",
+            show_default="what coverage wants, 20 for the others",
+        ),
+        "truth_cases": option(int | None, None, "Cases of the truth.", show_default=TRUTH_CASES),
+        "figure": option(
+            Path | None,
+            None,
+            "New file for FMC against cases: .png, .svg or .html.",
+            metavar="FILE",
+        ),
+        "workers": CORES,
+    },
+)
 def compare(
     given: Given,
     vut: VutOption,
@@ -61,23 +87,6 @@ def compare(
             autocompletion=complete.samplers,
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Runs of each sampler.")] = 10,
-    cases: Annotated[int, typer.Option(help="Cases of each run.")] = 400,
-    batch: Annotated[
-        int | None,
-        typer.Option(
-            help="Cases per batch.", show_default="what coverage wants, 20 for the others"
-        ),
-    ] = None,
-    truth_cases: Annotated[
-        int | None,
-        typer.Option(help="Cases of the truth.", show_default="10000, at level 2 20000"),
-    ] = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(help="New file for FMC against cases: .png, .svg or .html.", metavar="FILE"),
-    ] = None,
-    workers: CoresOption = None,
 ) -> None:
     """Compare samplers with each other and with the ground truth, over several seeds.
 
@@ -91,36 +100,26 @@ def compare(
     """
     from merge_sumo import api
 
-    result = api.compare(
-        vut,
-        samplers=None if samplers is None else samplers.split(","),
-        seeds=seeds,
-        cases=cases,
-        batch=batch,
-        truth_cases=truth_cases,
-        figure=figure,
-        workers=workers,
-        **given.keywords,
-    )
-    given.print(result)
+    names = None if samplers is None else samplers.split(",")
+    given.print(api.compare(vut, samplers=names, **given.keywords))
 
 
-@app.verb(options=("level", *SETUP, "net", "engine", "dask", "quiet"))
+@app.verb(
+    options=("level", *SETUP, "net", "engine", "dask", "quiet"),
+    own={
+        "radius": option(float, 0.01, "Radius of the balls, as a share of the axes of the pool."),
+        "workers": CORES,
+    },
+)
 def certify(
     given: Given,
     vut: VutOption,
-    radius: Annotated[
-        float, typer.Option(help="Radius of the balls, as a share of the axes of the pool.")
-    ] = 0.01,
     out: Annotated[
-        Path | None,
-        typer.Option(help="New folder to write.", show_default="runs/certify-VUT-DATE"),
+        Path | None, typer.Option(help="New folder to write.", show_default="runs/certify-VUT-DATE")
     ] = None,
     resume: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Go on with the certificate in this folder."),
+        Path | None, typer.Option(metavar="DIR", help="Go on with the certificate in this folder.")
     ] = None,
-    workers: CoresOption = None,
 ) -> None:
     """Certify that no ball of a radius in the pool fails throughout, or find one that may.
 
@@ -146,39 +145,35 @@ def certify(
         return same if folder.exists() else None
 
     with stoppable("block", how_to_go_on) as check:
-        result = api.certify(
-            vut,
-            radius=radius,
-            out=folder,
-            resume=resume is not None,
-            workers=workers,
-            check=check,
-            **given.keywords,
-        )
+        again = resume is not None
+        result = api.certify(vut, out=folder, resume=again, check=check, **given.keywords)
     given.print(result)
     raise typer.Exit(0 if result.certain else 1)
 
 
-@app.verb(options=("net", "policies", "pov", *HOSTING, "engine", *RUNNING, "trust_vut"))
-def probability(
-    given: Given,
-    run: RunArgument,
-    cases: Annotated[int, typer.Option(help="Fresh cases to run.")] = 4000,
-    distribution: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="JSON: how often cases occur.", show_default="uniform"),
-    ] = None,
-    confidence: Annotated[
-        float, typer.Option(help="Chance that the interval holds the probability.")
-    ] = 0.95,
-    seed: Annotated[int, typer.Option(help="Same seed, same cases.")] = 0,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="New file to write.", show_default="RUN/probability.json"
+@app.verb(
+    options=("net", "policies", "pov", *HOSTING, "engine", *RUNNING, "trust_vut"),
+    own={
+        "cases": option(int, 4000, "Fresh cases to run."),
+        "distribution": option(
+            Path | None,
+            None,
+            "JSON: how often cases occur.",
+            metavar="FILE",
+            show_default="uniform",
         ),
-    ] = None,
-) -> None:
+        "confidence": option(float, 0.95, "Chance that the interval holds the probability."),
+        "seed": SEED,
+        "out": option(
+            Path | None,
+            None,
+            "New file to write.",
+            metavar="FILE",
+            show_default="RUN/probability.json",
+        ),
+    },
+)
+def probability(given: Given, run: RunArgument) -> None:
     """Estimate how likely a VUT is to fail, with an interval that is valid.
 
     The cases of the campaign were chosen to fail: they only shape the distribution from which fresh
@@ -189,34 +184,25 @@ def probability(
     """
     from merge_sumo import api
 
-    result = api.probability(
-        run,
-        cases=cases,
-        distribution=distribution,
-        confidence=confidence,
-        seed=seed,
-        out=out,
-        **given.written,
-    )
-    given.print(result)
+    given.print(api.probability(run, **given.written))
 
 
-@app.verb(options=["dense", "policies", "dask", "quiet"])
-def reproduce(
-    given: Given,
-    seeds: Annotated[
-        int | None,
-        typer.Option(help="Runs of each sampler.", show_default="10, with --quick 2"),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="New folder to write.", show_default="runs/reproduce-DATE"),
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Few and short runs and a small truth: a first look.")
-    ] = False,
-    workers: CoresOption = None,
-) -> None:
+@app.verb(
+    options=["dense", "policies", "dask", "quiet"],
+    own={
+        "seeds": option(
+            int | None, None, "Runs of each sampler.", show_default="10, with --quick 2"
+        ),
+        "out": option(
+            Path | None, None, "New folder to write.", show_default="runs/reproduce-DATE"
+        ),
+        "quick": option(
+            bool, False, "Few and short runs and a small truth: a first look.", "--quick"
+        ),
+        "workers": CORES,
+    },
+)
+def reproduce(given: Given) -> None:
     """Reproduce the paper: Table II and every figure of its results, beside the paper's numbers.
 
     Writes table2.md, table2.json, the figures as PNG, and index.html that shows it all.
@@ -225,7 +211,7 @@ def reproduce(
     """
     from merge_sumo import api
 
-    result = api.reproduce(seeds=seeds, out=out, quick=quick, workers=workers, **given.keywords)
+    result = api.reproduce(**given.keywords)
     given.print(result)
     if given.as_json:
-        say(f"all of it: {result.index}")
+        say(result.text[-1])

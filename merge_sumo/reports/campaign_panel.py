@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from html import escape
-from pathlib import Path
 from typing import Final, Self
 
 from rich.console import Console, Group
@@ -16,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
-from merge_sumo.reports.progress import notebook, tenth
+from merge_sumo.reports.progress import notebook
 from merge_sumo.reports.running_page import RunningPage
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
@@ -41,7 +40,6 @@ class CampaignPanel:
         quiet: bool = False,
         console: Console | None = None,
     ) -> None:
-        """Show nothing yet."""
         self.progress = progress
         self._page, self._quiet = page, quiet
         self._console = console or Console(stderr=True)
@@ -50,8 +48,6 @@ class CampaignPanel:
         self._update: Callable[[str, str], None] | None = None
         """Replaces what a notebook shows, as HTML and as text."""
         self._appeared = self._said_where = False
-        self._said: dict[Phase, int] = {}
-        """How much of each phase was done in its last line."""
 
     def case_ended(self, outcome: Outcome) -> None:
         """Count a case."""
@@ -63,15 +59,8 @@ class CampaignPanel:
         """Count a case that ran before: it says nothing of how fast this goes."""
         self.progress.ran_before(outcome)
 
-    def driven_again(self, done: int, total: int) -> None:
-        """Count the failures that reference drivers have driven again."""
-        self._counted(Phase.CAREFUL, done, total)
-
-    def report_part(self, done: int, total: int) -> None:
-        """Count the parts of the report that are ready."""
-        self._counted(Phase.REPORT, done, total)
-
-    def _counted(self, phase: Phase, done: int, total: int) -> None:
+    def advance(self, phase: Phase, done: int, total: int) -> None:
+        """Set the progress of a phase after the cases: of counterfactuals, of the report."""
         begins = self.progress.phase is not phase
         self.progress.advance(phase, done, total)
         self._show(begins=begins)
@@ -104,14 +93,7 @@ class CampaignPanel:
         if self._where and not self._said_where:
             self._said_where = True
             self._print(f"{self.progress.title}: {self._where}")
-        phase = self.progress.phase
-        work = self.progress.work[phase]
-        if phase is Phase.CASES:
-            wanted = work.done % tenth(work.total) == 0
-        else:
-            wanted = begins or work.done - self._said.get(phase, 0) >= tenth(work.total)
-        if wanted or work.done == work.total:
-            self._said[phase] = work.done
+        if self.progress.work[self.progress.phase].is_due() or begins:
             self._print(self.progress.line)
 
     def _print(self, line: str) -> None:
@@ -160,7 +142,6 @@ class CampaignPanel:
         return Panel(parts, title=Text(now.title), title_align="left", expand=False)
 
     def __enter__(self) -> Self:
-        """Return the panel."""
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
@@ -171,20 +152,6 @@ class CampaignPanel:
             self._live.stop()
         if self._page is not None and error is not None:
             self._page.stopped(self.progress)
-
-
-def panel_of(
-    title: str,
-    cases: int,
-    levels: tuple[int, ...],
-    folder: Path,
-    *,
-    workers: int = 1,
-    quiet: bool = False,
-) -> CampaignPanel:
-    """Return the panel of a campaign that is written into a folder, with a page there."""
-    progress = CampaignProgress(title, cases, levels, workers)
-    return CampaignPanel(progress, RunningPage(folder), quiet=quiet)
 
 
 def _both(html: str, text: str) -> dict[str, str]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
 from merge_sumo.analysis.verdict import in_counts
 from merge_sumo.campaigns.store import failures
-from merge_sumo.reports.progress import clock_text, rate_text
+from merge_sumo.reports.progress import Work, clock_text, rate_text
 from merge_sumo.studies.counterfactuals import MOST
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import Case, to_unit
@@ -43,43 +42,10 @@ WORST: Final = 10
 """Listed failures."""
 
 
-@dataclass(slots=True)
-class Work:
-    """The progress of a phase.
-
-    Attributes:
-        total: items of the phase.
-        start_s: begin of the phase, by the monotonic clock.
-        done: items done.
-        before: items done before a resume.
-        end_s: end of the phase; None while it runs.
-    """
-
-    total: int
-    start_s: float
-    done: int = 0
-    before: int = 0
-    end_s: float | None = None
-
-    @property
-    def elapsed_s(self) -> float:
-        """Seconds that it has taken so far."""
-        return (time.monotonic() if self.end_s is None else self.end_s) - self.start_s
-
-    @property
-    def left_s(self) -> float | None:
-        """Seconds that are left at the rate so far; None where nothing was done yet."""
-        done = self.done - self.before
-        if self.done >= self.total:
-            return 0.0
-        return (self.total - self.done) * self.elapsed_s / done if done > 0 else None
-
-
 class CampaignProgress:
     """Counts the cases of a campaign and the parts of what follows them."""
 
     def __init__(self, title: str, cases: int, levels: Sequence[int], workers: int = 1) -> None:
-        """Begin with the cases; `workers` is how many processes run them."""
         self.title = printable(title)
         self.phase = Phase.CASES
         self.work = {Phase.CASES: Work(cases, time.monotonic())}
@@ -91,7 +57,7 @@ class CampaignProgress:
         self.newest: deque[Outcome] = deque(maxlen=KEPT)
         self.failures: deque[Outcome] = deque(maxlen=KEPT)
         self.worst: list[Outcome] = []
-        self._workers = workers
+        self.workers = workers
         self._stale: set[int] = set()
 
     def case_ended(self, outcome: Outcome) -> None:
@@ -113,7 +79,7 @@ class CampaignProgress:
         """Count a case that ran before a resume; it does not count for the rate."""
         self.case_ended(outcome)
         work = self.work[Phase.CASES]
-        work.before += 1
+        work.before = work.said = work.done
         work.start_s = time.monotonic()
 
     def advance(self, phase: Phase, done: int, total: int) -> None:
@@ -132,11 +98,7 @@ class CampaignProgress:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until the report is written; None if unknown.
-
-        The present phase is extrapolated by its own rate, later phases by times measured on
-        another machine.
-        """
+        """Seconds until the report is written, at the rate of this phase; None if unknown."""
         left_s = self.work[self.phase].left_s
         if left_s is None:
             left_s = self._expected_s(self.phase)
@@ -154,7 +116,7 @@ class CampaignProgress:
         found = sum(map(len, self.failing.values()))
         if self.phase is Phase.CASES:
             found = round(found * max(cases.total, cases.done) / max(cases.done, 1))
-        return FAILURE_S * min(found, MOST) / self._workers
+        return FAILURE_S * min(found, MOST) / self.workers
 
     @property
     def found(self) -> str:
@@ -173,10 +135,7 @@ class CampaignProgress:
         return "" if work is None else f"{work.done}/{work.total} {UNITS[phase]}"
 
     def rate(self, phase: Phase) -> str:
-        """Return the rate of a phase in words; empty where nothing was done yet.
-
-        Parts of a report differ too much for a rate.
-        """
+        """Return the rate of a phase in words; empty where it has none, as parts of a report."""
         work = self.work.get(phase)
         if work is None or work.done == work.before or phase is Phase.REPORT:
             return ""

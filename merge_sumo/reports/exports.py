@@ -56,7 +56,7 @@ def write_folders(
 ) -> Iterator[Path]:
     """Write cases as folders below `target`, and yield the file to open of each.
 
-    Raises `UserError`, before anything is written, when a case or a folder is not as it should be.
+    Raises `UserError` for a case or a folder that is not as it should be before it writes anything.
     """
     check_place(target)
     folders = {index: target / case_name(index) for index in indices}

@@ -121,12 +121,7 @@ def coverage_curves(
 ) -> Figure:
     """Draw FMC against cases: a median with its quartile band per sampler, truth, limit, oracle.
 
-    Args:
-        title: what is compared.
-        compared: each sampler, all with the same batches.
-        truth_fmc: FMC of the truth.
-        oracle: FMC of the oracle after numbers of cases.
-        limit_fmc: FMC of all that is known to fail.
+    All samplers have the same batches; `oracle` is by number of cases.
     """
     with _drawing(7.5, 4.6) as figure:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold")

@@ -15,12 +15,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.analysis.coordinates import described
-from merge_sumo.analysis.verdict import (
-    NOTHING_TESTED,
-    GateResult,
-    Verdict,
-    message_of,
-)
+from merge_sumo.analysis.verdict import NOTHING_TESTED, GateResult, Verdict, message_of
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_new, check_new_file, write_new
@@ -34,12 +29,7 @@ FAILED: Final = "failed"
 
 
 def check_junit(path: Path, folder: Path) -> None:
-    """Raise `UserError` where no JUnit file can be written when the campaign has ended.
-
-    Args:
-        path: file to write.
-        folder: folder of the campaign, which may not be there yet.
-    """
+    """Raise `UserError` where a campaign in `folder` cannot write this JUnit file later."""
     if path.absolute() == folder.absolute():
         raise UserError(f"--junit is {path}, the folder of the campaign: choose a file")
     if path.parent.absolute() == folder.absolute():

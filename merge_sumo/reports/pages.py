@@ -20,14 +20,7 @@ TEMPLATES: Final = Path(__file__).parent / "templates"
 
 
 def page(template: str, *, styles: tuple[str, ...] = (), script: str = "", **words: Any) -> str:
-    """Return a page as HTML.
-
-    Args:
-        template: name of the template.
-        styles: names of style sheets, which stand in the page, as one.
-        script: name of the script, which stands in the page.
-        words: what the template needs.
-    """
+    """Return a page as HTML, with style sheets and a script in it, by name, and words as needed."""
     style, source = "".join(map(source_of, styles)), source_of(script) if script else ""
     policy = {"style_hash": _policy_hash(style), "script_hash": _policy_hash(source)}
     own = {"style": Markup(style), "script": Markup(source)}  # noqa: S704 (our own files)

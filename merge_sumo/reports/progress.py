@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
 from merge_sumo.system.printable import printable
 
@@ -22,27 +17,60 @@ if TYPE_CHECKING:
     from merge_sumo.training.helix import TrainingProgress
 
 
+PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
+"""Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
+LINES: Final = 10
+"""Lines that are said of what goes on where there is no terminal to draw on."""
+
+
+@dataclass(slots=True)
+class Work:
+    """Progress of some work, in items.
+
+    Attributes:
+        total: items of the work.
+        start_s: its begin, by the monotonic clock.
+        done: items done.
+        before: items done before a resume, which say nothing of the rate.
+        end_s: its end; None while it runs.
+        said: items done when a line was last said of it.
+    """
+
+    total: int
+    start_s: float
+    done: int = 0
+    before: int = 0
+    end_s: float | None = None
+    said: int = 0
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds that it has taken so far."""
+        return (time.monotonic() if self.end_s is None else self.end_s) - self.start_s
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds that are left at the rate so far; None where nothing was done yet."""
+        done = self.done - self.before
+        if self.done >= self.total:
+            return 0.0
+        return (self.total - self.done) * self.elapsed_s / done if done > 0 else None
+
+    def is_due(self) -> bool:
+        """Return whether to say a line where there is no terminal: after each tenth, and last."""
+        since = self.done - self.said
+        due = since >= -(-self.total // LINES) or (self.done >= self.total and since > 0)
+        self.said = self.done if due else self.said
+        return due
+
+
 def rate_text(count: float, elapsed_s: float, unit: str) -> str:
     """Return a rate as people read it: "7,140 cases/s", "12 cases/s", "3.5 cases/min"."""
     if count <= 0.0 or elapsed_s <= 0.0:
         return f"- {unit}/s"
-    per_s = count / elapsed_s
-    rate, per = next(
-        ((per_s * seconds, name) for seconds, name in PER if per_s * seconds >= 1.0),
-        (per_s * PER[-1][0], PER[-1][1]),
-    )
+    rates = [(count / elapsed_s * seconds, name) for seconds, name in PER]
+    rate, per = next(((rate, name) for rate, name in rates if rate >= 1.0), rates[-1])
     return f"{rate:,.0f} {unit}/{per}" if rate >= 10.0 else f"{rate:.1f} {unit}/{per}"
-
-
-PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
-"""Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
-
-
-def left_text(count: int, total: int, elapsed_s: float) -> str:
-    """Return how long it takes still, at the rate so far; empty where nobody knows."""
-    if count <= 0:
-        return ""
-    return f"{clock_text((total - count) * elapsed_s / count)} left"
 
 
 def clock_text(duration_s: float) -> str:
@@ -67,15 +95,6 @@ def is_watched() -> bool:
     return notebook() is not None or sys.stderr.isatty()
 
 
-PLAIN_LINES: Final = 10
-"""Lines that are said of what goes on where there is no terminal to draw on."""
-
-
-def tenth(total: int) -> int:
-    """Return after how many things a line is said where there is no terminal."""
-    return -(-total // PLAIN_LINES)
-
-
 class Bars:
     """Progress bars by title; the first appears with the first thing that is counted.
 
@@ -95,25 +114,27 @@ class Bars:
             console=self._console,
         )
         self._tasks: dict[str, TaskID] = {}
-        self._start_s: dict[str, float] = {}
-        self._shown: dict[str, int] = {}
-        """How much of each bar was done in its last line."""
+        self._work: dict[str, Work] = {}
         self._opened_s = time.monotonic()
+
+    def _work_of(self, title: str, total: int) -> Work:
+        # What ends first began before: with the others, or when the bar before was full.
+        return self._work.setdefault(title, Work(total, self._opened_s))
 
     def show(self, title: str, completed: int, total: int, note: str) -> None:
         """Set a bar."""
-        if title not in self._start_s:
-            # What ends first began before: with the others, or when the bar before was full.
-            self._start_s[title] = self._opened_s
-        if not self._is_shown:
-            return
-        left = left_text(completed, total, self.elapsed_s(title)) if completed < total else ""
+        work = self._work_of(title, total)
+        work.done = completed
+        left_s = work.left_s if completed < total else None
+        left = "" if left_s is None else f"{clock_text(left_s)} left"
         said = "  ".join(filter(None, (note.strip(), left)))
-        if not self._console.is_terminal:
-            self._say_line(title, completed, total, said)
-        elif title in self._tasks:
+        if self._is_shown and not self._console.is_terminal:
+            if work.is_due():
+                line = f"{printable(title)}: {completed:,}/{total:,}, {said}"
+                self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+        elif self._is_shown and title in self._tasks:
             self._progress.update(self._tasks[title], completed=completed, note=said)
-        else:
+        elif self._is_shown:
             self._progress.start()
             self._tasks[title] = self._progress.add_task(
                 printable(title), total=total, completed=completed, note=said
@@ -123,26 +144,15 @@ class Bars:
 
     def counted(self, title: str, done: int, total: int, unit: str, note: str = "") -> None:
         """Set a bar that counts things called `unit`, with their rate."""
-        self.show(title, done, total, f"{rate_text(done, self.elapsed_s(title), unit)}  {note}")
-
-    def _say_line(self, title: str, completed: int, total: int, said: str) -> None:
-        since = completed - self._shown.get(title, 0)
-        if since >= tenth(total) or (completed >= total and since):
-            self._shown[title] = completed
-            line = f"{printable(title)}: {completed:,}/{total:,}, {said}"
-            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+        elapsed_s = self._work_of(title, total).elapsed_s
+        self.show(title, done, total, f"{rate_text(done, elapsed_s, unit)}  {note}")
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
         if self._is_shown:
             self._console.print(text)
 
-    def elapsed_s(self, title: str) -> float:
-        """Return the seconds since the work of a bar began."""
-        return time.monotonic() - self._start_s.get(title, self._opened_s)
-
     def __enter__(self) -> Self:
-        """Return the bars."""
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
@@ -157,7 +167,6 @@ class Counter(Bars):
     """A bar that counts things called `unit`, with their rate."""
 
     def __init__(self, title: str, total: int, unit: str, *, shown: bool | None = True) -> None:
-        """Count up to `total`."""
         super().__init__(shown=shown)
         self._title, self._total, self._unit = title, total, unit
         self._count = 0
@@ -172,7 +181,6 @@ class TrainingBars(Bars):
     """A bar per network with return and share of crashes, and its regret when it is finished."""
 
     def __init__(self, *, shown: bool | None = True) -> None:
-        """Show nothing yet."""
         super().__init__(shown=shown)
         self._regret: dict[str, str] = {}
 

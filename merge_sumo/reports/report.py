@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from markupsafe import Markup
 
@@ -20,16 +20,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
-from merge_sumo.reports.report_sections import (
-    head_words,
-    sections_of,
-    shared_words,
-)
+from merge_sumo.reports.report_sections import head_words, sections_of, shared_words
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
 from merge_sumo.system.workers import Workers
-
-if TYPE_CHECKING:
-    pass
 
 REPORT: Final = "report.html"
 GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
@@ -45,9 +38,8 @@ def write_report(
 ) -> Path:
     """Write `report.html` into the folder of a run, in place of an older one; return its path.
 
-    `summary` is that of the run, where it is known; on `workers` its surrogates are asked;
-    `on_part` is told how far it is. Raises `UserError` when it cannot be written, or what is there
-    is no report of ours.
+    See `ReportModel` for the other arguments. Raises `UserError` when it cannot be written, or what
+    is there is no report of ours.
     """
     check_report(run.folder)
     path = run.folder / REPORT

@@ -12,10 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.analysis.coordinates import Coordinate
-from merge_sumo.analysis.diagnosis import (
-    Diagnosis,
-    Kind,
-)
+from merge_sumo.analysis.diagnosis import Diagnosis, Kind
 from merge_sumo.analysis.predictions import prediction_error_m
 from merge_sumo.analysis.verdict import shortened
 from merge_sumo.reports.report_maps import maps_of

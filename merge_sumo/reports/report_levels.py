@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from merge_sumo.analysis.coordinates import Coordinate
 from merge_sumo.analysis.summary import LevelSummary
 from merge_sumo.analysis.surface import FEWEST_FAILURES
 from merge_sumo.analysis.verdict import counted
@@ -14,41 +14,44 @@ from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.system.printable import two_digits
 from merge_sumo.values.empty_ball import EmptyBall
 from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import OWN, level_name
-
-
-@dataclass(frozen=True, slots=True)
-class Third:
-    """A coordinate that the reader of a map moves through, and its bounds."""
-
-    name: str
-    low: float
-    high: float
+from merge_sumo.values.scenario import OWN
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """What the page says of a level; bars are shares of 100."""
+    """What the page says of a POV level.
+
+    Attributes:
+        level: the level.
+        found: what the cases have shown there.
+        caption: the level, or the name of a POV of the tester's own.
+        about: what a POV of the level does.
+        plausible: coverage if all places failed that the surrogate does not exclude.
+        truth: coverage of the truth.
+        note: what was found, in sentences.
+        axes: its coordinates.
+        pairs: pairs of coordinates that its map may show, the first one first.
+    """
 
     level: int
-    name: str
+    found: LevelSummary
     caption: str
     about: str
-    cases: int
-    failures: int
-    untested: int
-    share_bar: float
-    untested_bar: float
-    fmc: float | None
-    fmc_bar: float | None
     plausible: float | None
-    plausible_bar: float
     truth: float | None
-    truth_bar: float
     note: str
-    dims: int
-    third: Third | None
+    axes: tuple[Coordinate, ...]
     pairs: list[str]
+
+    @property
+    def has_bar(self) -> bool:
+        """Whether a bar shows the coverage found against what there may be."""
+        return self.plausible is not None or self.truth is not None
+
+    @property
+    def most(self) -> float:
+        """The largest of its coverages."""
+        return max(self.found.fmc, self.plausible or 0.0, self.truth or 0.0)
 
 
 ABOUT: Final = {
@@ -56,87 +59,38 @@ ABOUT: Final = {
     1: "makes room for a VUT that accelerates",
     2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
 }
-
-
 FMC_AXES: Final = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Ends of an axis of coverages; balls at the faces of the pool reach out of it."""
 
 
-def levels_of(facts: ReportModel) -> tuple[list[Level], str]:
-    """Return what the page says of each level, and the end of the axis of the coverages."""
-    plausible = {
-        level: None if surface is None else surface.plausible_fmc()
-        for level, surface in facts.surfaces.items()
-    }
-    truth = {
-        level: None if found is None else fmc(found.failures)
-        for level, found in facts.truths.items()
-    }
-    end = _fmc_axis(facts, plausible, truth)
-
-    def row(level: int, found: LevelSummary) -> Level:
-        # Found against what there may be: a bar shows nothing where only one of them is known.
-        known = plausible[level] is not None or truth[level] is not None
-        scale = 100.0 / end if known else 0.0
-        share = 100.0 / found.cases if found.cases else 0.0
-        return Level(
-            level=level,
-            name=level_name(level),
-            caption=f"own: {facts.run.pov}" if level == OWN else str(level),
-            about=ABOUT.get(level, ""),
-            cases=found.cases,
-            failures=found.failures,
-            untested=found.cases - found.tested,
-            share_bar=round(share * found.failures, 1),
-            untested_bar=round(share * (found.cases - found.tested), 1),
-            fmc=found.fmc if found.tested else None,
-            fmc_bar=round(scale * found.fmc, 1) if scale else None,
-            plausible=plausible[level],
-            plausible_bar=round(scale * (plausible[level] or 0.0), 1),
-            truth=truth[level],
-            truth_bar=round(scale * (truth[level] or 0.0), 1),
-            note=_note(facts, level, found),
-            dims=len(facts.run.scenario.dimensions(level)),
-            third=_third(facts, level),
-            pairs=_pairs(facts, level),
-        )
-
-    levels = [row(level, found) for level, found in facts.summary.levels.items()]
-    return levels, f"{end:g}" if any(level.fmc_bar is not None for level in levels) else ""
+def levels_of(model: ReportModel) -> tuple[list[Level], float]:
+    """Return what the page says of each level, and the coverage at which all bars end."""
+    levels = [_level(model, level, found) for level, found in model.summary.levels.items()]
+    most = max((level.most for level in levels), default=0.0)
+    return levels, next((end for end in FMC_AXES if most <= end), FMC_AXES[-1])
 
 
-def _fmc_axis(
-    facts: ReportModel, plausible: Mapping[int, float | None], truth: Mapping[int, float | None]
-) -> float:
-    """Return the coverage at which the bars of all levels end: a round number."""
-    most = max(
-        (
-            max(found.fmc, plausible[level] or 0.0, truth[level] or 0.0)
-            for level, found in facts.summary.levels.items()
-        ),
-        default=0.0,
+def _level(model: ReportModel, level: int, found: LevelSummary) -> Level:
+    surface, truth = model.surfaces[level], model.truths[level]
+    axes = model.coordinates_of(level)
+    return Level(
+        level=level,
+        found=found,
+        caption=f"own: {model.run.pov}" if level == OWN else str(level),
+        about=ABOUT.get(level, ""),
+        plausible=None if surface is None else surface.plausible_fmc(),
+        truth=None if truth is None else fmc(truth.failures),
+        note=_note(found, axes, learned=surface is not None),
+        axes=axes,
+        pairs=[
+            " × ".join(axes[axis].name for axis in pair.axes)
+            + ("" if pair.share is None else f": {pair.share:.0%}")
+            for pair in pairs_of(len(axes), surface)
+        ],
     )
-    return next((end for end in FMC_AXES if most <= end), FMC_AXES[-1])
 
 
-def _third(facts: ReportModel, level: int) -> Third | None:
-    if len(facts.run.scenario.dimensions(level)) != 3:
-        return None
-    found = facts.coordinates_of(level)[2]
-    return Third(found.name, round(found.dimension.low, 2), round(found.dimension.high, 2))
-
-
-def _pairs(facts: ReportModel, level: int) -> list[str]:
-    """Return the pairs of coordinates that a level's map may show, the first one first."""
-    found = facts.coordinates_of(level)
-    return [
-        " × ".join(found[axis].name for axis in pair.axes)
-        + ("" if pair.share is None else f": {pair.share:.0%}")
-        for pair in pairs_of(len(found), facts.surfaces[level])
-    ]
-
-
-def _note(facts: ReportModel, level: int, found: LevelSummary) -> str:
+def _note(found: LevelSummary, axes: tuple[Coordinate, ...], *, learned: bool) -> str:
     if found.cases and not found.tested:
         return f"Nothing was tested in {counted(found.cases, 'case')}."
     text = f"{counted(found.failures, 'failure')} in {counted(found.cases, 'case')}"
@@ -145,15 +99,14 @@ def _note(facts: ReportModel, level: int, found: LevelSummary) -> str:
     if found.tested < found.cases:
         text += f"; {found.cases - found.tested} not tested"
     if found.unseen is not None:
-        text += f". {_unseen(facts, level, found.unseen)}"
-    if facts.surfaces[level] is None:
+        text += f". {_unseen(axes, found.unseen)}"
+    if not learned:
         text += f". No surrogate: it takes {FEWEST_FAILURES} failures to learn one"
     return text + "."
 
 
-def _unseen(facts: ReportModel, level: int, ball: EmptyBall) -> str:
+def _unseen(axes: tuple[Coordinate, ...], ball: EmptyBall) -> str:
     """Return the largest ball that no case has entered, in a clause."""
-    axes = facts.coordinates_of(level)
     spans = [(c, c.dimension.high - c.dimension.low) for c in axes]
     radii = ", ".join(f"{two_digits(ball.radius * span)} {c.unit}" for c, span in spans)
     centre = ", ".join(

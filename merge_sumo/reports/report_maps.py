@@ -91,13 +91,8 @@ def maps_of(
 ) -> dict[str, Any]:
     """Return what the script draws the map of a level from.
 
-    Args:
-        scenario: of the run.
-        level: POV level.
-        others: outcomes of the level that the page does not show one by one: they are counted.
-        surface: what the surrogate says.
-        truth: the truth of the level.
-        expected: how near the twin of the VUT expects gaps, (n,), at the nodes of a grid.
+    `others` are outcomes that the page counts instead of showing one by one; `expected` is how near
+    the twin of the VUT expects gaps, (n,), at the nodes of a grid.
     """
     dims = len(scenario.dimensions(level))
     pairs = pairs_of(dims, surface)

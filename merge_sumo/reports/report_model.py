@@ -9,18 +9,13 @@ from functools import partial
 from typing import Final, TypeVar
 
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
-from merge_sumo.analysis.diagnosis import (
-    Diagnosis,
-    Kind,
-    diagnose,
-    failure_boxes,
-)
+from merge_sumo.analysis.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.analysis.predictions import surprises
 from merge_sumo.analysis.summary import Summary, summarise
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.analysis.verdict import Trouble, judge
 from merge_sumo.campaigns.repeats import read_repeats
-from merge_sumo.campaigns.store import SETTINGS, Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
 from merge_sumo.engine.plan import plan_key, versions
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
@@ -31,7 +26,7 @@ from merge_sumo.studies.counterfactuals import read_avoidance
 from merge_sumo.studies.expectation import read_expectation
 from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.scenario import ALL_LEVELS, DEADLINE_S, LEVELS, OWN
+from merge_sumo.values.scenario import DEADLINE_S, LEVELS, OWN
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -57,27 +52,22 @@ class ReportModel:
         workers: Workers | None = None,
         on_part: OnPart = lambda _done, _total: None,
     ) -> None:
-        """Read what the page shows; raises `UserError` where settings have no list of levels.
+        """Read what the page shows; `UserError` where settings have no list of levels.
 
-        `summary` is that of the run, where it is known; on `workers`, where they are several
-        processes, its surrogates are asked. `on_part` is told how many parts of the report are
-        ready, and how many there are, from 0 on; also from another thread.
+        `summary` is that of the run, where it is known; on several `workers` its surrogates are
+        asked. `on_part` is told how many parts of the report are ready, and how many there are,
+        from 0 on; also from another thread.
         """
-        levels = run.settings.get("levels")
-        if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
-            raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
         self.run = run
         self.road = _road_of(run)
-        self.summary = summary or summarise(run.outcomes, levels)
+        self.summary = summary or summarise(run.outcomes, run.levels)
         self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
         # The surrogate of each level; the cases; the text; the data.
         self._on_part, self._parts, self._ready = on_part, len(self.levels) + 3, 0
         self._counting = threading.Lock()
         on_part(0, self._parts)
-        self._surfaces = _meanwhile(
-            partial(_surfaces, run, self.levels, workers, self.part_ended),
-        )
+        self._surfaces = _meanwhile(partial(_surfaces, run, self.levels, workers, self.part_ended))
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.worst = failures(run.outcomes)
         self.regions = regions_of(self.worst)

@@ -13,10 +13,7 @@ from typing import Any, Final
 
 from markupsafe import Markup
 
-from merge_sumo.analysis.diagnosis import (
-    BRAKED_MPS,
-    MEANING,
-)
+from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
 from merge_sumo.analysis.plausibility import notes_on
 from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
@@ -200,12 +197,7 @@ def _kinds(model: ReportModel) -> list[dict[str, Any]]:
     found = Counter(model.kinds.values())
     avoidable = Counter(model.kinds[o.index] for o in model.worst if _avoidable_kind(model, o))
     return [
-        {
-            "name": kind.value,
-            "meaning": MEANING[kind],
-            "count": count,
-            "avoidable": avoidable[kind],
-        }
+        {"name": kind.value, "meaning": MEANING[kind], "count": count, "avoidable": avoidable[kind]}
         for kind, count in found.most_common()
     ]
 

@@ -26,9 +26,7 @@ PAGE: Final = "index.html"
 def write_reproduction_page(folder: Path) -> Path:
     """Draw the figures and the page of a reproduction into its folder; return the page's path.
 
-    Raises:
-        UserError: where the folder holds no reproduction, has figures already, or matplotlib is
-            missing.
+    Raises `UserError` where it holds no reproduction, or figures already, or without matplotlib.
     """
     result, captions = read_reproduction(folder), {}
     for name, figure, caption in _figures(result):

@@ -38,7 +38,6 @@ class RunningPage:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Write nothing yet."""
         self._path = folder / REPORT
         self._due_s = time.monotonic() + FIRST_S
         self._is_there = self._is_given_up = False

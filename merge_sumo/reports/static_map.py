@@ -18,58 +18,43 @@ BOTTOM: Final = 294.0
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A coordinate of a map, with what stands at its two ends."""
+    """Name and unit of a coordinate of a map, and what stands at its two ends."""
 
-    coordinate: Coordinate
-
-    @property
-    def name(self) -> str:
-        """Name and unit."""
-        return f"{self.coordinate.name}, {self.coordinate.unit}"
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """Lowest and highest value."""
-        at = self.coordinate.dimension
-        low, high = (f"{value:.4g}".replace("-", "−") for value in (at.low, at.high))
-        return low, high
-
-    def share(self, case: Case) -> float:
-        """Return where a case is, as a share of the axis."""
-        dimension = self.coordinate.dimension
-        value = self.coordinate.of(case)
-        # No coordinate of a level's map is missing in a case of that level.
-        return ((value or 0.0) - dimension.low) / (dimension.high - dimension.low)
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """A case in a map: its CSS class and its place."""
-
-    kind: str
-    x: float
-    y: float
+    name: str
+    ends: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class StaticMap:
-    """A map of one level; what is last lies on top."""
+    """A map of one level: CSS class and place (x, y) of each case; what is last lies on top."""
 
     across: Axis
     up: Axis
-    marks: list[Mark]
+    marks: list[tuple[str, float, float]]
 
 
 def map_of(cases: Sequence[tuple[Case, str]]) -> StaticMap:
     """Return the map of cases of one level, each with the CSS class of its mark; not of none."""
     first = cases[0][0]
-    across, up = map(Axis, coordinates(first.scenario, (first.level,))[:2])
+    across, up = coordinates(first.scenario, (first.level,))[:2]
     marks = [
-        Mark(
+        (
             kind,
-            round(LEFT + across.share(case) * (RIGHT - LEFT), 1),
-            round(BOTTOM - up.share(case) * (BOTTOM - TOP), 1),
+            round(LEFT + _share(across, case) * (RIGHT - LEFT), 1),
+            round(BOTTOM - _share(up, case) * (BOTTOM - TOP), 1),
         )
         for case, kind in cases
     ]
-    return StaticMap(across, up, marks)
+    return StaticMap(_axis(across), _axis(up), marks)
+
+
+def _axis(c: Coordinate) -> Axis:
+    ends = (c.dimension.low, c.dimension.high)
+    texts = (f"{value:.4g}".replace("-", "−") for value in ends)
+    return Axis(f"{c.name}, {c.unit}", tuple(texts))
+
+
+def _share(c: Coordinate, case: Case) -> float:
+    """Return where a case is, as a share of the axis."""
+    # No coordinate of a level's map is missing in a case of that level.
+    return ((c.of(case) or 0.0) - c.dimension.low) / (c.dimension.high - c.dimension.low)

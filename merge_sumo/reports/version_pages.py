@@ -27,6 +27,7 @@ from merge_sumo.system.folders import write_new
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.trajectory import Trajectory
 
@@ -125,40 +126,19 @@ Motions = Mapping[tuple[str, int], Trajectory]
 """What a VUT did in a case of the other's campaign, by that campaign, "A" or "B", and index."""
 
 
-@dataclass(frozen=True, slots=True)
-class Side:
-    """What one VUT did in a case; no charts where its motion is not known."""
-
-    name: str
-    how: str
-    charts: list[Chart]
-
-
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """A case of the page."""
-
-    case: ComparedCase
-    where: str
-    command: str
-    sides: list[Side]
-
-
 def comparison_page(
     compared: RunComparison, a: Run, b: Run, motions: Motions, tolerance: float = 0.0
 ) -> str:
-    """Return the page of a comparison as HTML: what got fixed, what broke, and both motions.
+    """Return the page of a comparison of two campaigns as HTML, with both motions of each case.
 
-    Args:
-        compared: what changed.
-        a: campaign of the VUT before.
-        b: campaign of the VUT after.
-        motions: of the cases that were run again with the other VUT.
-        tolerance: by how much B may be worse.
+    `motions` are those of the cases that were run again with the other VUT; B may be worse by
+    `tolerance`.
     """
     runs = {"A": a, "B": b}
     shown = [_shown(case, runs, motions) for case in compared.cases[:SHOWN]]
-    sections = {change: [one for one in shown if one.case.change is change] for change in MEANING}
+    sections = {
+        change: [one for one in shown if one["case"].change is change] for change in MEANING
+    }
     by_level = {
         level: [case for case in compared.cases if case.case.level == level]
         for level in compared.levels
@@ -193,7 +173,8 @@ def _counts(compared: RunComparison) -> str:
     return f"{counted(len(compared.cases), 'case')}: {in_words(parts)}."
 
 
-def _shown(case: ComparedCase, runs: Mapping[str, Run], motions: Motions) -> Shown:
+def _shown(case: ComparedCase, runs: Mapping[str, Run], motions: Motions) -> dict[str, Any]:
+    """Return what the page says of a case; a VUT has no charts where its motion is not known."""
     known = {name: motions.get((case.run, case.index)) for name in runs}
     try:
         known[case.run] = runs[case.run].trajectory(case.index)
@@ -201,17 +182,24 @@ def _shown(case: ComparedCase, runs: Mapping[str, Run], motions: Motions) -> Sho
         known[case.run] = None
     both = [motion for motion in known.values() if motion is not None]
     sides = []
-    for name, end, severity, score in (
-        ("A", case.end_a, case.severity_a, case.score_a),
-        ("B", case.end_b, case.severity_b, case.score_b),
-    ):
-        how = "not run" if end is None else end.value.replace("_", " ").lower()
-        how += "" if severity is None else f", {severity}"
-        how += "" if score is None else f", score {score:.0f}".replace("-", "−")
+    for name, outcome in (("A", case.a), ("B", case.b)):
         motion = known[name]
-        sides.append(Side(name, how, [] if motion is None else _motion_charts(motion, both)))
+        charts = [] if motion is None else _motion_charts(motion, both)
+        sides.append({"name": name, "how": _how(outcome), "charts": charts})
     command = f"merge-sumo replay {quoted(runs[case.run].folder)} {case.index} --gui"
-    return Shown(case, described(case.case), command, sides)
+    return {"case": case, "where": described(case.case), "command": command, "sides": sides}
+
+
+def _how(outcome: Outcome | None) -> str:
+    """Return how a case went with a VUT, in a few words."""
+    if outcome is None:
+        return "not run"
+    words = [outcome.measures.end.value.replace("_", " ").lower()]
+    if outcome.measures.severity is not None:
+        words.append(outcome.measures.severity)
+    if outcome.score is not None:
+        words.append(f"score {outcome.score:.0f}".replace("-", "−"))
+    return ", ".join(words)
 
 
 def _motion_charts(motion: Trajectory, both: Sequence[Trajectory]) -> list[Chart]:
@@ -285,7 +273,10 @@ def _history_charts(history: History) -> list[Chart]:
     }
     return [
         by_level("Failure mode coverage (FMC)", lambda level: level.fmc),
-        by_level("Failures", lambda level: float(level.failures) if level.tested else None),
+        by_level(
+            "Failures",
+            lambda level: float(level.verdict.failures) if level.verdict.tested else None,
+        ),
         by_level("Regions", lambda level: level.regions),
         _version_chart(
             "Kinds of failure, all levels", {key: row for key, row in kinds.items() if any(row)}
@@ -334,18 +325,18 @@ def _table(history: History, level: int) -> list[tuple[str, list[str]]]:
     known = [one for one in of_versions if one is not None]
 
     def if_tested(value: Callable[[LevelOfVersion], Any]) -> Callable[[LevelOfVersion], Any]:
-        return lambda one: value(one) if one.tested else "–"
+        return lambda one: value(one) if one.verdict.tested else "–"
 
     rows: list[tuple[str, Callable[[LevelOfVersion], Any]]] = [
         ("FMC", if_tested(lambda one: f"{one.fmc:.4f}")),
-        ("failures", if_tested(lambda one: one.failures)),
-        ("of these contacts", if_tested(lambda one: one.contacts)),
+        ("failures", if_tested(lambda one: one.verdict.failures)),
+        ("of these contacts", if_tested(lambda one: one.verdict.contacts)),
         *((f"{word} in all", if_tested(partial(_of_severity, word))) for word in Severity),
-        ("of tested cases", lambda one: one.tested),
+        ("of tested cases", lambda one: one.verdict.tested),
     ]
-    if any(one.errors or one.timeouts for one in known):
-        rows.append(("errors", lambda one: one.errors))
-        rows.append(("timeouts", lambda one: one.timeouts))
+    if any(one.verdict.errors or one.verdict.timeouts for one in known):
+        rows.append(("errors", lambda one: one.verdict.errors))
+        rows.append(("timeouts", lambda one: one.verdict.timeouts))
     rows.append(("regions", if_tested(lambda one: one.regions)))
     rows += [
         (kind.value, partial(_of_kind, kind))

@@ -159,7 +159,7 @@ def search(
     workers: Workers | None = None,
     on_search: Callable[[str, int], None] | None = None,
 ) -> dict[str, list[Search]]:
-    """Let samplers search the pool of a plan's scenario.
+    """Let samplers search the pool of a plan's scenario; return the searches of each by seed.
 
     Args:
         plan: how cases run.
@@ -170,9 +170,6 @@ def search(
         batch: cases of a batch; by default what a sampler wants, or `COMPARED_BATCH`.
         workers: each search runs on one of them, by default in this process.
         on_search: told sampler and seed of a search that has ended.
-
-    Returns:
-        The searches of each sampler in the order of the seeds.
     """
     tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
     for level in levels:
@@ -216,12 +213,9 @@ def limit_fmc(
 def compare(
     searches: Sequence[Search], truths: Mapping[int, Truth], limit: float | None = None
 ) -> SamplerSummary:
-    """Compare what one sampler found with the truth at each level.
+    """Compare what one sampler found, one search a seed, with the truth at each level.
 
-    Args:
-        searches: one search a seed.
-        truths: the truth by level.
-        limit: coverage of all that is known to fail (`limit_fmc`).
+    `limit` is the coverage of all that is known to fail (`limit_fmc`).
     """
     truth_fmc = sum(fmc(truth.failures) for truth in truths.values())
     real = [(level, region) for level, truth in truths.items() for region in truth.real_regions()]

@@ -25,7 +25,6 @@ from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.prediction_skill import Query
-from merge_sumo.studies.versions import levels_of
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import Record, convert, decode
@@ -65,7 +64,7 @@ def _levels(run: Run) -> dict[str, list[int]]:
     """Return how near gaps are expected, by name of level, in the order of `nodes`."""
     from threadpoolctl import threadpool_limits
 
-    levels = levels_of(run)
+    levels = run.levels
     limit_m = run.scenario.dx_crash_m if run.criterion.is_papers else DX_CRASH_M
     twin = learned_twin(run, levels)
     result = {}
@@ -130,7 +129,7 @@ def read_expectation(run: Run) -> dict[int, tuple[Grid, NDArray[np.uint8]]]:
 
 
 def _row(run: Run, name: str, row: tuple[int, ...]) -> tuple[int, tuple[Grid, NDArray[np.uint8]]]:
-    for level in levels_of(run):
+    for level in run.levels:
         grid = GRID.get(len(run.scenario.dimensions(level)))
         if level_name(level) == name and grid is not None and len(row) == math.prod(grid):
             return level, (grid, np.array(row, dtype=np.uint8))

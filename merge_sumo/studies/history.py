@@ -30,7 +30,7 @@ from merge_sumo.analysis.verdict import Verdict, in_words, judge
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.studies.counterfactuals import Avoidance, read_avoidance
-from merge_sumo.studies.versions import check_comparable, levels_of
+from merge_sumo.studies.versions import check_comparable
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import fmc, radius_for, regions
 from merge_sumo.values.scenario import level_name
@@ -45,13 +45,8 @@ class LevelOfVersion:
     """What was found of a version at one POV level.
 
     Attributes:
-        cases: cases that ran.
-        tested: those with a verdict.
-        failures: those that failed.
-        contacts: failures in which bodies touch.
+        verdict: on its cases.
         severities: cases by severity, those that occur.
-        errors: cases that ended in an error.
-        timeouts: cases in which the VUT never reached the merge point.
         fmc: failure mode coverage in the level's unit cube; None where nothing was tested.
         regions: groups of failures that are linked at the radius of FMC; None as well.
         avoidance_known: failures of which it is recorded who would have avoided them.
@@ -59,18 +54,19 @@ class LevelOfVersion:
         kinds: failures by kind, of those under the paper's rule whose motion is there.
     """
 
-    cases: int
-    tested: int
-    failures: int
-    contacts: int
+    verdict: Verdict
     severities: dict[str, int]
-    errors: int
-    timeouts: int
     fmc: float | None
     regions: int | None
     avoidance_known: int
     avoided: int
     kinds: dict[Kind, int]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        own = {name: value for name, value in asdict(self).items() if name != "verdict"}
+        names = "cases", "tested", "failures", "contacts", "errors", "timeouts"
+        return {**{name: getattr(self.verdict, name) for name in names}, **own}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +92,9 @@ class Version:
         verdict = self.verdict
         record = {"folder": self.folder, "vut": self.vut, "sampler": self.sampler}
         counts = {"cases": verdict.cases, "failures": verdict.failures, **verdict.to_record()}
-        levels = {level_name(level): asdict(of_level) for level, of_level in self.levels.items()}
+        levels = {
+            level_name(level): of_level.to_record() for level, of_level in self.levels.items()
+        }
         return {**record, **counts, "levels": levels}
 
 
@@ -237,16 +235,15 @@ class History(Result):
 
 
 def history_of(runs: Sequence[Run]) -> History:
-    """Return the history of campaigns, the oldest first.
+    """Return the history of campaigns, the oldest first; `UserError` for fewer than two.
 
-    Raises:
-        UserError: for fewer than two, and where they differ in the scenario, the initial speed of
-            the VUT, the criterion or, at a level, the POV: FMC of these is of different pools.
+    So also where they differ in the scenario, the initial speed of the VUT, the criterion or, at a
+    level, the POV: FMC of these is of different pools.
     """
     if len(runs) < 2:
         raise UserError("a history needs two campaigns or more: name the older one first")
     levels_by_run = [
-        sorted({*levels_of(run), *(outcome.case.level for outcome in run.outcomes)}) for run in runs
+        sorted({*run.levels, *(outcome.case.level for outcome in run.outcomes)}) for run in runs
     ]
     for run in runs[1:]:
         check_comparable(runs[0], run, ())
@@ -302,21 +299,16 @@ def _version(run: Run, levels: Sequence[int]) -> Version:
 
 def _level(run: Run, level: int, known: dict[int, Avoidance]) -> LevelOfVersion:
     outcomes = [outcome for outcome in run.outcomes if outcome.case.level == level]
-    verdict, failed = judge(outcomes), [outcome for outcome in outcomes if outcome.failed]
+    failed = [outcome for outcome in outcomes if outcome.failed]
     points = to_unit((outcome.case for outcome in failed), level, run.scenario)
     kinds = Counter(_kind(run, outcome) for outcome in failed)
     avoidances = [known[outcome.index] for outcome in failed if outcome.index in known]
-    tested = sum(outcome.is_tested for outcome in outcomes)
+    verdict = judge(outcomes)
     return LevelOfVersion(
-        cases=verdict.cases,
-        tested=tested,
-        failures=verdict.failures,
-        contacts=verdict.contacts,
+        verdict=verdict,
         severities=severities_of(outcomes),
-        errors=verdict.errors,
-        timeouts=verdict.timeouts,
-        fmc=fmc(points) if tested else None,
-        regions=int(regions(points).max(initial=-1)) + 1 if tested else None,
+        fmc=fmc(points) if verdict.tested else None,
+        regions=int(regions(points).max(initial=-1)) + 1 if verdict.tested else None,
         avoidance_known=len(avoidances),
         avoided=sum(one.by_careful for one in avoidances),
         kinds={kind: kinds[kind] for kind in Kind if kinds[kind]},
@@ -331,25 +323,21 @@ def _kind(run: Run, outcome: Outcome) -> Kind | None:
         return None
 
 
+ORDER: Final = (
+    *(RegionChange.BROKE, RegionChange.FIXED, RegionChange.STILL),
+    *(RegionChange.NOT_SEEN_BEFORE, RegionChange.NOT_SEEN_AFTER),
+)
+"""In which the regions of a step are listed."""
+
+
 def _step(runs: Sequence[Run], before: int, after: int, level: int) -> Step:
     """Return what changed at a level between two of some campaigns, given by their places."""
     earlier, later = (_Tested(runs[place], level) for place in (before, after))
+    fixed = _regions(before + 1, earlier, later, RegionChange.FIXED, RegionChange.NOT_SEEN_AFTER)
+    broke = _regions(after + 1, later, earlier, RegionChange.BROKE, RegionChange.NOT_SEEN_BEFORE)
     # Where both fail the region is given once, as one of the earlier version.
-    both = [
-        *_regions(before + 1, earlier, later, (RegionChange.FIXED, RegionChange.NOT_SEEN_AFTER)),
-        *(
-            region
-            for region in _regions(
-                after + 1, later, earlier, (RegionChange.BROKE, RegionChange.NOT_SEEN_BEFORE)
-            )
-            if not region.failed
-        ),
-    ]
-    order = (
-        *(RegionChange.BROKE, RegionChange.FIXED, RegionChange.STILL),
-        *(RegionChange.NOT_SEEN_BEFORE, RegionChange.NOT_SEEN_AFTER),
-    )
-    both.sort(key=lambda region: (order.index(region.became), -region.fmc, region.worst))
+    both = [*fixed, *(region for region in broke if not region.failed)]
+    both.sort(key=lambda region: (ORDER.index(region.became), -region.fmc, region.worst))
     first, second = (
         {tuple(point): o.failed for point, o in zip(one.points.tolist(), one.outcomes, strict=True)}
         for one in (earlier, later)
@@ -386,16 +374,11 @@ class _Tested:
 
 
 def _regions(
-    of: int, own: _Tested, other: _Tested, if_none_failed: tuple[RegionChange, RegionChange]
+    of: int, own: _Tested, other: _Tested, none_failed: RegionChange, not_seen: RegionChange
 ) -> list[Region]:
-    """Return the regions of a version's failures, and what the other one's cases say of them.
+    """Return the regions of failures of version `of`, and what the other one's cases say of them.
 
-    Args:
-        of: number of the version.
-        own: its cases.
-        other: the other one's.
-        if_none_failed: what became of a region with and without cases of the other, none of which
-            fails.
+    A region where the other one's cases do not fail became `none_failed`, without any `not_seen`.
     """
     radius, labels = radius_for(own.points.shape[1]), regions(own.failing)
     result = []
@@ -409,7 +392,7 @@ def _regions(
         result.append(
             Region(
                 of=of,
-                became=RegionChange.STILL if failed else if_none_failed[not inside],
+                became=RegionChange.STILL if failed else none_failed if inside else not_seen,
                 failures=len(failures),
                 worst=min(failures, key=lambda o: (o.score, o.index)).index,
                 where=_box_in_words([o.case for o in failures]),

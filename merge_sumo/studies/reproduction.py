@@ -105,7 +105,6 @@ class Scale:
     dense: bool | None = None
 
     def __post_init__(self) -> None:
-        """Check the number of seeds."""
         if self.seeds < 1:
             raise UserError(f"--seeds is {self.seeds}: it must be 1 or more")
 
@@ -199,15 +198,9 @@ def reproduce(
 ) -> Reproduction:
     """Run what Table II and the figures need, and write it into a new folder.
 
-    Args:
-        folder: new; `reproduction.json` is written after each column.
-        scale: how much is run.
-        policies: folder of the learned POVs, by default the shipped ones.
-        workers: where cases run, by default in this process.
-        on_part: told how far it is.
-
-    Raises:
-        UserError: when the folder exists or cannot be written, or where a level has no POV.
+    `reproduction.json` is written after each column. The POVs are those of `policies`, by default
+    the shipped ones; `on_part` is told how far it is. Raises `UserError` when the folder exists or
+    cannot be written, or where a level has no POV.
     """
     povs = Povs(policies=policies or policies_of(US23))
     for level in LEVELS:

@@ -22,7 +22,7 @@ from merge_sumo.analysis.verdict import counted, judge
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.repeats import cause
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
-from merge_sumo.campaigns.store import SETTINGS, Run, failures
+from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan, versions
 from merge_sumo.engine.simulator import road_for
@@ -32,8 +32,8 @@ from merge_sumo.system.hashing import changed
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import ALL_LEVELS, level_name
-from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.registry import built_in_vuts
 
@@ -63,79 +63,75 @@ class Change(StrEnum):
 
 
 MOST_TELLING: Final = (
-    Change.BROKE,
-    Change.NO_VERDICT_OF_B,
-    Change.NOT_RUN_AGAIN,
-    Change.NO_VERDICT,
-    Change.BOTH_FAIL,
-    Change.NO_VERDICT_OF_A,
-    Change.FIXED,
+    *(Change.BROKE, Change.NO_VERDICT_OF_B, Change.NOT_RUN_AGAIN),
+    *(Change.NO_VERDICT, Change.BOTH_FAIL, Change.NO_VERDICT_OF_A, Change.FIXED),
 )
-"""The order in which cases are listed."""
-
-
-def change_between(a: Outcome | None, b: Outcome | None) -> Change:
-    """Return what became of a case in which A or B failed or gave no verdict; None: not run."""
-    if a is None or b is None:
-        return Change.NOT_RUN_AGAIN
-    if not (a.is_tested or b.is_tested):
-        return Change.NO_VERDICT
-    if not a.is_tested:
-        return Change.NO_VERDICT_OF_A
-    if not b.is_tested:
-        return Change.NO_VERDICT_OF_B
-    if a.failed and b.failed:
-        return Change.BOTH_FAIL
-    return Change.BROKE if b.failed else Change.FIXED
+"""The order in which cases are listed; those of the first three are to be looked at."""
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedCase:
-    """A case in which at least one of the two VUTs failed or gave no verdict.
+    """A case and its outcomes with both VUTs.
 
     Attributes:
         run: "A" or "B", the campaign that has the case.
         index: its index there.
-        case: the case.
-        score_a: P of A; None where an error ended it or A was not run.
-        score_b: P of B.
-        end_a: how it ended with A; None where A was not run.
-        end_b: how it ended with B.
-        severity_a: contact, conflict, harsh or safe with A; None where it has none.
-        severity_b: the same with B.
-        change: what became of it.
+        a: its outcome with A; None where A was not run. One of the two is known.
+        b: its outcome with B.
     """
 
     run: str
     index: int
-    case: Case
-    score_a: float | None
-    score_b: float | None
-    end_a: End | None
-    end_b: End | None
-    severity_a: str | None
-    severity_b: str | None
-    change: Change
+    a: Outcome | None
+    b: Outcome | None
 
-    @classmethod
-    def of(cls, run: str, index: int, a: Outcome | None, b: Outcome | None) -> ComparedCase:
-        """Return the case of a run, "A" or "B"; an outcome is None where a VUT was not run."""
-        known = a or b
+    @property
+    def case(self) -> Case:
+        """The case."""
+        known = self.a or self.b
         assert known is not None, "a run has the case"  # noqa: S101
-        (score_a, end_a, severity_a), (score_b, end_b, severity_b) = (
-            (None, None, None) if o is None else (o.score, o.measures.end, o.measures.severity)
-            for o in (a, b)
-        )
-        return cls(
-            *(run, index, known.case, score_a, score_b, end_a, end_b, severity_a, severity_b),
-            change_between(a, b),
-        )
+        return known.case
+
+    @property
+    def change(self) -> Change:
+        """What became of a case in which A or B failed or gave no verdict."""
+        a, b = self.a, self.b
+        if a is None or b is None:
+            return Change.NOT_RUN_AGAIN
+        if not (a.is_tested or b.is_tested):
+            return Change.NO_VERDICT
+        if not a.is_tested:
+            return Change.NO_VERDICT_OF_A
+        if not b.is_tested:
+            return Change.NO_VERDICT_OF_B
+        if a.failed and b.failed:
+            return Change.BOTH_FAIL
+        return Change.BROKE if b.failed else Change.FIXED
+
+    @property
+    def became(self) -> str:
+        """What it was and is in words; where these are the same, which of them is a failure."""
+        both = [outcome for outcome in (self.a, self.b) if outcome is not None]
+        words = [outcome.measures.became for outcome in both]
+        if len(set(words)) == 1:
+            words = [f"{words[0]}, {'a failure' if o.failed else 'no failure'}" for o in both]
+        return " -> ".join(words)
 
     def rank(self) -> tuple[int, float, str, int]:
         """Return the sort key: what broke comes first, the worst of B first."""
         # Of what was not run again, B's cases may have broken, A's may be fixed.
-        score = self.score_b if self.score_b is not None else 0.0
-        return MOST_TELLING.index(self.change), score, self.run, self.index
+        score = None if self.b is None else self.b.score
+        return MOST_TELLING.index(self.change), score or 0.0, self.run, self.index
+
+    def to_record(self, a: str = "a", b: str = "b") -> dict[str, Any]:
+        """Return change, scores, ends and severities as JSON shows them, with names for A and B."""
+        record: dict[str, Any] = {"index": self.index, "change": self.change}
+        for name, outcome in ((a, self.a), (b, self.b)):
+            measures = None if outcome is None else outcome.measures
+            record[f"score_{name}"] = None if outcome is None else outcome.score
+            record[f"end_{name}"] = None if measures is None else measures.end
+            record[f"severity_{name}"] = None if measures is None else measures.severity
+        return record
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,8 +205,7 @@ class RunComparison(Result):
 
     Attributes:
         levels: by POV level.
-        cases: every case in which one failed or gave no verdict; what broke comes first, the
-            worst of B first.
+        cases: every case in which one failed or gave no verdict, as `ComparedCase.rank` orders.
         evidence: how the verdicts of the other VUT came about, as a sentence.
     """
 
@@ -219,12 +214,7 @@ class RunComparison(Result):
     evidence: str
 
     def worse(self, tolerance: float) -> list[str]:
-        """Return in sentences why B is worse than A; empty where it is not.
-
-        At some level B reached the merge point in no case of its campaign, or one of these grew by
-        more than the tolerance: the share of cases with an error, the share of cases with an error
-        or a timeout, FMC.
-        """
+        """Return in sentences why B is worse than A by more than the tolerance, if it is."""
         return [
             reason
             for level, change in self.levels.items()
@@ -233,7 +223,11 @@ class RunComparison(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
-        return asdict(self)
+        cases = [
+            {"run": one.run, "case": asdict(one.case), **one.to_record()} for one in self.cases
+        ]
+        levels = {level: asdict(change) for level, change in self.levels.items()}
+        return {"levels": levels, "cases": cases, "evidence": self.evidence}
 
     def lines(self) -> list[str]:
         """Return a table of what changed, level by level, and how that is known."""
@@ -250,7 +244,6 @@ class RunComparison(Result):
         return [*table, f"evidence: {self.evidence}"]
 
     def __repr__(self) -> str:
-        """Return FMC of both in a line."""
         levels = (
             f"level {level_name(level)}: FMC {change.fmc_a:.4f} -> {change.fmc_b:.4f}"
             for level, change in self.levels.items()
@@ -273,22 +266,18 @@ def _level_change(
 ) -> LevelChange:
     """Return what changed at a level.
 
-    Args:
-        cases: the compared cases of the level.
-        own_a: all outcomes of the campaign of A at the level.
-        own_b: all outcomes of B.
-        level: POV level.
-        same_cases: whether the cases of B are those of A, run again.
-        records_only: whether no case was to run again.
+    `cases` are the compared ones of the level, `own_a` and `own_b` all outcomes of the campaigns
+    there: `same_cases` where those of B are those of A, run again, `records_only` where none was to
+    run again.
     """
-    fails_a = [c.case for c in cases if _fails(c.score_a)]
-    fails_b = [c.case for c in cases if _fails(c.score_b)]
+    fails_a = [c.case for c in cases if c.a is not None and c.a.failed]
+    fails_b = [c.case for c in cases if c.b is not None and c.b.failed]
     # Where one fails and the other gives no verdict, or could not be run, nothing is known to be
     # fixed and nothing to be broken. Records alone are compared as they are.
     silent = {Change.NO_VERDICT_OF_A, Change.NO_VERDICT_OF_B}
     silent |= set() if records_only else {Change.NOT_RUN_AGAIN}
     unknown = [
-        c.case for c in cases if c.change in silent and (_fails(c.score_a) or _fails(c.score_b))
+        c.case for c in cases if c.change in silent and any(o and o.failed for o in (c.a, c.b))
     ]
     # Both VUTs were tried on the same cases: the others of both campaigns raise no question.
     shared = all(case.change is not Change.NOT_RUN_AGAIN for case in cases)
@@ -296,8 +285,8 @@ def _level_change(
 
     def untested(run: str, own: Sequence[Outcome]) -> Untested:
         tried = cases if shared else [c for c in cases if c.run == run]
-        results = [(c.end_a, c.score_a) if run == "A" else (c.end_b, c.score_b) for c in tried]
-        ends = Counter(end for end, score in results if not _fails(score))
+        outcomes = [c.a if run == "A" else c.b for c in tried]
+        ends = Counter(o.measures.end for o in outcomes if o is not None and not o.failed)
         return Untested(
             cases=together if shared else len(own),
             errors=ends[End.VUT_ERROR] + ends[End.SIM_ERROR],
@@ -318,10 +307,6 @@ def _level_change(
         fmc_broke=max(either - volume(fails_a + unknown), 0.0),
         changes={change.value: sum(case.change is change for case in cases) for change in Change},
     )
-
-
-def _fails(score: float | None) -> bool:
-    return score is not None and score < FAILURE_SCORE
 
 
 def _comparison(
@@ -364,26 +349,21 @@ def compare_runs(
     trust: bool = False,
     on_motion: OnMotion = lambda _run, _index, _trajectory: None,
 ) -> RunComparison:
-    """Compare two campaigns level by level.
+    """Compare the campaigns of two VUTs, A before and B after, level by level.
 
     That a VUT is still the one of its campaign is checked first: it must give again the scores that
-    were recorded.
+    were recorded. Raises `UserError` where the campaigns do not compare.
 
     Args:
-        a: campaign of the VUT before.
-        b: campaign of the VUT after.
+        a: campaign of A.
+        b: campaign of B.
         rerun: run the failures, errors and timeouts of each with the VUT of the other.
         net: net for that; must be the one of the campaigns.
         given: settings in the place of what the folders name: policies that are elsewhere.
         trust: run the controllers that the folders name although they may be a stranger's.
         on_motion: told what a VUT did in a case of the other's campaign.
-
-    Raises:
-        UserError: where the campaigns have no level in common or no case at one, differ in the
-            initial speed of the VUT or in the POV of a level, or were run on another net than the
-            one to run again on.
     """
-    levels = sorted(set(levels_of(a)) & set(levels_of(b)))
+    levels = sorted(set(a.levels) & set(b.levels))
     if not levels:
         raise UserError(f"{a.folder} and {b.folder} have no POV level in common")
     check_comparable(a, b, levels)
@@ -406,22 +386,14 @@ def compare_runs(
         again_b = _run_again(b, telling_a, road, given, partial(on_motion, "A"), trust=trust)
         again_a = _run_again(a, telling_b, road, given, partial(on_motion, "B"), trust=trust)
     cases = [
-        *(ComparedCase.of("A", o.index, o, again_b.outcomes.get(o.index)) for o in telling_a),
-        *(ComparedCase.of("B", o.index, again_a.outcomes.get(o.index), o) for o in telling_b),
+        *(ComparedCase("A", o.index, o, again_b.outcomes.get(o.index)) for o in telling_a),
+        *(ComparedCase("B", o.index, again_a.outcomes.get(o.index), o) for o in telling_b),
     ]
     evidence = (
         f"with {_in_words(own_a)} of A, B {again_b.how}; "
         f"with {_in_words(own_b)} of B, A {again_a.how}"
     )
     return _comparison(cases, own_a, own_b, levels, evidence, records_only=not rerun)
-
-
-def levels_of(run: Run) -> list[int]:
-    """Return the POV levels that the settings of a campaign name; `UserError` for none."""
-    levels = run.settings.get("levels")
-    if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
-        raise UserError(f"{run.folder / SETTINGS} is no campaign's: it has no list of levels")
-    return levels
 
 
 def check_comparable(a: Run, b: Run, levels: Iterable[int]) -> None:
@@ -502,42 +474,6 @@ def _run_again(
 # One campaign: its recorded cases with a changed VUT.
 
 
-@dataclass(frozen=True, slots=True)
-class ChangedVerdict:
-    """A case whose verdict is another than the recorded one."""
-
-    before: Outcome
-    after: Outcome
-
-    @property
-    def change(self) -> str:
-        """What that means: fixed, broke, or between failing and giving no verdict."""
-        return change_between(self.before, self.after)
-
-    @property
-    def became(self) -> str:
-        """What the case was and is; where the words are one, which of them is a failure."""
-        words = [outcome.measures.became for outcome in (self.before, self.after)]
-        if words[0] == words[1]:
-            words = [
-                f"{words[0]}, {'a failure' if outcome.failed else 'no failure'}"
-                for outcome in (self.before, self.after)
-            ]
-        return " -> ".join(words)
-
-    def to_record(self) -> dict[str, Any]:
-        """Return it as JSON shows it."""
-        before, after = self.before.measures, self.after.measures
-        return {
-            "index": self.before.index,
-            "level": self.before.case.level,
-            "change": self.change,
-            **{"end_before": before.end, "end_after": after.end},
-            **{"severity_before": before.severity, "severity_after": after.severity},
-            **{"score_before": self.before.score, "score_after": self.after.score},
-        }
-
-
 @dataclass(frozen=True, slots=True, repr=False)
 class Rerun(Result):
     """Recorded cases and what the VUT of today makes of them.
@@ -558,10 +494,10 @@ class Rerun(Result):
     unrepeated: tuple[int, ...] = ()
 
     @property
-    def changed(self) -> list[ChangedVerdict]:
+    def changed(self) -> list[ComparedCase]:
         """The cases whose verdict changed, in the order of the campaign."""
         return [
-            ChangedVerdict(a, b)
+            ComparedCase("A", a.index, a, b)
             for a, b in zip(self.before, self.after, strict=True)
             if (a.measures.end, a.failed) != (b.measures.end, b.failed)
         ]
@@ -571,7 +507,10 @@ class Rerun(Result):
         return {
             "vut": self.vut,
             "cases": len(self.before),
-            "changed": [one.to_record() for one in self.changed],
+            "changed": [
+                {"level": one.case.level, **one.to_record("before", "after")}
+                for one in self.changed
+            ],
             "levels": self.compared.to_record()["levels"],
             "unrepeated": self.unrepeated,
         }
@@ -594,7 +533,7 @@ class Rerun(Result):
         )
         for one in changed[:MOST_CHANGED]:
             change = one.change.replace("of A", "before").replace("of B", "now")
-            text.append(f"  case {one.before.index}: {one.became} ({change})")
+            text.append(f"  case {one.index}: {one.became} ({change})")
         if len(changed) > MOST_CHANGED:
             text.append(f"  and {len(changed) - MOST_CHANGED} others")
         return text
@@ -605,8 +544,7 @@ def settings_today(
 ) -> CampaignSettings:
     """Return the settings of a campaign with what is given in the place of what it recorded.
 
-    A VUT that is not given is that of the campaign, as its files are today. The controller that a
-    folder names runs only where the folder was made here, or with `trust`.
+    A VUT that is not given is that of the campaign, as its files are today (`settings_of`).
     """
     wanted = dict(given or {})
     if "vut" in wanted:
@@ -623,19 +561,10 @@ def rerun(
     workers: Workers | None = None,
     on_case: Callable[[int], None] = lambda _: None,
 ) -> Rerun:
-    """Run cases of a campaign again.
+    """Run cases of a campaign again, by default all, with `settings_today` and their plan.
 
-    Args:
-        run: the campaign.
-        settings: how: `settings_today`.
-        plan: how they run: that of the settings, on the net of the campaign.
-        indices: its cases; all of them when left out.
-        workers: where the cases run, by default in this process.
-        on_case: told how many cases have just ended.
-
-    Raises:
-        UserError: for an index without a case, and where net or POV are not those of the campaign:
-            then not only the VUT would have changed.
+    `on_case` is told how many have just ended. Raises `UserError` for an index without a case, and
+    where net or POV are not the campaign's: then not only the VUT would have changed.
     """
     before = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
     if not before:
@@ -664,7 +593,7 @@ def rerun(
             on_case(1)
     after = [by_index[outcome.index] for outcome in before]
     cases = [
-        ComparedCase.of("A", a.index, a, b)
+        ComparedCase("A", a.index, a, b)
         for a, b in zip(before, after, strict=True)
         if any(o.failed or not o.is_tested for o in (a, b))
     ]
@@ -691,14 +620,8 @@ def _unrepeated(before: Sequence[Outcome], after: Sequence[Outcome]) -> tuple[in
     """Return the indices of the cases that did not go as before, except those with an error."""
 
     def motion(outcome: Outcome) -> tuple[object, ...]:
-        measures = outcome.measures
-        return (
-            measures.end,
-            measures.t_end_s,
-            measures.dx_m,
-            measures.dv_mps,
-            measures.clipped_steps,
-        )
+        found = outcome.measures
+        return found.end, found.t_end_s, found.dx_m, found.dv_mps, found.clipped_steps
 
     return tuple(
         a.index

@@ -147,10 +147,7 @@ def _run(ground: Simulator, cases: Sequence[Case]) -> list[Trajectory]:
 
 
 def _meetings(trajectories: Sequence[Trajectory]) -> list[Case]:
-    """Return, for each speed of the POV, the case in which the two would meet at M.
-
-    A controller may keep something of a narrow escape alone.
-    """
+    """Return, for each speed of the POV, the case in which the two would meet at M."""
     low_m, high_m = US23.x_pov0_m
     nearest: dict[float, Trajectory] = {}
     for one in sorted(trajectories, key=lambda one: -abs(_gap_m(one))):

@@ -53,7 +53,7 @@ case: ms.CaseRun = ms.run_case(Mine, run.failures[0], level=0, x_pov0_m=-300.0, 
 again = ms.run_case(recorded=(run, 3), debug=True)
 print(case.measures.end, case.failed, again.trajectory.motion[0, 0, 0])
 ms.resume(run, cases=80, workers=2)
-print(ms.rerun(run, [1, 2], vut="design2", level=0).changed[0].before.index)
+print(ms.rerun(run, [1, 2], vut="design2", level=0).changed[0].index)
 print(ms.compare_runs(run, "runs/b").worse(0.01), ms.history([run, "runs/b"]).lines())
 print(ms.export(run, 3)[0].name, ms.report(run).name, ms.replay(run, 3).diverged_at_s)
 code: int = ms.open_in_gui(run, 3)

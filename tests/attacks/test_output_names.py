@@ -152,7 +152,7 @@ def no_cases(monkeypatch) -> None:
     monkeypatch.setattr(conductor, "open_simulators", lambda *_: None)
     for name in ("evaluate", "evaluate_chunks"):
         monkeypatch.setattr(conductor, name, stop)
-    monkeypatch.setattr(reproduction._Work, "column", stop)
+    monkeypatch.setattr(reproduction, "_column", stop)
 
 
 @pytest.fixture(scope="module")

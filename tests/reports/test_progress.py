@@ -24,8 +24,9 @@ from merge_sumo.reports.campaign_progress import (
 from merge_sumo.reports.progress import (
     Bars,
     Counter,
+    Work,
+    clock_text,
     is_watched,
-    left_text,
     rate_text,
 )
 from merge_sumo.reports.report import GENERATOR, REPORT, report_page, write_report
@@ -46,9 +47,9 @@ def said(outcomes, *, terminal: bool, quiet: bool = False) -> str:
             panel.case_ended(outcome)
         failing = sum(outcome.failed for outcome in outcomes)
         for done in range(failing + 1 if outcomes else 0):
-            panel.driven_again(done, failing)
+            panel.advance(Phase.CAREFUL, done, failing)
         for done in range(7 if outcomes else 0):
-            panel.report_part(done, 6)
+            panel.advance(Phase.REPORT, done, 6)
     return out.getvalue()
 
 
@@ -193,8 +194,8 @@ class TestABar:
 
 
 def test_what_is_left_is_in_hours_where_it_takes_that_long():
-    assert left_text(1, 3, 3600.0) == "2:00:00 left"
-    assert left_text(0, 3, 5.0) == ""
+    assert clock_text(7200.0) == "2:00:00"
+    assert Work(3, 5.0).left_s is None
 
 
 class TestInANotebook:
@@ -279,9 +280,9 @@ class TestThePageOfACampaignThatRuns:
         run = write_run(tmp_path / "run")
         with self.counted(run.folder, run.outcomes, clock) as panel:
             page = (run.folder / REPORT).read_bytes()
-            panel.report_part(0, 6)
+            panel.advance(Phase.REPORT, 0, 6)
             clock[0] += 10 * EVERY_S
-            panel.report_part(1, 6)
+            panel.advance(Phase.REPORT, 1, 6)
             assert (run.folder / REPORT).read_bytes() == page
             write_report(run)
         final = (run.folder / REPORT).read_text()

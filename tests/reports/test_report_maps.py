@@ -152,7 +152,7 @@ class TestWords:
         name, _, share = zero.pairs[0].partition(": ")
         assert " × " in name
         assert share.endswith("%")
-        assert zero.third is None
+        assert len(zero.axes) != 3
 
     def test_say_how_large_a_ball_is_where_it_is_not_the_papers(self, words):
         assert "0.10 for 4 coordinates and 0.16 for 5 coordinates" in words["radii"]
@@ -167,8 +167,10 @@ class TestWords:
     def test_have_a_slider_for_a_third_coordinate(self, tmp_path):
         run = write_run(tmp_path / "run", 10, levels=(0, 2), error=None, scenario=RANGED)
         zero, two = shared_words(ReportModel(run))["levels"]
-        assert (zero.third.name, zero.third.low, zero.third.high) == ("v_VUT0", 14.0, 22.0)
-        assert two.third is None
+        third = zero.axes[2]
+        shown = (third.name, third.dimension.low, third.dimension.high)
+        assert (len(zero.axes), shown) == (3, ("v_VUT0", 14.0, 22.0))
+        assert len(two.axes) != 3
         assert len(two.pairs) == 6
 
 

@@ -115,7 +115,7 @@ def test_a_version_in_which_nothing_was_tested_has_no_fmc(tmp_path):
     first, second = (version.levels[0] for version in history_of([a, b]).versions)
     assert first.fmc == pytest.approx(BALL)
     assert first.regions == 1
-    assert (second.fmc, second.regions, second.errors) == (None, None, 1)
+    assert (second.fmc, second.regions, second.verdict.errors) == (None, None, 1)
 
 
 def test_a_version_without_a_level_is_passed_over_there(tmp_path):
@@ -146,7 +146,7 @@ def test_kinds_and_who_avoids_are_counted_where_they_are_known(tmp_path):
     (run.folder / "avoidance.jsonl").write_text(json.dumps(line) + "\n")
     found = history_of([run, run]).versions[0].levels[0]
     assert (found.avoidance_known, found.avoided) == (1, 1)
-    assert sum(found.kinds.values()) == found.failures > 0
+    assert sum(found.kinds.values()) == found.verdict.failures > 0
     assert "100% (1 of 1)" in history_page(history_of([run, run]))
 
 

@@ -213,7 +213,7 @@ class TestTheOtherFunctions:
     def test_cases_run_again_with_another_vut(self, run):
         worst = ms.open_run(run.folder).failures[0]["index"]
         found = ms.rerun(run.folder, [worst], vut="design2")
-        assert [(c.before.index, c.change) for c in found.changed] == [(worst, "fixed")]
+        assert [(c.index, c.change) for c in found.changed] == [(worst, "fixed")]
         assert repr(found) == "<Rerun: recorded: 1 failure (1 contact) in 1 case>"
         assert str(found).endswith(f"  case {worst}: contact -> safe (fixed)")
         assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
