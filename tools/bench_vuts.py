@@ -184,7 +184,7 @@ def main() -> None:
         world: Any = SimpleNamespace(road=road_of(), scenario=US23)
 
         def driver(spec: str, corridors: int = 1, given: VutOptions | None = None) -> Driver:
-            return VutFactory(spec, given)(corridors, world)
+            return VutFactory(spec, given or VutOptions())(corridors, world)
 
         drivers = {
             "python": driver(f"{folder / 'law.py'}:Vut"),

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import os
 import shutil
-import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any, Final
 
 from lxml import etree
@@ -132,10 +132,10 @@ class Window(AbstractContextManager["Window"]):
         """Make a step when its time has come; real time, from the second one on."""
         if self._shown:
             self._look()
-            now_s = time.monotonic()
+            now_s = monotonic()
             first = self._due_s is None
             self._due_s = now_s + BEFORE_S if first else self._due_s + DT_S  # type: ignore[operator]
-            time.sleep(max(self._due_s - now_s, 0.0))
+            sleep(max(self._due_s - now_s, 0.0))
         self._call("simulation.step")
         self._shown += 1
         if self._shown == 1:
@@ -154,7 +154,7 @@ class Window(AbstractContextManager["Window"]):
                 self.vehicle.setSpeed(name, 0.0)
             while True:
                 self._call("simulation.step")
-                time.sleep(LOOK_S)
+                sleep(LOOK_S)
 
     def close(self) -> None:
         """Close the window."""

@@ -51,11 +51,17 @@ MAX_TIMESTEPS: Final = round(MAX_EPISODE_S / DT_S) + 1 + HOLD_STEPS
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Replay(Result):
-    """A headless replay beside its record."""
+    """A headless replay beside its record.
 
-    rows: int  # rows that were compared
-    diverged_at_s: float | None  # time of the first row that differs; None where none does
-    detail: str  # in what it differs
+    Attributes:
+        rows: rows that were compared.
+        diverged_at_s: time of the first row that differs; None where none does.
+        detail: in what it differs.
+    """
+
+    rows: int
+    diverged_at_s: float | None
+    detail: str
 
     @property
     def identical(self) -> bool:

@@ -81,7 +81,7 @@ def returns_of(trajectories: list[Trajectory], reward: Reward) -> Returns:
             parts[0, n] = reward.safety(dx, np.array([v_pov_end - v_vut_end]))[0]
             parts[2, n] += reward.vut_end(np.array([v_vut_end]))[0]
             collided[n] = abs(dx[0]) < reward.scenario.dx_crash_m
-    return Returns(*parts, collided)
+    return Returns(parts[0], parts[1], parts[2], collided)
 
 
 def play(

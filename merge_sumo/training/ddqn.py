@@ -234,7 +234,7 @@ def _loss(
 ) -> Tensor:
     rows = rng.integers(0, replay.filled, batch)
     before, after = replay.before[rows], replay.after[rows]
-    svo_rad = np.zeros(batch, dtype=np.float32)
+    svo_rad: np.ndarray = np.zeros(batch, dtype=np.float32)
     if sees_svo:
         svo_rad = rng.uniform(SVO.low, SVO.high, batch).astype(np.float32)
         columns = _svo_columns(svo_rad)

@@ -12,15 +12,10 @@ PAPER: Final = "paper"
 
 @dataclass(frozen=True, slots=True)
 class NamedCriterion:
-    """A criterion that has a name.
+    """A criterion that has a name."""
 
-    Attributes:
-        condition: over measures, under which a case fails.
-        about: what fails, in a phrase.
-    """
-
-    condition: str
-    about: str
+    condition: str  # over measures, under which a case fails
+    about: str  # what fails, in a phrase
 
 
 CRITERIA: Final[Registry[NamedCriterion]] = Registry(

@@ -25,31 +25,22 @@ Further = tuple[tuple[str, float | None], ...]
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """A measure of an episode.
+    """A measure of an episode."""
 
-    Attributes:
-        name: in records and conditions, with the unit at its end.
-        about: what it is, in a sentence without its full stop.
-        unit: as a person reads it; empty for a number without one and for a text.
-        label: name in the listing of an episode; empty where that leaves it out.
-        column: name in the table of the report; empty where that leaves it out.
-        digits: decimals in tables.
-        missing: what a condition takes where an episode has no value: that of cars that never
-            meet; None for a measure that is no number.
-        worse: at which end of its values an episode is worse, if at one.
-        of: measures an episode on a road, and returns None where that has no value; None for the
-            fields of `Measures`.
-    """
-
-    name: str
-    about: str
-    unit: str = ""
-    label: str = ""
-    column: str = ""
-    digits: int = 1
+    name: str  # in records and conditions, with the unit at its end
+    about: str  # what it is, in a sentence without its full stop
+    unit: str = ""  # as a person reads it; empty for a number without one and for a text
+    label: str = ""  # name in the listing of an episode; empty where that leaves it out
+    column: str = ""  # name in the table of the report; empty where that leaves it out
+    digits: int = 1  # decimals in tables
     missing: float | None = None
+    """What a condition takes where an episode has no value: that of cars that never meet; None
+    for a measure that is no number."""
     worse: Literal["low", "high"] | None = None
+    """At which end of its values an episode is worse, if at one."""
     of: Callable[[Trajectory, CentreLines | None], float | None] | None = None
+    """Measures an episode on a road, and returns None where that has no value; None for the
+    fields of `Measures`."""
 
     @property
     def title(self) -> str:

@@ -15,20 +15,13 @@ class Units:
     A driver that measures in these units sees the same numbers in merges that are alike. Where
     lengths, speeds and accelerations are all the same multiple of the paper's, all else is equal,
     to the last bit if that is a power of two.
-
-    Attributes:
-        length: of the way of the VUT to M.
-        speed: of the VUT at M, on the level-0 profile.
-        time: that such a way takes at such a speed.
-        gap: of the gap below which two vehicles collide.
-        acceleration: of the hardest acceleration.
     """
 
-    length: float
-    speed: float
-    time: float
-    gap: float
-    acceleration: float
+    length: float  # of the way of the VUT to M
+    speed: float  # of the VUT at M, on the level-0 profile
+    time: float  # that such a way takes at such a speed
+    gap: float  # of the gap below which two vehicles collide
+    acceleration: float  # of the hardest acceleration
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:

@@ -32,26 +32,20 @@ from merge_sumo.vuts.blame_cell import NO_CORRIDOR, current_call
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class VutOptions:
-    """How a VUT is hosted; `UserError` for values out of their range.
-
-    Attributes:
-        command: command line of a controller that is a program of its own, else None.
-        deadline_s: time for one step, and for one reset.
-        connect_s: time for a program to start and connect.
-        in_process: whether a user's code runs in this process instead of one of its own: a debugger
-            reaches it then, and its faults may end this process.
-        memory_gib: memory that the process of a user's code may take.
-        log: file to which what a controller prints is added; None is standard error.
-        policies: folder of the networks of the learned VUTs; None for the shipped ones.
-    """
+    """How a VUT is hosted; `UserError` for values out of their range."""
 
     command: str | None = None
-    deadline_s: float = DEADLINE_S
-    connect_s: float = 60.0
+    """Command line of a controller that is a program of its own, else None."""
+    deadline_s: float = DEADLINE_S  # time for one step, and for one reset
+    connect_s: float = 60.0  # time for a program to start and connect
     in_process: bool = False
-    memory_gib: float = MEMORY_GIB
+    """Whether a user's code runs in this process instead of one of its own: a debugger reaches
+    it then, and its faults may end this process."""
+    memory_gib: float = MEMORY_GIB  # memory that the process of a user's code may take
     log: Path | None = None
+    """File to which what a controller prints is added; None is standard error."""
     policies: Path | None = None
+    """Folder of the networks of the learned VUTs; None for the shipped ones."""
 
     def __post_init__(self) -> None:
         if not _is_positive(self.deadline_s):
@@ -66,26 +60,20 @@ def _is_positive(value: object) -> bool:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Vut:
-    """A VUT that is ready to be made.
-
-    Attributes:
-        make: returns the driver for a number of corridors in a world; None for no world.
-        max_corridors: corridors that one driver can serve; None for any number.
-        max_workers: processes that can each have such a driver at a time; None for any number.
-        vut_type: attributes of the SUMO vType with which SUMO itself drives; None if it does not.
-        files: files of the user's that it is made of, as far as they are known.
-        named_only: whether it may be made of unknown files besides `files`.
-        by_arrays: whether it is a driver of this package, which needs nothing of SUMO and takes any
-            number of corridors.
-    """
+    """A VUT that is ready to be made."""
 
     make: Callable[[int, World | None], Driver]
-    max_corridors: int | None = None
+    """Returns the driver for a number of corridors in a world; None for no world."""
+    max_corridors: int | None = None  # corridors that one driver can serve; None for any number
     max_workers: int | None = None
+    """Processes that can each have such a driver at a time; None for any number."""
     vut_type: Mapping[str, str] | None = None
-    files: tuple[Path, ...] = ()
-    named_only: bool = False
+    """Attributes of the SUMO vType with which SUMO itself drives; None if it does not."""
+    files: tuple[Path, ...] = ()  # files of the user's that it is made of, as far as they are known
+    named_only: bool = False  # whether it may be made of unknown files besides `files`
     by_arrays: bool = False
+    """Whether it is a driver of this package, which needs nothing of SUMO and takes any number
+    of corridors."""
 
 
 def split_options(argument: str, spec: str) -> tuple[str, dict[str, str]]:

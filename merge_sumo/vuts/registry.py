@@ -32,31 +32,23 @@ from merge_sumo.vuts.traci.vut import traci_vut
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class VutKind:
-    """A kind of VUT: all that the package asks of it.
+    """A kind of VUT: all that the package asks of it."""
 
-    Attributes:
-        form: what a person writes for it; "" for a kind that no list shows.
-        what: what it is, in a phrase.
-        example: an option `--vut` that names one.
-        prepare: makes the VUT of an argument, which is what stands behind the colon of a kind with
-            a name of its own, else the whole spec; raises `UserError`.
-        hosted: whether it runs a user's code in this process, unless that is hosted in one of its
-            own.
-        own_code: whether to test it is to run code that is neither of this package nor of SUMO.
-        by_command: whether it is a program that `--vut-command` starts; without, a person does.
-        file_of: returns the file that an argument names; "" for none.
-        no_pov: why it cannot drive a POV; "" where it can.
-    """
-
-    form: str = ""
-    what: str = ""
-    example: str = ""
+    form: str = ""  # what a person writes for it; "" for a kind that no list shows
+    what: str = ""  # what it is, in a phrase
+    example: str = ""  # an option `--vut` that names one
     prepare: Callable[[str, VutOptions], Vut]
+    """Makes the VUT of an argument, which is what stands behind the colon of a kind with a name
+    of its own, else the whole spec; raises `UserError`."""
     hosted: bool = False
+    """Whether it runs a user's code in this process, unless that is hosted in one of its own."""
     own_code: bool = True
+    """Whether to test it is to run code that is neither of this package nor of SUMO."""
     by_command: bool = False
+    """Whether it is a program that `--vut-command` starts; without, a person does."""
     file_of: Callable[[str], str] = lambda _: ""
-    no_pov: str = ""
+    """Returns the file that an argument names; "" for none."""
+    no_pov: str = ""  # why it cannot drive a POV; "" where it can
 
 
 def _python_file(spec: str) -> str:

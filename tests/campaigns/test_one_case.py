@@ -143,11 +143,12 @@ class TestInSumoGui:
         monkeypatch.setenv("DISPLAY", display)
         monkeypatch.setattr(Window, "wait", lambda _: None)
         monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
+        monkeypatch.setattr("merge_sumo.sumo.live.sleep", lambda _: None)
         return monkeypatch
 
     def test_a_case_is_run_live_and_moves_as_without_a_window(self, window):
         slept: list[float] = []
-        window.setattr(Window, "__init__", _with_sleep(Window.__init__, slept.append))
+        window.setattr("merge_sumo.sumo.live.sleep", slept.append)
         plan = plan_for("design2", corridors=1)
         live = run_one(plan, COLLIDES, live=True)
         without = run_one(plan, COLLIDES)
@@ -165,7 +166,6 @@ class TestInSumoGui:
             names = this.vehicle.getIDList()
             labels.extend(this.vehicle.getParameter(name, LABEL) for name in names)
 
-        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
         window.setattr(Window, "wait", look)
         live = run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
         assert lines == [case_line(COLLIDES), verdict_line(live.outcome)]
@@ -182,7 +182,6 @@ class TestInSumoGui:
             step(this)
 
         step = Window.step
-        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
         window.setattr(Window, "step", look)
         run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
         assert len(ports) > 20
@@ -195,11 +194,6 @@ class TestInSumoGui:
             step(this)
 
         step = Window.step
-        window.setattr(Window, "__init__", _with_sleep(Window.__init__, lambda _: None))
         window.setattr(Window, "step", close_window)
         with pytest.raises(UserError, match="the window was closed before the case had ended"):
             run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
-
-
-def _with_sleep(init, sleep):
-    return lambda this: init(this, sleep)

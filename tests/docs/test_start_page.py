@@ -63,8 +63,7 @@ def test_the_last_step_shows_it_live(campaign, command_line, display, monkeypatc
     monkeypatch.chdir(folder)
     monkeypatch.setenv("DISPLAY", display)
     monkeypatch.setattr(Window, "wait", lambda _: None)
-    begin = Window.__init__
-    monkeypatch.setattr(Window, "__init__", lambda this: begin(this, lambda _: None))
+    monkeypatch.setattr("merge_sumo.sumo.live.sleep", lambda _: None)
     monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
     arguments = the_worst(LIVE, worst)
     assert arguments == [*the_worst(RUN, worst), "--gui"]
