@@ -24,7 +24,7 @@ from merge_sumo.values.scenario import Scenario
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 
 COUNT_GRID: Final = (32, 20)
-GRID: Final = {2: (97, 97, 1), 3: (49, 49, 17)}
+GRID: Final = {2: (49, 49, 1), 3: (33, 33, 9)}
 """Nodes of a map in its two coordinates and in the one that it moves through."""
 NEIGHBOURS: Final = 3
 """Cases of the truth that decide whether a node of the map fails."""
