@@ -96,9 +96,7 @@ COMMANDS = {
         ("tables/trajectories.csv",),
     ),
     "export sumo": Command(
-        ("export", "run", *map(str, range(20)), "--out", "folders"),
-        ROUNDS,
-        ("folders",),
+        ("export", "run", *map(str, range(20)), "--out", "folders"), ROUNDS, ("folders",)
     ),
     "report": Command(("report", "run"), ROUNDS),
     "train": Command((str(Path(__file__).parents[1] / "training"),), 1, script=CHILD),

@@ -395,11 +395,7 @@ TEXTS: dict[str, tuple[str, Edit, str]] = {
     "breakpoints in the view": (VIEW, added('<breakpoints-file value="{SECRET}"/>'), IDENTICAL),
     "a case that is no JSON": (CASE, lambda _: "[" * 100_000, IDENTICAL),
     **{
-        f"{name} in {file}": (
-            file,
-            bomb(text),
-            REFUSED if file in READ else IDENTICAL,
-        )
+        f"{name} in {file}": (file, bomb(text), REFUSED if file in READ else IDENTICAL)
         for name, text in BOMBS.items()
         for file in (CONFIG, *READ)
     },
@@ -488,8 +484,7 @@ TEXTS: dict[str, tuple[str, Edit, str]] = {
     "a net with a parameter of a lane": (
         NET,
         instead(
-            f'shape="{RAMP}"/>',
-            f'shape="{RAMP}"><param key="file" value="{{VICTIM}}"/></lane>',
+            f'shape="{RAMP}"/>', f'shape="{RAMP}"><param key="file" value="{{VICTIM}}"/></lane>'
         ),
         IDENTICAL,
     ),
@@ -690,8 +685,7 @@ class TestAnHonestNet:
         assert cleaned(cleaned(text)) == cleaned(text)
 
     @pytest.mark.parametrize(
-        "projection",
-        ["!", "-", "+proj=utm +zone=17 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"],
+        "projection", ["!", "-", "+proj=utm +zone=17 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"]
     )
     def test_may_lie_somewhere_on_earth(self, projection):
         text = instead('projParameter="!"', f'projParameter="{projection}"')(

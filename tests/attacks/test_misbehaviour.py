@@ -54,8 +54,7 @@ def test_one_case_is_guilty_and_the_catalogue_has_more_than_a_hundred_kinds():
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=() if n in SOME else pytest.mark.long) for n in CATALOGUE],
+    "name", [pytest.param(n, marks=() if n in SOME else pytest.mark.long) for n in CATALOGUE]
 )
 def test_only_the_guilty_case_has_an_error_and_nothing_is_left(
     name, without, tmp_path, monkeypatch, capfd

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from calling import assert_refused
 from campaigning import run_campaign
 from conftest import some
 from handmade import write_run
@@ -91,11 +92,11 @@ class TestAVutFile:
         (tmp_path / f"{NOT_UTF8}.py").write_text("raise SystemExit('it was loaded')")
         vut = f"{NOT_UTF8}.py:drive" if given == "--vut" else "traci"
         options = () if given == "--vut" else ("--vut-command", f"{NOT_UTF8} {{port}}")
-        code, out, err = call("campaign", "--vut", vut, *options, "--cases", 2)
-        assert (code, out) == (2, "")
-        assert f"merge-sumo: {given} is " in err
-        assert "it is not UTF-8" in err
-        assert err.count("\n") == 1
+        assert_refused(
+            call("campaign", "--vut", vut, *options, "--cases", 2),
+            f"merge-sumo: {given} is ",
+            "it is not UTF-8",
+        )
         assert [path.suffix for path in tmp_path.iterdir()] == [".py"]
 
     def test_in_a_command_that_is_no_text_is_refused_from_python_too(self):

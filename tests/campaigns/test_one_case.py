@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calling import assert_refused
 from plans import plan_for
 from processes import ports_of
 
@@ -110,9 +111,7 @@ class TestTheCommand:
         ],
     )
     def test_is_refused_in_a_sentence(self, command_line, arguments, part):
-        code, out, err = command_line("run", *arguments)
-        assert (code, out) == (2, "")
-        assert part in err
+        assert_refused(command_line("run", *arguments), part)
 
     def test_without_a_display_no_window_opens(self, command_line, monkeypatch):
         monkeypatch.delenv("DISPLAY", raising=False)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from calling import assert_refused
 from campaigning import resume_campaign, run_campaign
 from conftest import some
 
@@ -303,9 +304,9 @@ class TestAFolderOfOnesOwn:
         assert code in (0, 1), err
         assert "now: " in out
         assert own.ran()
-        code, _, err = command_line("campaign", "--resume", own.run, "--quiet")
-        assert code == 2
-        assert "vut_files.my_vut.py differs" in err
+        assert_refused(
+            command_line("campaign", "--resume", own.run, "--quiet"), "vut_files.my_vut.py differs"
+        )
 
     def test_that_was_moved_is_asked_about(self, own, tmp_path, command_line, monkeypatch):
         own.folder.rename(tmp_path / "moved")

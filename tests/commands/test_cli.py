@@ -210,14 +210,6 @@ class TestACampaign:
         arguments.remove("--gui")
         assert call(*arguments).code == 0
 
-    def test_of_all_levels_says_which_it_has_policies_for(self, call, monkeypatch):
-        monkeypatch.setattr("merge_sumo.engine.povs.policies_sha256", lambda _: {})
-        said = call("campaign", "--vut", "level0", "--cases", 3, "--out", "run", "--json")
-        assert said.code == 0
-        assert list(json.loads(said.out)["levels"]) == ["0"]
-        assert "level 0" in said.err
-        assert "merge-sumo train" in said.err
-
     def test_goes_by_default_into_a_folder_named_after_the_vut(self, call):
         assert call(*SMALL, "--cases", 2, "--sampler", "uniform").code == 0
         (folder,) = Path("runs").glob("*-*")

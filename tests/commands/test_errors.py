@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import pytest
+from calling import assert_refused
 from conftest import some
 
 import merge_sumo as ms
@@ -186,19 +187,15 @@ class TestAnOptionThatIsGivenTwice:
         ],
     )
     def test_is_refused(self, command_line, asked):
-        code, out, err = command_line(*asked)
-        assert (code, out) == (2, "")
-        assert "is given 2 times: give it once" in err
+        assert_refused(command_line(*asked), "is given 2 times: give it once")
 
     @pytest.mark.parametrize(
         "asked", [("--gate", "errors", "--gate", "failures"), ("--quiet", "-q")]
     )
     def test_is_taken_where_that_says_nothing_else(self, command_line, asked):
-        code, _, err = command_line("campaign", "--vut", "desgin2", *asked)
-        assert code == 2
-        assert "there is no VUT 'desgin2'" in err
+        assert_refused(
+            command_line("campaign", "--vut", "desgin2", *asked), "there is no VUT 'desgin2'"
+        )
 
     def test_may_be_a_value_that_looks_like_one(self, command_line):
-        code, _, err = command_line("campaign", "--vut", "--vut")
-        assert code == 2
-        assert "there is no VUT '--vut'" in err
+        assert_refused(command_line("campaign", "--vut", "--vut"), "there is no VUT '--vut'")

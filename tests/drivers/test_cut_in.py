@@ -14,13 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from merge_sumo.drivers.safety_models import (
-    CarefulModel,
-    FsmModel,
-    Reaction,
-    Reg157Model,
-    RssModel,
-)
+from merge_sumo.drivers.safety_models import CarefulModel, FsmModel, Reaction, Reg157Model, RssModel
 
 TABLES = Path(__file__).parents[1] / "data" / "reference"
 DT_S, STEPS, LENGTH_M, WIDTH_M, LANE_M = 0.1, 350, 4.3, 1.9, 3.5

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calling import assert_refused
 from campaigning import resume_campaign, run_campaign
 from conftest import some
 from misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS
@@ -304,8 +305,7 @@ SOME = ("os._exit 0", "batched: dies")
 
 class TestWhatItDoesWrong:
     @pytest.mark.parametrize(
-        "name",
-        [pytest.param(n, marks=() if n in SOME else pytest.mark.long) for n in CATALOGUE],
+        "name", [pytest.param(n, marks=() if n in SOME else pytest.mark.long) for n in CATALOGUE]
     )
     def test_is_an_error_of_its_case_and_never_the_vuts(self, name):
         how = CATALOGUE[name]
@@ -442,9 +442,7 @@ class TestACampaign:
         pov(YIELDS)
         for command in (("campaign", "--vut", "design1"), ("compare", "--vut", "design1")):
             level = () if "--level" in arguments or command[0] == "campaign" else ("--level", "all")
-            code, out, err = call(*command, *level, *arguments)
-            assert (code, out, err.count("\n")) == (2, "", 1)
-            assert said in err
+            assert_refused(call(*command, *level, *arguments), said)
         assert sorted(path.name for path in Path().iterdir()) == ["my_pov.py"]
 
 
@@ -461,9 +459,7 @@ class TestResuming:
 
     def test_is_refused_by_name_when_its_file_has_changed(self, stopped, call):
         Path("my_pov.py").write_text(KEEPS)
-        code, _, err = call("campaign", "--resume", stopped)
-        assert code == 2
-        assert "pov_files.my_pov.py differs" in err
+        assert_refused(call("campaign", "--resume", stopped), "pov_files.my_pov.py differs")
 
     def test_with_another_pov_is_refused_by_name(self, stopped):
         other = pov(YIELDS, "other.py")
@@ -507,9 +503,7 @@ class TestTrust:
             ("campaign", "--resume", theirs, "--vut", "design2"),
             ("probability", theirs, "--cases", 4, "--out", tmp_path / "p.json"),
         ):
-            code, _, err = call(*command)
-            assert code == 2
-            assert "my_pov.py:Pov: say --trust-vut" in err
+            assert_refused(call(*command), "my_pov.py:Pov: say --trust-vut")
         assert call("report", theirs)[0] == 0
         assert call("export", theirs, 0)[0] == 0
         assert call("compare-runs", theirs, tmp_path / "copy", "--no-rerun")[0] == 0
@@ -554,9 +548,9 @@ class TestOtherCommands:
     def test_campaigns_against_other_povs_are_not_compared(self, call, tmp_path):
         for name, spec in (("a", pov(YIELDS)), ("b", pov(KEEPS, "other.py"))):
             run_campaign(settings(spec), tmp_path / name)
-        code, _, err = call("compare-runs", tmp_path / "a", tmp_path / "b")
-        assert code == 2
-        assert "the POV of level own is another" in err
+        assert_refused(
+            call("compare-runs", tmp_path / "a", tmp_path / "b"), "the POV of level own is another"
+        )
         run_campaign(settings("my_pov.py:Pov", vut="design1"), tmp_path / "c")
         code, out, _ = call("compare-runs", tmp_path / "a", tmp_path / "c")
         assert code in (0, 1)

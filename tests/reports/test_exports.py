@@ -244,8 +244,7 @@ class TestTheCommand:
         assert "indices" in str(said.exception)
 
     @pytest.mark.parametrize(
-        ("package", "file_format"),
-        [("polars", "parquet"), ("scenariogeneration", "openscenario")],
+        ("package", "file_format"), [("polars", "parquet"), ("scenariogeneration", "openscenario")]
     )
     def test_says_what_to_install(self, made, tmp_path, monkeypatch, package, file_format):
         load = importlib.import_module

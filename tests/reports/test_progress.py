@@ -15,20 +15,8 @@ from merge_sumo.analysis.summary import summarise
 from merge_sumo.campaigns.store import failures
 from merge_sumo.reports import campaign_panel, running_page
 from merge_sumo.reports.campaign_panel import CampaignPanel
-from merge_sumo.reports.campaign_progress import (
-    FAILURE_S,
-    LEVEL_S,
-    CampaignProgress,
-    Phase,
-)
-from merge_sumo.reports.progress import (
-    Bars,
-    Counter,
-    Work,
-    clock_text,
-    is_watched,
-    rate_text,
-)
+from merge_sumo.reports.campaign_progress import FAILURE_S, LEVEL_S, CampaignProgress, Phase
+from merge_sumo.reports.progress import Bars, Counter, Work, clock_text, is_watched, rate_text
 from merge_sumo.reports.report import GENERATOR, REPORT, report_page, write_report
 from merge_sumo.reports.running_page import EVERY_S, FIRST_S, MOST_SHARE, RunningPage
 

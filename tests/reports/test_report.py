@@ -340,10 +340,7 @@ class TestTheTruth:
     def test_of_a_pool_with_a_range_of_speeds_is_drawn_too(self, tmp_path, cached):
         net, ranged = road_of().sha256, replace(US23, v_vut0_mps=(14.0, 22.0))
         run = write_run(
-            *(tmp_path / "run", 10, (0, 2)),
-            scenario=ranged,
-            net_sha256=net,
-            v_vut0_mps=None,
+            *(tmp_path / "run", 10, (0, 2)), scenario=ranged, net_sha256=net, v_vut0_mps=None
         )
         maps = data_of(report_page(run))["maps"]
         assert {grid["truth"] is None for of in maps.values() for grid in of["grids"]} == {False}

@@ -161,7 +161,7 @@ class TestWords:
         features = " ".join(words["sentences"])
         assert "due at M" in features
         assert [c.name for c in words["coordinates"]] == [
-            *("x_POV0", "v_POV0", "headway ahead", "headway behind", "psi"),
+            *("x_POV0", "v_POV0", "headway ahead", "headway behind", "psi")
         ]
 
     def test_have_a_slider_for_a_third_coordinate(self, tmp_path):

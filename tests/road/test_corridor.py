@@ -10,15 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_nets import (
-    ALL,
-    AUXILIARY,
-    edge,
-    lane_drop,
-    node,
-    plain,
-    straight,
-)
+from foreign_nets import ALL, AUXILIARY, edge, lane_drop, node, plain, straight
 from plans import POVS
 
 from merge_sumo.engine.povs import PovLibrary
@@ -327,7 +319,7 @@ def test_idle_vehicles_of_a_short_ramp_stand_where_it_begins(tmp_path):
 @pytest.mark.parametrize(
     ("mainline", "ramp", "said"),
     [
-        ("in out", "r9 out", "has no edge r9: did you mean r0 or r1"),
+        ("in out", "r9 out", "has no edge r9: did you mean r[01] or r[01]"),
         ("in :m_0", "r1 out", "has no edge :m_0"),
         ("in out", "r1", "never meet; name the edge behind the merge point"),
         ("in r1 out", "r0 out", "edge in does not lead to edge r1; r0 do"),

@@ -7,13 +7,7 @@ import pytest
 
 from merge_sumo.samplers import subset
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.subset import (
-    STAGE_SIZE,
-    Stage,
-    SubsetSampler,
-    failure_probability,
-    replay,
-)
+from merge_sumo.samplers.subset import STAGE_SIZE, Stage, SubsetSampler, failure_probability, replay
 from merge_sumo.values.case import Pool
 from merge_sumo.values.scenario import US23
 

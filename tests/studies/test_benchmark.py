@@ -19,7 +19,6 @@ from vut_contract import factory
 from merge_sumo.errors import UserError
 from merge_sumo.studies.benchmark import Search, compare, limit_fmc, oracle, search
 from merge_sumo.studies.truth import Truth, ground_truth, known_truth
-from merge_sumo.system.workers import open_workers
 from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
@@ -36,14 +35,6 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="module")
 def truth(cache):
     return ground_truth(plan_for("design1"), 0, 300, cache=cache)
-
-
-def test_two_workers_find_the_same_truth_as_one(truth, tmp_path):
-    with open_workers(2) as workers:
-        both = ground_truth(plan_for("design1"), 0, 300, workers=workers, cache=tmp_path)
-    assert np.array_equal(both.points, truth.points)
-    assert np.array_equal(both.score, truth.score)
-    assert len(truth.failures) > 0
 
 
 def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch):

@@ -26,7 +26,6 @@ from merge_sumo.studies.importance import (
     estimate,
     mean_at_least,
 )
-from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import V_POV0, dimensions
 from merge_sumo.values.scenario import US23
 
@@ -301,13 +300,6 @@ class TestOfACampaign:
             texts.append((tmp_path / name).read_bytes())
             texts.append((tmp_path / name).with_suffix(".jsonl").read_bytes())
         assert texts[:2] == texts[2:]
-
-    @pytest.mark.long
-    def test_on_workers_is_the_same(self, run, tmp_path):
-        found = failure_probability(run, tmp_path / "a.json", cases=60, seed=3)
-        with open_workers(2) as there:
-            again = failure_probability(run, tmp_path / "b.json", cases=60, seed=3, workers=there)
-        assert again == found
 
     def test_takes_how_the_vut_is_hosted(self, run, tmp_path, command_line):
         out = tmp_path / "p.json"

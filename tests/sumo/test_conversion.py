@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
+from calling import assert_refused
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
@@ -85,11 +86,12 @@ class TestTheCommand:
 
     def test_says_which_edges_there_are_and_writes_nothing(self, here, command_line):
         asked = ("scenario", "new", "a.toml", "--net", "ramp.osm")
-        code, out, err = command_line(*asked, "--mainline", "10 11x", "--ramp", "12 11")
-        assert (code, out, err.count("\n")) == (2, "", 1)
-        assert "the net ramp.osm cannot host a merge: it has no edge 11x: did you mean 11?" in err
-        assert "it has 10, 11, 12" in err
-        assert "`netconvert --osm-files ramp.osm " in err
+        assert_refused(
+            command_line(*asked, "--mainline", "10 11x", "--ramp", "12 11"),
+            "the net ramp.osm cannot host a merge: it has no edge 11x: did you mean 11?",
+            "it has 10, 11, 12",
+            "`netconvert --osm-files ramp.osm ",
+        )
         assert [path.name for path in here.iterdir()] == ["ramp.osm"]
 
     @pytest.mark.parametrize("taken", ["a.net.xml", "a.svg", "a.toml"])
@@ -100,15 +102,17 @@ class TestTheCommand:
         else:
             (here / taken).symlink_to(here / "elsewhere")
         before = sorted(path.name for path in here.iterdir())
-        code, _, err = command_line("scenario", "new", "a.toml", "--net", "ramp.osm", *EDGES)
-        assert code == 2
-        assert f"{taken} exists" in err
+        assert_refused(
+            command_line("scenario", "new", "a.toml", "--net", "ramp.osm", *EDGES),
+            f"{taken} exists",
+        )
         assert sorted(path.name for path in here.iterdir()) == before
 
     def test_of_another_option_says_how_a_map_becomes_a_net(self, here, command_line):
-        code, _, err = command_line("campaign", "--vut", "level0", "--net", "ramp.osm")
-        assert code == 2
-        assert "`merge-sumo scenario new` makes one of such a map" in err
+        assert_refused(
+            command_line("campaign", "--vut", "level0", "--net", "ramp.osm"),
+            "`merge-sumo scenario new` makes one of such a map",
+        )
 
 
 def test_maps_are_known_by_their_names():
@@ -156,9 +160,10 @@ class TestAHostileMap:
             path.mkdir()
         elif kind == "device":
             path.symlink_to("/dev/zero")
-        code, _, err = command_line("scenario", "new", "a.toml", "--net", "evil.osm", *EDGES)
-        assert code == 2
-        assert "cannot read the map evil.osm" in err
+        assert_refused(
+            command_line("scenario", "new", "a.toml", "--net", "evil.osm", *EDGES),
+            "cannot read the map evil.osm",
+        )
 
     def test_gives_netconvert_only_what_a_road_needs(self, here, given):
         hostile = '<include file="/etc/passwd"/><note href="http://127.0.0.1:9/">x</note>'

@@ -20,13 +20,7 @@ from processes import marked, none_left
 import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.store import failures
-from merge_sumo.sumo.replay_folder import (
-    COLOURS,
-    LABELS,
-    SURROUNDINGS_COLOUR,
-    VIEW,
-    write_scenario,
-)
+from merge_sumo.sumo.replay_folder import COLOURS, LABELS, SURROUNDINGS_COLOUR, VIEW, write_scenario
 
 PICTURE_TIMES_S = (2.0, 7.0)
 LABELS_SHARE = 0.2
@@ -143,8 +137,7 @@ STOPS = {"SIGTERM": 143, "SIGHUP": 129, "SIGKILL": -9, "SIGINT": 1}
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["SIGTERM", *(pytest.param(name, marks=pytest.mark.long) for name in list(STOPS)[1:])],
+    "name", ["SIGTERM", *(pytest.param(name, marks=pytest.mark.long) for name in list(STOPS)[1:])]
 )
 def test_no_window_is_left_of_a_command_that_is_stopped_before_it_is_connected(
     name, display, tmp_path

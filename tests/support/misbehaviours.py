@@ -625,7 +625,7 @@ CHANGES: Final = {
         shared=True,
     ),
     "forgets numpy": acts(
-        "import sys\nfor n in list(sys.modules):\n    if n.startswith('numpy'): del sys.modules[n]",
+        "import sys\nfor n in list(sys.modules):\n    if n.startswith('numpy'): del sys.modules[n]"
     ),
     "forgets all modules": acts("import sys; sys.modules.clear()", shared=True),
     "breaks numpy": acts(
@@ -643,9 +643,7 @@ CHANGES: Final = {
     "breaks zip": acts("import builtins; builtins.zip = lambda *_, **__: 1 / 0", "", shared=True),
     "breaks isinstance": acts("import builtins; builtins.isinstance = None", "", shared=True),
     "breaks the watch": acts(
-        "from merge_sumo.vuts import base; base.Deadline.call = lambda *_: 1 / 0",
-        "",
-        shared=True,
+        "from merge_sumo.vuts import base; base.Deadline.call = lambda *_: 1 / 0", "", shared=True
     ),
     "blames another": acts(
         "from merge_sumo.vuts import base; import os; base.asked.note(1); os._exit(3)",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -160,18 +159,6 @@ class TestAWorkerThatDies:
         assert End.SIM_ERROR not in ends[:2] + ends[3:]
 
 
-class TestWhatTravels:
-    def test_arrives_as_it_was_sent(self):
-        cases = from_unit(np.random.default_rng(0).random((1, 3)), 2, scenario=US23)
-        plan = plan_for("level0", corridors=1)
-        (sent,) = run_cases(plan, cases)
-        came = pickle.loads(pickle.dumps(sent))  # noqa: S301 (our own)
-        assert came.trajectory.case == sent.trajectory.case == cases[0]
-        assert came.measures == sent.measures
-        assert (came.trajectory.motion == sent.trajectory.motion).all()
-        assert came.trajectory.end is sent.trajectory.end
-
-
 class TestLocalProcesses:
     def test_are_replaced_after_a_number_of_chunks(self):
         with Workers(lambda: LocalProcesses(1), 1, recycle_after=2) as workers:
@@ -258,13 +245,6 @@ class TestACampaign:
     def test_has_the_same_outcomes_on_two_workers(self, two, expected, tmp_path):
         run_campaign(SETTINGS, tmp_path / "run", workers=two)
         assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
-
-    def test_closes_its_simulation_in_this_process(self, tmp_path):
-        for name in ("first", "second"):
-            settings = CampaignSettings(
-                vut="level0", levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
-            )
-            run_campaign(settings, tmp_path / name)
 
     def test_is_refused_by_workers_with_other_software(self):
         other = {**versions(), "libsumo": "1.0"}

@@ -7,12 +7,7 @@ from conftest import some
 
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.report_sections import SECTIONS
-from merge_sumo.testing import (
-    CriterionContract,
-    ExportContract,
-    ReportSectionContract,
-    VutContract,
-)
+from merge_sumo.testing import CriterionContract, ExportContract, ReportSectionContract, VutContract
 from merge_sumo.values.criteria import CRITERIA
 
 VUTS = ("level0", "level2", "design2", "careful", "sumo:IDM")

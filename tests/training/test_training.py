@@ -20,23 +20,12 @@ from merges import HALF, LIKE_A_ROUNDABOUT
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, QNetwork, actions_mps2
-from merge_sumo.drivers.policies import (
-    MANIFEST,
-    load_network,
-    plays_as,
-    read_manifest,
-    scenario_of,
-)
+from merge_sumo.drivers.policies import MANIFEST, load_network, plays_as, read_manifest, scenario_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import to_toml
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
 from merge_sumo.training.check import QuickRegret, check_cases, play, returns_of
-from merge_sumo.training.env import (
-    MergeGame,
-    MergeVectorEnv,
-    exploring_starts,
-    pool_starts,
-)
+from merge_sumo.training.env import MergeGame, MergeVectorEnv, exploring_starts, pool_starts
 from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID

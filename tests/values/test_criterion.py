@@ -324,8 +324,7 @@ class TestNamed:
 class TestTheVerdictAlone:
     @pytest.mark.parametrize("dx", [0.0, 5.5, -4.9, -25.0, 80.0])
     @pytest.mark.parametrize(
-        "text",
-        ["paper", "contact", "unsafe", "ttc_s < 1.5", "last_avoidable_s < 2 or contact"],
+        "text", ["paper", "contact", "unsafe", "ttc_s < 1.5", "last_avoidable_s < 2 or contact"]
     )
     def test_is_that_of_the_whole_outcome(self, text, dx):
         episode = ending(dx, v_pov=36.0, v_vut=26.0)

@@ -90,8 +90,7 @@ def expected(trajectory: Trajectory) -> str | None:
 
 
 @pytest.mark.parametrize(
-    "tested",
-    some([(scenario, vut) for vut in VUTS for scenario in SCENARIOS], *QUICK),
+    "tested", some([(scenario, vut) for vut in VUTS for scenario in SCENARIOS], *QUICK)
 )
 def test_agrees_with_polygons_and_steps(tested):
     scenario, vut = tested

@@ -129,12 +129,7 @@ def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "answer",
-    [
-        [np.nan],
-        pytest.param([np.inf], marks=pytest.mark.long),
-        [0, 0, 0, 0, np.nan, 0, 0],
-    ],
+    "answer", [[np.nan], pytest.param([np.inf], marks=pytest.mark.long), [0, 0, 0, 0, np.nan, 0, 0]]
 )
 def test_an_answer_that_is_no_number_is_a_vut_error(tmp_path, answer):
     path = network(tmp_path / "bad.onnx", answer=np.zeros(len(answer)))

@@ -23,13 +23,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import traci
-from campaigning import run_campaign
 from conftest import require, some
 from controllers import RAW_CLIENT, assert_drives_as_level0, free_port, program, raw_client
 from raw_traci import GET_LANE, MISDEEDS, STEP, Client, GoneError, command, text
 from vut_contract import cases_of, factory, run_cases
 
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
@@ -197,10 +195,7 @@ class TestAStockClient:
             return seen
 
         seen = Played(stock(drive), episodes=2, steps=3).result
-        assert seen[0] == {
-            time_id: 0.1,
-            traci.constants.VAR_DEPARTED_VEHICLES_IDS: ("pov", "vut"),
-        }
+        assert seen[0] == {time_id: 0.1, traci.constants.VAR_DEPARTED_VEHICLES_IDS: ("pov", "vut")}
         assert seen[1] == {speed: 18.0}
         assert seen[2]["vut"] == {speed: pytest.approx(18.1)}
         assert "pov" in seen[2]
@@ -223,34 +218,9 @@ class TestAStockClient:
         assert Played(client, episodes=2, steps=5).reasons == [None, None]
 
 
-def measures_of(folder: Path) -> list[dict]:
-    from merge_sumo.campaigns.store import Run
-
-    return [outcome.to_record() for outcome in Run(folder).outcomes]
-
-
-def assert_same_to_1e9(one: list[dict], other: list[dict]) -> None:
-    assert len(one) == len(other)
-    for a, b in zip(one, other, strict=True):
-        assert a.keys() == b.keys()
-        for name, value in a.items():
-            if isinstance(value, float):
-                assert b[name] == pytest.approx(value, abs=1e-9, rel=0), name
-            else:
-                assert b[name] == value, name
-
-
-@pytest.mark.parametrize("count", [40, pytest.param(400, marks=pytest.mark.long)])
-def test_the_same_law_by_traci_and_in_process_gives_the_same_measures(tmp_path, count):
+def test_the_controller_of_the_tutorial_drives_like_the_same_law_in_process(tmp_path):
     command = program(tmp_path, CONTROLLER)
-    shared = {"levels": (0,), "sampler": "uniform", "cases": count, "batch": 20, "seed": 4}
-    by_traci = CampaignSettings(vut="traci", vut_command=command, **{"scenario": US23, **shared})
-    in_process = CampaignSettings(vut="level0", **{"scenario": US23, **shared})
-    run_campaign(by_traci, tmp_path / "traci")
-    run_campaign(in_process, tmp_path / "python")
-    found = measures_of(tmp_path / "traci")
-    assert_same_to_1e9(found, measures_of(tmp_path / "python"))
-    assert sum(m["severity"] in ("contact", "conflict") for m in found) > 0
+    assert_drives_as_level0(factory("traci", command=command), cases_of(20))
 
 
 CPP = r"""
