@@ -47,8 +47,10 @@ def vuts(tmp_path_factory) -> dict[str, str]:
 
 
 def campaign(vut: str, folder: Path, *options: object) -> Result:
-    small = ("--level", 0, "--cases", 20, "--batch", 10, "--seed", 1, "--sampler", "uniform", "-q")
-    small += ("--in-process",)
+    small = (
+        *("--level", 0, "--cases", 20, "--batch", 10, "--seed", 1, "--sampler", "uniform"),
+        *("-q", "--in-process"),
+    )
     return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)
 
 

@@ -357,8 +357,10 @@ class TestAfterTheRun:
     ):
         monkeypatch.chdir(tmp_path)
         Path("hard.py").write_text("def f(seen):\n    return 9.0\n")
-        asked = ("campaign", "--vut", "hard.py:f", "--level", 0, "--cases", 6, "--in-process")
-        asked += ("--sampler", "uniform")
+        asked = (
+            *("campaign", "--vut", "hard.py:f", "--level", 0, "--cases", 6, "--in-process"),
+            *("--sampler", "uniform"),
+        )
         code, out, err = command_line(*asked, "--out", "run")
         assert code == 0, err
         (line,) = (line for line in out.splitlines() if "note: in " in line)
