@@ -269,10 +269,10 @@ class TestTwoProcessesOnOneFolder:
     def test_that_create_one_folder_leave_it_to_the_first(self, tmp_path, monkeypatch):
         take_name = folders._take_name
 
-        def overtaken(new: Path, path: Path, shown: Path, option: str) -> None:
+        def overtaken(new: Path, path: Path, shown: Path) -> None:
             monkeypatch.setattr(folders, "_take_name", take_name)
             Journal.create(shown, {"first": True})
-            take_name(new, path, shown, option)
+            take_name(new, path, shown)
 
         monkeypatch.setattr(folders, "_take_name", overtaken)
         with pytest.raises(UserError, match="run exists"):
