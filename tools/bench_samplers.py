@@ -3,19 +3,22 @@
     python tools/bench_samplers.py --vut design1 --level 0 --seeds 10
     python tools/bench_samplers.py --vut design1 --level 0 --seeds 10 --ablate
     python tools/bench_samplers.py --time
+    python tools/bench_samplers.py --per-case
     python tools/bench_samplers.py --trials --seeds 10 --first 1000
 
 The first prints medians of FMC / truth after 100, 200 and 400 cases, `coverage` in batches of its
 own and the others in batches of 20; the second does so for `gpr` with one of its choices changed
-at a time; the third prints the seconds that a sampler takes for a batch after N cases; the last
-lets `coverage`, the same without its twin, and `gpr` search the VUTs of `trial_vuts.py`, on which
-nothing was tuned, at every level at which they fail.
+at a time; the third prints the seconds that a sampler takes for a batch after N cases; the fourth
+prints the CPU time of `coverage` with its twin for a case at three levels after N uniform cases,
+and the memory of the twin; the last lets `coverage`, the same without its twin, and `gpr` search
+the VUTs of `trial_vuts.py`, on which nothing was tuned, at every level at which they fail.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import pickle
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -37,6 +40,7 @@ from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
+from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import LEVELS, US23
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
@@ -171,6 +175,38 @@ def print_times(names: list[str]) -> dict[str, dict[int, float]]:
     return figures
 
 
+def print_cost_per_case() -> dict[str, dict[int, float]]:
+    """Print and return what `coverage` with its twin takes for a case after N cases of design2."""
+    sizes = (100, 500, 5000, 12_000)
+    settings = CampaignSettings(vut="design2", levels=LEVELS, scenario=US23)
+    plan, pool = resolve(settings), settings.pool
+    cases = make_sampler("uniform", pool, 0).ask(sizes[-1])
+    order, rng = np.random.default_rng(1).permutation(len(cases)), np.random.default_rng(2)
+    outcomes, motions = [], {}
+    for index, result in enumerate(run_cases(plan, [cases[place] for place in order.tolist()])):
+        gap_m = np.nan if result.measures.dx_m is None else result.measures.dx_m
+        chance = 0.9 if abs(gap_m) < US23.dx_crash_m else 0.1
+        told = Prediction.of(gap_m + rng.normal(0.0, 0.5, (2, 4)), chance, chance, chance)
+        outcomes.append(result.outcome(index, index // BATCH, told))
+        motions[index] = result.trajectory.motion
+    figures: dict[str, dict[int, float]] = {"ms of CPU per case": {}, "MB of the twin": {}}
+    for size in sizes:
+        twin = Twin(pool, plan.povs, 0)
+        sampler = make_sampler("coverage", pool, 0, twin)
+        sampler.tell(outcomes[: size - BATCH], motions)
+        sampler.ask(sampler.batch_size())  # what the first batch alone has to learn
+        start = time.process_time()
+        sampler.tell(outcomes[size - BATCH : size], motions)
+        batch = sampler.ask(sampler.batch_size())
+        spent_s = time.process_time() - start
+        figures["ms of CPU per case"][size] = 1e3 * spent_s / len(batch)
+        figures["MB of the twin"][size] = len(pickle.dumps(twin)) / 1e6
+    print(f"{'after N =':30s}" + " ".join(f"{n:7d}" for n in sizes))
+    for name, values in figures.items():
+        print(f"{name:30s}" + " ".join(f"{value:7.1f}" for value in values.values()))
+    return figures
+
+
 def print_trials(trials: Sequence[str], seeds: int, first: int) -> dict[str, dict[str, float]]:
     """Print and return how samplers search VUTs on which nothing was tuned."""
     figures = {}
@@ -206,11 +242,14 @@ def main() -> None:
         help=f"search VUTs unlike ours: all, or some of {', '.join(TRIALS)}",
     )
     parser.add_argument("--time", action="store_true", help="time batches up to N = 5,000")
+    parser.add_argument("--per-case", action="store_true", help="CPU time per case of coverage")
     add_record_option(parser)
     options = parser.parse_args()
     names = options.samplers.split(",")
     if options.time:
         append_record(options.record, "samplers, time", print_times(names))
+    elif options.per_case:
+        append_record(options.record, "samplers, per case", print_cost_per_case())
     elif options.trials is not None:
         figures = print_trials(options.trials or TRIALS, options.seeds, options.first)
         append_record(options.record, "samplers, trials", figures)

@@ -48,6 +48,11 @@ class Sampler(ABC):
         self.seed = seed
         self.predictor = predictor if self.uses_predictions else None
         self._outcomes: dict[int, Outcome] = {}
+        self._last_index = -1
+        self._observed: dict[int | None, list[Outcome]] | None = {None: []}
+        """Outcomes with a verdict by level, and all of them; None where they are to be sorted."""
+        self._histories: dict[int, LevelHistory] = {}
+        """Of the first outcomes of a level; later ones are added when it is asked for."""
         self._proposed: Counter[int] = Counter()
 
     @abstractmethod
@@ -71,7 +76,12 @@ class Sampler(ABC):
         """
         for outcome in outcomes:
             self._proposed[outcome.case.level] += outcome.index not in self._outcomes
+            if outcome.index <= self._last_index:
+                self._observed = None
+            self._last_index = max(outcome.index, self._last_index)
             self._outcomes[outcome.index] = outcome
+            if self._observed is not None:
+                _observe(self._observed, outcome)
         if self.predictor is not None and motions is not None:
             self.predictor.tell(outcomes, motions)
 
@@ -81,11 +91,11 @@ class Sampler(ABC):
 
     def observed(self, level: int | None = None) -> list[Outcome]:
         """Return the outcomes with a verdict, of one level or of all, in order of their index."""
-        return [
-            outcome
-            for _, outcome in sorted(self._outcomes.items())
-            if outcome.score is not None and level in (None, outcome.case.level)
-        ]
+        if self._observed is None:
+            self._observed, self._histories = {None: []}, {}
+            for _, outcome in sorted(self._outcomes.items()):
+                _observe(self._observed, outcome)
+        return list(self._observed.get(level, ()))
 
     def proposed(self, level: int | None = None) -> int:
         """Return the number of cases told, with or without a verdict, of one level or of all."""
@@ -93,8 +103,10 @@ class Sampler(ABC):
 
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays."""
-        outcomes = self.observed(level)
-        return LevelHistory(
+        observed = self.observed(level)
+        before = self._histories.get(level)
+        outcomes = observed if before is None else observed[len(before.points) :]
+        history = LevelHistory(
             points=to_unit((o.case for o in outcomes), level, self.pool.scenario),
             score=np.array([o.score for o in outcomes], dtype=np.float64),
             failed=np.array([o.failed for o in outcomes], dtype=bool),
@@ -102,6 +114,10 @@ class Sampler(ABC):
             dx_m=np.array([o.signed_gap_m for o in outcomes], dtype=np.float64),
             batch=np.array([o.batch for o in outcomes], dtype=np.int64),
         )
+        if before is not None:
+            history = before.then(history)
+        self._histories[level] = history
+        return history.take(np.arange(len(observed)))
 
     def rng(self, *key: int) -> np.random.Generator:
         """Return the generator of this proposal: seed, cases told so far, and a key.
@@ -136,6 +152,13 @@ class LevelwiseSampler(Sampler):
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
         """Return `n` points, (n, d), of the level's unit cube; the history's points have its d."""
+
+
+def _observe(observed: dict[int | None, list[Outcome]], outcome: Outcome) -> None:
+    """Add an outcome, if it has a verdict, to those of its level and to all."""
+    if outcome.score is not None:
+        observed[None].append(outcome)
+        observed.setdefault(outcome.case.level, []).append(outcome)
 
 
 def reflect(points: FloatArray) -> FloatArray:

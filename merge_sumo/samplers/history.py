@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,13 @@ class LevelHistory:
     def dims(self) -> int:
         """Return d, the number of coordinates."""
         return int(self.points.shape[1])
+
+    def then(self, later: LevelHistory) -> LevelHistory:
+        """Return the outcomes with later ones after them."""
+        if not len(later.points):
+            return self
+        pairs = ((getattr(self, f.name), getattr(later, f.name)) for f in fields(self))
+        return LevelHistory(*(np.concatenate(pair) for pair in pairs))
 
     def take(self, places: slice | NDArray[np.int64]) -> LevelHistory:
         """Return some of the outcomes."""

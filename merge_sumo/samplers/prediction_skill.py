@@ -34,6 +34,8 @@ EM_ROUNDS: Final = 12
 """Of expectation and maximisation, which learns how often gaps are how far off."""
 HALF_LIFE: Final = 40.0
 """Cases after which what was predicted counts half: a predictor learns."""
+FORGOTTEN: Final = 2000
+"""Cases after which what was predicted counts nothing: that is below the last digit of a sum."""
 OTHER_LEVELS: Final = 0.4
 """What a case at another level counts: it is the same VUT."""
 TEMPERED: Final = 0.5
@@ -115,6 +117,7 @@ class PredictionSkill:
 
         `replayed` are gaps, (E,), by the index of a case, of members that did not learn from it.
         """
+        outcomes = outcomes[-FORGOTTEN:]
         known = [(o, o.prediction) for o in outcomes if o.prediction is not None]
         self._limit_m = limit_m
         self._mixture = (PRIOR / PRIOR.sum())[None]

@@ -30,6 +30,10 @@ LEARNED: Final = 500
 """Cases that a member learns from at most: half of them the last ones, half spread before."""
 
 
+KEPT: Final = 4 * LEARNED
+"""Cases of which it is kept what the VUT saw, which takes four times the memory of the motion."""
+
+
 class Twin:
     """Learns from the motions of a campaign; see `Predictor`.
 
@@ -54,7 +58,9 @@ class Twin:
         self._now = Observation(pool.scenario, 0).now
         self._rollout = TwinRollout(pool, povs, criterion, lines)
         self._batch: dict[int, int] = {}
+        self._motions: dict[int, FloatArray] = {}
         self._steps: dict[int, Steps] = {}
+        """What the VUT saw and did, of cases that were learned from lately."""
         self._learned: dict[int, tuple[int, ...]] = {}
         """By group, the cases that its members learn from; empty after each new outcome."""
         self._others = self._observed_steps(others, own=False)
@@ -67,15 +73,14 @@ class Twin:
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
         """Take outcomes and their motions by index; an episode that went wrong teaches nothing."""
         new = [o for o in outcomes if not o.measures.end.is_error and o.index not in self._batch]
-        watched = self._observed_steps([motions[o.index] for o in new])
         self._learned.clear()
-        for outcome, steps in zip(new, watched, strict=True):
+        for outcome in new:
             self._batch[outcome.index] = outcome.batch
-            self._steps[outcome.index] = steps
+            self._motions[outcome.index] = motions[outcome.index]
 
     def can_predict(self, level: int) -> bool:
         """Return whether it has seen enough, and the POV is no program of a person's own."""
-        known = len(self._steps) >= FEWEST or bool(self._others)
+        known = len(self._motions) >= FEWEST or bool(self._others)
         return known and self._rollout.can_predict(level)
 
     def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
@@ -121,7 +126,7 @@ class Twin:
 
     def _speakers(self) -> list[int]:
         """Return who speaks for each expert: who knows nothing of this VUT lets others speak."""
-        first = 0 if self._steps else len(EXPERTS)
+        first = 0 if self._motions else len(EXPERTS)
         return [max(e, e % len(EXPERTS) + first) for e in range(len(self._experts))]
 
     def _forest(self) -> Forest:
@@ -148,7 +153,7 @@ class Twin:
         known = self._members.get((expert, group))
         if known is None or known[0] != indices:
             cases = [steps for place, steps in enumerate(self._others) if place % GROUPS != group]
-            cases += [self._steps[index] for index in indices]
+            cases += self._steps_of(indices)
             seed = (self._seed * len(self._experts) + expert) * GROUPS + group
             known = indices, self._experts[expert].learn(cases, seed % 2**32)
             self._members[expert, group] = known
@@ -165,6 +170,15 @@ class Twin:
             spread = np.linspace(0, len(some) - half, half, endpoint=False).astype(np.int64)
             some = [some[place] for place in spread.tolist()] + some[-half:]
         return tuple(index for index in some if index % GROUPS != group or len(some) < GROUPS)
+
+    def _steps_of(self, indices: Sequence[int]) -> list[Steps]:
+        """Return what the VUT saw and did in cases, by index."""
+        if len(self._steps) > KEPT:
+            self._steps.clear()
+        new = [index for index in indices if index not in self._steps]
+        watched = self._observed_steps([self._motions[index] for index in new])
+        self._steps.update(zip(new, watched, strict=True))
+        return [self._steps[index] for index in indices]
 
     def _observed_steps(self, motions: Sequence[FloatArray], *, own: bool = True) -> list[Steps]:
         """Return what the VUT saw and did in motions, (T + 1, A, 3) each."""

@@ -193,6 +193,17 @@ class TestTwin:
         in_parts.tell(outcomes[:40], motions)
         assert (at_once.predict([query])[0] == in_parts.predict([query])[0]).all()
 
+    def test_says_the_same_where_it_sees_cases_again(self, seen, monkeypatch):
+        outcomes, motions = seen
+        query = Query(0, np.random.default_rng(4).random((7, 2)))
+        keeps, forgets = (Twin(Pool(levels=(0,), scenario=US23), POVS, 5) for _ in range(2))
+        for twin, kept in ((keeps, 1000), (forgets, 0)):
+            monkeypatch.setattr("merge_sumo.twin.twin.KEPT", kept)
+            twin.tell(outcomes[:30], motions)
+            twin.predict([query])
+            twin.tell(outcomes, motions)
+        assert (keeps.predict([query])[0] == forgets.predict([query])[0]).all()
+
     def test_answers_queries_together_as_alone(self, seen):
         outcomes, motions = seen
         twin = Twin(Pool(levels=(0, 2), scenario=US23), POVS, 0)
