@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from io import BufferedWriter, FileIO, TextIOWrapper
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NoReturn
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
@@ -26,7 +26,10 @@ STDERR: Final = 2
 
 
 class _Output(FileIO):
-    """A descriptor that is written to until that fails; afterwards what is written is dropped."""
+    """A descriptor that is written to until that fails; afterwards what is written is dropped.
+
+    On standard output lies the result: where it cannot be written, that is an error.
+    """
 
     def __init__(self, descriptor: int) -> None:
         super().__init__(descriptor, "w", closefd=False)
@@ -39,21 +42,16 @@ class _Output(FileIO):
                 return super().write(content) or 0
             except OSError as error:
                 self._failed = True
-                self.fail(error)
+                if self.fileno() == STDOUT:
+                    _result_lost(error)
         return memoryview(content).nbytes
 
-    def fail(self, error: OSError) -> None:
-        """Do what the first failure asks for."""
 
-
-class _Results(_Output):
-    """Standard output: a result that cannot be written is an error."""
-
-    def fail(self, error: OSError) -> None:
-        """Raise `UserError`, or `Stopped` where the reader has gone, as for other programs."""
-        if error.errno == errno.EPIPE and hasattr(signal, "SIGPIPE"):
-            raise Stopped(signal.SIGPIPE)
-        raise UserError(f"cannot write the result to standard output: {error.strerror}") from error
+def _result_lost(error: OSError) -> NoReturn:
+    """Raise `UserError`, or `Stopped` where the reader has gone, as for other programs."""
+    if error.errno == errno.EPIPE and hasattr(signal, "SIGPIPE"):
+        raise Stopped(signal.SIGPIPE)
+    raise UserError(f"cannot write the result to standard output: {error.strerror}") from error
 
 
 def prepare_streams() -> None:
@@ -66,7 +64,7 @@ def prepare_streams() -> None:
     if STDIN in opened:
         sys.stdin = open(STDIN, encoding="utf-8", closefd=False)  # noqa: SIM115
     if STDOUT in opened or sys.stdout is sys.__stdout__:
-        sys.stdout = _text(_Results(STDOUT), sys.__stdout__)
+        sys.stdout = _text(_Output(STDOUT), sys.__stdout__)
     if STDERR in opened or sys.stderr is sys.__stderr__:
         sys.stderr = _text(_Output(STDERR), sys.__stderr__)
     for stream in (sys.stdout, sys.stderr):

@@ -75,7 +75,7 @@ class RewardParts:
         """Return the agent's reward, (K,); `svo_rad` is psi of the POV."""
         if role == "vut":
             return self.safe + self.vut_ego
-        return pov_reward(self.safe, self.pov_ego, self.vut_ego, svo_rad)
+        return self.safe + self.pov_ego * np.cos(svo_rad) + self.vut_ego * np.sin(svo_rad)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,10 +153,3 @@ class Reward:
 def phi_acc(a_mps2: FloatArray) -> FloatArray:
     """Return minus the squared acceleration, (m/s2)^2."""
     return -np.square(a_mps2)
-
-
-def pov_reward(
-    safe: FloatArray, pov_ego: FloatArray, vut_ego: FloatArray, svo_rad: FloatArray
-) -> FloatArray:
-    """Return r_POV of the three parts for a social value orientation psi."""
-    return safe + pov_ego * np.cos(svo_rad) + vut_ego * np.sin(svo_rad)

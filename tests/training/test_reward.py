@@ -70,9 +70,9 @@ def test_the_parts_of_the_reward_by_hand():
 
 def test_orientation_turns_from_egoistic_to_altruistic():
     parts = (np.array([-1.0]), np.array([-2.0]), np.array([-3.0]))
-    assert reward.pov_reward(*parts, np.array([0.0])) == pytest.approx([-3.0])
-    assert reward.pov_reward(*parts, np.array([math.pi / 2])) == pytest.approx([-4.0])
-    assert reward.pov_reward(*parts, np.array([math.pi / 6])) == pytest.approx(
+    assert reward.RewardParts(*parts).of("pov", np.array([0.0])) == pytest.approx([-3.0])
+    assert reward.RewardParts(*parts).of("pov", np.array([math.pi / 2])) == pytest.approx([-4.0])
+    assert reward.RewardParts(*parts).of("pov", np.array([math.pi / 6])) == pytest.approx(
         [-1.0 - 2.0 * math.sqrt(0.75) - 1.5]
     )
 
