@@ -36,13 +36,12 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.studies.truth import Truth, ground_truth
-from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import LEVELS, US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
 CASES, BATCH = 400, 20
@@ -152,7 +151,7 @@ def outcome(index: int, case: Any) -> Outcome:
     dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7)
     overlap_m = 6.0 - abs(dx_m)
     score = -560.0 - 75.0 * overlap_m if overlap_m > 0 else -450.0 * math.exp(overlap_m / 15.0)
-    measures = bare_measures(End.MERGED, score, dx_m=dx_m)
+    measures = Measures(end=End.MERGED, score=score, t_end_s=8.3, dx_m=dx_m)
     return Outcome(index, index // BATCH, case, measures)
 
 

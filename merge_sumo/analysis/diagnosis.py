@@ -18,7 +18,17 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VEHICLES, VUT, Scenario, level_name
+from merge_sumo.values.scenario import (
+    AHEAD,
+    BEHIND,
+    DT_S,
+    POV,
+    VEHICLES,
+    VUT,
+    MergeScenario,
+    Scenario,
+    level_name,
+)
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import Trajectory
 
@@ -117,10 +127,13 @@ NAMED: Final = {POV: "POV", AHEAD: "car ahead", BEHIND: "car behind"}
 def features(scenario: Scenario, level: int) -> tuple[Feature, ...]:
     """Return what sentences on a level speak of.
 
-    Beside the coordinates it is the time at which a car would reach M at constant speed: failures
-    lie in bands along which it is the same.
+    Of a merge it is beside the coordinates the time at which a car would reach M at constant speed:
+    failures lie in bands along which it is the same.
     """
-    x, v, *others = (_of_coordinate(c) for c in coordinates(scenario, (level,)))
+    features = tuple(_of_coordinate(c) for c in coordinates(scenario, (level,)))
+    if not isinstance(scenario, MergeScenario):
+        return features
+    x, v, *others = features
     cars = [row for row in range(scenario.vehicles) if row != VUT]
     return (*(_due(row) for row in cars), v, x, *others)
 
@@ -129,7 +142,7 @@ def _of_coordinate(coordinate: Coordinate) -> Feature:
     return Feature(
         coordinate.name,
         coordinate.unit,
-        DECIMALS[coordinate.unit],
+        DECIMALS.get(coordinate.unit, coordinate.digits),
         lambda case: coordinate.of(case) or 0.0,
     )
 

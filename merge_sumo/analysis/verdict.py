@@ -16,8 +16,8 @@ from typing import Any, Final
 from merge_sumo.analysis.summary import Summary
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
-from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.scenario import Scenario, level_name
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.trajectory import End
 
@@ -29,7 +29,6 @@ MOST_MESSAGES: Final = 5
 """Messages of errors and timeouts that are printed; the report has the others."""
 QUOTED_CHARACTERS: Final = 120
 """Of a message within a sentence."""
-NOTHING_TESTED: Final = "nothing was tested: the VUT reached the merge point in no case"
 _VARYING: Final = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)")
 """Measured values and addresses: messages that differ in them alone are one."""
 
@@ -72,8 +71,9 @@ class Verdict:
         failures: cases that fail under the criterion.
         contacts: failures in which bodies touch.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
-        timeouts: cases in which the VUT never reached the merge point.
+        timeouts: cases in which the VUT never reached its goal.
         troubles: errors and timeouts by message: errors first, then the most frequent.
+        goal: what the VUT reaches in a case that is tested.
     """
 
     cases: int
@@ -82,11 +82,17 @@ class Verdict:
     errors: int
     timeouts: int
     troubles: tuple[Trouble, ...]
+    goal: str
 
     @property
     def tested(self) -> int:
-        """Cases in which the VUT reached the merge point."""
+        """Cases in which the VUT reached its goal."""
         return self.cases - self.errors - self.timeouts
+
+    @property
+    def nothing_tested(self) -> str:
+        """Return that no case was tested, as a sentence without its full stop."""
+        return f"nothing was tested: the VUT reached {self.goal} in no case"
 
     @property
     def counts(self) -> str:
@@ -112,8 +118,7 @@ class Verdict:
         if self.timeouts:
             there = "" if self.timeouts == self.cases else "there "
             said.append(
-                f"{self._cases(self.timeouts)} timed out: {there}the VUT never reached the "
-                "merge point."
+                f"{self._cases(self.timeouts)} timed out: {there}the VUT never reached {self.goal}."
             )
         if self.cases and not self.tested:
             said.append("Nothing was tested.")
@@ -150,9 +155,11 @@ class Verdict:
 def judge(outcomes: Iterable[Outcome]) -> Verdict:
     """Return the verdict on outcomes."""
     cases = failures = contacts = errors = timeouts = 0
+    goal = Scenario.goal
     groups: dict[tuple[End, str], tuple[str, list[int]]] = {}
     for outcome in outcomes:
         cases += 1
+        goal = outcome.case.scenario.goal
         measures = outcome.measures
         failures += outcome.failed
         contacts += outcome.failed and measures.severity == Severity.CONTACT
@@ -160,24 +167,25 @@ def judge(outcomes: Iterable[Outcome]) -> Verdict:
             continue
         errors += measures.end.is_error
         timeouts += not measures.end.is_error
-        message = message_of(measures)
+        message = message_of(outcome)
         key = measures.end, _VARYING.sub("#", message)
         groups.setdefault(key, (message, []))[1].append(outcome.index)
     troubles = [
         Trouble(end, message, tuple(indices)) for (end, _), (message, indices) in groups.items()
     ]
     troubles.sort(key=lambda t: (not t.end.is_error, -t.count, t.cases[0]))
-    return Verdict(cases, failures, contacts, errors, timeouts, tuple(troubles))
+    return Verdict(cases, failures, contacts, errors, timeouts, tuple(troubles), goal)
 
 
-def message_of(measures: Measures) -> str:
+def message_of(outcome: Outcome) -> str:
     """Return why a case was not tested, on one line and fit to be shown anywhere."""
+    measures = outcome.measures
     if measures.error is not None:
         # Cut before it is escaped: a message may have megabytes.
         return shortened(printable(measures.error[: MESSAGE_CHARACTERS + 1]), MESSAGE_CHARACTERS)
     if measures.end.is_error:
         return "no reason given"
-    return f"the VUT did not reach the merge point in {measures.t_end_s:g} s"
+    return f"the VUT did not reach {outcome.case.scenario.goal} in {measures.t_end_s:g} s"
 
 
 def shortened(text: str, characters: int) -> str:

@@ -44,6 +44,7 @@ from merge_sumo.api.keywords import (
     runner_of,
     scenario_of,
     settings_for,
+    with_criterion,
 )
 from merge_sumo.api.results import (
     CampaignRun,
@@ -62,7 +63,6 @@ from merge_sumo.campaigns.campaign import (
 )
 from merge_sumo.campaigns.one_case import (
     DEBUG_DEADLINE_S,
-    FIELDS,
     ONE,
     Ended,
     case_of,
@@ -122,7 +122,7 @@ from merge_sumo.system.folders import (
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.scenario import LEVELS, US23, Scenario, level_name
+from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import Car, Seen
@@ -210,7 +210,8 @@ def resume(
     settings = settings_of(folder, recorded, fields, trust=trust_vut)
     if "level" in named:
         policies = policies_folder(settings.policies, settings.scenario)
-        levels = parse_levels(str(named["level"]), policies, own=settings.pov is not None)
+        scenario_levels, own = settings.scenario.levels, settings.pov is not None
+        levels = parse_levels(str(named["level"]), policies, scenario_levels, own=own)
         settings = replace(settings, levels=levels)
     check_report(folder)
     plan = resolve(settings, _path(net))
@@ -281,7 +282,9 @@ def _write_findings(
     """Write what follows the cases into the folder: counterfactuals, expectation, report."""
     done, checks = result.run, runner.checks
     careful, page = (partial(panel.advance, phase) for phase in (Phase.CAREFUL, Phase.REPORT))
-    note_avoidance(done, plan, workers=opened, check=checks, on_part=careful)
+    # The careful drivers are models of merges.
+    if isinstance(plan.scenario, MergeScenario):
+        note_avoidance(done, plan, workers=opened, check=checks, on_part=careful)
     link_latest(done.folder)
     # Learned on another machine, surrogates may differ in a last bit.
     local = opened if runner.dask is None else None
@@ -301,10 +304,11 @@ def _notice_untrained(
     settings: CampaignSettings, plan: SimulationPlan, given: CampaignKeywords
 ) -> None:
     """Warn with a `Notice` where learned POVs are missing, or were not trained on the scenario."""
-    if given.get("level", "all") == "all" and not set(settings.levels) >= set(LEVELS):
-        levels = ", ".join(map(level_name, settings.levels))
+    levels = set(LEVELS) & set(settings.scenario.levels)
+    if given.get("level", "all") == "all" and not levels <= set(settings.levels):
+        present = ", ".join(map(level_name, settings.levels))
         warnings.warn(
-            f"--level all: policies are there for level {levels}; `merge-sumo train` makes others",
+            f"--level all: policies are there for level {present}; `merge-sumo train` makes others",
             Notice,
             stacklevel=3,
         )
@@ -362,14 +366,13 @@ def run_case(
             not made here.
         on_end: called with the result when the case has ended, before a window is closed.
         given: coordinates `x_pov0_m`, `v_pov0_mps`, at level 2 `svo_rad`, and others that the
-            scenario has: `v_vut0_mps`, `headway_ahead_s`, `headway_behind_s`; and the keywords of
-            `Setup`, as of `campaign`.
+            scenario has: `v_vut0_mps`, `headway_ahead_s`, `headway_behind_s`, those of another
+            kind of scenario; and the keywords of `Setup`, as of `campaign`.
     """
-    values = {name: value for name, value in given.items() if name in FIELDS and value is not None}
-    setup = {name: value for name, value in given.items() if name not in FIELDS}
-    unknown = setup.keys() - Setup.__optional_keys__
-    if unknown:
-        raise UserError(f"a case has no {min(unknown)}: it has {', '.join(FIELDS)}")
+    setup = {name: value for name, value in given.items() if name in Setup.__optional_keys__}
+    values = {
+        name: value for name, value in given.items() if name not in setup and value is not None
+    }
     if debug:
         setup |= {"in_process": True, "deadline_s": DEBUG_DEADLINE_S}
     if recorded is not None:
@@ -409,7 +412,8 @@ def _recorded_case(
     number = before.level
     if level is not None:
         policies = policies_folder(setup.get("policies"), run.scenario)
-        number = one_level(str(level), policies, own=fields.get("pov") is not None)
+        own = fields.get("pov") is not None
+        number = one_level(str(level), policies, run.scenario.levels, own=own)
     settings = settings_today(run, {**fields, **ONE, "levels": (number,)}, trust=trust)
     names = ("v_vut0_mps", *(d.field for d in settings.scenario.dimensions(number)))
     kept = {name: getattr(before, name) for name in names}
@@ -425,10 +429,12 @@ def _given_case(
 ) -> tuple[CampaignSettings, Case]:
     """Return a case by its coordinates, which win over those of a row, and how it is run."""
     fields, _ = given_again(vut, {"scenario": US23, **setup}, {})
-    coordinates = {name: row[name] for name in FIELDS if row.get(name) is not None}
+    fields = with_criterion(fields)
+    scenario, own = fields["scenario"], fields.get("pov") is not None
+    coordinates = {name: row[name] for name in scenario.notation if row.get(name) is not None}
     name = level_name(int(row.get("level", 0))) if level is None else str(level)
-    policies = policies_folder(setup.get("policies"), fields["scenario"])
-    number = one_level(name, policies, own=fields.get("pov") is not None)
+    policies = policies_folder(setup.get("policies"), scenario)
+    number = one_level(name, policies, scenario.levels, own=own)
     settings = CampaignSettings(**fields, **ONE, levels=(number,))
     return settings, case_of(settings.scenario, number, {**coordinates, **values})
 

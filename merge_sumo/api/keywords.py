@@ -48,13 +48,13 @@ class Setup(Hosting, total=False):
         scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
         follow_up_s: time in s for which both drive on after the merge; the scenario's by default.
         fail_when: what counts as a failure: the name of a criterion, or a condition over the
-            measures.
+            measures; by default the criterion of the scenario, "paper" in merges.
         require: what must hold over time instead, in signal temporal logic.
     """
 
     scenario: Scenario | Path | str
     follow_up_s: float | None
-    fail_when: str
+    fail_when: str | None
     require: str | None
 
 
@@ -211,11 +211,20 @@ def recordable(given: Mapping[str, Any]) -> dict[str, Any]:
         fields["scenario"] = scenario_of(fields["scenario"], follow_up_s)
     elif follow_up_s is not None:
         raise UserError("--follow-up is of the scenario: name that, too, with --scenario")
+    if fields.get("fail_when", "") is None:
+        del fields["fail_when"]
     if fields.get("policies") is not None:
         fields["policies"] = str(fields["policies"])
     if "learn_from" in fields:
         fields["learn_from"] = tuple(map(str, fields["learn_from"] or ()))
     return fields
+
+
+def with_criterion(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of `CampaignSettings` with a criterion, by default the scenario's."""
+    if fields.get("require") is not None:
+        return dict(fields)
+    return {"fail_when": fields["scenario"].default_criterion, **fields}
 
 
 def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSettings, Runner]:
@@ -230,9 +239,10 @@ def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSetting
     """
     runner, given = runner_of(given)
     spec, pov_spec, workers = drivers_of(vut, given.get("pov"), runner.workers, stacklevel=4)
-    fields = recordable({"scenario": US23, **given, "pov": pov_spec})
-    policies = policies_folder(fields.get("policies"), fields["scenario"])
-    levels = parse_levels(str(given.get("level", "all")), policies, own=pov_spec is not None)
+    fields = with_criterion(recordable({"scenario": US23, **given, "pov": pov_spec}))
+    scenario, level = fields["scenario"], str(given.get("level", "all"))
+    policies = policies_folder(fields.get("policies"), scenario)
+    levels = parse_levels(level, policies, scenario.levels, own=pov_spec is not None)
     settings = CampaignSettings(vut=spec, levels=levels, **fields)
     for note in settings.criterion.notes(settings.scenario):
         warnings.warn(f"note: {note}", Notice, stacklevel=3)

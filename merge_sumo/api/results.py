@@ -15,7 +15,6 @@ from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
 from merge_sumo.analysis.verdict import (
     MESSAGE_CHARACTERS,
-    NOTHING_TESTED,
     GateResult,
     Verdict,
     counted,
@@ -216,7 +215,7 @@ class CampaignRun(Result):
 
     def remarks(self) -> list[str]:
         """Return what decided whether the campaign passed: the gates, and whether it tested."""
-        untested = [] if self.verdict.tested else [NOTHING_TESTED]
+        untested = [] if self.verdict.tested else [self.verdict.nothing_tested]
         return [*(gate.sentence for gate in self.gates), *untested]
 
     def _converged_line(self) -> str:

@@ -27,7 +27,7 @@ ONE: Final[dict[str, Any]] = {
 """Settings of a campaign that is one case."""
 DEBUG_DEADLINE_S: Final = 86_400.0
 """A person at a breakpoint takes their time."""
-FIELDS: Final = {
+OPTIONS: Final = {
     "x_pov0_m": "--x",
     "v_pov0_mps": "--v",
     "svo_rad": "--psi",
@@ -35,7 +35,7 @@ FIELDS: Final = {
     "headway_ahead_s": "--headway-ahead",
     "headway_behind_s": "--headway-behind",
 }
-"""Fields of a case that a person gives, by their names in `Case`, and the option of each."""
+"""Options for coordinates of a case, by the names of their fields; --at sets any of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,21 +60,29 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     fixed = scenario.v_vut0_mps
     if isinstance(fixed, float):
         given.setdefault("v_vut0_mps", fixed)
+    names = {**scenario.notation, "v_vut0_mps": None}
+    for name in given:
+        if name not in names:
+            raise UserError(f"a case has no {name}: it has {', '.join(names)}")
     for dimension in scenario.dimensions(level):
         if dimension.field not in given:
-            option = FIELDS.get(dimension.field, dimension.field)
             raise UserError(
-                f"{option} ({dimension.field}) is missing: the pool has {dimension.low:g} to "
+                f"{_option(dimension.field)} is missing: the pool has {dimension.low:g} to "
                 f"{dimension.high:g}"
             )
     known = {"v_vut0_mps", *(dimension.field for dimension in scenario.dimensions(level))}
     for name in given.keys() - known:
         raise UserError(
-            f"{FIELDS.get(name, name)} ({name}) is none of the coordinates of {scenario.name} at "
-            f"level {level_name(level)}: leave it out"
+            f"{_option(name)} is none of the coordinates of {scenario.name} at level "
+            f"{level_name(level)}: leave it out"
         )
     case: Case = scenario.case_type(level=level, scenario=scenario, **given)
     return case
+
+
+def _option(name: str) -> str:
+    """Return how a person gives a coordinate."""
+    return f"{OPTIONS[name]} ({name})" if name in OPTIONS else f"--at {name}=NUMBER"
 
 
 def run_one(

@@ -21,7 +21,7 @@ def resolve(settings: CampaignSettings, net: Path | None = None) -> SimulationPl
     options = settings.vut_options(policies)
     vut = VutFactory(settings.vut, options)
     own = None if settings.pov is None else own_pov(settings.pov, options)
-    povs = Povs(policies=policies, own=own)
+    povs = Povs(policies=policies, own=own, scenario_levels=settings.scenario.levels)
     for level in settings.levels:
         povs.check_level(level)
     return SimulationPlan(

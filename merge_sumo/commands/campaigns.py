@@ -121,6 +121,12 @@ def run(
             metavar="RUN INDEX", help="A case of a campaign instead; options given beside it win."
         ),
     ] = None,
+    at: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=NUMBER", help="Any coordinate of the case, by its name in outcomes.jsonl."
+        ),
+    ] = None,
     gui: Annotated[
         bool, typer.Option("--gui", help="Show it in sumo-gui while it runs, in real time.")
     ] = False,
@@ -160,9 +166,21 @@ def run(
         gui=gui,
         out=out,
         on_end=ended,
-        **(given.keywords if case is None else given.written),
+        **{**(given.keywords if case is None else given.written), **_coordinates(at or [])},
     )
     raise typer.Exit(0 if result.passed else 1)
+
+
+def _coordinates(given: list[str]) -> dict[str, float]:
+    """Return coordinates that are given as NAME=NUMBER."""
+    values: dict[str, float] = {}
+    for text in given:
+        name, _, number = text.partition("=")
+        try:
+            values[name.strip()] = float(number)
+        except ValueError:
+            raise UserError(f"--at {text}: give NAME=NUMBER, as x_pov0_m=-250") from None
+    return values
 
 
 @app.verb(options=("level", *HOSTING, "policies", "net", "tolerance", *RUNNING, "trust_vut"))

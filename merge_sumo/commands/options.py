@@ -19,7 +19,7 @@ from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
         *("vut", "vut_command", "level", "pov", "policies", "scenario", "net", "v_vut0"),
-        *("mainline", "ramp", "follow_up", "case", "x", "v", "psi", "headway_ahead"),
+        *("mainline", "ramp", "follow_up", "case", "at", "x", "v", "psi", "headway_ahead"),
         *("headway_behind", "only", "check"),
     ),
     "How many cases, and which": (
@@ -166,11 +166,12 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         show_default="those kept",
     ),
     "fail_when": option(
-        str,
-        "paper",
+        str | None,
+        None,
         "What counts as a failure: {criteria} (paper: front bumpers within 6 m at M), or a "
         "condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
         metavar="EXPR",
+        show_default="the scenario's, paper in merges",
     ),
     "require": option(
         str | None,

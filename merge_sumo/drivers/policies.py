@@ -105,7 +105,8 @@ def scenario_of(entry: dict[str, Any]) -> Scenario:
 
 def plays_as(one: Scenario, other: Scenario) -> bool:
     """Return whether a driver learns the same in two scenarios."""
-    return all(getattr(one, name) == getattr(other, name) for name in PLAYED)
+    numbers = [[getattr(scenario, name, None) for name in PLAYED] for scenario in (one, other)]
+    return one.kind == other.kind and numbers[0] == numbers[1]
 
 
 def load_network(name: str, folder: Path | None = None) -> QNetwork:

@@ -20,6 +20,7 @@ from merge_sumo.drivers.policies import (
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.hashing import Files
+from merge_sumo.system.suggestions import either
 from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, level_name
 from merge_sumo.vuts.base import VutOptions
@@ -37,19 +38,21 @@ class Povs:
     Attributes:
         policies: folder of the networks that drive at levels 1 and 2.
         own: makes the controller that drives at the level of a person's own; None without one.
+        scenario_levels: the levels that the kind of scenario has.
     """
 
     policies: Path
     own: VutFactory | None = None
+    scenario_levels: tuple[int, ...] = ALL_LEVELS
 
     @property
     def levels(self) -> tuple[int, ...]:
         """The levels for which there is a POV."""
-        return levels_in(self.policies, own=self.own is not None)
+        return levels_in(self.policies, self.scenario_levels, own=self.own is not None)
 
     def check_level(self, level: int) -> None:
         """Raise `UserError` where there is no POV of a level."""
-        check_level(level, self.policies, own=self.own is not None)
+        check_level(level, self.policies, self.scenario_levels, own=self.own is not None)
 
     def sha256(self) -> dict[str, str]:
         """Return the hashes of the policies by name."""
@@ -78,45 +81,62 @@ CHOICE: Final = "0, 1, 2 or all, or own with --pov"
 ONE: Final = "0, 1 or 2, or own with --pov"
 
 
-def levels_in(policies: Path, *, own: bool) -> tuple[int, ...]:
-    """Return the levels for which there is a POV; level 0 needs no policy."""
+def levels_in(
+    policies: Path, scenario_levels: tuple[int, ...] = ALL_LEVELS, *, own: bool
+) -> tuple[int, ...]:
+    """Return the levels of a scenario for which there is a POV; level 0 needs no policy."""
     trained = policies_sha256(policies)
-    learned = [level for level, name in POLICIES.items() if name in trained]
-    return (0, *learned, OWN) if own else (0, *learned)
+    learned = {level for level, name in POLICIES.items() if name in trained}
+    ready = {0, *learned, OWN} if own else {0, *learned}
+    return tuple(level for level in scenario_levels if level in ready)
 
 
-def check_level(level: int, policies: Path, *, own: bool) -> None:
+def check_level(
+    level: int, policies: Path, scenario_levels: tuple[int, ...] = ALL_LEVELS, *, own: bool
+) -> None:
     """Raise `UserError` where there is no POV of a level."""
     if level not in ALL_LEVELS:
         raise UserError(f"there is no POV level {level}: choose {CHOICE}")
+    if level not in scenario_levels:
+        levels = either(map(level_name, scenario_levels))
+        raise UserError(f"this scenario has no POV level {level_name(level)}: choose {levels}")
     if level == OWN and not own:
         raise UserError("--level own is a POV that you bring: name it with --pov")
-    if level not in levels_in(policies, own=own):
+    if level not in levels_in(policies, scenario_levels, own=own):
         raise UserError(f"there is no policy for a POV of level {level}{how_to_train(policies)}")
 
 
-def parse_levels(text: str, policies: Path, *, own: bool, choice: str = CHOICE) -> tuple[int, ...]:
-    """Return the levels that `--level` names: one, or all for which there is a POV.
+def parse_levels(
+    text: str,
+    policies: Path,
+    scenario_levels: tuple[int, ...] = ALL_LEVELS,
+    *,
+    own: bool,
+    choice: str = CHOICE,
+) -> tuple[int, ...]:
+    """Return the levels that `--level` names: one, or all of a scenario for which there is a POV.
 
     Raises `UserError` for a name of none, and where a POV of a person's own would not drive.
     """
     if text == "all":
-        return levels_in(policies, own=own)
+        return levels_in(policies, scenario_levels, own=own)
     by_name = {level_name(level): level for level in ALL_LEVELS}
     if text not in by_name:
         raise UserError(f"there is no POV level {text!r}: choose {choice}")
     level = by_name[text]
-    check_level(level, policies, own=own)
+    check_level(level, policies, scenario_levels, own=own)
     if own and level != OWN:
         raise UserError(f"--pov drives at --level own or all, not at --level {text}")
     return (level,)
 
 
-def one_level(text: str, policies: Path, *, own: bool) -> int:
+def one_level(
+    text: str, policies: Path, scenario_levels: tuple[int, ...] = ALL_LEVELS, *, own: bool
+) -> int:
     """Return the one level that `--level` names."""
     if text == "all":
         raise UserError(f"--level all does not go here: choose {ONE}")
-    return parse_levels(text, policies, own=own, choice=ONE)[0]
+    return parse_levels(text, policies, scenario_levels, own=own, choice=ONE)[0]
 
 
 def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:

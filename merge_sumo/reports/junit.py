@@ -15,7 +15,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.analysis.coordinates import described
-from merge_sumo.analysis.verdict import NOTHING_TESTED, GateResult, Verdict, message_of
+from merge_sumo.analysis.verdict import GateResult, Verdict, message_of
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.system.folders import check_new, check_new_file, write_new
@@ -72,9 +72,9 @@ def junit(
 
 def _gates(root: etree._Element, verdict: Verdict, gates: Sequence[GateResult]) -> None:
     suite = etree.SubElement(root, "testsuite", name="gates")
-    tested = _test(suite, "the VUT reaches the merge point", f"{CLASS}.gates", 0.0)
+    tested = _test(suite, f"the VUT reaches {verdict.goal}", f"{CLASS}.gates", 0.0)
     if not verdict.tested:
-        _wrong(tested, "failure", "NOTHING_TESTED", NOTHING_TESTED)
+        _wrong(tested, "failure", "NOTHING_TESTED", verdict.nothing_tested)
     for gate in gates:
         test = _test(suite, gate.name, f"{CLASS}.gates", 0.0)
         if gate.met:
@@ -87,9 +87,9 @@ def _case(suite: etree._Element, outcome: Outcome) -> None:
     name = f"case {outcome.index}: {described(case)}"
     test = _test(suite, name, f"{CLASS}.level{level_name(case.level)}", measures.t_end_s)
     if measures.end.is_error:
-        _wrong(test, "error", measures.end.value, message_of(measures))
+        _wrong(test, "error", measures.end.value, message_of(outcome))
     elif not outcome.is_tested:
-        _wrong(test, "failure", End.TIMEOUT.value, message_of(measures))
+        _wrong(test, "failure", End.TIMEOUT.value, message_of(outcome))
     elif outcome.failed:
         _wrong(test, "failure", measures.severity or FAILED, _why(outcome))
 

@@ -33,7 +33,7 @@ def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
         verdict_of(outcome, trajectory),
         *_margin(outcome),
         "",
-        *_measures(outcome.measures, _met(outcome.measures)),
+        *_measures(outcome, _met(outcome.measures)),
         "",
         *motion_lines(trajectory),
     ]
@@ -44,8 +44,10 @@ def verdict_of(outcome: Outcome, trajectory: Trajectory) -> str:
     found = outcome.measures
     met = _met(found)
     at = f"{found.end.value} at {found.t_end_s:g} s"
+    if found.end is End.COMPLETED:
+        return f"{at}, {found.severity}{_impact(found)}"
     if found.end is not End.MERGED:
-        return f"{at}: {message_of(found)}"
+        return f"{at}: {message_of(outcome)}"
     first = "VUT" if found.merged_first == "VUT" else met
     apart = f"the front bumper of the {first} is {abs(found.dx_m or 0.0):.1f} m ahead at M"
     if met != "POV" and first == "VUT":
@@ -71,11 +73,12 @@ def _margin(outcome: Outcome) -> Iterator[str]:
         yield f"{'fails' if outcome.failed else 'does not fail'}: margin {outcome.margin:.3g}"
 
 
-def _measures(found: Measures, met: str) -> Iterator[str]:
+def _measures(outcome: Outcome, met: str) -> Iterator[str]:
+    found, labels = outcome.measures, outcome.case.scenario.measure_labels
     if met != "POV":
         yield f"  of the {met}, which is nearest to the VUT at the end:"
     for name, measure in MEASURES.items():
-        value, text = found.value(name), measure.label.replace("POV", met)
+        value, text = found.value(name), labels.get(name, measure.label).replace("POV", met)
         if value is not None and text:
             yield f"  {text:<31} {value:10.2f} {measure.unit}".rstrip()
     if found.clipped_steps:

@@ -21,7 +21,7 @@ from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.measures import MEASURES, Measure
-from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
+from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, MergeScenario, level_name
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.signals import to_record
 from merge_sumo.values.trajectory import End, Trajectory
@@ -43,9 +43,11 @@ UNKNOWN: Final = Diagnosis(None, None, False, False, None)
 def page_data(facts: ReportModel) -> dict[str, Any]:
     """Return what the script draws from: plain JSON."""
     speeds, offsets = _packed(facts.motion)
+    scenario = facts.run.scenario
     return {
         "dt": DT_S,
-        "crash_m": facts.run.scenario.dx_crash_m,
+        "crash_m": scenario.dx_crash_m if isinstance(scenario, MergeScenario) else 0.0,
+        "goal": scenario.goal,
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
         "speed_unit_mps": SPEED_UNIT_MPS,
         "coordinates": [_coordinate(c) for c in facts.coordinates],
@@ -53,9 +55,7 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
         "ends": [end.value for end in End],
         "severities": [severity.value for severity in Severity],
         "kinds": [kind.value for kind in Kind],
-        "measures": [
-            {"name": m.name, "title": m.title, "digits": m.digits} for m in listed_measures()
-        ],
+        "measures": _headings(facts),
         "cases": _columns(facts, offsets),
         "boxes": _boxes(facts),
         "errors": {
@@ -75,6 +75,16 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
 def listed_measures() -> list[Measure]:
     """Return the measures that the table of all cases has a column for."""
     return [measure for measure in MEASURES.values() if measure.column]
+
+
+def _headings(facts: ReportModel) -> list[dict[str, Any]]:
+    """Return the columns of the table: the score, and measures of which a case has a value."""
+    labels = facts.run.scenario.measure_labels
+    return [
+        {"name": m.name, "title": m.title_as(labels.get(m.name)), "digits": m.digits}
+        for m in listed_measures()
+        if m.name == "score" or any(o.measures.value(m.name) is not None for o in facts.shown)
+    ]
 
 
 def _boxes(facts: ReportModel) -> list[dict[str, Any]]:

@@ -54,11 +54,6 @@ class Level:
         return max(self.found.fmc, self.plausible or 0.0, self.truth or 0.0)
 
 
-ABOUT: Final = {
-    0: "keeps its speed",
-    1: "makes room for a VUT that accelerates",
-    2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
-}
 FMC_AXES: Final = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Ends of an axis of coverages; balls at the faces of the pool reach out of it."""
 
@@ -77,7 +72,7 @@ def _level(model: ReportModel, level: int, found: LevelSummary) -> Level:
         level=level,
         found=found,
         caption=f"own: {model.run.pov}" if level == OWN else str(level),
-        about=ABOUT.get(level, ""),
+        about=model.run.scenario.level_about.get(level, ""),
         plausible=None if surface is None else surface.plausible_fmc(),
         truth=None if truth is None else fmc(truth.failures),
         note=_note(found, axes, learned=surface is not None),

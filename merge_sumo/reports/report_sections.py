@@ -37,7 +37,7 @@ from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.printable import printable
 from merge_sumo.system.registry import Registry
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.scenario import level_name
+from merge_sumo.values.scenario import MergeScenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import meanings
 from merge_sumo.vuts.output import LOG, end_of
@@ -75,6 +75,7 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "summary": summary,
         "settings": {name: _shown(value) for name, value in run.settings.items() if value},
         "scenario": run.scenario,
+        "is_merge": isinstance(run.scenario, MergeScenario),
         "traffic": run.scenario.vehicles > 2,
         "coordinates": model.coordinates,
         "levels": levels,
@@ -130,7 +131,7 @@ def _numbers(model: ReportModel) -> dict[str, Any]:
 def _maps(model: ReportModel) -> dict[str, Any]:
     scenario = model.run.scenario
     return {
-        "severities": meanings(scenario.dx_crash_m),
+        "severities": meanings(scenario),
         "covered": any(len(scenario.dimensions(level)) <= 3 for level in model.levels),
     }
 

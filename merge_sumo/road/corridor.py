@@ -1,5 +1,7 @@
 """A merge in any SUMO net: two paths of lanes that become one at M, as a value.
 
+Where both vehicles drive on one lane all the way, the paths are equal.
+
 Each path has its own coordinate: the distance of the front bumper along its lanes from the merge
 point M, in metres, negative before M. The lanes inside of junctions belong to the paths, so the
 coordinate is continuous, and M is where the first lane begins that both paths have.
@@ -142,6 +144,11 @@ class Corridor:
     """Length behind M in the file; from there on the last lane is continued straight on."""
     surroundings: tuple[tuple[Point, ...], ...]
     """Shapes of the other lanes near M, for drawings."""
+
+    @property
+    def is_one_path(self) -> bool:
+        """Whether both vehicles drive on one lane all the way."""
+        return self.mainline_edges == self.ramp_edges
 
     def lane_point(self, x_m: float, *, on_ramp: bool) -> LanePoint:
         """Return where a lane coordinate of one of the paths is."""

@@ -31,14 +31,16 @@ def find_corridor(
     ramp: Sequence[str],
     *,
     room_after_m: float = ROOM_AFTER_M,
+    edge_at_m: str | None = None,
 ) -> Corridor:
     """Find the merge of two sequences of edges in a net.
 
-    Both name the edge on which the paths become one, and may go on behind it. Where the file ends
-    nearer than `room_after_m` behind M, the last lane is continued straight on. Raises `UserError`
-    when an edge is unknown, a sequence is not connected, or they never meet.
+    Both name the edge on which the paths become one, and may go on behind it. Equal sequences are
+    one path, and M is where `edge_at_m` begins, by default the last one. Where the file ends nearer
+    than `room_after_m` behind M, the last lane is continued straight on. Raises `UserError` when an
+    edge is unknown, a sequence is not connected, or they never meet.
     """
-    own, tail = _split(net, tuple(mainline), tuple(ramp))
+    own, tail = _split(net, tuple(mainline), tuple(ramp), edge_at_m)
     layers = [_layers(net, edges + tail, len(edges)) for edges in own]
     meeting = _meeting(net, own, tail, layers)
     onward = _onward(net, meeting.target, tail[meeting.place :])
@@ -95,10 +97,15 @@ class _Meeting(NamedTuple):
         return self.ramp.target
 
 
-def _split(net: NetFile, mainline: _Edges, ramp: _Edges) -> tuple[tuple[_Edges, _Edges], _Edges]:
+def _split(
+    net: NetFile, mainline: _Edges, ramp: _Edges, edge_at_m: str | None
+) -> tuple[tuple[_Edges, _Edges], _Edges]:
     """Return the edges that each path has for itself, and those that follow on both."""
     for edge in mainline + ramp:
         net.lanes(edge)
+    if mainline == ramp and len(ramp) > 1:
+        before = ramp.index(edge_at_m or ramp[-1])
+        return (ramp[:before], ramp[:before]), ramp[before:]
     common = next((edge for edge in ramp if edge in mainline), None)
     if common is None:
         raise net.broken(

@@ -65,7 +65,6 @@ OF_A_SEARCH: Final = (
     *("in_process", "policies"),
 )
 """Settings of a campaign that decide nothing here."""
-UNITS: Final = {"_mps": "m/s", "_m": "m", "_rad": "rad", "_s": "s"}
 SLACK: Final = 1e-9
 """Share of the radius that is left for rounding."""
 MOST_POINTS: Final = 3_000_000
@@ -569,7 +568,7 @@ def _sentence(
 ) -> str:
     """Return the result of all levels in a sentence."""
     most = max((settings.scenario.dimensions(level) for level in found), key=len)
-    units = [next(unit for end, unit in UNITS.items() if d.field.endswith(end)) for d in most]
+    units = [settings.scenario.notation[d.field].unit for d in most]
     parts = [
         f"{two_digits(radius * (d.high - d.low))} {unit}"
         for d, unit in zip(most, units, strict=True)

@@ -95,13 +95,14 @@ class _Hop(NamedTuple):
 
 
 def _hosted_lanes(road: Corridor) -> tuple[list[_HostedLane], list[_HostedLane]]:
-    """Return the lanes of mainline and ramp; those behind M are the same."""
+    """Return the lanes of mainline and ramp; those behind M are the same, or all of them."""
+    ramp_name = "main" if road.is_one_path else "ramp"
     main, ramp = (
         [
             *_named(name, [piece for piece in path.pieces if piece.start_m < 0.0], AT_M),
             *_named("out", [piece for piece in path.pieces if piece.start_m >= 0.0], END),
         ]
-        for name, path in (("main", road.mainline), ("ramp", road.ramp))
+        for name, path in (("main", road.mainline), (ramp_name, road.ramp))
     )
     return main, ramp
 
@@ -131,13 +132,13 @@ def _elements(road: Corridor) -> list[etree._Element]:
     """Return the edges, junctions and connections of one copy, in any order."""
     elements: list[etree._Element] = []
     at_m: list[_Hop] = []
-    approaches = (road.ramp_approach, road.mainline_approach)
     main, ramp = _hosted_lanes(road)
+    paths: list[tuple[str, list[_HostedLane], Approach | None]] = [("main", main, None)]
+    if not road.is_one_path:
+        paths = [("ramp", ramp, road.ramp_approach), ("main", main, road.mainline_approach)]
     seen: set[str] = set()
-    for begin, lanes, approach in zip(
-        (f"ramp-begin{COPY}", f"main-begin{COPY}"), (ramp, main), approaches, strict=True
-    ):
-        behind = begin
+    for name, lanes, approach in paths:
+        begin = behind = f"{name}-begin{COPY}"
         elements.append(_junction(begin, "dead_end", lanes[0].piece.shape[0], []))
         for hop in _hops(lanes):
             source = hop.source
@@ -153,8 +154,9 @@ def _elements(road: Corridor) -> list[etree._Element]:
                 kind = "priority" if hop.target else "dead_end"
                 elements.append(_junction(source.junction, kind, source.piece.shape[-1], [hop]))
             elements += _connections(hop, approach if source.junction == AT_M else None)
-    kind = road.junction_type if road.junction_type in KEPT_TYPES else "priority"
-    yields = [approach.yields for approach in approaches]
+    kept = road.junction_type in KEPT_TYPES and not road.is_one_path
+    kind = road.junction_type if kept else "priority"
+    yields = [approach is not None and approach.yields for _, _, approach in paths]
     elements.append(_junction(AT_M, kind, at_m[0].source.piece.shape[-1], at_m, yields))
     return elements
 

@@ -162,7 +162,11 @@ def corridor_of_hosted(content: bytes, path: Path) -> Corridor:
         [name.decode() for name, of, _ in sorted(edges, key=lambda e: int(e[2])) if of == kind]
         for kind in (b"main", b"ramp", b"out")
     )
-    return find_corridor(NetFile(path, content), main + out, ramp + out, room_after_m=0.0)
+    # Without a ramp both vehicles drive on one path, beside which the net has nothing.
+    is_one_path = len(main + out) == len(re.findall(rb'<edge [^>]*\bid="[^:"]', content))
+    paths = main + out, (main if is_one_path else ramp) + out
+    edge_at_m = out[0] if out else None
+    return find_corridor(NetFile(path, content), *paths, room_after_m=0.0, edge_at_m=edge_at_m)
 
 
 def write_files(

@@ -7,6 +7,7 @@ from merge_sumo.testing.contracts import (
     MeasureContract,
     ReportSectionContract,
     SamplerContract,
+    ScenarioKindContract,
     VutContract,
 )
 
@@ -16,6 +17,7 @@ __all__ = [
     "MeasureContract",
     "ReportSectionContract",
     "SamplerContract",
+    "ScenarioKindContract",
     "VutContract",
     "assert_no_failures",
 ]

@@ -7,7 +7,6 @@ from typing import Final, Unpack
 
 from merge_sumo import api
 from merge_sumo.analysis.coordinates import described
-from merge_sumo.analysis.verdict import NOTHING_TESTED
 from merge_sumo.api.keywords import Settings
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.store import failures
@@ -67,7 +66,7 @@ def _message(run: CampaignRun, seed: int) -> str | None:
         lines.append(f"  a case fails when {run.run.criterion.words}")
     lines += run.verdict.trouble_lines()
     if not run.verdict.tested:
-        lines.append(f"  {NOTHING_TESTED}")
+        lines.append(f"  {run.verdict.nothing_tested}")
     if wrong:
         lines += _worst(run, wrong[0], "worst case" if failed else "first error")
     return "\n".join(map(printable, [*lines, f"  report: {run.report_file}"]))

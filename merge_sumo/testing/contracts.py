@@ -28,11 +28,12 @@ from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.report_sections import ReportSection, shared_words
 from merge_sumo.road.merge import road_of
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.case import Case, Pool, from_unit, to_unit
 from merge_sumo.values.criteria import NamedCriterion
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.measures import Measure
-from merge_sumo.values.scenario import DT_S, US23, VUT
+from merge_sumo.values.scenario import DT_S, US23, VUT, Scenario
+from merge_sumo.values.scenario_kinds import SCENARIO_KINDS, scenario_of_record
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions
@@ -40,16 +41,6 @@ from merge_sumo.vuts.registry import VutFactory
 
 HALF_WIDTH: Final = 0.03
 """Of the band of failures in the unit square; about 7 % of the square."""
-
-
-def bare_measures(
-    end: End, score: float | None, error: str | None = None, dx_m: float | None = None
-) -> Measures:
-    """Return measures that say no more than a verdict and perhaps a gap."""
-    values: dict[str, Any] = dict.fromkeys(Measures.__dataclass_fields__)
-    values |= {"end": end, "score": score, "dx_m": dx_m, "t_end_s": 8.3, "error": error}
-    values |= {"vut_max_brake_mps2": 0.0, "pov_max_brake_mps2": 0.0, "clipped_steps": 0}
-    return Measures(**values | {"nearest": "pov", "further": ()})
 
 
 def play_case(index: int, batch: int, case: Case) -> Outcome:
@@ -61,13 +52,13 @@ def play_case(index: int, batch: int, case: Case) -> Outcome:
         score = -550.0 - 450.0 * (1.0 - distance / HALF_WIDTH)
     else:
         score = -450.0 * math.exp((HALF_WIDTH - distance) / 0.15)
-    measures = bare_measures(End.MERGED, score, dx_m=6.0 * offset / HALF_WIDTH)
+    measures = Measures(end=End.MERGED, score=score, t_end_s=8.3, dx_m=6.0 * offset / HALF_WIDTH)
     return Outcome(index, batch, case, measures)
 
 
 def without_verdict(index: int, batch: int, case: Case, end: End) -> Outcome:
     """Return the outcome of a case that ended in an error."""
-    return Outcome(index, batch, case, bare_measures(end, None, "no answer"))
+    return Outcome(index, batch, case, Measures(end=end, t_end_s=8.3, error="no answer"))
 
 
 def play(sampler: Sampler, batches: int, n: int) -> list[Outcome]:
@@ -298,11 +289,72 @@ class CriterionContract:
 
 
 @cache
-def campaign_of(vut: str = "level0") -> Run:
+def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> Run:
     """Return a campaign in SUMO at level 0; its folder stays until the process ends."""
     folder = Path(tempfile.mkdtemp(prefix="merge-sumo-contract-")) / "run"
     keywords: dict[str, Any] = {"level": 0, "sampler": "uniform", "cases": 20, "seed": 1}
-    return api.campaign(vut, out=folder, progress=False, **keywords).run
+    return api.campaign(vut, out=folder, scenario=scenario, progress=False, **keywords).run
+
+
+class ScenarioKindContract:
+    """What a campaign relies on in a kind of scenario, which is registered.
+
+    Attributes:
+        scenario_kind: the subclass of `Scenario` under test.
+        vut: what drives in it.
+    """
+
+    scenario_kind: type[Scenario]
+    vut: str = "level0"
+
+    def test_is_read_back_from_its_record(self) -> None:
+        """The record of a run names the kind."""
+        scenario = self.scenario_kind()
+        assert SCENARIO_KINDS[self.scenario_kind.kind] is self.scenario_kind
+        assert scenario_of_record(json.loads(json.dumps(scenario.to_record()))) == scenario
+
+    def test_has_coordinates_with_names(self) -> None:
+        """Maps and tables show them, and a case has a field for each."""
+        scenario = self.scenario_kind()
+        for level in scenario.levels:
+            middle = np.full((1, len(scenario.dimensions(level))), 0.5)
+            (case,) = from_unit(middle, level, scenario=scenario)
+            assert len(case.starts()) == scenario.vehicles
+            for dimension in scenario.dimensions(level):
+                assert dimension.field in scenario.notation
+                assert dimension.low < getattr(case, dimension.field) < dimension.high
+
+    def test_refuses_cases_that_make_no_scenario(self) -> None:
+        """A coordinate that is no number is a `UserError`."""
+        scenario = self.scenario_kind()
+        for name in {dimension.field for dimension in scenario.dimensions(0)}:
+            middle = {d.field: (d.low + d.high) / 2.0 for d in scenario.dimensions(0)}
+            try:
+                scenario.case_type(level=0, scenario=scenario, **{**middle, name: math.nan})
+            except UserError:
+                continue
+            raise AssertionError(f"{name} of NaN is accepted")
+
+    def test_says_of_every_corridor_whether_its_episode_has_ended(self) -> None:
+        """The engine asks for all K at once."""
+        scenario = self.scenario_kind()
+        ended = scenario.has_ended(*np.zeros((2, scenario.vehicles, 3)))
+        assert ended.shape == (3,)
+        assert ended.dtype == np.bool_
+
+    def test_runs_in_sumo(self) -> None:
+        """No case ends in an error, and some are tested."""
+        run = campaign_of(self.vut, self.scenario_kind())
+        ends = [outcome.measures.end for outcome in run.outcomes]
+        assert not [end for end in ends if end.is_error]
+        assert [end for end in ends if end.is_tested]
+
+    def test_outcomes_are_read_back_from_their_records(self) -> None:
+        """A line of `outcomes.jsonl` says everything."""
+        scenario = self.scenario_kind()
+        for outcome in campaign_of(self.vut, scenario).outcomes:
+            line = json.dumps(outcome.to_record())
+            assert Outcome.from_json(line, scenario) == outcome
 
 
 class VutContract:

@@ -17,7 +17,7 @@ from merge_sumo.twin.observation import Inputs, Observation
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT
+from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT, MergeScenario
 from merge_sumo.values.trajectory import End, Trajectory
 
 Answer = Callable[[Inputs], FloatArray]
@@ -62,10 +62,12 @@ class TwinRollout:
     def can_predict(self, level: int) -> bool:
         """Return whether the POV of a level is known, and not a program of a person's own.
 
-        A rollout ends at M, so none is possible where what happens behind it counts.
+        A rollout is of a merge and ends at M: none is possible of other kinds of scenarios, or
+        where what happens behind M counts.
         """
         known = level == 0 or level in self._networks
-        return known and (self._criterion.is_papers or not self._scenario.follow_up_s)
+        is_merge = isinstance(self._scenario, MergeScenario)
+        return known and is_merge and (self._criterion.is_papers or not self._scenario.follow_up_s)
 
     def _starts(self, points: FloatArray, level: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""

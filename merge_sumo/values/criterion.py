@@ -21,7 +21,7 @@ from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.criteria import CRITERIA, PAPER
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
 from merge_sumo.values.measures import MEASURES
-from merge_sumo.values.scenario import VEHICLES, VUT, Scenario
+from merge_sumo.values.scenario import VEHICLES, VUT, MergeScenario, Scenario
 from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, Verdict, measure
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.temporal import check_formula, formula_range, robustness, try_formula
@@ -78,6 +78,11 @@ class Criterion:
         Also where it is no formula, or what evaluates one is missing, and where no case could fail
         or every case would (`vacuity.py`).
         """
+        if self.is_papers and not isinstance(scenario, MergeScenario):
+            raise UserError(
+                f"--fail-when {PAPER} is of merges, and {scenario.name} is of kind "
+                f"{scenario.kind}: choose {scenario.default_criterion}, or a condition"
+            )
         if self.require is not None:
             try_formula(self.require)
             if (why := self._emptiness(Speeds.possible(scenario), scenario)) is not None:

@@ -42,10 +42,9 @@ class Measure:
     """Measures an episode on a road, and returns None where that has no value; None for the
     fields of `Measures`."""
 
-    @property
-    def title(self) -> str:
-        """Name and unit, as the head of a column shows them."""
-        return f"{self.column} {self.unit}".replace("s2", "s²").rstrip()
+    def title_as(self, name: str | None = None) -> str:
+        """Return name and unit, as the head of a column shows them; `column` is the usual name."""
+        return f"{name or self.column} {self.unit}".replace("s2", "s²").rstrip()
 
 
 OURS: Final = (
@@ -57,7 +56,8 @@ OURS: Final = (
     ),
     Measure(
         "score",
-        "P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)",
+        "P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR), and where a kind of "
+        "scenario has none",
         label="score P",
         column="score",
         digits=0,

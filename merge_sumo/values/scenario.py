@@ -172,8 +172,16 @@ class Scenario:
     notation: ClassVar[Mapping[str, Notation]]
     """The coordinates of the pool, in order: fields of a case. A field of the scenario of the same
     name says by its range whether it is one; the SVO is one at level 2."""
-    ends_as: ClassVar[str]
+    ends_as: ClassVar[str] = "COMPLETED"
     """The `End` of an episode that `has_ended`."""
+    level_about: ClassVar[Mapping[int, str]] = {}
+    """What the POV of a level does, in the words of a caption."""
+    goal: ClassVar[str] = "the end of the scenario"
+    """What the VUT reaches in an episode that is no TIMEOUT."""
+    measure_labels: ClassVar[Mapping[str, str]] = {}
+    """What listings call measures of which `MEASURES` has the words for merges, by name."""
+    default_criterion: ClassVar[str] = "contact"
+    """The criterion of a campaign that names none. The paper's is one of merges alone."""
 
     name: str
     net: str | None = None
@@ -307,8 +315,8 @@ class Scenario:
     @property
     def case_fields(self) -> tuple[str, ...]:
         """Fields of a case beside its level that say where it is in the scenario."""
-        ranges = (dimension.field for dimension in self.dimensions(0))
-        return tuple(dict.fromkeys((*ranges, "v_vut0_mps")))
+        fields = [dimension.field for level in self.levels for dimension in self.dimensions(level)]
+        return tuple(dict.fromkeys((*fields, "v_vut0_mps")))
 
     def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return in which corridors the episode has ended in states (A, K), (K,)."""
@@ -340,6 +348,13 @@ class MergeScenario(Scenario):
         "svo_rad": Notation("psi", "rad", 2, "$\\psi$ (rad)"),
     }
     ends_as: ClassVar[str] = "MERGED"
+    level_about: ClassVar[Mapping[int, str]] = {
+        0: "keeps its speed",
+        1: "makes room for a VUT that accelerates",
+        2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
+    }
+    goal: ClassVar[str] = "the merge point"
+    default_criterion: ClassVar[str] = "paper"
 
     name: str = "us23"
     mainline: Edges = ("main_in", "main_out")

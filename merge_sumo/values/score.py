@@ -57,7 +57,7 @@ MEASURED: Final = frozenset(measure.name for measure in OURS if measure.of is No
 
 
 @quickly_pickled
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Measures:
     """Named measures of one episode, with the verdict first.
 
@@ -66,35 +66,54 @@ class Measures:
     is nearest to the VUT at the end: it takes the POV's place. What bodies do (severity, clearance,
     bumper gap, braking after M, impact speed) is that of all cars.
 
-    `measures.py` says what each is; `further` holds those with a function of their own.
+    `measures.py` says what each is; `further` holds those with a function of their own. A kind of
+    scenario leaves out what it does not measure.
     """
 
     end: End
-    score: float | None
-    dx_m: float | None
-    dv_mps: float | None
-    ttc_s: float | None
-    pet_s: float | None
+    score: float | None = None
+    dx_m: float | None = None
+    dv_mps: float | None = None
+    ttc_s: float | None = None
+    pet_s: float | None = None
     t_end_s: float
-    severity: Severity | None
-    bumper_gap_m: float | None
-    clearance_m: float | None
-    before_clearance_m: float | None
-    drac_mps2: float | None
-    brake_after_mps2: float | None
-    vut_max_brake_mps2: float
-    pov_max_brake_mps2: float
-    impact_speed_mps: float | None
-    merged_first: Literal["VUT", "POV"] | None
-    last_avoidable_s: float | None
-    avoidable: bool | None
-    clipped_steps: int
-    error: str | None
+    severity: Severity | None = None
+    bumper_gap_m: float | None = None
+    clearance_m: float | None = None
+    before_clearance_m: float | None = None
+    drac_mps2: float | None = None
+    brake_after_mps2: float | None = None
+    vut_max_brake_mps2: float = 0.0
+    pov_max_brake_mps2: float = 0.0
+    impact_speed_mps: float | None = None
+    merged_first: Literal["VUT", "POV"] | None = None
+    last_avoidable_s: float | None = None
+    avoidable: bool | None = None
+    clipped_steps: int = 0
+    error: str | None = None
     nearest: Vehicle = VEHICLES[POV]
     after_gap_m: float | None = None
     after_ttc_s: float | None = None
     after_drac_mps2: float | None = None
     further: Further = ()
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, **values: Any) -> Measures:
+        """Return the measures of an episode: those that every kind of scenario has, and `values`.
+
+        After an error a verdict says nothing, and `values` are left out.
+        """
+        hardest_mps2 = [max(0.0, -a) for a in trajectory.motion[:, :, 2].min(axis=0).tolist()]
+        common: dict[str, Any] = {
+            "end": trajectory.end,
+            "t_end_s": trajectory.t_end_s,
+            "vut_max_brake_mps2": hardest_mps2[VUT],
+            "pov_max_brake_mps2": hardest_mps2[trajectory.nearest],
+            "clipped_steps": trajectory.clipped_steps,
+            "error": None if trajectory.error is None else as_reason(trajectory.error),
+            "nearest": VEHICLES[trajectory.nearest],
+        }
+        return cls(**common) if trajectory.end.is_error else cls(**common | values)
 
     def value(self, name: str) -> Any:
         """Return the value of a measure, of this package or further; None where it has none."""
@@ -312,8 +331,7 @@ def measure_merges(
 
 
 def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> Measures:
-    nearest = trajectory.nearest
-    pair = trajectory.facing(nearest)
+    pair = trajectory.facing(trajectory.nearest)
     (x_pov, v_pov, _), (x_vut, v_vut, _) = pair.motion[-1].tolist()
     end, close = trajectory.end, is_close(trajectory)
     dx = dv = ttc = pet = drac = avoidable = last_avoidable = None
@@ -329,34 +347,27 @@ def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> 
         if not close:
             gap = abs(dx) - trajectory.case.scenario.dx_crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
-    hardest = -pair.motion[:, :, 2].min(axis=0)
     clearance, impact = closest_after_m(trajectory)
     brake = brake_after_mps2(trajectory)
     severity = severity_of(end, clearance, is_close=close, brake_mps2=brake)
     followed: tuple[float | None, ...] = followed_up(trajectory) or (None, None, None)
-    return Measures(
-        end=end,
+    return Measures.of(
+        trajectory,
         severity=severity,
-        score=None if trajectory.error is not None else _score(trajectory, dx, ttc, close=close),
+        score=_score(trajectory, dx, ttc, close=close),
         dx_m=dx,
         bumper_gap_m=min((gap for gap, _ in neighbours(trajectory)), default=None),
         clearance_m=_finite(clearance),
-        before_clearance_m=None if end.is_error else _finite(before_m),
+        before_clearance_m=_finite(before_m),
         dv_mps=dv,
         ttc_s=ttc,
         pet_s=pet,
-        t_end_s=trajectory.t_end_s,
         drac_mps2=drac,
         brake_after_mps2=_finite(brake) if end is End.MERGED else None,
-        vut_max_brake_mps2=max(0.0, float(hardest[VUT])),
-        pov_max_brake_mps2=max(0.0, float(hardest[POV])),
         impact_speed_mps=impact,
         merged_first=first,
         last_avoidable_s=last_avoidable,
         avoidable=avoidable,
-        clipped_steps=trajectory.clipped_steps,
-        error=None if trajectory.error is None else as_reason(trajectory.error),
-        nearest=VEHICLES[nearest],
         after_gap_m=followed[0],
         after_ttc_s=_finite(followed[1]),
         after_drac_mps2=_finite(followed[2]),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 from merge_sumo.values.merge import HARSH_MPS2
+from merge_sumo.values.scenario import MergeScenario, Scenario
 from merge_sumo.values.trajectory import End
 
 
@@ -22,11 +23,13 @@ class Severity(StrEnum):
     SAFE = "safe"
 
 
-def meanings(crash_m: float) -> dict[Severity, str]:
-    """Return what the words mean, at a scenario's distance of a conflict (`dx_crash_m`)."""
+def meanings(scenario: Scenario) -> dict[Severity, str]:
+    """Return what the words mean in a scenario."""
+    if not isinstance(scenario, MergeScenario):
+        return {Severity.CONTACT: "bodies touch", Severity.SAFE: "no contact"}
     return {
         Severity.CONTACT: "bodies touch at M or right after it",
-        Severity.CONFLICT: f"front bumpers within {crash_m:g} m at M, no contact",
+        Severity.CONFLICT: f"front bumpers within {scenario.dx_crash_m:g} m at M, no contact",
         Severity.HARSH: f"the rear car must brake harder than {HARSH_MPS2:g} m/s² after M",
         Severity.SAFE: "none of these",
     }

@@ -14,10 +14,9 @@ from merge_sumo.campaigns.stopping import PATIENCE, StoppingRule, covered_balls,
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.samplers.uniform import UniformSampler
-from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import MergeCase, Pool
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
 
@@ -44,7 +43,7 @@ def outcomes(*failures_by_batch: int, safe: int = 1) -> list[Outcome]:
             found += failed
             case = MergeCase(level=0, x_pov0_m=x, v_pov0_mps=30.0, scenario=US23)
             end, score = End.MERGED, -600.0 if failed else -1.0
-            measures = bare_measures(end, score)
+            measures = Measures(end=end, score=score, t_end_s=8.3)
             ran.append(Outcome(len(ran), batch, case, measures))
     return ran
 

@@ -200,7 +200,7 @@ class TestACampaign:
         assert (folder / "run" / "outcomes.jsonl").read_bytes().startswith(short)
 
     def test_tells_a_person_what_to_do_next(self, call):
-        said = call(*SMALL, "--cases", 60, "--seed", 1, "--sampler", "gpr", "--out", "run")
+        said = call(*SMALL, "--cases", 60, "--seed", 4, "--sampler", "gpr", "--out", "run")
         assert said.code == 0
         assert "failures in 60 cases" in said.out
         assert f"report: {Path('run', 'report.html')}" in said.out

@@ -658,7 +658,8 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
         assert sorted(map(int, drawn)) == [0, 3, 4, 6, 9, 11]
         assert page.inner_text("#case-words").startswith("VUT_ERROR: boom")
         page.locator(".list [data-case='3']").click()
-        assert page.inner_text("#case-words").startswith("Timeout: the VUT did not arrive")
+        words = page.inner_text("#case-words")
+        assert words.startswith("Timeout: the VUT did not reach the merge point")
         verdict = page.locator("#filters [name=verdict]")
         for label, expected in (
             ("boom (2)", [4, 11]),

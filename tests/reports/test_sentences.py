@@ -225,7 +225,7 @@ CHECKS: dict[str, Callable[..., None]] = {
     rf"Full braking or full acceleration of the VUT would have kept 6 m at M until {NUMBER} s\.":
         check_way_out,
     r"There never was a way out for the VUT\.": check_no_way_out,
-    rf"Timeout: the VUT did not arrive in {NUMBER} s\.": check_timeout,
+    rf"Timeout: the VUT did not reach the merge point in {NUMBER} s\.": check_timeout,
     rf"Bodies touch at a relative speed of {NUMBER} m/s\.": check_impact,
     r"Bodies overlap before M, where the lanes run together\.": of_another_test,
     r"In the VUT's place .+ would have avoided it\.": of_another_test,

@@ -14,10 +14,9 @@ from merge_sumo.samplers.allocation import (
     softmax_shares,
     whole_shares,
 )
-from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
 
@@ -42,7 +41,7 @@ def outcome(index: int, batch: int, level: int, *, failed: bool) -> Outcome:
     end, score = End.MERGED, -700.0 if failed else -3.0
     svo = 0.5 if level == 2 else None
     case = MergeCase(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo, scenario=US23)
-    return Outcome(index, batch, case, bare_measures(end, score))
+    return Outcome(index, batch, case, Measures(end=end, score=score, t_end_s=8.3))
 
 
 class TestByHand:

@@ -19,11 +19,10 @@ from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin
-from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
 
@@ -34,7 +33,7 @@ def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = Tr
     overlap_m = 6.0 - abs(dx_m)
     end = End.MERGED
     score = -560.0 - 75.0 * overlap_m if overlap_m > 0.0 else -450.0 * math.exp(overlap_m / 15.0)
-    measures = bare_measures(end, score, dx_m=None if blind else dx_m)
+    measures = Measures(end=end, score=score, t_end_s=8.3, dx_m=None if blind else dx_m)
     return Outcome(index, batch, case, measures)
 
 

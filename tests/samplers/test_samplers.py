@@ -12,10 +12,10 @@ from conftest import some
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.testing.contracts import SamplerContract, bare_measures, play
+from merge_sumo.testing.contracts import SamplerContract, play
 from merge_sumo.values.case import Pool, to_unit
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
 TRAFFIC = replace(US23, headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 3.0))
@@ -96,7 +96,7 @@ def test_gpr_gives_more_cases_to_the_level_with_the_failures():
     sampler = make_sampler("gpr", Pool(levels=(0, 1), scenario=US23), 4)
     cases = sampler.ask(20)
     # Level 0 never fails, all of level 1 does.
-    verdicts = {0: bare_measures(End.MERGED, -5.0), 1: bare_measures(End.MERGED, -700.0)}
+    verdicts = [Measures(end=End.MERGED, score=s, t_end_s=8.3) for s in (-5.0, -700.0)]
     outcomes = [Outcome(index, 0, case, verdicts[case.level]) for index, case in enumerate(cases)]
     sampler.tell(outcomes)
     levels = [case.level for case in sampler.ask(20)]

@@ -19,11 +19,10 @@ from vut_contract import factory
 from merge_sumo.errors import UserError
 from merge_sumo.studies.benchmark import Search, compare, limit_fmc, oracle, search
 from merge_sumo.studies.truth import Truth, ground_truth, known_truth
-from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
 
@@ -163,7 +162,7 @@ def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float 
         for failed, point in [(False, (0.0, 0.0)), *((True, point) for point in points)]:
             (case,) = from_unit(np.array([point]), 0, scenario=US23)
             end, score = End.MERGED, -600.0 if failed else -1.0
-            measures = bare_measures(end, score)
+            measures = Measures(end=end, score=score, t_end_s=8.3)
             outcomes.append(Outcome(len(outcomes), batch, case, measures))
         curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0, scenario=US23)))
     return Search(outcomes, curve, sampler_s)

@@ -35,7 +35,6 @@ from merge_sumo.studies.expectation import (
     read_expectation,
 )
 from merge_sumo.system.records import decode, to_plain
-from merge_sumo.testing.contracts import bare_measures
 from merge_sumo.twin.experts import GROUPS, Expert, Forest, Steps
 from merge_sumo.twin.observation import NOW, Observation
 from merge_sumo.twin.rollout import Starts, TwinRollout
@@ -44,7 +43,7 @@ from merge_sumo.values.case import MergeCase, Pool, to_unit
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
 SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2, scenario=US23)
@@ -275,7 +274,7 @@ def outcome(
         scenario=US23,
     )
     score = -600.0 if abs(dx_m) < 6.0 else -100.0
-    measures = bare_measures(End.MERGED, score, dx_m=dx_m)
+    measures = Measures(end=End.MERGED, score=score, t_end_s=8.3, dx_m=dx_m)
     return Outcome(index, 0, case, measures, prediction)
 
 

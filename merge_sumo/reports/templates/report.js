@@ -80,8 +80,12 @@ function words(i) {
     else if (cases.brake_after_mps2[i] === null) parts.push("No braking of the car behind is in time.");
     else if (cases.brake_after_mps2[i] < 0.1) parts.push("The car behind has to brake at less than 0.1 m/s² after M.");
     else parts.push(`The car behind has to brake at ${fixed(cases.brake_after_mps2[i], 1)} m/s² after M.`);
+  } else if (end === "COMPLETED") {
+    if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}.`);
+    parts.push(`The episode ends at ${at}.`);
+    if (cases.impact_speed_mps[i] !== null) parts.push(`Bodies touch at a relative speed of ${fixed(cases.impact_speed_mps[i], 1)} m/s.`);
   } else if (end === "TIMEOUT") {
-    parts.push(`Timeout: the VUT did not arrive in ${fixed(cases.t_end_s[i], 0)} s.`);
+    parts.push(`Timeout: the VUT did not reach ${data.goal} in ${fixed(cases.t_end_s[i], 0)} s.`);
   } else {
     parts.push(`${end}: ${(data.errors[cases.index[i]] || "no reason given").replace(/\.?$/, ".")}`);
   }
