@@ -23,6 +23,7 @@ from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
+from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import as_reason
 from merge_sumo.vuts.base import VutOptions
@@ -118,6 +119,28 @@ def Vut(seen):
             assert {file.name for file in vut.files()} == {"my_vut.py", "gains.txt"}
     finally:
         vut.close()
+
+
+@pytest.mark.parametrize(
+    ("dies", "starts"),
+    [
+        ("os._exit(3)", MAX_DEATHS),
+        ("os.kill(os.getpid(), 9)", MAX_KILLS),
+        ("time.sleep(600)", 1),
+    ],
+)
+def test_while_it_is_opened_a_death_is_blamed_by_the_rule_of_all_deaths(
+    spec, tmp_path, dies, starts
+):
+    source = f"""
+import os, pathlib, time
+with pathlib.Path(__file__).with_name("starts").open("a") as starts:
+    starts.write("x")
+{dies}
+"""
+    with pytest.raises(UserError, match="opening the VUT"):
+        HostedVut(1, FINDER, spec(source), VutOptions(connect_s=10.0))
+    assert len((tmp_path / "starts").read_text()) == starts
 
 
 def test_what_it_loads_while_it_drives_is_of_its_files_and_what_it_writes_is_not(spec, tmp_path):
