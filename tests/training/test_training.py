@@ -228,7 +228,7 @@ class TestDdqn:
     def train(self, seed=0):
         game = MergeGame("pov", Level0Vut(16), REWARD)
         try:
-            return ddqn.train(game, seed, TINY)
+            return ddqn.train(game, seed, dataclasses.replace(TINY, updates=200))
         finally:
             game.close()
 
