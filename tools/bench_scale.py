@@ -4,6 +4,8 @@
               `truth` uses: cases per second and the largest memory of a worker process
     workers   the same cases on one worker process and on two, in turns, beside a loop that only
               computes, on one process and on two: what the machine itself can give
+    engines   verdicts on uniform cases of design2 at level 2 by SUMO and by the kinematic engine,
+              which runs one case of a hundred in SUMO as well: CPU time per case, in turns
     campaign  the whole command of a uniform campaign of design2, from its start to the report, on
               one worker and on two, in turns
     parent    cases per second that the process takes that asks, tells and keeps, where workers are
@@ -36,6 +38,7 @@ from typing import Any
 
 import numpy as np
 from bench_record import add_record_option, append_record
+from threadpoolctl import threadpool_limits
 
 from merge_sumo.campaigns.campaign import conduct, run_campaign
 from merge_sumo.campaigns.plan import resolve
@@ -43,6 +46,7 @@ from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES, Journal, Run, failures, read_outcomes, to_line
 from merge_sumo.engine.evaluate import CaseResult, CaseResults, CasesAt, evaluate, run_cases
+from merge_sumo.engine.kinematic_simulator import CHUNK
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.studies.truth import _scores
@@ -57,7 +61,7 @@ ROUNDS = 5
 CAMPAIGN_ROUNDS = 5
 PAIR_CASES = 2000
 BATCH = 20
-PARTS = ("truth", "workers", "campaign", "parent", "samplers", "files")
+PARTS = ("truth", "workers", "engines", "campaign", "parent", "samplers", "files")
 
 
 def memory_mb() -> float:
@@ -142,6 +146,32 @@ def two_workers() -> dict[str, list[float]]:
             found["cases"].append(alone / seconds(two))
             found["cases_per_s_on_one"].append(PAIR_CASES / alone)
             found["computing"].append(rate(two, 2) / rate(one, 1))
+    return found
+
+
+def engines(cases: int, rounds: int) -> dict[str, list[float]]:
+    """Return the CPU time of a case by each engine, in us, and its ratio, round by round."""
+    plan = resolve(CampaignSettings(vut="design2", levels=(2,), scenario=US23))
+    plans = {"sumo": plan, "kinematic": plan.with_engine("kinematic")}
+    pool, rng = Pool(levels=(2,), scenario=US23), np.random.default_rng(2)
+    found: dict[str, list[float]] = {"sumo_us": [], "kinematic_us": [], "ratio": []}
+
+    def us(name: str, points: Any) -> tuple[float, list[bool]]:
+        run_cases(plans[name], CasesAt(pool, 2, points[:200]))  # SUMO starts
+        start = time.process_time()
+        verdicts = run_cases(plans[name], CasesAt(pool, 2, points)).verdicts()
+        return (time.process_time() - start) / len(points) * 1e6, [one.failed for one in verdicts]
+
+    with threadpool_limits(1):
+        for _ in range(rounds):
+            points = rng.random((cases, 3))
+            by_name = {name: us(name, points) for name in plans}
+            (sumo, expected), (kinematic, failed) = by_name["sumo"], by_name["kinematic"]
+            if failed != expected:
+                raise RuntimeError("the engines disagree about a verdict")
+            found["sumo_us"].append(sumo)
+            found["kinematic_us"].append(kinematic)
+            found["ratio"].append(sumo / kinematic)
     return found
 
 
@@ -301,6 +331,9 @@ def main() -> None:
     if {"workers", "parent"} & set(chosen.only):
         result["workers"] = two_workers()
         tell_spread("workers", result["workers"])
+    if "engines" in chosen.only:
+        result["engines"] = engines(CHUNK, ROUNDS)
+        tell_spread("engines", result["engines"])
     if "campaign" in chosen.only:
         result["campaign"] = whole_campaigns(chosen.campaign, CAMPAIGN_ROUNDS)
         tell_spread("campaign", result["campaign"])

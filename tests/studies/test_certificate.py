@@ -436,6 +436,23 @@ class TestTheCommand:
         assert again == 0
         assert "no ball of radius 10 % of the axes (16 m, 1 m/s) fails throughout" in out
 
+    def test_says_that_sumo_ran_a_share_of_the_cases_and_stays_with_its_engine(
+        self, command_line, tmp_path
+    ):
+        plan = ("certify", "--vut", "design2", "--level", 0, "--radius", 0.1, "--workers", 1)
+        kinematic = (*plan, "--engine", "kinematic")
+        code, out, err = command_line(*kinematic, "--out", tmp_path / "c", "--json")
+        assert code == 0, err
+        sentence = json.loads(out)["sentence"]
+        assert "52 cases by the equations of motion, at least 1% of them in SUMO, too" in sentence
+        assert json.loads((tmp_path / "c" / "certificate.json").read_bytes())["engine"] == (
+            "kinematic"
+        )
+        assert check_certificate.check(tmp_path / "c")[1] == []
+        code, _, err = command_line(*plan, "--resume", tmp_path / "c")
+        assert code == 2
+        assert "engine differs" in err
+
     def test_names_what_fails_and_ends_with_1(self, command_line, tmp_path):
         plan = ("certify", "--vut", "design1", "--level", 0, "--radius", 0.04, "--workers", 1)
         code, out, err = command_line(*plan, "--out", tmp_path / "c")

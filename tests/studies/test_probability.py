@@ -301,6 +301,15 @@ class TestOfACampaign:
             texts.append((tmp_path / name).with_suffix(".jsonl").read_bytes())
         assert texts[:2] == texts[2:]
 
+    def test_by_the_kinematic_engine_is_the_same(self, run, tmp_path, command_line):
+        found = failure_probability(run, tmp_path / "a.json", cases=60, seed=3)
+        options = ("--cases", 60, "--seed", 3, "--workers", 1, "--engine", "kinematic")
+        out = tmp_path / "b.json"
+        code, _, err = command_line("probability", run.folder, *options, "--out", out)
+        assert code == 0, err
+        record = json.loads(out.read_bytes())
+        assert (record["probability"], record["engine"]) == (found.probability, "kinematic")
+
     def test_takes_how_the_vut_is_hosted(self, run, tmp_path, command_line):
         out = tmp_path / "p.json"
         options = ("--deadline", "2", "--vut-memory", "1", "--workers", "1", "--json")
