@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +63,12 @@ class TestCampaignOfBraking:
     @classmethod
     def run(cls, tmp_path_factory):
         folder = tmp_path_factory.mktemp("braking") / "run"
-        keywords = {"scenario": BrakingScenario(), "cases": 60, "seed": 1, "progress": False}
+        keywords: dict[str, Any] = {
+            "scenario": BrakingScenario(),
+            "cases": 60,
+            "seed": 1,
+            "progress": False,
+        }
         return ms.campaign(keep_distance, out=folder, **keywords)
 
     def test_fails_by_contacts(self, run):
@@ -92,13 +98,13 @@ class TestCampaignOfBraking:
         assert ms.replay(tmp_path / "case").identical
 
     def test_coordinates_are_given_by_name(self):
-        keywords = {"scenario": BrakingScenario(), "level": 0}
-        near = ms.run_case(keep_distance, gap0_m=6.0, a_pov_mps2=-1.0, **keywords)
+        keywords: dict[str, Any] = {"scenario": BrakingScenario(), "level": 0}
+        near = ms.run_case(keep_distance, case={"gap0_m": 6.0, "a_pov_mps2": -1.0}, **keywords)
         assert near.outcome.case.gap0_m == 6.0
         with pytest.raises(UserError, match="--at a_pov_mps2=NUMBER is missing"):
-            ms.run_case(keep_distance, gap0_m=6.0, **keywords)
+            ms.run_case(keep_distance, case={"gap0_m": 6.0}, **keywords)
         with pytest.raises(UserError, match="a case has no gap: it has gap0_m"):
-            ms.run_case(keep_distance, gap=6.0, **keywords)
+            ms.run_case(keep_distance, **(keywords | {"gap": 6.0}))
 
     def test_has_the_levels_of_its_kind(self):
         with pytest.raises(UserError, match="no POV level 1: choose 0"):
