@@ -1003,7 +1003,9 @@ def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None
     name = checked.name if isinstance(scenario, Scenario) else str(scenario)
     road, differing = about(road_for(checked)), unseen(checked, folder)
     lines = ["the learned drivers (levels 1 and 2) were trained on such starts, or on like ones"]
-    if differing:
+    if not isinstance(checked, MergeScenario):
+        lines = []
+    elif differing:
         made = quoted(f"{checked.name}-policies")
         lines = [
             "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",

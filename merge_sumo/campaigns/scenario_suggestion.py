@@ -70,10 +70,13 @@ def limit_at(path: LanePath, x_m: float) -> float:
 def about(road: Corridor) -> list[str]:
     """Return what was found of a road, in lines."""
     lines = [f"net: {road.path.name}"]
-    for name, path, edges in (
+    paths = [
         ("mainline", road.mainline, road.mainline_edges),
         ("ramp", road.ramp, road.ramp_edges),
-    ):
+    ]
+    if road.is_one_path:
+        paths = [("lane of all vehicles", road.mainline, road.mainline_edges)]
+    for name, path, edges in paths:
         limits = ", ".join(
             f"{limit:g} m/s from {max(start_m, -path.before_m):.0f} m"
             for start_m, limit in path.speed_limits_mps()
@@ -81,6 +84,8 @@ def about(road: Corridor) -> list[str]:
         )
         lines.append(f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; limits: {limits}")
     m = road.lane_point(0.0, on_ramp=True)
+    if road.is_one_path:
+        return [*lines, f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"]
     lines.append(f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), junction {road.junction_type}")
     first = "ramp" if road.mainline_approach.yields else "mainline"
     yields = road.mainline_approach.yields or road.ramp_approach.yields

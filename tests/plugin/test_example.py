@@ -11,6 +11,7 @@ from merge_sumo_braking import BrakingScenario
 from merge_sumo_example import CLOSEST, CLOSEST_APPROACH, ENDINGS, NEAR, MiddleSampler
 
 import merge_sumo as ms
+from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.testing import (
     CriterionContract,
@@ -105,6 +106,11 @@ class TestCampaignOfBraking:
             ms.run_case(keep_distance, case={"gap0_m": 6.0}, **keywords)
         with pytest.raises(UserError, match="a case has no gap: it has gap0_m"):
             ms.run_case(keep_distance, **(keywords | {"gap": 6.0}))
+
+    def test_its_road_is_one_lane(self):
+        lines = api.check_scenario(BrakingScenario()).lines()
+        assert lines[1].startswith("lane of all vehicles: main_in main_out, 1000.0 m before M")
+        assert not re.findall("ramp|mainline|trained", "\n".join(lines))
 
     def test_has_the_levels_of_its_kind(self):
         with pytest.raises(UserError, match="no POV level 1: choose 0"):
