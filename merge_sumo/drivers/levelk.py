@@ -63,7 +63,21 @@ def features(
     *,
     scenario: Scenario,
 ) -> FloatArray:
-    """Return what the network sees of n states, (n, 26), or (n, 28) with an orientation.
+    """Return what the network sees of n states, (n, 26), or (n, 28) with an orientation."""
+    state = x_pov_m, v_pov_mps, x_vut_m, v_vut_mps
+    return np.stack(feature_columns(*state, svo_rad, scenario=scenario), axis=-1)
+
+
+def feature_columns(
+    x_pov_m: FloatArray,
+    v_pov_mps: FloatArray,
+    x_vut_m: FloatArray,
+    v_vut_mps: FloatArray,
+    svo_rad: FloatArray | None = None,
+    *,
+    scenario: Scenario,
+) -> list[FloatArray]:
+    """Return what the network sees of n states as 26 arrays (n,), or 28 with an orientation.
 
     All are functions of the state [x_POV, v_POV, x_VUT, v_VUT] and psi alone: the state itself,
     scaled; the VUT's time to M on the level-0 profile, at constant speed and at full
@@ -91,7 +105,7 @@ def features(
     ]
     if svo_rad is not None:
         columns += [np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0]
-    return np.stack(columns, axis=-1)
+    return columns
 
 
 def prospects(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.following import keep_safe
-from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, features
+from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, feature_columns
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.engine.povs import POLICIES, Povs
 from merge_sumo.twin.observation import Inputs, Observation
@@ -189,7 +189,7 @@ class TwinRollout:
             of = np.flatnonzero(levels == level)
             if not len(of):
                 continue
-            seen = features(
+            seen = feature_columns(
                 x_m[:, of].ravel(),
                 v_mps[:, of].ravel(),
                 np.tile(x_vut_m[of], cars),
@@ -197,5 +197,5 @@ class TwinRollout:
                 np.tile(svo_rad[of], cars) if network.sees_svo else None,
                 scenario=self._scenario,
             )
-            chosen = network.values_at_once(seen).argmax(axis=1)
+            chosen = network.values_at_once(np.array(seen).T).argmax(axis=1)
             held_mps2[:, of] = actions_mps2(self._scenario)[chosen].reshape(cars, -1)
