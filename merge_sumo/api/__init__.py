@@ -61,13 +61,7 @@ from merge_sumo.campaigns.campaign import (
     resume_campaign,
     run_campaign,
 )
-from merge_sumo.campaigns.one_case import (
-    DEBUG_DEADLINE_S,
-    ONE,
-    Ended,
-    case_of,
-    run_one,
-)
+from merge_sumo.campaigns.one_case import DEBUG_DEADLINE_S, ONE, Ended, case_of, run_one
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.scenario_suggestion import about, suggested, unseen
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of

@@ -280,12 +280,7 @@ def predicted_scores(
             n = len(predicted.score)
             across, up = np.linspace(x.low, x.high, n), np.linspace(v.low, v.high, n)
             filled = axes.contourf(
-                across,
-                up,
-                np.minimum(predicted.score, 0.0),
-                steps,
-                cmap="cividis",
-                extend="min",
+                across, up, np.minimum(predicted.score, 0.0), steps, cmap="cividis", extend="min"
             )
             line: Any = {"colors": "white", "linewidths": 1.6, "linestyles": "solid"}
             if predicted.score.min() < FAILURE_SCORE < predicted.score.max():

@@ -87,11 +87,7 @@ def learned_twin(run: Run, levels: list[int]) -> Twin:
         speed = convert(run.settings["v_vut0_mps"], float)
     if speed is not None and not 0.0 <= speed <= run.scenario.v_start_max_mps:
         raise UserError(f"the VUT began with {speed} m/s, which no campaign of ours has")
-    pool = Pool(
-        levels=tuple(levels),
-        v_vut0_mps=speed,
-        scenario=run.scenario,
-    )
+    pool = Pool(levels=tuple(levels), v_vut0_mps=speed, scenario=run.scenario)
     lines = centre_lines(road_for(run.scenario))
     twin = Twin(pool, povs, 0, criterion=run.criterion, lines=lines)
     last = run.outcomes[-MOST_CASES:]
