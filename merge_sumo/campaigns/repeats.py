@@ -23,7 +23,6 @@ import numpy as np
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import CaseResult
-from merge_sumo.errors import UserError
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import read_indexed
 from merge_sumo.values.case import Case
@@ -79,7 +78,7 @@ def repeat(
     Cases whose trajectory is lost, and those that end in an error now, are left out.
     """
     chosen = chosen_again(run.outcomes, settings)
-    recorded = {o.index: motion for o in chosen if (motion := _trajectory(run, o)) is not None}
+    recorded = run.trajectories(outcome.index for outcome in chosen)
     again = [outcome for outcome in chosen if outcome.index in recorded]
     found = []
     for place, ran in run_cases([outcome.case for outcome in again]) if again else ():
@@ -142,13 +141,6 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
     # The acceleration of a step is the answer to its state, which was the same.
     vehicles = np.flatnonzero(differs[step, :, 2]).tolist()
     return round(step * DT_S, 1), VEHICLES[vehicles[0]] if len(vehicles) == 1 else None
-
-
-def _trajectory(run: Run, outcome: Outcome) -> Trajectory | None:
-    try:
-        return run.trajectory(outcome.index)
-    except UserError:
-        return None
 
 
 def write_repeats(run: Run, found: Iterable[Repeat]) -> None:

@@ -21,7 +21,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
@@ -169,6 +169,14 @@ class Run:
             measures.clipped_steps,
             signals=self._signals.get(index),
         )
+
+    def trajectories(self, indices: Iterable[int]) -> dict[int, Trajectory]:
+        """Return the trajectories of cases by index, without those that are lost."""
+        known = {}
+        for index in indices:
+            with suppress(UserError):
+                known[index] = self.trajectory(index)
+        return known
 
     def whole_batches(self) -> int:
         """Return the number of outcomes without those of a last batch that is not complete.

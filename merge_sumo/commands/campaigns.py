@@ -9,7 +9,7 @@ import typer
 
 from merge_sumo.commands import complete
 from merge_sumo.commands.application import Given, app
-from merge_sumo.commands.options import HOSTING, RUNNING, SETUP, RunArgument
+from merge_sumo.commands.options import HOSTING, RUNNING, SETUP, RunArgument, Shared, option
 from merge_sumo.commands.printing import print_json, quoted, say, show, stoppable
 from merge_sumo.errors import UserError
 
@@ -19,6 +19,17 @@ if TYPE_CHECKING:
 SETTINGS: Final = ("vut", "level", "sampler", "cases", "batch", "seed", "learn_from", "v_vut0")
 COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
 SETUP_OF_A_CASE: Final = tuple(name for name in SETUP if name != "in_process")
+
+
+def _vut_option(help: str, show_default: str) -> Shared:
+    return option(
+        str | None,
+        None,
+        help,
+        metavar="SPEC",
+        show_default=show_default,
+        autocompletion=complete.vuts,
+    )
 
 
 @app.verb(options=(*SETTINGS, "stop_after_converged", *SETUP, "net", *RUNNING, "trust_vut"))
@@ -95,26 +106,27 @@ def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path 
     return f"stopped; go on with: merge-sumo campaign {words}"
 
 
-@app.verb(options=(*COORDINATES, *SETUP_OF_A_CASE, "net", "trust_vut"))
-def run(
-    given: Given,
-    vut: Annotated[
-        str,
-        typer.Option(
-            metavar="SPEC",
-            help="Vehicle under test.",
-            show_default="with --case the campaign's",
-            autocompletion=complete.vuts,
-        ),
-    ] = "",
-    level: Annotated[
-        str | None,
-        typer.Option(
-            help="POV level: 0, 1, 2 or own.",
+@app.verb(
+    options=(*COORDINATES, *SETUP_OF_A_CASE, "net", "trust_vut"),
+    own={
+        "vut": _vut_option("Vehicle under test.", "with --case the campaign's"),
+        "level": option(
+            str | None,
+            None,
+            "POV level: 0, 1, 2 or own.",
             show_default="0, with --case the campaign's",
             autocompletion=complete.one_level,
         ),
-    ] = None,
+        "debug": option(
+            bool,
+            False,
+            "Run the VUT in this process without a deadline: breakpoints work.",
+            "--debug",
+        ),
+    },
+)
+def run(
+    given: Given,
     case: Annotated[
         tuple[Path, int] | None,
         typer.Option(
@@ -129,12 +141,6 @@ def run(
     ] = None,
     gui: Annotated[
         bool, typer.Option("--gui", help="Show it in sumo-gui while it runs, in real time.")
-    ] = False,
-    debug: Annotated[
-        bool,
-        typer.Option(
-            "--debug", help="Run the VUT in this process without a deadline: breakpoints work."
-        ),
     ] = False,
     out: Annotated[
         Path | None, typer.Option(help="New folder to keep it in, for `replay` and sumo-gui.")
@@ -158,16 +164,9 @@ def run(
         if gui:
             say("close the window to go on")
 
-    result = api.run_case(
-        vut or None,
-        recorded=case,
-        level=level,
-        debug=debug,
-        gui=gui,
-        out=out,
-        on_end=ended,
-        **{**(given.keywords if case is None else given.written), **_coordinates(at or [])},
-    )
+    options = given.keywords if case is None else given.written
+    options = {**options, **_coordinates(at or [])}
+    result = api.run_case(recorded=case, gui=gui, out=out, on_end=ended, **options)
     raise typer.Exit(0 if result.passed else 1)
 
 
@@ -183,7 +182,10 @@ def _coordinates(given: list[str]) -> dict[str, float]:
     return values
 
 
-@app.verb(options=("level", *HOSTING, "policies", "net", "tolerance", *RUNNING, "trust_vut"))
+@app.verb(
+    options=("level", *HOSTING, "policies", "net", "tolerance", *RUNNING, "trust_vut"),
+    own={"vut": _vut_option("The changed VUT.", "the campaign's, as its files are now")},
+)
 def rerun(
     given: Given,
     run: RunArgument,
@@ -191,15 +193,6 @@ def rerun(
         list[int] | None,
         typer.Argument(help="Indices of cases in outcomes.jsonl; all if left out."),
     ] = None,
-    vut: Annotated[
-        str,
-        typer.Option(
-            metavar="SPEC",
-            help="The changed VUT.",
-            show_default="the campaign's, as its files are now",
-            autocompletion=complete.vuts,
-        ),
-    ] = "",
 ) -> None:
     """Run recorded cases again with a changed VUT, and say which verdicts changed.
 
@@ -213,7 +206,7 @@ def rerun(
 
     tolerance = given.keywords["tolerance"]
     changed = {name: value for name, value in given.written.items() if name != "tolerance"}
-    result = api.rerun(run, case or (), vut=vut or None, **changed)
+    result = api.rerun(run, case or (), **changed)
     why = result.compared.worse(tolerance)
     if given.as_json:
         print_json({**result.to_record(), **_judgement(why, tolerance)})
@@ -234,28 +227,31 @@ def _judgement(why: list[str], tolerance: float) -> dict[str, Any]:
     return {"tolerance": tolerance, "worse": bool(why), "why": why}
 
 
-@app.verb(options=["net"])
+@app.verb(
+    options=["net"],
+    own={
+        "file_format": option(
+            str,
+            "sumo",
+            "Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders with "
+            "OpenSCENARIO and OpenDRIVE. csv, parquet: one table of motion.",
+            "--format",
+            autocompletion=complete.formats,
+        ),
+        "out": option(
+            Path | None,
+            None,
+            "Folder to write into.",
+            show_default="RUN/scenarios for sumo, else RUN/exports",
+        ),
+    },
+)
 def export(
     given: Given,
     run: RunArgument,
     case: Annotated[
         list[int] | None,
         typer.Argument(help="Indices of cases in outcomes.jsonl; csv, parquet: all if left out."),
-    ] = None,
-    file_format: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            help="Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders "
-            "with OpenSCENARIO and OpenDRIVE. csv, parquet: one table of motion.",
-            autocompletion=complete.formats,
-        ),
-    ] = "sumo",
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder to write into.", show_default="RUN/scenarios for sumo, else RUN/exports"
-        ),
     ] = None,
 ) -> None:
     """Write cases of a campaign for SUMO, for other simulators, or as a table.
@@ -264,7 +260,7 @@ def export(
     """
     from merge_sumo import api
 
-    paths = api.export(run, case or None, file_format=file_format, out=out, **given.keywords)
+    paths = api.export(run, case or None, **given.keywords)
     if given.as_json:
         print_json({"written": list(map(str, paths))})
         return
@@ -315,7 +311,18 @@ def report(given: Given, run: RunArgument) -> None:
         show(path)
 
 
-@app.verb("compare-runs", options=["tolerance", "net", "policies", "trust_vut"])
+@app.verb(
+    "compare-runs",
+    options=["tolerance", "net", "policies", "trust_vut"],
+    own={
+        "rerun": option(
+            bool,
+            True,
+            "Run the failures, errors and timeouts of each with the other's VUT.",
+            "--rerun/--no-rerun",
+        )
+    },
+)
 def compare_runs(
     given: Given,
     a: Annotated[
@@ -324,13 +331,6 @@ def compare_runs(
     b: Annotated[
         Path, typer.Argument(help="Folder of the campaign after.", autocompletion=complete.runs)
     ],
-    rerun: Annotated[
-        bool,
-        typer.Option(
-            "--rerun/--no-rerun",
-            help="Run the failures, errors and timeouts of each with the other's VUT.",
-        ),
-    ] = True,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -351,7 +351,7 @@ def compare_runs(
     from merge_sumo import api
 
     tolerance, runs = given.keywords["tolerance"], {"A": api.open_run(a), "B": api.open_run(b)}
-    compared = api.compare_runs(runs["A"], runs["B"], rerun=rerun, out=out, **given.keywords)
+    compared = api.compare_runs(runs["A"], runs["B"], out=out, **given.keywords)
     why = compared.worse(tolerance)
     if given.as_json:
         campaigns = {

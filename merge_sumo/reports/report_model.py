@@ -28,7 +28,6 @@ from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import DEADLINE_S, LEVELS, OWN
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import Trajectory
 
 LISTED: Final = 10
 """Cases in a list, and messages of errors and timeouts."""
@@ -85,7 +84,7 @@ class ReportModel:
         listed = [*(*examples, *self.spread, *self.near[:LISTED], *self.surprises)]
         telling = {o.index: o for o in (*listed, *self.worst, *self.untested, *self.near)}
         self.shown = sorted(list(telling.values())[:SHOWN], key=lambda outcome: outcome.index)
-        self.motion = {o.index: motion for o in self.shown if (motion := _motion(run, o.index))}
+        self.motion = run.trajectories(outcome.index for outcome in self.shown)
         self.diagnoses: dict[int, Diagnosis] = {
             o.index: diagnose(self.motion[o.index], o.measures)
             for o in self.shown
@@ -150,14 +149,6 @@ def _surfaces(
 
 def _is_told(outcome: Outcome) -> bool:
     return outcome.is_tested and outcome.score is not None
-
-
-def _motion(run: Run, index: int) -> Trajectory | None:
-    """Return the trajectory of a case; None where it is lost: the report goes without."""
-    try:
-        return run.trajectory(index)
-    except UserError:
-        return None
 
 
 def _road_of(run: Run) -> Corridor:

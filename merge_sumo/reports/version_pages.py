@@ -18,7 +18,6 @@ from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.diagnosis import Kind
 from merge_sumo.analysis.verdict import counted, in_words
 from merge_sumo.campaigns.store import Run
-from merge_sumo.errors import UserError
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.static_map import map_of
 from merge_sumo.studies.history import History, LevelOfVersion, RegionChange
@@ -176,10 +175,7 @@ def _counts(compared: RunComparison) -> str:
 def _shown(case: ComparedCase, runs: Mapping[str, Run], motions: Motions) -> dict[str, Any]:
     """Return what the page says of a case; a VUT has no charts where its motion is not known."""
     known = {name: motions.get((case.run, case.index)) for name in runs}
-    try:
-        known[case.run] = runs[case.run].trajectory(case.index)
-    except UserError:  # lost: the page goes without
-        known[case.run] = None
+    known[case.run] = runs[case.run].trajectories([case.index]).get(case.index)
     both = [motion for motion in known.values() if motion is not None]
     sides = []
     for name, outcome in (("A", case.a), ("B", case.b)):

@@ -34,7 +34,6 @@ from merge_sumo.studies.versions import check_comparable
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import fmc, radius_for, regions
 from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import Outcome
 
 ROUNDING: Final = 1e-9
 """Share of the radius by which two points may be further apart and still count as near."""
@@ -301,7 +300,8 @@ def _level(run: Run, level: int, known: dict[int, Avoidance]) -> LevelOfVersion:
     outcomes = [outcome for outcome in run.outcomes if outcome.case.level == level]
     failed = [outcome for outcome in outcomes if outcome.failed]
     points = to_unit((outcome.case for outcome in failed), level, run.scenario)
-    kinds = Counter(_kind(run, outcome) for outcome in failed)
+    motions = run.trajectories(outcome.index for outcome in failed)
+    kinds = Counter(diagnose(m, run.outcome(index).measures).kind for index, m in motions.items())
     avoidances = [known[outcome.index] for outcome in failed if outcome.index in known]
     verdict = judge(outcomes)
     return LevelOfVersion(
@@ -313,14 +313,6 @@ def _level(run: Run, level: int, known: dict[int, Avoidance]) -> LevelOfVersion:
         avoided=sum(one.by_careful for one in avoidances),
         kinds={kind: kinds[kind] for kind in Kind if kinds[kind]},
     )
-
-
-def _kind(run: Run, outcome: Outcome) -> Kind | None:
-    """Return the kind of a failure; None where its motion is lost or it has none."""
-    try:
-        return diagnose(run.trajectory(outcome.index), outcome.measures).kind
-    except UserError:
-        return None
 
 
 ORDER: Final = (
