@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 from merge_sumo.analysis.diagnosis import MEANING, Kind
 from merge_sumo.analysis.summary import Summary
@@ -16,24 +15,11 @@ from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
 
 
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """What counts as a failure in a campaign.
-
-    Attributes:
-        criterion: what a case fails by.
-        crash_m: distance of the front bumpers at M below which the paper's criterion fails a case.
-    """
-
-    criterion: Criterion
-    crash_m: float
-
-    @property
-    def in_words(self) -> str:
-        """Return when a case fails, in a clause."""
-        if self.criterion.is_papers:
-            return f"front bumpers within {self.crash_m:g} m at M"
-        return self.criterion.in_short
+def rule_in_words(criterion: Criterion, crash_m: float) -> str:
+    """Return when a case fails, in a clause; `crash_m` is the distance of the paper's criterion."""
+    if criterion.is_papers:
+        return f"front bumpers within {crash_m:g} m at M"
+    return criterion.in_short
 
 
 def headline(
@@ -41,7 +27,8 @@ def headline(
     summary: Summary,
     worst: Sequence[Outcome],
     kinds: Mapping[int, Kind],
-    rule: Rule,
+    criterion: Criterion,
+    crash_m: float,
 ) -> str:
     """Return the result of a campaign in a few sentences: what was not tested comes first."""
     if not verdict.cases:
@@ -51,7 +38,7 @@ def headline(
         for level, found in summary.levels.items():
             if found.cases and not found.tested:
                 said.append(f"At POV level {level_name(level)} nothing was tested.")
-        said.append(_failures(verdict, summary, worst, kinds, rule))
+        said.append(_failures(verdict, summary, worst, kinds, criterion, crash_m))
     return " ".join(said)
 
 
@@ -60,12 +47,14 @@ def _failures(
     summary: Summary,
     worst: Sequence[Outcome],
     kinds: Mapping[int, Kind],
-    rule: Rule,
+    criterion: Criterion,
+    crash_m: float,
 ) -> str:
+    rule = rule_in_words(criterion, crash_m)
     if not summary.failures:
         others = "the other " if verdict.tested < verdict.cases else ""
         return (
-            f"No failure ({rule.in_words}) in {others}{counted(verdict.tested, 'case')}. That is "
+            f"No failure ({rule}) in {others}{counted(verdict.tested, 'case')}. That is "
             "no proof: the search saw these cases and no others."
         )
     failing = {level: found for level, found in summary.levels.items() if found.failures}
@@ -81,17 +70,13 @@ def _failures(
     common = Counter(kinds[o.index] for o in worst if o.index in kinds).most_common(1)
     if common:
         (kind, count), of_a_kind = common[0], sum(o.index in kinds for o in worst)
-        near = (
-            ""
-            if of_a_kind == summary.failures
-            else f" with front bumpers within {rule.crash_m:g} m"
-        )
+        near = "" if of_a_kind == summary.failures else f" with front bumpers within {crash_m:g} m"
         share = "All are" if count == summary.failures else f"{count} of {of_a_kind}{near} are"
         text += f" {share} of the kind “{kind}”: {MEANING[kind]}."
     return text
 
 
-def failures_in_words(failures: Sequence[Outcome], rule: Rule) -> str:
+def failures_in_words(failures: Sequence[Outcome], rule: str) -> str:
     """Return how many failures there are, what fails, and how severe they are, in a clause."""
     found = Counter(outcome.measures.severity for outcome in failures)
     severe = [
@@ -99,7 +84,7 @@ def failures_in_words(failures: Sequence[Outcome], rule: Rule) -> str:
         for word in Severity
         if (number := found[word])
     ]
-    told = "; ".join(filter(None, (rule.in_words, ", ".join(severe))))
+    told = "; ".join(filter(None, (rule, ", ".join(severe))))
     return f"{counted(len(failures), 'failure')} ({told})"
 
 

@@ -23,7 +23,6 @@ from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
 from merge_sumo.reports.headline import (
-    Rule,
     avoidable_text,
     harmful_merges_text,
     headline,
@@ -90,8 +89,8 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
 def head_words(model: ReportModel) -> dict[str, Any]:
     """Return the result in sentences, and what a reader is to know of the page as a whole."""
     run, wanted = model.run, model.run.settings.get("cases")
-    rule = Rule(run.criterion, run.scenario.dx_crash_m)
-    result = headline(model.verdict, model.summary, model.worst, model.kinds, rule)
+    rule = run.criterion, run.scenario.dx_crash_m
+    result = headline(model.verdict, model.summary, model.worst, model.kinds, *rule)
     lost = [str(o.index) for o in model.shown if o.index not in model.motion]
     if len(lost) > LISTED:
         lost = [*lost[:LISTED], counted(len(lost) - LISTED, "other")]

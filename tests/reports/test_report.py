@@ -23,7 +23,7 @@ from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report_data
 from merge_sumo.reports import report_model as report_facts
-from merge_sumo.reports.headline import Rule, headline
+from merge_sumo.reports.headline import headline
 from merge_sumo.reports.report import report_page, write_report
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
 from merge_sumo.road.merge import road_of
@@ -383,8 +383,8 @@ class TestTheSurrogate:
 
 def headline_of(outcomes) -> str:
     levels = (0, 1, 2) if outcomes else (0,)
-    rule = Rule(PAPER_CRITERION, US23.dx_crash_m)
-    return headline(judge(outcomes), summarise(outcomes, levels), failures(outcomes), {}, rule)
+    rule = PAPER_CRITERION, US23.dx_crash_m
+    return headline(judge(outcomes), summarise(outcomes, levels), failures(outcomes), {}, *rule)
 
 
 class TestTheHeadline:
