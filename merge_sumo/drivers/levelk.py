@@ -36,7 +36,7 @@ SVO_FEATURES: Final = 2
 LEVEL0_GAP_FEATURE: Final = 8
 """Column with the gap at M if the POV keeps its speed and the VUT the level-0 profile, as
 tanh(gap / 25 m)."""
-MANY_ROWS: Final = 64
+MANY_ROWS: Final = 40
 """Rows from which products of whole matrices are quicker than one after the other."""
 SINGLE_ERROR: Final = 1e-3
 """A lead of the best action, as a share of 1 + max |Q|, that float32 cannot turn round. Of 200,000

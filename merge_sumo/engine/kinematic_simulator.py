@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Final
@@ -60,7 +60,7 @@ class KinematicSimulator(Simulator):
         Raises `UserError` where a case ends otherwise in SUMO.
         """
         ended = dict(rollout(self.world, self.pov, self.vut, cases, ran_again))
-        close = {place for place, trajectory in ended.items() if self._is_close_call(trajectory)}
+        close = self._close_calls(ended)
         places = sorted(close | drawn(cases))
         in_sumo = self._in_sumo([cases[place] for place in places])
         for place, trajectory in zip(places, in_sumo, strict=True):
@@ -70,20 +70,28 @@ class KinematicSimulator(Simulator):
         self.in_sumo = frozenset(places)
         yield from ended.items()
 
-    def _is_close_call(self, trajectory: Trajectory) -> bool:
-        """Return whether a rounding error could end an episode in another step or turn its verdict.
+    def _close_calls(self, ended: Mapping[int, Trajectory]) -> set[int]:
+        """Return the places where a rounding error could turn the verdict or end another step.
 
-        The VUT is put forward and back by one, at the end and a step before it.
+        For the end the VUT is put forward and back by one, in the last step and the one before.
         """
-        x_m, v_mps = trajectory.motion[-2:, :, 0].T, trajectory.motion[-2:, :, 1].T
-        scenario, ahead_m, behind_m = trajectory.case.scenario, x_m.copy(), x_m.copy()
-        ahead_m[VUT] += ROUNDING
-        behind_m[VUT] -= ROUNDING
-        ended = scenario.has_ended(ahead_m, v_mps), scenario.has_ended(behind_m, v_mps)
-        criterion = self._plan.criterion
-        return bool((ended[0] != ended[1]).any()) or criterion.is_close_call(
-            trajectory, ROUNDING, centre_lines(self._plan.road)
-        )
+        if not ended:
+            return set()
+        criterion, lines = self._plan.criterion, centre_lines(self._plan.road)
+        last = np.concatenate([one.motion[-2:] for one in ended.values()])
+        starts = np.cumsum([0, *(min(2, len(one.motion)) for one in ended.values())])[:-1]
+        x_m, v_mps = last[..., 0].T, last[..., 1].T
+        by_shift = []
+        for shift_m in (ROUNDING, -ROUNDING):
+            shifted_m = x_m.copy()
+            shifted_m[VUT] += shift_m
+            by_shift.append(self._plan.scenario.has_ended(shifted_m, v_mps))
+        unclear = np.logical_or.reduceat(by_shift[0] != by_shift[1], starts)
+        return {
+            place
+            for (place, one), of_end in zip(ended.items(), unclear.tolist(), strict=True)
+            if of_end or criterion.is_close_call(one, ROUNDING, lines)
+        }
 
     def _in_sumo(self, cases: Sequence[Case]) -> list[Trajectory]:
         """Return what becomes of cases in SUMO."""

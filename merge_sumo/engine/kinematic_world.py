@@ -43,7 +43,8 @@ class EquationWorld:
 
         `starts` are (x in m, v in m/s) in the order of rows. `own` is for a `World` alone.
         """
-        self.x_m[:, corridor], self.v_mps[:, corridor] = np.transpose(starts)
+        for row, (x, v) in enumerate(starts):
+            self.x_m[row, corridor], self.v_mps[row, corridor] = x, v
 
     def park(self, corridor: int) -> None:
         """Put the vehicles of a corridor aside, at a stand before M."""

@@ -365,9 +365,9 @@ class _Rollout:
         length = self.row - episode.first_row + (error is None)
         first = episode.first_row % self.ring
         rows = self.record[corridor]
-        # In two parts, of which the second is empty where the ring does not close.
-        parts = rows[first : first + length], rows[: max(first + length - self.ring, 0)]
-        motion = np.concatenate(parts)
+        motion = rows[first : first + length].copy()
+        if len(motion) < length:  # the ring closes
+            motion = np.concatenate((motion, rows[: length - len(motion)]))
         if error is None:
             motion[-1, :, 0] = self.world.x_m[:, corridor]
             motion[-1, :, 1] = self.world.v_mps[:, corridor]

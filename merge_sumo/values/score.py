@@ -402,11 +402,14 @@ def _task(trajectory: Trajectory) -> float:
     """Return P_task in [-1, 0]: a slow ramp, a final speed off the highway's, harshness, no end."""
     v_vut, scenario = trajectory.v_vut_mps, trajectory.case.scenario
     v_end = float(v_vut[-1])
-    slow = float(np.maximum(scenario.v_min_mps - v_vut, 0.0).mean()) / scenario.v_min_mps
+    steps = len(v_vut)
+    # The sums are a third of the time of `mean`, and the same to the last bit.
+    slow = float(np.add.reduce(np.maximum(scenario.v_min_mps - v_vut, 0.0)) / steps)
+    slow /= scenario.v_min_mps
     off_range = max(scenario.v_hw_min_mps - v_end, v_end - scenario.v_hw_max_mps, 0.0)
     off_range = min(off_range / scenario.v_hw_min_mps, 1.0)
     hardest = max(-scenario.a_min_mps2, scenario.a_max_mps2)
-    harsh = float(np.square(trajectory.a_vut_mps2).mean()) / hardest**2
+    harsh = float(np.add.reduce(np.square(trajectory.a_vut_mps2)) / steps) / hardest**2
     return -(slow + off_range + harsh + (trajectory.end is End.TIMEOUT)) / 4.0
 
 

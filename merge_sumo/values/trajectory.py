@@ -111,6 +111,8 @@ class Trajectory:
     @property
     def nearest(self) -> int:
         """Row of the car of the mainline that is nearest to the VUT at the end."""
+        if self.motion.shape[1] == 2:
+            return POV
         cars = [row for row in range(self.motion.shape[1]) if row != VUT]
         return min(cars, key=lambda row: abs(self.motion[-1, row, 0] - self.motion[-1, VUT, 0]))
 
