@@ -228,14 +228,9 @@ def with_criterion(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSettings, Runner]:
-    """Return the settings that keywords make, and where their cases run.
+    """Return the settings that keywords of `CampaignKeywords` make, and where their cases run.
 
-    Args:
-        vut: a spec, or a class, function or object of this process.
-        given: keywords of `CampaignKeywords`.
-
-    Raises `UserError` for values that make no settings. Warns with a `Notice` of what is odd about
-    the criterion.
+    Warns with a `Notice` of what is odd about the criterion.
     """
     runner, given = runner_of(given)
     spec, pov_spec, workers = drivers_of(vut, given.get("pov"), runner.workers, stacklevel=4)
@@ -252,12 +247,9 @@ def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSetting
 def given_again(
     vut: AnyVut | None, given: Mapping[str, Any], recorded: Mapping[str, Any]
 ) -> tuple[dict[str, Any], Runner]:
-    """Return the fields of settings that are given for a recorded campaign, and where cases run.
+    """Return the settings that are given for a recorded campaign, and where its cases run.
 
-    Args:
-        vut: the VUT, where it is given.
-        given: the other keywords.
-        recorded: VUT and POV where they are not given.
+    `recorded` has VUT and POV for where they are not given.
     """
     runner, given = runner_of(given)
     named = {

@@ -91,8 +91,8 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
     """Return the outcomes of the cases that are to run again, in that order.
 
     None where the package brings all that drives, nor of a TraCI client that nobody starts: it may
-    have gone. Half of them are the first ones, which ran when the controller was new; the others
-    are spread over the campaign, and run before those. Errors may be a slow machine's doing.
+    have gone. Half are the first cases, which a new controller ran; the others are spread over the
+    campaign, and run before those. Errors may be a slow machine's doing, and are left out.
     """
     built_in = built_in_vuts()
     if waits_for_client(settings.vut, settings.vut_command):

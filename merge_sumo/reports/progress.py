@@ -25,15 +25,10 @@ LINES: Final = 10
 
 @dataclass(slots=True)
 class Work:
-    """Progress of some work, in items.
+    """Progress of some work: items done of a total, and its time by the monotonic clock.
 
-    Attributes:
-        total: items of the work.
-        start_s: its begin, by the monotonic clock.
-        done: items done.
-        before: items done before a resume, which say nothing of the rate.
-        end_s: its end; None while it runs.
-        said: items done when a line was last said of it.
+    What was done `before` a resume says nothing of the rate; `said` is what was done when a line
+    was last said of it.
     """
 
     total: int

@@ -22,15 +22,12 @@ class Level:
     """What the page says of a POV level.
 
     Attributes:
-        level: the level.
         found: what the cases have shown there.
-        caption: the level, or the name of a POV of the tester's own.
-        about: what a POV of the level does.
+        caption: the level, or the name of a POV of the tester's own; `about` says what it does.
         plausible: coverage if all places failed that the surrogate does not exclude.
         truth: coverage of the truth.
         note: what was found, in sentences.
-        axes: its coordinates.
-        pairs: pairs of coordinates that its map may show, the first one first.
+        pairs: pairs of its axes that its map may show, the first one first.
     """
 
     level: int
