@@ -98,30 +98,6 @@ class TestOpenScenario:
         centre, size = box.find("Center"), box.find("Dimensions")
         assert float(centre.get("x")) + float(size.get("length")) / 2.0 == 0.0
 
-    def test_lies_on_the_road_of_its_opendrive(self, scenario):
-        tree = etree.parse(scenario)
-        road_file = tree.find(".//RoadNetwork/LogicFile").get("filepath")
-        # Roads with junction -1 are the edges; the others join them at M.
-        roads = etree.parse(scenario.parent / road_file).findall("road[@junction='-1']")
-        assert len(roads) == 3
-        lines = []
-        for road in roads:
-            geometry = road.findall("planView/geometry")
-            assert sum(float(g.get("length")) for g in geometry) == pytest.approx(
-                float(road.get("length")), abs=1e-3
-            )
-            lines += [tuple(float(g.get(n)) for n in ("x", "y", "hdg", "length")) for g in geometry]
-        for who in ("pov", "vut"):
-            for _, x, y, _ in vertices(tree, who):
-                across = []
-                for x0, y0, heading, length in lines:
-                    along = (x - x0) * math.cos(heading) + (y - y0) * math.sin(heading)
-                    aside = (y - y0) * math.cos(heading) - (x - x0) * math.sin(heading)
-                    if -0.01 <= along <= length + 0.01:
-                        across.append(abs(aside))
-                # The reference line of a road is its edge: two lanes of 3.2 m lie beside it.
-                assert min(across) <= 6.4 + 1e-3
-
     def test_of_the_same_case_is_the_same_bytes(self, made, scenario, tmp_path):
         again = write_openscenario(
             made, failures(made.outcomes)[0].index, tmp_path / "again", road_of()
