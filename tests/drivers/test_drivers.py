@@ -157,5 +157,5 @@ def test_every_built_in_vut_makes_a_driver_and_unknown_names_are_refused():
         for k in range(4):
             driver.begin(k, CASE)
         assert driver.act(scene(x_pov=[-300.0, -250.0, -200.0, -180.0])).shape == (4,)
-    with pytest.raises(UserError, match="no VUT 'design9': did you mean design[12] or design[12]"):
+    with pytest.raises(UserError, match=r"no VUT 'design9': did you mean design[12] or "):
         VutFactory("design9")
