@@ -199,7 +199,7 @@ def resume(
     check_keywords("resume", given, CampaignKeywords)
     folder = run.folder if isinstance(run, CampaignRun) else Path(run)
     recorded = read_settings(folder)
-    named = {name: value for name, value in given.items() if value is not None}
+    named = {name: one for name, one in given.items() if one is not None or name == "workers"}
     fields, runner = given_again(vut, named, {name: recorded.get(name) for name in ("vut", "pov")})
     settings = settings_of(folder, recorded, fields, trust=trust_vut)
     if "level" in named:

@@ -9,6 +9,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
@@ -345,7 +347,7 @@ class TruthResult(Result):
                 "cases": len(truth.score),
                 "failures": len(truth.failures),
                 "fmc": fmc(truth.failures),
-                "region_sizes": _region_sizes(truth),
+                "region_sizes": np.bincount(regions(truth.failures)).tolist(),
                 "real_regions": len(truth.real_regions()),
                 "fail_when": self.criterion.text,
                 "in_sumo": truth.in_sumo,
@@ -377,11 +379,6 @@ def _engine_of(truth: Truth) -> str:
     if truth.in_sumo == len(truth.score):
         return ""
     return f"; by the equations of motion, and {truth.in_sumo} cases in SUMO as well, all alike"
-
-
-def _region_sizes(truth: Truth) -> list[int]:
-    labels = regions(truth.failures).tolist()
-    return [labels.count(label) for label in range(max(labels, default=-1) + 1)]
 
 
 @dataclass(frozen=True, repr=False)

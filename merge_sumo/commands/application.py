@@ -85,7 +85,7 @@ class Given:
 
     Attributes:
         keywords: all of them, written or by default.
-        written: those that a person wrote, and `progress`.
+        written: those that a person wrote, and `workers` and `progress`, which decide nothing.
         as_json: whether to print JSON.
     """
 
@@ -136,6 +136,8 @@ class Commands(typer.Typer):
                 }
                 given = {keywords[name]: values.pop(name) for name in passed}
                 named = {keywords[name]: given[keywords[name]] for name in written}
+                if "workers" in given:
+                    named["workers"] = given["workers"]
                 if "quiet" in given:
                     given["progress"] = named["progress"] = not given.pop("quiet")
                     named.pop("quiet", None)
