@@ -37,7 +37,7 @@ from merge_sumo.values.score import FAILURE_SCORE
 
 NO_GAP_M: Final = 200.0
 """Gap of a VUT that never arrives: the POV goes first, at the largest possible distance."""
-MAX_LEARNED: Final = 600
+MAX_LEARNED: Final = 1000
 """Cases that a process learns from; bounds the time per batch in a long campaign."""
 BRANCH_FROM: Final = 20
 """Fewest cases of either merging order to learn the gap of each order by itself."""
