@@ -22,7 +22,7 @@ from merge_sumo.values.trajectory import End, Trajectory
 
 Answer = Callable[[Inputs], FloatArray]
 """Gives accelerations of the VUT, (R,), by inputs, (R, inputs)."""
-STILL: Final = 0.8
+STILL: Final = 0.92
 """Share of rows that still move below which the others are dropped."""
 
 
