@@ -214,12 +214,12 @@ def failure_boxes(
     siblings are. The shares are of cases that a sampler chose: they are no probabilities. `kinds`
     are the kinds of failures by index, as far as known.
     """
-    from sklearn.tree import DecisionTreeClassifier
-
     scored = [o for o in outcomes if o.case.level == level and o.score is not None]
     failed = np.array([o.failed for o in scored], dtype=bool)
     if failed.sum() < FEWEST_FAILURES:
         return []
+    from sklearn.tree import DecisionTreeClassifier
+
     axes = features(scored[0].case.scenario, level)
     places = np.array([[feature.value(o.case) for feature in axes] for o in scored])
     tree = DecisionTreeClassifier(
