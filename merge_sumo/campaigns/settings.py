@@ -21,7 +21,7 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.system.records import RecordError, check_fields
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, OWN, US23, Scenario
+from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, OWN, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import VutOptions
 
@@ -62,6 +62,10 @@ class CampaignSettings:
         self.vut_options(None)
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
+        for level in self.levels:
+            if level not in self.scenario.levels:
+                levels = ", ".join(map(level_name, self.scenario.levels))
+                raise UserError(f"the levels are {list(self.levels)}: choose from {levels}")
         self._check_sampler()
         for name in ("cases", "batch"):
             if (number := getattr(self, name)) is not None and number < 1:

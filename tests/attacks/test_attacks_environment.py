@@ -72,6 +72,7 @@ def shell(world: World, command: str, streams: str = "", before: str = "") -> tu
 
 
 class TestStreams:
+    @pytest.mark.slow
     @pytest.mark.parametrize("command", some(COMMANDS, "scenario list"))
     def test_that_are_closed_change_nothing_else(self, world, command):
         code, out, _ = shell(world, command)
@@ -83,10 +84,12 @@ class TestStreams:
             if ">&-" not in streams.split() and "--version" in command:
                 assert said == out
 
+    @pytest.mark.slow
     def test_that_are_all_closed_leave_a_campaign_as_it_is(self, world):
         code, out, errors = shell(world, CAMPAIGN.format(workers=2), CLOSED[-1])
         assert (code, out, errors) == (0, "", "")
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("command", some(COMMANDS, "scenario list"))
     def test_a_result_that_cannot_be_written_is_an_error(self, world, command):
         code, out, _ = shell(world, command)
@@ -100,6 +103,7 @@ class TestStreams:
         )
         assert "Traceback" not in errors
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("command", some(COMMANDS, "scenario list"))
     def test_a_full_standard_error_costs_what_is_said_there_alone(self, world, command):
         code, out, _ = shell(world, command)
@@ -115,6 +119,7 @@ class TestStreams:
 class TestLimits:
     """Each ends as without a limit, or with 2 and one sentence, and leaves nothing."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "limit",
         some(

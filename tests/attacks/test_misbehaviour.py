@@ -53,6 +53,7 @@ def test_one_case_is_guilty_and_the_catalogue_has_more_than_a_hundred_kinds():
     assert set(SOME) <= set(CATALOGUE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n in SOME else pytest.mark.long) for n in CATALOGUE]
 )

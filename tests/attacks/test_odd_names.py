@@ -58,6 +58,7 @@ def in_a_process(terminal: dict[str, str], *arguments: object) -> tuple[int, str
 
 
 class TestAVutFile:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "name",
         [
@@ -105,6 +106,7 @@ class TestAVutFile:
 
 
 class TestATerminal:
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", SOME_TERMINALS)
     def test_of_any_encoding_shows_results_in_folders_of_any_name(self, made, tmp_path, name):
         folder = Path(shutil.copytree(made.folder, tmp_path / NASTY))

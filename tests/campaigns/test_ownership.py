@@ -251,6 +251,7 @@ class TestACopyOfOnesOwnRun:
             assert refuses(command_line(*command), f"was begun in {mine.folder}"), command
         assert not other.ran()
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("over", ["it", "what is left of it"])
     def test_that_is_unpacked_over_it_runs_nothing(
         self, over, own, tmp_path, command_line, monkeypatch
@@ -277,6 +278,7 @@ class TestACopyOfOnesOwnRun:
         assert refuses(command_line("rerun", own.run), "is another folder")
         assert not own.ran()
 
+    @pytest.mark.slow
     def test_behind_a_link_is_the_folder_that_it_leads_to(self, tmp_path, mine, command_line):
         link = tmp_path / "link"
         link.symlink_to(mine.run)
@@ -290,12 +292,14 @@ class TestACopyOfOnesOwnRun:
 
 
 class TestAFolderOfOnesOwn:
+    @pytest.mark.slow
     def test_runs_its_code_by_every_command(self, tmp_path, mine, command_line):
         for command in commands(mine.run, tmp_path):
             code, _, err = command_line(*command)
             assert code in (0, 1), err
             assert mine.ran(), command
 
+    @pytest.mark.slow
     def test_runs_ones_own_changed_code_where_a_changed_vut_is_what_is_wanted(
         self, own, command_line
     ):
@@ -308,6 +312,7 @@ class TestAFolderOfOnesOwn:
             command_line("campaign", "--resume", own.run, "--quiet"), "vut_files.my_vut.py differs"
         )
 
+    @pytest.mark.slow
     def test_that_was_moved_is_asked_about(self, own, tmp_path, command_line, monkeypatch):
         own.folder.rename(tmp_path / "moved")
         monkeypatch.chdir(tmp_path / "moved")
@@ -315,6 +320,7 @@ class TestAFolderOfOnesOwn:
         assert command_line("rerun", "run", 0, "--trust-vut")[0] == 0
         assert command_line("rerun", "run", 0, "--vut", "my_vut.py:Vut")[0] == 0
 
+    @pytest.mark.slow
     def test_is_ones_own_from_anywhere_where_the_controller_has_its_whole_path(
         self, tmp_path, command_line, monkeypatch
     ):

@@ -79,6 +79,7 @@ def campaign(spec: str, folder: Path, workers: int = 1, **settings) -> Run:
         return run_campaign(CampaignSettings(**{"scenario": US23, **given}), folder, workers=there)
 
 
+@pytest.mark.slow
 def test_a_class_without_reset_drives_as_one_with_it(vut, tmp_path):
     lines = []
     for number, (source, workers) in enumerate([(WITH_RESET, 1), (WITHOUT_RESET, 2)]):
@@ -148,6 +149,7 @@ def test_a_callable_object_of_python_begins_every_episode_as_it_was_given(tmp_pa
     assert all(one.same for one in run.repeats)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some(REMEMBERING, "module"))
 def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, name):
     spec, folder = vut(REMEMBERING[name]), tmp_path / "run"
@@ -177,6 +179,7 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, n
     assert "no file of the VUT has changed" in str(again)
 
 
+@pytest.mark.slow
 def test_a_random_controller_is_found_and_told_from_one_that_remembers(vut, tmp_path):
     run = campaign(vut(RANDOM), tmp_path / "run", cases=40)
     repeats = read_repeats(run)

@@ -321,6 +321,7 @@ LONG = [*("--vut", "design1", "--level", "0", "--sampler", "uniform"), "--cases"
 
 
 class TestASignal:
+    @pytest.mark.slow
     @pytest.mark.parametrize("number", some([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
     def test_lets_the_batch_end_and_says_how_to_go_on(self, tmp_path, number):
         folder = tmp_path / "run"
@@ -336,6 +337,7 @@ class TestASignal:
         assert len(run.outcomes) == run.whole_batches() > 0
         assert len(run.outcomes) % 40 == 0
 
+    @pytest.mark.slow
     def test_stops_at_once_when_it_comes_twice_even_with_workers(self, tmp_path):
         folder = tmp_path / "run"
         process = started(folder, "--batch", "100000", "--workers", "2")

@@ -117,6 +117,7 @@ def test_a_share_that_is_none_and_a_sampler_that_cannot_tell_are_refused(sampler
         CampaignSettings(vut="design1", levels=(0,), scenario=US23, **asked)
 
 
+@pytest.mark.slow
 def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(tmp_path):
     plan: dict[str, Any] = {
         "vut": "design1",

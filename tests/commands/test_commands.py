@@ -147,6 +147,7 @@ class TestCompletion:
 class TestCtrlC:
     """On a terminal: what is drawn is ended, the cursor is shown, and the exit code is 130."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "command",
         [

@@ -103,6 +103,7 @@ def world(request, monkeypatch, tmp_path, command_line) -> World:
     return World(TRIED[request.param], command_line)
 
 
+@pytest.mark.slow
 def test_every_command_judges_a_case_alike(world: World):
     records = world.records
     assert 0 < sum(map(fails, records)) < CASES, "else nothing is told apart"

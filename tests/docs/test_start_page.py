@@ -48,6 +48,7 @@ def test_installing_is_all_that_comes_before():
     assert len(SOURCE.splitlines()) <= 10
 
 
+@pytest.mark.slow
 def test_the_steps_lead_to_a_failing_case(campaign, command_line, monkeypatch):
     folder, worst = campaign
     monkeypatch.chdir(folder)
@@ -58,6 +59,7 @@ def test_the_steps_lead_to_a_failing_case(campaign, command_line, monkeypatch):
     assert command_line(*RERUN)[0] == 0, "nothing has changed yet"
 
 
+@pytest.mark.slow
 def test_the_last_step_shows_it_live(campaign, command_line, display, monkeypatch):
     folder, worst = campaign
     monkeypatch.chdir(folder)

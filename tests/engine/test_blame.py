@@ -142,6 +142,7 @@ class TestClocks:
 
 
 class TestKills:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("how", "times"),
         [(KILLED, 1), (KILLED, MAX_KILLS - 1), ("os._exit(3)", 1), ("os.abort()", 1)],
@@ -156,6 +157,7 @@ class TestKills:
         assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] == bad
         assert f"{bad} cases ran again, because a process of theirs" in struck.ran_again_in_words
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("how", "said"),
         [(KILLED, "(SIGKILL)"), ("os._exit(3)", "exit code 3"), ("os.abort()", "(SIGABRT)")],
@@ -170,6 +172,7 @@ class TestKills:
                 assert not outcome.measures.end.is_error
         assert run.ran_again == 0
 
+    @pytest.mark.slow
     def test_while_a_vut_is_opened_do_not_end_the_campaign(self, campaign, calm):
         once = """
 import os, pathlib, signal
@@ -182,6 +185,7 @@ if not flag.exists():
         with pytest.raises(UserError, match=r"opening the VUT .* by signal 9 \(SIGKILL\)"):
             campaign("always", f"import os, signal\n{KILLED}\n{CALM}")
 
+    @pytest.mark.slow
     def test_of_a_vut_that_is_opened_again_are_not_those_of_all_cases(self, campaign, calm):
         """The process dies at a case, and again when it starts anew: the other cases pass."""
         source = DIES.format(how="(FLAGS / 'again').touch(); os._exit(3)", times=1)
@@ -192,6 +196,7 @@ if (FLAGS / "again").exists():
 """
         assert outcomes(campaign("struck", source)) == outcomes(calm)
 
+    @pytest.mark.slow
     def test_of_a_worker_mark_what_ran_again(self, tmp_path):
         with open_workers(2) as workers:
             work = partial(killed_once, tmp_path / "flag")
@@ -213,6 +218,7 @@ def marked(result):
     return result[0], True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hosted", some(["yes", ""], "yes"))
 def test_a_stop_of_all_of_us_is_no_error_of_the_vut(campaign, calm, hosted):
     source = STOPS.replace("{hosted}", hosted)

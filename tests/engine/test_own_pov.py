@@ -304,6 +304,7 @@ SOME = ("os._exit 0", "batched: dies")
 
 
 class TestWhatItDoesWrong:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "name", [pytest.param(n, marks=() if n in SOME else pytest.mark.long) for n in CATALOGUE]
     )
@@ -357,6 +358,7 @@ class TestWhatItDoesWrong:
             erred = trajectory.case.v_pov0_mps >= 30.0
             assert (trajectory.end is End.SIM_ERROR) == erred
 
+    @pytest.mark.slow
     def test_when_both_processes_die_in_the_same_case_is_found_out(self):
         dies = "import os\ndef Pov(seen):\n    return os._exit(3) if seen.{} > 34.0 else 0.0\n"
         vut, other = pov(dies.format("v_pov_mps"), "vut.py"), pov(dies.format("v_vut_mps"))

@@ -422,6 +422,7 @@ ADDRESSES = [
 ]
 
 
+@pytest.mark.slow
 def test_what_an_address_says_wrongly_is_left_out(browser, made):
     with shown(browser, made.folder / report.REPORT) as page:
         for address in ADDRESSES:
@@ -524,6 +525,7 @@ def placed(page, view: str, who: str) -> tuple[float, float]:
     return float(x), float(y)
 
 
+@pytest.mark.slow
 @BOTH
 def test_two_top_views_move_together_and_show_the_same_stretch_of_road(browser, tmp_path, size):
     run = write_run(tmp_path / "run", 20, error=None, timeouts=(0,))
@@ -726,6 +728,7 @@ def drawn_at(page, outcome, axes: Sequence[str]) -> tuple[float, float]:
     return x - u, y - v
 
 
+@pytest.mark.slow
 @LOOKS
 def test_a_campaign_in_traffic_fits_the_window_too(browser, in_traffic, options):
     with shown(browser, in_traffic.folder / report.REPORT, **options) as page:

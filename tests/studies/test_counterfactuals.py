@@ -169,12 +169,14 @@ def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
 
 
 class TestWorkers:
+    @pytest.mark.slow
     def test_of_any_number_find_the_same(self, run, found):
         with open_workers(2) as two:
             assert avoidance_of(run, two) == found
         with Workers(InProcess, 3) as three:
             assert avoidance_of(run, three) == found
 
+    @pytest.mark.slow
     def test_that_die_at_a_failure_leave_out_that_one_and_no_other(self, run, found):
         left_out = found[1].index
         with Workers(lambda: DiesAt(left_out), 1) as workers:

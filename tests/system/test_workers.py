@@ -142,11 +142,13 @@ class TestAWorkerThatDies:
         assert (tmp_path / "flag").exists()
         assert found == [(place, place * place) for place in range(20)]
 
+    @pytest.mark.slow
     def test_each_time_at_one_item_loses_that_one_and_no_other(self, two):
         work = partial(killed_always_at, {7})
         found = sorted(two.run(work, range(20), lambda item: -item, chunk=10))
         assert found == [(place, -7 if place == 7 else place * place) for place in range(20)]
 
+    @pytest.mark.slow
     def test_at_a_case_makes_it_a_sim_error_with_a_reason(self, two):
         cases = from_unit(np.random.default_rng(0).random((4, 2)), 0, scenario=US23)
         plan = plan_for("design1", corridors=4)
@@ -160,12 +162,14 @@ class TestAWorkerThatDies:
 
 
 class TestLocalProcesses:
+    @pytest.mark.slow
     def test_are_replaced_after_a_number_of_chunks(self):
         with Workers(lambda: LocalProcesses(1), 1, recycle_after=2) as workers:
             found = dict(workers.run(process_ids, range(6), no_loss, chunk=1))
         assert len(set(found.values())) == 3
         assert os.getpid() not in found.values()
 
+    @pytest.mark.slow
     def test_do_not_hear_ctrl_c(self, two):
         ids = set(dict(two.run(process_ids, range(8), no_loss, chunk=1)).values())
         results = two.run(slowly, range(4), no_loss, chunk=1)
@@ -174,6 +178,7 @@ class TestLocalProcesses:
             os.kill(process, signal.SIGINT)
         assert sorted([first, *results]) == [(place, place * place) for place in range(4)]
 
+    @pytest.mark.slow
     def test_end_with_a_parent_that_is_killed(self, tmp_path):
         script = tmp_path / "parent.py"
         script.write_text(
@@ -236,6 +241,7 @@ class TestWorkersThatBeginHere:
 
 
 class TestACampaign:
+    @pytest.mark.slow
     def test_has_the_same_outcomes_where_it_goes_on_in_processes(self, expected, tmp_path):
         with open_workers(2, here_s=1e-9) as workers:
             run_campaign(SETTINGS, tmp_path / "run", workers=workers)
@@ -308,6 +314,7 @@ def workers_at(address: str) -> int:
 
 
 class TestADaskCluster:
+    @pytest.mark.slow
     def test_gives_the_same_outcomes_although_a_worker_is_killed(self, cluster, expected, tmp_path):
         address, (first, _) = cluster
         seen = []
@@ -337,6 +344,7 @@ class TestFolderWhereAPersonIs:
 
     SHADOWED = ("multiprocessing", "json", "numpy", "threadpoolctl", "merge_sumo")
 
+    @pytest.mark.slow
     def test_brings_no_modules(self, tmp_path):
         for name in self.SHADOWED:
             (tmp_path / f"{name}.py").write_text("raise SystemExit('it was run')\n")
@@ -347,6 +355,7 @@ class TestFolderWhereAPersonIs:
         assert ended.returncode == 0, ended.stderr
         assert "it was run" not in ended.stdout + ended.stderr
 
+    @pytest.mark.slow
     def test_is_searched_by_what_a_worker_starts(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "beside.py").write_text("print('mine')\n")

@@ -70,6 +70,7 @@ def test_the_page_of_measures_has_its_measure(merge_sumo):
     assert "| `closest_m` | m | least distance of the front bumpers" in page
 
 
+@pytest.mark.slow
 def test_records_have_its_measure_after_those_of_the_package(folder):
     records = [json.loads(line) for line in (folder / "outcomes.jsonl").read_text().splitlines()]
     assert len(records) == 40
@@ -79,6 +80,7 @@ def test_records_have_its_measure_after_those_of_the_package(folder):
     assert all((r["margin"] < 0.0) == (r["closest_m"] < 4.0) for r in records)
 
 
+@pytest.mark.slow
 def test_the_record_of_the_campaign_has_the_version_of_the_package(folder):
     record = json.loads((folder / "campaign.json").read_text(encoding="utf-8"))
     assert record["versions"]["merge-sumo-example"] == "1.0"
@@ -91,6 +93,7 @@ def test_the_report_has_its_section_and_a_column_for_its_measure(folder):
     assert '"title":"closest m"' in page
 
 
+@pytest.mark.slow
 def test_commands_that_read_the_campaign_know_it(folder, merge_sumo):
     assert "closest approach" in merge_sumo("run", "--case", "run", "3")
     merge_sumo("export", "run", "--format", "endings", "--out", "written")
@@ -99,6 +102,7 @@ def test_commands_that_read_the_campaign_know_it(folder, merge_sumo):
     assert json.loads(lines[3])["case"] == 3
 
 
+@pytest.mark.slow
 def test_it_keeps_the_contracts(merge_sumo):
     said = merge_sumo("-q", "-n", "0", PLUGIN, "-p", "no:cacheprovider", program=("-m", "pytest"))
     assert " passed" in said

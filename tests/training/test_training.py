@@ -232,6 +232,7 @@ class TestDdqn:
         finally:
             game.close()
 
+    @pytest.mark.slow
     def test_same_seed_same_weights_and_another_seed_other_weights(self):
         one, two, other = self.train(), self.train(), self.train(seed=1)
         for (w1, b1), (w2, b2) in zip(one.layers, two.layers, strict=True):
@@ -443,6 +444,7 @@ class TestRefinement:
         before, after = map(regret, self.refined(seed=0, settings=enough))
         assert after < 0.5 * before
 
+    @pytest.mark.slow
     def test_same_seed_same_weights_and_another_seed_other_weights(self):
         one, two, other = (self.refined(seed)[1] for seed in (0, 0, 1))
         for (w1, b1), (w2, b2) in zip(one.layers, two.layers, strict=True):
@@ -459,6 +461,7 @@ class TestHelix:
         train_library(folder, ("pov1",), settings=SMALL, scenario=US23)
         return folder
 
+    @pytest.mark.slow
     def test_a_network_has_a_manifest_entry_and_a_log(self, library):
         entry = read_manifest(library)["pov1"]
         assert entry["command"] == "merge-sumo train --only pov1 --seed 0"
@@ -470,6 +473,7 @@ class TestHelix:
         assert last["regret"] >= 0.0
         assert load_network("pov1", library).layers[-1][0].shape[0] == 7
 
+    @pytest.mark.slow
     def test_a_finished_network_is_not_trained_again(self, library):
         before = (library / "pov1.safetensors").stat().st_mtime_ns
         told = []
@@ -540,6 +544,7 @@ class TestTrainingForAnotherScenario:
         assert done.exit_code == 0, done.output
         return out, done.output
 
+    @pytest.mark.slow
     def test_the_regret_is_printed_and_the_manifest_has_the_scenario(self, trained):
         folder, said = trained
         assert "pov1: mean regret" in said
@@ -551,6 +556,7 @@ class TestTrainingForAnotherScenario:
         expected = dataclasses.asdict(reward.RewardWeights.of(LIKE_A_ROUNDABOUT))
         assert entry["reward_weights"] == expected
 
+    @pytest.mark.slow
     def test_its_drivers_know_the_scenario_and_the_shipped_ones_do_not(self, trained, ring):
         assert unseen(LIKE_A_ROUNDABOUT, trained[0]) == []
         said = invoke("scenario", "check", ring, "--policies", trained[0]).output

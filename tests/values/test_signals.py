@@ -69,6 +69,7 @@ def campaign(tmp_path):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", [LEAVES, FUNCTION])
 @pytest.mark.parametrize("in_process", [False, True])
 def test_every_step_has_what_was_left_at_it(campaign, source, in_process):

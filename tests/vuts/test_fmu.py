@@ -73,6 +73,7 @@ def test_what_an_fmu_does_wrong_is_the_outcome_of_its_own_case(unit, version, fa
             assert trajectory.end is End.MERGED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [

@@ -61,6 +61,7 @@ def campaign(spec: str, out: Path, *more: str) -> subprocess.Popen:
     return subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["2", pytest.param("1", marks=pytest.mark.long)])
 def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_and_ignores_signals(
     spec, tmp_path, workers
@@ -73,6 +74,7 @@ def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_
         parent.stderr.close()
 
 
+@pytest.mark.slow
 def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
     with none_left():
         parent = campaign(spec(HANGS), tmp_path / "run", "--deadline", "600")
@@ -121,6 +123,7 @@ def Vut(seen):
         vut.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dies", "starts"),
     [

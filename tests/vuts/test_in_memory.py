@@ -155,6 +155,7 @@ class TestACampaign:
         assert run.trajectory(0).a_pov_mps2[0] == -0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "way", ["standard input", pytest.param("a script", marks=pytest.mark.long)]
 )

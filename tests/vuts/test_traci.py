@@ -218,6 +218,7 @@ class TestAStockClient:
         assert Played(client, episodes=2, steps=5).reasons == [None, None]
 
 
+@pytest.mark.slow
 def test_the_controller_of_the_tutorial_drives_like_the_same_law_in_process(tmp_path):
     command = program(tmp_path, CONTROLLER)
     assert_drives_as_level0(factory("traci", command=command), cases_of(20))
@@ -289,6 +290,7 @@ def cpp_client(tmp_path_factory) -> Path:
     return folder / "client"
 
 
+@pytest.mark.slow
 def test_a_controller_in_cpp_on_libtraci_drives_like_the_same_law_in_process(cpp_client):
     assert_drives_as_level0(factory("traci", command=f"{cpp_client} {{port}}"), cases_of(20))
 
@@ -368,6 +370,7 @@ def children() -> set[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("misdeed", "reason"),
     [
@@ -483,6 +486,7 @@ class Monkey:
         self.thread.join()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [25, pytest.param(1000, marks=pytest.mark.long)])
 def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count):
     before, port, deadline_s = descriptors(), free_port(), 0.2
@@ -563,6 +567,7 @@ def mutated(message: bytes, rng: random.Random) -> bytes:
     return bytes(content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [30, pytest.param(2000, marks=pytest.mark.long)])
 def test_of_mutated_messages_of_a_session_every_case_has_its_verdict_or_its_reason(count):
     session = recorded_session()

@@ -127,6 +127,7 @@ class TestAProgram:
         (trajectory,) = run_cases(factory("traci", command=command), cases_of(1))
         assert trajectory.error is None
 
+    @pytest.mark.slow
     def test_that_ends_while_its_client_goes_on_is_an_error_of_every_case(self, tmp_path):
         leaves = "client.step()\nif os.fork():\n    os._exit(0)\nclient.drive(10_000)\n"
         command = program(tmp_path, RAW_CLIENT + leaves)
@@ -136,6 +137,7 @@ class TestAProgram:
             assert trajectory.end is End.VUT_ERROR
             assert "ended with exit code 0, and its connection goes on" in trajectory.error
 
+    @pytest.mark.slow
     def test_is_told_a_token_by_which_another_process_is_served(self, tmp_path):
         """As one in a container is, which is no child of `docker run`."""
         port, file = free_port(), tmp_path / "token"
@@ -160,6 +162,7 @@ class TestAProgram:
         assert [t.error for t in trajectories] == [None, None]
         assert ran == [0]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("campaign", ["that ends", "that is late"])
     def test_that_we_end_leaves_no_traceback(self, campaign, tmp_path):
         log = tmp_path / "controller.log"
@@ -258,6 +261,7 @@ class TestAnotherUser:
         )
 
 
+@pytest.mark.slow
 def test_the_sumo_that_a_controller_asks_has_no_port(tmp_path):
     """Of all sockets by TCP or UDP, its process has the client's connection alone."""
     port, seen, stopped = free_port(), list[list[str]](), threading.Event()
@@ -393,6 +397,7 @@ def shadows() -> list[int]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("signal", "times", "errors"), [(9, 1, 0), (15, 2, 1)])
 def test_a_sumo_that_is_ended_once_is_nobodys_fault(tmp_path, signal, times, errors):
     """A controller may bring SUMO down by a question, and would again; here somebody else does."""
@@ -444,6 +449,7 @@ def test_who_serves_is_locked_and_keeps_no_file_of_its_own(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["controller.log", "controller.py"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGTERM", pytest.param("SIGINT", marks=pytest.mark.long)])
 def test_a_campaign_that_is_stopped_twice_while_a_controller_thinks_ends_at_once(name, tmp_path):
     """And not when the controller's deadline of ten minutes has passed; nothing is left."""
