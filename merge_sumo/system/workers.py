@@ -379,10 +379,10 @@ def _begin_worker(preload: str | None) -> None:
     leave_signals_to_parent()
     # Processes of multiprocessing end without atexit.
     multiprocessing.util.Finalize(None, end_worker, exitpriority=100)
-    # As many threads as workers keep all cores busy.
+    for module in filter(None, ("numpy", preload)):
+        import_module(module)
+    # As many threads as workers keep all cores busy. A library that is loaded later has no limit.
     threadpool_limits(1)
-    if preload is not None:
-        import_module(preload)
 
 
 def leave_signals_to_parent() -> None:
