@@ -5,13 +5,20 @@
     python tools/bench_samplers.py --time
     python tools/bench_samplers.py --per-case
     python tools/bench_samplers.py --trials --seeds 10 --first 1000
+    python tools/bench_samplers.py --dense --vut design1 --level 0 --seeds 10 --first 1000
+    python tools/bench_samplers.py --dense --vut design1 --learned-from 'my_older.py:Vut' --level 0
 
 The first prints medians of FMC / truth after 100, 200 and 400 cases, `coverage` in batches of its
 own and the others in batches of 20; the second does so for `gpr` with one of its choices changed
 at a time; the third prints the seconds that a sampler takes for a batch after N cases; the fourth
 prints the CPU time of `coverage` with its twin for a case at three levels after N uniform cases,
-and the memory of the twin; the last lets `coverage`, the same without its twin, and `gpr` search
+and the memory of the twin; `--trials` lets `coverage`, the same without its twin, and `gpr` search
 the VUTs of `trial_vuts.py`, on which nothing was tuned, at every level at which they fail.
+
+`--dense` measures against a dense truth of 1,000,000 cases by the kinematic engine: the share of
+its FMC after few cases, and the cases to .9 of it as a ratio to those of an oracle, which knows all
+failures of the truth and takes the most useful one each time. With `--learned-from` the twin has
+learned from a campaign of 100 cases on another version of the VUT.
 """
 
 from __future__ import annotations
@@ -20,6 +27,7 @@ import argparse
 import math
 import pickle
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,10 +40,11 @@ from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import CaseResult, run_cases
-from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.studies.truth import Truth, ground_truth
+from merge_sumo.studies.benchmark import greedy_cover
+from merge_sumo.studies.truth import DENSE_CASES, Truth, ground_truth
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
@@ -121,6 +130,75 @@ def search(
         for region in truth.real_regions()
     )
     return [curve[n] / whole if whole else math.nan for n in SHOWN], regions, seconds
+
+
+SOON = (30, 50, 100, 400)
+MOST = 0.9
+"""Numbers of cases, and share of the FMC of a dense truth, that `--dense` prints."""
+LEARNED_CASES = 100
+
+
+def print_dense(
+    vut: str, level: int, names: Sequence[str], seeds: Sequence[int], learned_from: str | None
+) -> dict[str, Any]:
+    """Print and return how soon samplers find the failures of a dense truth."""
+    plan = resolve(CampaignSettings(vut=vut, levels=(level,), scenario=US23)).with_engine(
+        Engine.KINEMATIC
+    )
+    truth = ground_truth(plan, level, DENSE_CASES).failures
+    whole, (best, _) = fmc(truth), greedy_cover(truth, max(SOON))
+    oracle = _cases_to(MOST * whole, best, np.arange(len(best)), len(best))
+    figures: dict[str, Any] = {"FMC": whole, "oracle": oracle}
+    after = " ".join(f"{f'N={n}':>6s}" for n in SOON)
+    print(f"{vut}, level {level}: dense FMC {whole:.4f}, oracle {oracle:.0f} cases to {MOST:.0%}")
+    print(
+        f"{'median FMC / dense FMC':30s}{after}  cases to {MOST:.0%} [quartiles]  ratio to oracle"
+    )
+    for name in names:
+        shares, needed = [], []
+        for seed in seeds:
+            others = [] if learned_from is None else _motions(learned_from, level, seed)
+            points, index = _failures(plan, name, level, seed, others)
+            shares.append([fmc(points[index < n]) / whole for n in SOON])
+            needed.append(_cases_to(MOST * whole, points, index, max(SOON)))
+        low, median, high = np.quantile(needed, (0.25, 0.5, 0.75), method="nearest").tolist()
+        by_cases = np.median(shares, axis=0).tolist()
+        figures[name] = {"shares": by_cases, "cases": needed, "ratio": median / oracle}
+        columns = " ".join(f"{share:6.2f}" for share in by_cases)
+        print(
+            f"{name:30s}{columns}  {median:5.0f} [{low:.0f}, {high:.0f}]  {median / oracle:6.2f}",
+            flush=True,
+        )
+    return figures
+
+
+def _failures(
+    plan: SimulationPlan, name: str, level: int, seed: int, others: Sequence[Any]
+) -> tuple[Any, Any]:
+    """Return the failures that a sampler finds, (m, d), and their indices, (m,)."""
+    pool = Pool(levels=(level,), scenario=US23)
+    sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed, others))
+    batch = None if sampler.predictor else BATCH
+    batches = conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), max(SOON), batch)
+    failed = [outcome for ran in batches for outcome, _ in ran if outcome.failed]
+    points = to_unit([outcome.case for outcome in failed], level, scenario=US23)
+    return points, np.array([outcome.index for outcome in failed], dtype=np.int64)
+
+
+def _motions(vut: str, level: int, seed: int) -> list[Any]:
+    """Return the motions of a campaign on another version of a VUT."""
+    settings = CampaignSettings(vut=vut, levels=(level,), scenario=US23)
+    plan, pool = resolve(settings), settings.pool
+    sampler = make_sampler("coverage", pool, seed, Twin(pool, plan.povs, seed))
+    batches = conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), LEARNED_CASES, None)
+    return [trajectory.motion for ran in batches for _, trajectory in ran]
+
+
+def _cases_to(wanted: float, points: Any, index: Any, most: int) -> float:
+    """Return the cases after which failures, (m, d), of ascending indices have a coverage."""
+    if fmc(points) < wanted:
+        return math.inf
+    return 1.0 + bisect_left(range(most), wanted, key=lambda n: fmc(points[index <= n]))
 
 
 def bench(
@@ -240,6 +318,8 @@ def main() -> None:
         metavar="NAME",
         help=f"search VUTs unlike ours: all, or some of {', '.join(TRIALS)}",
     )
+    parser.add_argument("--dense", action="store_true", help="beside a dense truth and an oracle")
+    parser.add_argument("--learned-from", metavar="VUT", help="of --dense: an earlier version")
     parser.add_argument("--time", action="store_true", help="time batches up to N = 5,000")
     parser.add_argument("--per-case", action="store_true", help="CPU time per case of coverage")
     add_record_option(parser)
@@ -249,6 +329,11 @@ def main() -> None:
         append_record(options.record, "samplers, time", print_times(names))
     elif options.per_case:
         append_record(options.record, "samplers, per case", print_cost_per_case())
+    elif options.dense:
+        seeds = range(options.first, options.first + options.seeds)
+        figures = print_dense(options.vut, options.level, names, seeds, options.learned_from)
+        what = f"samplers, {options.vut}, level {options.level}, dense"
+        append_record(options.record, what, figures)
     elif options.trials is not None:
         figures = print_trials(options.trials or TRIALS, options.seeds, options.first)
         append_record(options.record, "samplers, trials", figures)

@@ -312,7 +312,7 @@ def oracle(truths: Mapping[int, Truth], cases: int, batch: int | None) -> dict[i
         Without a `batch`, samplers choose, and every ORACLE_STEP cases are shown.
     """
     batch = batch or ORACLE_STEP
-    greedy = {level: _greedy(truth.failures, cases) for level, truth in truths.items()}
+    greedy = {level: greedy_cover(truth.failures, cases) for level, truth in truths.items()}
     ball = {level: fmc(np.zeros((1, truth.points.shape[1]))) for level, truth in truths.items()}
     gains = [(-g * ball[level], level) for level, (_, gain) in greedy.items() for g in gain]
     order = [level for _, level in sorted(gains)]
@@ -323,7 +323,7 @@ def oracle(truths: Mapping[int, Truth], cases: int, batch: int | None) -> dict[i
     }
 
 
-def _greedy(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+def greedy_cover(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
     """Return at most so many points, (m, d), in greedy order and what each adds, in balls.
 
     What a point adds never grows. So the best is one that still adds as much as it once did, if no
