@@ -31,7 +31,7 @@ from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
-from merge_sumo.studies.importance import Estimate
+from merge_sumo.studies.stratified import Estimate
 from merge_sumo.studies.truth import REAL_REGION, Truth
 from merge_sumo.system.printable import quoted
 from merge_sumo.values.criterion import Criterion
@@ -442,7 +442,7 @@ class ProbabilityResult(Result):
 
     def lines(self) -> list[str]:
         """Return the probability, its interval, and that of the plain cases."""
-        one, arm = self.estimate, self.estimate.uniform_arm
+        one, plain = self.estimate, self.estimate.plain
         cases = "under uniform cases" if self.is_uniform else "under the stated distribution"
         lines = [
             f"P(fail) {cases}: {one.probability:.3g}, {100.0 * one.confidence:g} % interval "
@@ -458,8 +458,13 @@ class ProbabilityResult(Result):
             )
         return [
             *lines,
-            f"  for comparison, the {arm.cases} plain cases among them alone: {arm.failures} "
-            f"failures, [{arm.low:.3g}, {arm.high:.3g}]",
+            *(
+                f"  {one.share:.2%} of them with P(fail) {one.expected:.2g} expected: "
+                f"{counted(one.failures, 'failure')} in {counted(one.cases, 'case')}"
+                for one in one.strata
+            ),
+            f"  for comparison, as many cases without strata would have an interval like "
+            f"[{plain.low:.3g}, {plain.high:.3g}]",
             f"written: {self.file}",
         ]
 

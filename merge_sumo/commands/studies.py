@@ -177,9 +177,9 @@ def certify(
 def probability(given: Given, run: RunArgument) -> None:
     """Estimate how likely a VUT is to fail, with an interval that is valid.
 
-    The cases of the campaign were chosen to fail: they only shape the distribution from which fresh
-    cases are drawn. These are independent, run in SUMO, and weighted; the interval is by betting,
-    and holds for any number of cases.
+    The cases of the campaign were chosen to fail: they only say where failures are expected. Fresh
+    cases are drawn independently from where they are, are in doubt, and are not, and run in SUMO;
+    the interval is exact, however wrong the expectation is.
 
     Example:  merge-sumo probability runs/design2 --cases 4000
     """

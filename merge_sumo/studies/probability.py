@@ -2,14 +2,15 @@
 
 A sampler chose the cases of a campaign because they were expected to fail, given those before. No
 share of them is the probability of a failure, and no binomial interval of theirs is valid. So they
-only shape the mixture from which fresh cases are drawn independently; the estimate rests on these
-(`importance.py`).
+only decide how the pool is cut into strata, from which fresh cases are drawn independently; the
+estimate rests on these (`stratified.py`).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -23,19 +24,23 @@ from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.samplers.belief import learn_chance
+from merge_sumo.samplers.coverage import REPLAYED
+from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.importance import (
-    DEFENSIVE,
-    DefensiveMixture,
+from merge_sumo.studies.stratified import (
     Draws,
     Estimate,
-    cells,
+    Strata,
     estimate,
-    expected_chance,
+    of_cells,
 )
 from merge_sumo.system.folders import add_to, check_new_file, write_new
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import Case
+from merge_sumo.twin.twin import Twin
+from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DX_CRASH_M
 from merge_sumo.values.score import Outcome
 
 RESULT: Final = "probability.json"
@@ -44,6 +49,12 @@ LINES: Final = ".jsonl"
 DEFAULT_CASES: Final = 4000
 STREAM: Final = 7
 """Key of the random stream, so that it is none of a sampler's."""
+MOST_LEARNED: Final = 1000
+"""Cases, the last ones, that the twin learns from."""
+CHUNK: Final = 1000
+"""Cases that are predicted at a time."""
+TWIN_ALONE: Final = 0.9
+"""Weight of the twin from which the surrogate, which is slow, is not asked."""
 WRITTEN: Final = 500
 """Cases after which outcomes are written and synced."""
 
@@ -97,16 +108,15 @@ def failure_probability(
     if lines == out:
         raise UserError(f"--out is {out}: end it in .json, as cases go to {LINES} beside it")
     check_new_file(lines)
-    mixture = _mixture(run, settings, stated)
-    draws = mixture.draw(cases, np.random.default_rng([seed, STREAM]))
+    strata = strata_of(run, settings, plan, stated, cases, confidence)
+    draws = strata.draw(np.random.default_rng([seed, STREAM]))
     outcomes = _run(settings, plan, stated, draws, lines, on_case, workers)
     failed = np.array([outcome.failed for outcome in outcomes])
     judged = np.array([outcome.score is not None for outcome in outcomes])
-    result = estimate(draws, failed, judged, mixture.bound, confidence)
+    result = estimate(strata, draws, failed, judged, confidence)
     record = {
         **asdict(result),
         "distribution": stated.record(),
-        "defensive_share": DEFENSIVE,
         "seed": seed,
         "engine": plan.engine,
         "campaign": record_of(settings, plan),
@@ -115,15 +125,85 @@ def failure_probability(
     return result
 
 
-def _mixture(run: Run, settings: CampaignSettings, stated: Distribution) -> DefensiveMixture:
-    """Return the mixture that the outcomes of a campaign suggest."""
-    sampler = make_sampler("uniform", settings.pool, 0)
-    sampler.tell(run.outcomes)
+def strata_of(
+    run: Run,
+    settings: CampaignSettings,
+    plan: SimulationPlan,
+    stated: Distribution,
+    cases: int,
+    confidence: float,
+) -> Strata:
+    """Return the strata that the outcomes of a campaign suggest."""
+    from threadpoolctl import threadpool_limits
+
+    expected = _Expected(run, settings, plan)
     chance = {}
-    for level in stated.levels:
-        history = sampler.history(level)
-        chance[level] = expected_chance(history, stated.points(level, cells(history.dims)))
-    return DefensiveMixture(stated.levels, chance, settings.scenario)
+    # One thread: rounding must not depend on the number of cores.
+    with threadpool_limits(1):
+        for level in stated.levels:
+            at_level = expected.at(level)
+            dims = len(settings.scenario.dimensions(level))
+            chance[level] = of_cells(
+                dims, lambda chances, of=at_level, level=level: of(stated.points(level, chances))
+            )
+    return Strata(stated.levels, chance, settings.scenario, cases, confidence)
+
+
+class _Expected:
+    """P(fail) of cases as expected after a campaign: by twin and surrogate, or surrogate alone.
+
+    What is expected decides the width of the interval, and not its validity.
+    """
+
+    def __init__(self, run: Run, settings: CampaignSettings, plan: SimulationPlan) -> None:
+        self._sampler = make_sampler("uniform", settings.pool, 0)
+        self._sampler.tell(run.outcomes)
+        self._limit_m = settings.scenario.dx_crash_m if plan.criterion.is_papers else DX_CRASH_M
+        lines = centre_lines(plan.road)
+        self._twin = Twin(settings.pool, plan.povs, 0, criterion=plan.criterion, lines=lines)
+        last = run.outcomes[-MOST_LEARNED:]
+        # Without motions, as in a folder of which only the outcomes were kept, it learns nothing.
+        with suppress(UserError):
+            self._twin.tell(last, {o.index: run.trajectory(o.index).motion for o in last})
+
+    def at(self, level: int) -> Callable[[FloatArray], FloatArray]:
+        """Return P(fail), (n,), as a function of points, (n, d), of a level's unit cube."""
+        history = self._sampler.history(level)
+        surrogate = learn_chance(history)
+
+        def by_surrogate(points: FloatArray) -> FloatArray:
+            if surrogate is None:
+                return np.zeros(len(points))
+            return np.concatenate([surrogate(part) for part in _parts(points)])
+
+        if not self._twin.can_predict(level) or not history.failed.any():
+            return by_surrogate
+        skill = self._skill(level)
+        if skill.is_worthless:
+            return by_surrogate
+
+        def by_both(points: FloatArray) -> FloatArray:
+            gaps = [self._twin.predict([Query(level, part)])[0] for part in _parts(points)]
+            gaps_m = np.concatenate(gaps, axis=-1)
+            chance = skill.chance(gaps_m)
+            if surrogate is None or skill.twin.min() > TWIN_ALONE:
+                return chance
+            return skill.mixed(gaps_m, chance, by_surrogate(points))
+
+        return by_both
+
+    def _skill(self, level: int) -> PredictionSkill:
+        """Return the skill of the twin, judged by predictions of its last cases, too."""
+        last = self._sampler.observed(level)[-REPLAYED:]
+        indices = [outcome.index for outcome in last]
+        points = self._sampler.history(level).points[-REPLAYED:]
+        gaps_m = self._twin.predict([Query(level, points, held_out=indices)])[0]
+        replayed = dict(zip(indices, gaps_m.T, strict=True))
+        return PredictionSkill(self._sampler.observed(), level, self._limit_m, replayed)
+
+
+def _parts(points: FloatArray) -> list[FloatArray]:
+    return np.array_split(points, len(points) // CHUNK + 1)
 
 
 def _same_system(run: Run, today: Mapping[str, Any]) -> None:
@@ -175,6 +255,6 @@ def _append(lines: Path, outcomes: Sequence[Outcome], draws: Draws) -> None:
     for o in outcomes:
         record = o.to_record()
         record["weight"] = float(draws.weight[o.index])
-        record["plain"] = bool(draws.plain[o.index])
+        record["stratum"] = int(draws.stratum[o.index])
         content += json.dumps(record, allow_nan=False) + "\n"
     add_to(lines, content.encode(), new=outcomes[0].index == 0)

@@ -10,21 +10,23 @@ import pytest
 from campaigning import run_campaign
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import kstest, norm, truncnorm
+from scipy.stats import binom, kstest, norm, truncnorm
 
 from merge_sumo.analysis.exposure import read_distribution
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.studies import probability
-from merge_sumo.studies.importance import (
+from merge_sumo.studies.stratified import (
     CELLS,
     DEFENSIVE,
-    DefensiveMixture,
+    Strata,
     cells,
     clopper_pearson,
     estimate,
-    mean_at_least,
+    of_cells,
+    risks,
+    upper_end,
 )
 from merge_sumo.values.case import V_POV0, dimensions
 from merge_sumo.values.scenario import US23
@@ -44,135 +46,174 @@ def band_area(half_width):
     return 2.0 * half_width / 0.8
 
 
-def mixture(weights, chance) -> DefensiveMixture:
-    return DefensiveMixture(weights, chance, US23)
+def strata_by(chance, cases, weights=None, confidence=0.95) -> Strata:
+    return Strata(weights or {1: 1.0}, chance, US23, cases, confidence)
 
 
-def aimed_at(half_width, blur=0.02):
-    """Return a proposal whose surrogate knows the band, but not sharply."""
+def knowing(half_width, cases, blur=0.005, confidence=0.95):
+    """Return strata of a surrogate that knows the band, but not sharply."""
     middle = cells(2)
     beyond = np.abs(0.6 * middle[:, 0] + 0.8 * middle[:, 1] - 0.7) - half_width
-    return mixture({1: 1.0}, {1: 1.0 / (1.0 + np.exp(beyond / blur))})
+    return strata_by({1: 1.0 / (1.0 + np.exp(beyond / blur))}, cases, confidence=confidence)
 
 
-def estimate_band(proposal, half_width, n, seed, confidence=0.95):
-    draws = proposal.draw(n, np.random.default_rng(seed))
+def estimate_band(strata, half_width, seed, confidence=0.95):
+    draws = strata.draw(np.random.default_rng(seed))
     failed = band(draws.chances[:, :2], half_width)
-    return estimate(draws, failed, np.ones(n, dtype=bool), proposal.bound, confidence)
+    return estimate(strata, draws, failed, np.ones(len(failed), dtype=bool), confidence)
 
 
-class TestTheMixture:
-    @pytest.mark.parametrize("seed", range(3))
-    def test_has_a_density_that_integrates_to_1(self, seed):
-        rng = np.random.default_rng(seed)
+def estimate_counts(share, cases, failures, confidence=0.95):
+    """Return both ends for failures in the cases of strata."""
+    share, cases, failures = map(np.array, (share, cases, failures))
+    low, high = risks(len(share), confidence)
+    return 1.0 - upper_end(share, cases, cases - failures, low), upper_end(
+        share, cases, failures, high
+    )
+
+
+class TestTheStrata:
+    def test_have_shares_that_add_up_to_1_and_all_cases(self):
+        rng = np.random.default_rng(0)
         chance = {level: rng.random(len(cells(3 if level == 2 else 2))) ** 4 for level in LEVELS}
-        shares = {0: 0.2, 1: 0.5, 2: 0.3}
-        density = mixture(shares, chance)
-        means = [
-            share * (1.0 / density.weight(level, cells(3 if level == 2 else 2))).mean()
-            for level, share in shares.items()
-        ]
-        assert sum(means) == pytest.approx(1.0, abs=1e-12)
+        strata = strata_by(chance, 600, {0: 0.2, 1: 0.5, 2: 0.3})
+        assert strata.share.sum() == pytest.approx(1.0, abs=1e-12)
+        assert strata.cases.sum() == 600
+        assert (strata.cases >= np.floor(DEFENSIVE * 600 * strata.share)).all()
+        assert (np.diff(strata.expected) > 0.0).all()
 
-    def test_never_weighs_a_case_by_more_than_the_defensive_share_allows(self):
-        proposal = aimed_at(0.01)
-        draws = proposal.draw(5000, np.random.default_rng(0))
-        assert draws.weight.max() <= proposal.bound <= 1.0 / DEFENSIVE
-        assert draws.weight.min() < 0.3, "and those in the band by much less"
-
-    def test_draws_what_its_weights_say(self):
-        """E_q[w 1(A)] = p(A), for a set A far from any cell's edge."""
+    def test_draw_what_their_weights_say(self):
+        """E[w 1(A)] = p(A), for a set A far from any cell's edge."""
         chance = {1: cells(2)[:, 0] ** 8, 2: cells(3)[:, 2] ** 8}
-        proposal = mixture({1: 0.25, 2: 0.75}, chance)
-        draws = proposal.draw(40_000, np.random.default_rng(1))
+        strata = strata_by(chance, 40_000, {1: 0.25, 2: 0.75})
+        assert len(strata.share) == 3
+        draws = strata.draw(np.random.default_rng(1))
         inside = (draws.level == 2) & (draws.chances[:, 2] > 0.9)
         x = draws.weight * inside
-        error = x.std() / math.sqrt(len(x))
-        assert x.mean() == pytest.approx(0.075, abs=5.0 * error)
-        assert error < 0.001, "aimed draws see this corner better than plain ones"
-        assert draws.weight.mean() == pytest.approx(1.0, abs=0.02)
+        assert x.mean() == pytest.approx(0.075, abs=0.006)
+        assert draws.weight.mean() == pytest.approx(1.0, abs=1e-12)
 
-    def test_gives_each_draw_the_weight_of_its_place(self):
-        proposal = mixture({0: 0.5, 2: 0.5}, {0: cells(2)[:, 1], 2: cells(3)[:, 1]})
-        draws = proposal.draw(500, np.random.default_rng(2))
-        for level in (0, 2):
-            at = draws.level == level
-            dims = len(dimensions(level))
-            again = proposal.weight(level, draws.chances[at, :dims])
-            assert np.array_equal(draws.weight[at], again)
+    def test_draw_each_case_from_its_stratum(self):
+        strata = knowing(0.05, 2000, blur=0.02)
+        draws = strata.draw(np.random.default_rng(2))
+        near = np.abs(0.6 * draws.chances[:, 0] + 0.8 * draws.chances[:, 1] - 0.7)
+        assert near[draws.stratum == 2].max() < near[draws.stratum == 0].min()
+        assert np.array_equal(np.bincount(draws.stratum), strata.cases)
 
-    def test_is_the_stated_distribution_where_nothing_is_expected(self):
-        proposal = mixture({1: 1.0}, {1: np.zeros(CELLS[2] ** 2)})
-        draws = proposal.draw(100, np.random.default_rng(0))
+    def test_are_one_where_nothing_is_expected(self):
+        strata = strata_by({1: np.zeros(CELLS[2] ** 2)}, 100)
+        draws = strata.draw(np.random.default_rng(0))
         assert np.array_equal(draws.weight, np.ones(100))
-        assert proposal.bound == 1.0
+        assert strata.share.tolist() == [1.0]
+
+    def test_are_found_with_few_predictions(self):
+        asked = []
+
+        def expected(points):
+            asked.append(len(points))
+            return band(points, 0.05).astype(float)
+
+        fine = of_cells(2, expected)
+        assert np.mean(fine != band(cells(2), 0.05)) < 0.001
+        assert sum(asked) < 0.4 * len(cells(2))
 
 
 class TestTheInterval:
     @pytest.mark.parametrize(("half_width", "n"), [(0.002, 400), (0.02, 400), (0.1, 150)])
     def test_holds_the_truth_at_least_as_often_as_it_says(self, half_width, n):
-        proposal = aimed_at(half_width)
+        strata = knowing(half_width, n, confidence=0.8)
         truth = band_area(half_width)
-        found = [estimate_band(proposal, half_width, n, seed, 0.8) for seed in range(150)]
+        found = [estimate_band(strata, half_width, seed, 0.8) for seed in range(20)]
         held = sum(e.low <= truth <= e.high for e in found)
-        assert held >= 0.8 * 150
-        assert np.mean([e.probability for e in found]) == pytest.approx(truth, rel=0.15)
+        assert held >= 0.8 * 20
+        assert np.mean([e.probability for e in found]) == pytest.approx(truth, rel=0.25)
 
     def test_holds_with_a_surrogate_that_looks_in_the_wrong_place(self):
-        middle = cells(2)
-        wrong = mixture({1: 1.0}, {1: np.exp(-50.0 * middle.sum(axis=1))})
-        truth = band_area(0.02)
-        held = 0
-        for seed in range(100):
-            e = estimate_band(wrong, 0.02, 300, seed, 0.8)
+        wrong = strata_by({1: np.exp(-50.0 * cells(2).sum(axis=1))}, 300, confidence=0.8)
+        truth, held = band_area(0.02), 0
+        for seed in range(20):
+            e = estimate_band(wrong, 0.02, seed, 0.8)
             held += e.low <= truth <= e.high
-        assert held >= 80
+        assert held >= 16
 
-    def test_is_narrower_than_that_of_plain_cases_on_a_rare_set(self):
-        proposal, truth, n = aimed_at(0.004), band_area(0.004), 8000
-        ours = [estimate_band(proposal, 0.004, n, seed) for seed in range(3)]
-        plain = clopper_pearson(round(n * truth), n, 0.05)
-        assert max(e.high - e.low for e in ours) < 0.8 * (plain[1] - plain[0])
+    def test_is_half_as_wide_as_that_of_plain_cases_on_a_rare_set(self):
+        truth, n = band_area(0.0036), 600
+        ours = [estimate_band(knowing(0.0036, n, blur=0.002), 0.0036, seed) for seed in range(3)]
+        plain = clopper_pearson(round(n * truth), n, 0.025)
+        assert max(e.high - e.low for e in ours) < 0.6 * (plain[1] - plain[0])
+
+    def test_of_one_stratum_is_that_of_clopper_and_pearson(self):
+        assert estimate_counts([1.0], [600], [5]) == pytest.approx(
+            clopper_pearson(5, 600, 0.025), abs=1e-12
+        )
+
+    def test_by_hand_where_only_the_safe_stratum_is_open(self):
+        """No failure in 100 cases of .9 of the pool, and only failures in 10^6 of the rest.
+
+        Of a risk of .0375, .0025 is for values that single strata exclude: .9 (1 - .03375^(1/100))
+        remains for the upper end.
+        """
+        low, high = estimate_counts([0.9, 0.1], [100, 10**6], [0, 10**6])
+        assert high == pytest.approx(0.1 + 0.9 * (1.0 - 0.03375 ** (1 / 100)), rel=0.005)
+        assert low == pytest.approx(0.1, abs=1e-5)
+
+    @pytest.mark.parametrize(
+        ("share", "cases", "p"),
+        [
+            ((0.9, 0.1), (12, 8), (0.1, 0.6)),
+            ((0.9, 0.1), (12, 8), (0.0, 0.5)),
+            ((0.5, 0.5), (10, 10), (0.02, 0.1)),
+            ((0.8, 0.15, 0.05), (6, 3, 2), (0.05, 0.5, 0.95)),
+        ],
+    )
+    def test_is_wrong_as_often_as_it_says_by_all_results(self, share, cases, p):
+        """Sum the chances of all results whose interval does not hold the probability."""
+        truth, wrong = float(np.dot(share, p)), np.zeros(2)
+        for failures in np.ndindex(*(n + 1 for n in cases)):
+            chance = float(np.prod(binom.pmf(failures, cases, p)))
+            if chance > 1e-6:
+                low, high = estimate_counts(share, cases, failures, 0.8)
+                wrong += chance * np.array([low > truth, high < truth])
+        assert (wrong <= np.array(risks(len(share), 0.8)) + 1e-4).all()
 
     @pytest.mark.parametrize(("fails", "p"), [(False, 0.0), (True, 1.0)])
     def test_of_certain_cases_ends_at_the_certain_probability(self, fails, p):
-        proposal = mixture({1: 1.0}, {1: np.ones(CELLS[2] ** 2)})
-        draws = proposal.draw(1000, np.random.default_rng(0))
-        failed = np.full(1000, fails)
-        e = estimate(draws, failed, np.ones(1000, dtype=bool), proposal.bound, 0.95)
+        strata = strata_by({1: np.zeros(CELLS[2] ** 2)}, 1000)
+        draws = strata.draw(np.random.default_rng(0))
+        e = estimate(strata, draws, np.full(1000, fails), np.ones(1000, dtype=bool), 0.95)
         assert e.probability == p
         assert (e.high if fails else e.low) == pytest.approx(p, abs=1e-12)
-        # The rule of three, a bit wider: no gambler bets all.
-        assert e.high - e.low == pytest.approx(math.log(40.0) / 1000, rel=0.2)
+        # The rule of three, for half of the risk.
+        assert e.high - e.low == pytest.approx(1.0 - 0.025 ** (1 / 1000), rel=1e-9)
 
     def test_takes_a_case_without_a_verdict_as_safe_below_and_as_a_failure_above(self):
-        proposal = mixture({1: 1.0}, {1: np.ones(CELLS[2] ** 2)})
-        draws = proposal.draw(400, np.random.default_rng(0))
+        strata = strata_by({1: np.zeros(CELLS[2] ** 2)}, 400)
+        draws = strata.draw(np.random.default_rng(0))
         part = np.random.default_rng(1).permutation(400)
         failed, judged = part < 100, part < 300
-        e = estimate(draws, failed, judged, proposal.bound, 0.95)
+        e = estimate(strata, draws, failed, judged, 0.95)
         assert e.low < 0.25
         assert e.high > 0.5
         assert e.probability == pytest.approx(0.25)
-        assert e.without_verdict == 100
-        known = estimate(draws, failed, np.ones(400, dtype=bool), proposal.bound, 0.95)
+        assert e.without_verdict == e.strata[0].without_verdict == 100
+        known = estimate(strata, draws, failed, np.ones(400, dtype=bool), 0.95)
         assert known.low == e.low
         assert known.high < e.high
 
-    @given(st.floats(0.0, 1.0), st.integers(1, 200), st.floats(0.001, 0.5))
-    @settings(deadline=None, max_examples=30)
-    def test_of_a_constant_begins_below_it(self, value, n, alpha):
-        assert 0.0 <= mean_at_least(np.full(n, value), alpha) <= value + 1e-12
+    @given(st.lists(st.integers(0, 20), min_size=3, max_size=3))
+    @settings(deadline=None, max_examples=5)
+    def test_holds_the_estimate_and_grows_with_each_failure(self, failures):
+        share, cases = [0.7, 0.2, 0.1], [20, 20, 20]
+        low, high = estimate_counts(share, cases, failures)
+        assert 0.0 <= low <= np.dot(share, failures) / 20 + 1e-9 <= high + 2e-9 <= 1.0 + 3e-9
+        more = np.minimum(np.add(failures, [1, 0, 0]), 20)
+        assert estimate_counts(share, cases, more)[1] >= high - 0.01
 
-    def test_of_a_constant_comes_near_it_with_many_cases(self):
-        x = np.full(2000, 0.01)
-        assert mean_at_least(x, 0.025) > 0.009
-
-    def test_of_the_uniform_arm_is_the_exact_binomial_one(self):
+    def test_of_plain_cases_is_the_exact_binomial_one(self):
         # Clopper and Pearson by hand: no failure in n gives 1 - (alpha/2)^(1/n).
-        assert clopper_pearson(0, 100, 0.05) == pytest.approx((0.0, 1.0 - 0.025 ** (1 / 100)))
-        assert clopper_pearson(100, 100, 0.05) == pytest.approx((0.025 ** (1 / 100), 1.0))
-        assert clopper_pearson(10, 100, 0.05) == pytest.approx((0.0490, 0.1762), abs=1e-4)
+        assert clopper_pearson(0, 100, 0.025) == pytest.approx((0.0, 1.0 - 0.025 ** (1 / 100)))
+        assert clopper_pearson(100, 100, 0.025) == pytest.approx((0.025 ** (1 / 100), 1.0))
+        assert clopper_pearson(10, 100, 0.025) == pytest.approx((0.0490, 0.1762), abs=1e-4)
 
 
 class TestADistribution:
@@ -224,10 +265,10 @@ class TestADistribution:
             tmp_path, {"levels": {"1": 1}, "v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 1}}
         )
         middle = found.points(1, cells(2))
-        proposal = mixture(found.levels, {1: (middle[:, 1] > 0.68).astype(float)})
-        draws = proposal.draw(3000, np.random.default_rng(0))
+        strata = strata_by({1: (middle[:, 1] > 0.68).astype(float)}, 3000, found.levels, 0.99)
+        draws = strata.draw(np.random.default_rng(0))
         failed = found.points(1, draws.chances[:, :2])[:, 1] > 0.7
-        e = estimate(draws, failed, np.ones(3000, dtype=bool), proposal.bound, 0.99)
+        e = estimate(strata, draws, failed, np.ones(3000, dtype=bool), 0.99)
         assert e.low < norm.sf(2.0) < e.high
         assert e.high - e.low < 0.02
 
@@ -291,7 +332,10 @@ class TestOfACampaign:
         drawn = [json.loads(line) for line in lines]
         weighted = sum(d["weight"] for d in drawn if d["score"] < -500.0)
         assert weighted / 600 == pytest.approx(found.probability)
-        assert sum(d["plain"] for d in drawn) == found.uniform_arm.cases
+        counts = [sum(d["stratum"] == h for d in drawn) for h in range(3)]
+        assert counts == [stratum.cases for stratum in found.strata]
+        plain = found.plain.high - found.plain.low
+        assert found.high - found.low < 0.6 * plain, "half as wide, in the mean over seeds"
 
     def test_with_the_same_seed_is_the_same(self, run, tmp_path):
         texts = []

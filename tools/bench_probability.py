@@ -1,0 +1,199 @@
+"""Measure the intervals of `probability`: how often they hold, and how wide they are.
+
+`python tools/bench_probability.py`
+
+    sets      failure sets in the unit square with a known area, and surrogates that know them well,
+              blurred, in part, in a wrong place or not at all; no simulation
+    campaign  design1 at level 0 after a campaign of `coverage`: fresh cases by the kinematic
+              engine, and the probability from a ground truth of 1,000,000 uniform cases
+
+Each row gives seeds whose interval holds the probability, its mean width as a ratio to that of
+Clopper and Pearson on as many plain cases (in brackets the largest ratio of a seed to that mean),
+and the standard deviation of the estimate as a ratio to that of the plain share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from bench_record import add_record_option, append_record
+
+from merge_sumo.analysis.exposure import read_distribution
+from merge_sumo.api import truths
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.evaluate import evaluate
+from merge_sumo.engine.plan import Engine
+from merge_sumo.studies import stratified
+from merge_sumo.studies.probability import STREAM, strata_of
+from merge_sumo.studies.stratified import Draws, Strata, cells, clopper_pearson, estimate
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import US23
+
+CONFIDENCE = 0.95
+PARTS = ("sets", "campaign")
+TRUTH_CASES = 1_000_000
+CAMPAIGN = CampaignSettings(vut="design1", levels=(0,), cases=200, seed=5, scenario=US23)
+CHUNK = 20_000
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured of one kind of probability."""
+
+    name: str
+    probability: float
+    cases: int
+    held: int
+    width: float
+    widest: float
+    spread: float
+
+
+def measured(
+    name: str,
+    strata: Strata,
+    probability: float,
+    seeds: range,
+    verdicts: Callable[[list[Draws]], Iterator[FloatArray]],
+) -> Row:
+    """Draw from strata with each seed, and compare the intervals with those of plain cases."""
+    draws = [strata.draw(np.random.default_rng([seed, STREAM])) for seed in seeds]
+    n = int(strata.cases.sum())
+    found = []
+    for drawn, failed in zip(draws, verdicts(draws), strict=True):
+        found.append(estimate(strata, drawn, failed, np.ones(n, dtype=bool), CONFIDENCE))
+    plain_failures = np.random.default_rng([seeds.start, 1]).binomial(n, probability, 1000)
+    plain = [clopper_pearson(int(k), n, (1.0 - CONFIDENCE) / 2.0) for k in plain_failures]
+    usual = float(np.mean([high - low for low, high in plain]))
+    widths = np.array([one.high - one.low for one in found])
+    spread = np.std([one.probability for one in found])
+    return Row(
+        name,
+        probability,
+        n,
+        sum(one.low <= probability <= one.high for one in found),
+        float(widths.mean()) / usual,
+        float(widths.max()) / usual,
+        float(spread) / np.sqrt(probability * (1.0 - probability) / n),
+    )
+
+
+def sets(cases: int, seeds: range) -> Iterator[Row]:
+    """Measure on bands across the unit square, by what a surrogate knows of them."""
+    for area in (0.009, 0.05, 0.2):
+        # A band leaves the square through u = 0 and u = 1, and is this high everywhere.
+        def beyond(points: FloatArray, middle: float, area: float = area) -> FloatArray:
+            return np.abs(0.75 * points[:, 0] + points[:, 1] - middle) - area / 2.0
+
+        def fails(points: FloatArray, beyond: Callable[..., FloatArray] = beyond) -> FloatArray:
+            return beyond(points, 0.875) < 0.0
+
+        def half_as_much(points: FloatArray, area: float = area) -> FloatArray:
+            known = points[:, 0] < 0.5
+            return np.asarray(fails(points) & known)
+
+        where = cells(2)
+        at, elsewhere = beyond(where, 0.875), beyond(where, 1.0 + area)
+        left = np.where(where[:, 0] < 0.5, at, 1.0)
+        surrogates = {
+            "well": 1.0 / (1.0 + np.exp(np.clip(at / 0.002, -30, 30))),
+            "blurred": 1.0 / (1.0 + np.exp(np.clip(at / 0.01, -30, 30))),
+            "half of it": 1.0 / (1.0 + np.exp(np.clip(left / 0.002, -30, 30))),
+            "wrong place": 1.0 / (1.0 + np.exp(np.clip(elsewhere / 0.002, -30, 30))),
+            "nothing": np.zeros(len(where)),
+        }
+        for name, chance in surrogates.items():
+            strata = Strata({1: 1.0}, {1: chance}, US23, cases, CONFIDENCE)
+
+            def verdicts(draws: list[Draws], of: Callable[..., FloatArray] = fails) -> Iterator:
+                return (of(one.chances[:, :2]) for one in draws)
+
+            yield measured(f"band, known: {name}", strata, area, seeds, verdicts)
+
+
+def campaign(cases: list[int], seeds: range) -> Iterator[Row]:
+    """Measure after a campaign, against a ground truth of a million cases."""
+    known = truths("design1", 0, cases=TRUTH_CASES, engine=Engine.KINEMATIC).truths[0]
+    probability = len(known.failures) / len(known.score)
+    plan = resolve(CAMPAIGN).with_engine(Engine.KINEMATIC)
+    stated = read_distribution(None, CAMPAIGN.levels, CAMPAIGN.scenario)
+
+    def verdicts(draws: list[Draws]) -> Iterator[FloatArray]:
+        points = np.concatenate([one.chances[:, :2] for one in draws])
+        of_points = CAMPAIGN.pool.cases(stated.points(0, points), 0)
+        failed = np.empty(len(of_points), dtype=bool)
+        for first in range(0, len(of_points), CHUNK):
+            part = of_points[first : first + CHUNK]
+            for place, result in evaluate(plan.for_cases(len(part)), part):
+                failed[first + place] = result.outcome(first + place, 0).failed
+        return iter(failed.reshape(len(draws), -1))
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = run_campaign(CAMPAIGN, resolve(CAMPAIGN), Path(folder) / "run")
+        for number in cases:
+            strata = strata_of(run, CAMPAIGN, plan, stated, number, CONFIDENCE)
+            yield measured("design1, level 0", strata, probability, seeds, verdicts)
+
+
+def main() -> None:
+    """Print a table of what was measured."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, default=200)
+    parser.add_argument("--first-seed", type=int, default=1000)
+    parser.add_argument("--cases", type=int, nargs="+", default=[600, 4000])
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
+    add_record_option(parser)
+    args = parser.parse_args()
+    stratified.upper_end = _once(stratified.upper_end)  # the same counts have the same end
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    print(f"seeds {seeds.start} to {seeds.stop - 1}, confidence {CONFIDENCE:.0%}")
+    print(f"{'':30} {'p':>7} {'cases':>6} {'held':>9}  {'width':>14}  {'spread':>6}")
+    figures = []
+    rows = (
+        [row for number in args.cases for row in sets(number, seeds)] if "sets" in args.only else []
+    )
+    for row in rows:
+        show(row, args.seeds)
+        figures.append(row)
+    if "campaign" in args.only:
+        for row in campaign(args.cases, seeds):
+            show(row, args.seeds)
+            figures.append(row)
+    append_record(args.record, "probability", {row.name: row.width for row in figures})
+
+
+def show(row: Row, seeds: int) -> None:
+    """Print a row."""
+    print(
+        f"{row.name:30} {row.probability:7.4f} {row.cases:6d} {row.held:5d}/{seeds}"
+        f"  {row.width:5.2f} (<= {row.widest:.2f})  {row.spread:6.2f}",
+        flush=True,
+    )
+
+
+def _once(end: Callable[..., float]) -> Callable[..., float]:
+    """Return the function, which keeps its results."""
+
+    @cache
+    def kept(
+        share: tuple[float, ...], cases: tuple[int, ...], failures: tuple[int, ...], risk: float
+    ) -> float:
+        return end(np.array(share), np.array(cases), np.array(failures), risk)
+
+    return lambda share, cases, failures, risk: kept(
+        tuple(share.tolist()), tuple(cases.tolist()), tuple(failures.tolist()), risk
+    )
+
+
+if __name__ == "__main__":
+    main()
