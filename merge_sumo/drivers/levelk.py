@@ -7,6 +7,7 @@ not depend on how many others run beside it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Final
@@ -29,7 +30,11 @@ DECISION_STEPS: Final = 5
 """A learned driver decides every 0.5 s and holds its acceleration in between."""
 
 BLOCK: Final = 512
-"""Rows whose hidden units fit into the cache of a core."""
+"""Most rows of a product: their hidden units fit into the cache of a core."""
+LEAST_ROWS: Final = 256
+TILE: Final = 16
+"""Fewest rows of a product, and what divides their number: products of fewer rows, or of the rows
+that are left over, round otherwise."""
 
 FEATURES: Final = 26
 SVO_FEATURES: Final = 2
@@ -194,20 +199,27 @@ class QNetwork:
     def values_at_once(self, inputs: FloatArray) -> NDArray[np.float32]:
         """Return Q, (n, actions), in float32 by products of whole matrices.
 
-        Several times faster for many rows, but the last bits of a row depend on the others: for
+        Several times faster for many rows. The sizes of the products are chosen so that a row is
+        the same whatever rows stand beside it, but no library promises that to the last bit: for
         training and searching, not for driving.
         """
-        values = np.empty((len(inputs), len(self._single[-1][1])), dtype=np.float32)
-        buffers = [np.empty((BLOCK, len(bias)), dtype=np.float32) for _, bias in self._single[:-1]]
-        for first in range(0, len(inputs), BLOCK):
-            hidden = inputs[first : first + BLOCK].astype(np.float32)
+        n = len(inputs)
+        size = max(LEAST_ROWS, math.ceil(n / max(math.ceil(n / BLOCK), 1) / TILE) * TILE)
+        single: NDArray[np.float32] = np.zeros(
+            (math.ceil(n / size) * size, inputs.shape[1]), np.float32
+        )
+        single[:n] = inputs
+        values = np.empty((len(single), len(self._single[-1][1])), dtype=np.float32)
+        buffers = [np.empty((size, len(bias)), dtype=np.float32) for _, bias in self._single[:-1]]
+        for first in range(0, n, size):
+            hidden = single[first : first + size]
             for (weight, bias), buffer in zip(self._single, buffers, strict=False):
-                hidden = np.matmul(hidden, weight, out=buffer[: len(hidden)])
+                hidden = np.matmul(hidden, weight, out=buffer)
                 hidden += bias
                 np.maximum(hidden, 0.0, out=hidden)
             weight, bias = self._single[-1]
-            values[first : first + BLOCK] = hidden @ weight + bias
-        return values
+            values[first : first + size] = hidden @ weight + bias
+        return values[:n]
 
     def greedy(self, inputs: FloatArray) -> NDArray[np.int64]:
         """Return the actions of the highest Q by `values`, (n,); -1 where Q is not finite.

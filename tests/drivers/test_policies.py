@@ -101,6 +101,16 @@ def test_a_row_of_q_does_not_depend_on_the_rows_beside_it():
         assert np.array_equal(network.values(inputs[row : row + 1])[0], together[row])
 
 
+@pytest.mark.parametrize("name", ["pov1", "pov2"])
+def test_a_row_of_q_in_float32_does_not_depend_on_the_rows_beside_it(name):
+    network, rng = load_network(name), np.random.default_rng(0)
+    rows = rng.normal(size=(1500, network.layers[0][0].shape[1]))
+    q = network.values_at_once(rows)
+    for count in (1, 7, 40, 171, 300, 513, 600, 1025):
+        some = rng.choice(len(rows), count, replace=False)
+        assert network.values_at_once(rows[some]).tobytes() == q[some].tobytes()
+
+
 def test_features_are_finite_and_bounded_wherever_a_vut_may_take_a_driver():
     rng = np.random.default_rng(0)
     n = 20_000
