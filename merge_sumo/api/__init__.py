@@ -275,6 +275,7 @@ def _write_findings(
 ) -> None:
     """Write what follows the cases into the folder: counterfactuals, expectation, report."""
     done, checks = result.run, runner.checks
+    expected = opened.begin_beside(note_expectation, Run(done.folder.resolve(), done.outcomes))
     careful, page = (partial(panel.advance, phase) for phase in (Phase.CAREFUL, Phase.REPORT))
     # The careful drivers are models of merges.
     if isinstance(plan.scenario, MergeScenario):
@@ -282,7 +283,7 @@ def _write_findings(
     link_latest(done.folder)
     # Learned on another machine, surrogates may differ in a last bit.
     local = opened if runner.dask is None else None
-    note_expectation(done)
+    expected()
     write_report(done, result.summary, local, page)
 
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 from merge_sumo.campaigns.ownership import FILES
 from merge_sumo.campaigns.prefetch import Prefetch, proposals
 from merge_sumo.campaigns.repeats import repeat, write_repeats
+from merge_sumo.campaigns.sampler_copy import search_on_two_cores
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
 from merge_sumo.campaigns.store import RAN_AGAIN, SETTINGS, Journal, Run, spread_failures
 from merge_sumo.campaigns.transfer import lessons
@@ -243,6 +244,7 @@ def _run(
     """Run what is missing of a campaign, then some cases a second time; export the worst."""
     history = [] if before is None else before.outcomes
     sampler = make_sampler(settings.sampler, settings.pool, settings.seed, _twin(settings, plan))
+    search_on_two_cores(sampler, workers, settings.cases - len(history))
     motions = None
     if before is not None and sampler.uses_predictions:
         motions = {o.index: before.trajectory(o.index).motion for o in history}

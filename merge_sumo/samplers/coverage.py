@@ -8,7 +8,8 @@ the batch is picked from them greedily.
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import DX_CRASH_M
+from merge_sumo.values.score import Outcome
 
 FIRST_BATCH: Final = 10
 YOUNG: Final = 60
@@ -46,16 +48,48 @@ PATIENCE: Final = 40
 """Cases before near misses stand in for failures."""
 
 
+class SamplerCopy(Protocol):
+    """A copy of a sampler, in another process, that is told what the sampler is told.
+
+    Attributes:
+        levels: levels that it searches.
+    """
+
+    levels: Sequence[int]
+
+    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
+        """Tell it outcomes; see `Sampler.tell`."""
+
+    def begin(self, n: int) -> bool:
+        """Have it begin to search a batch of `n` cases; return whether it does."""
+
+    def proposals(self) -> dict[int, Proposal] | None:
+        """Return the batch of each of its levels; None where the copy is gone."""
+
+
 class CoverageSampler(Sampler):
     """Maximises the expected new coverage over all levels.
 
     Gains are in balls, not in volumes: volumes of two and of three dimensions do not compare, and
     level 2 would get no case.
+
+    Attributes:
+        copy: searches some of the levels while this process searches the others; None for all
+            levels here. The proposals are the same.
     """
 
     about = "asks for the batch that promises the most new coverage"
     colour = "#D55E00"
     uses_predictions = True
+    copy: SamplerCopy | None = None
+
+    def tell(
+        self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
+    ) -> None:
+        """Take outcomes; see `Sampler.tell`."""
+        super().tell(outcomes, motions)
+        if self.copy is not None:
+            self.copy.tell(outcomes, motions)
 
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
@@ -107,14 +141,24 @@ class CoverageSampler(Sampler):
         return gain / covered if covered > 0.0 else np.inf
 
     def _proposals(self, n: int) -> dict[int, Proposal]:
-        """Return the batch of each level on its own.
+        """Return the batch of each level on its own."""
+        levels = self.pool.levels
+        if self.copy is None or not self.copy.begin(n):
+            return self.search(levels, n)
+        theirs = self.copy.levels
+        proposals = self.search([level for level in levels if level not in theirs], n)
+        proposals |= self.copy.proposals() or self.search(theirs, n)
+        return {level: proposals[level] for level in levels}
 
-        The searches of the levels go in step, so that the predictor answers all of them at once.
+    def search(self, levels: Sequence[int], n: int) -> dict[int, Proposal]:
+        """Return the batch of each of some levels.
+
+        Their searches go in step, so that the predictor answers all of them at once.
         """
         from threadpoolctl import threadpool_limits
 
         proposals: dict[int, Proposal] = {}
-        searches = {level: self._propose(level, n) for level in self.pool.levels}
+        searches = {level: self._propose(level, n) for level in levels}
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
             answers: dict[int, FloatArray | None] = dict.fromkeys(searches)
@@ -130,7 +174,7 @@ class CoverageSampler(Sampler):
                 if queries and self.predictor is not None:
                     gaps = self.predictor.predict(list(queries.values()))
                     answers.update(zip(queries, gaps, strict=True))
-        return {level: proposals[level] for level in self.pool.levels}
+        return {level: proposals[level] for level in levels}
 
     def _propose(self, level: int, n: int) -> Asking[Proposal]:
         history, rng = self.history(level), self.rng(level)

@@ -34,9 +34,11 @@ from merge_sumo.values.scenario import DX_CRASH_M, level_name
 
 EXPECTED: Final = "expected.json"
 GRID: Final[dict[int, Grid]] = {2: (41, 41, 1), 3: (25, 25, 9)}
-"""Nodes in each coordinate, by their number; each node is a rollout of the twin."""
+"""Nodes in each coordinate, by their number."""
 MOST_CASES: Final = 1000
-"""Cases, the last ones, that the twin learns from, and nodes that it is asked at a time."""
+"""Cases, the last ones, that the twin learns from."""
+MOST_NODES: Final = 4000
+"""Nodes that the twin is asked at a time."""
 HIGHEST: Final = 255
 """What stands for a gap of 0 in the file."""
 
@@ -99,12 +101,13 @@ def nearness(twin: Twin, level: int, points: FloatArray, limit_m: float) -> Floa
     """Return how near gaps are expected at points, (n, d), as (n,).
 
     1 where the gap is 0, 0.5 at the limit of a failure, 0 from twice the limit on, as a mean over
-    the members of the twin.
+    the experts of the twin. Their members take turns, from point to point.
     """
-    parts = np.array_split(points, len(points) // MOST_CASES + 1)
-    gaps_m = np.concatenate([twin.predict([Query(level, part)])[0] for part in parts], axis=-1)
+    parts = np.array_split(points, len(points) // MOST_NODES + 1)
+    by_turns = [Query(level, part, held_out=range(len(part))) for part in parts]
+    gaps_m = np.concatenate([twin.predict([query])[0] for query in by_turns], axis=-1)
     far = np.nan_to_num(np.abs(gaps_m), nan=np.inf) / (2.0 * limit_m)
-    return np.asarray(np.clip(1.0 - far, 0.0, 1.0).mean(axis=(0, 1)), dtype=np.float64)
+    return np.asarray(np.clip(1.0 - far, 0.0, 1.0).mean(axis=0), dtype=np.float64)
 
 
 def read_expectation(run: Run) -> dict[int, tuple[Grid, NDArray[np.uint8]]]:

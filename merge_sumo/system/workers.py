@@ -28,9 +28,10 @@ from concurrent.futures import (
 from concurrent.futures.process import ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from numbers import Integral
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.blame import Blame
@@ -54,6 +55,7 @@ TRIED: Final = 8
 
 T = TypeVar("T")
 R = TypeVar("R")
+P = ParamSpec("P")
 
 
 class Workers(AbstractContextManager["Workers"]):
@@ -72,14 +74,18 @@ class Workers(AbstractContextManager["Workers"]):
         recycle_after: int | None = None,
         on_close: Callable[[], None] | None = None,
         here_s: float | None = None,
+        open_beside: Callable[[], LocalProcesses | None] = lambda: None,
     ) -> None:
         """Open an executor with `count` workers.
 
         `died` is what a future raises when its worker is dead. The executor is closed and opened
         anew after a death, and after `recycle_after` chunks per worker. With `here_s` it is opened
-        only when work in this process has taken so many seconds.
+        only when work in this process has taken so many seconds. `open_beside` is for
+        `start_beside`.
         """
         self.count = count
+        self._open_beside = open_beside
+        self._beside: LocalProcesses | None = None
         self._open = open_executor
         self._here_s, self._here_items = here_s, 0
         """Seconds that this process goes on for, and items that it has begun; None for no more."""
@@ -116,6 +122,38 @@ class Workers(AbstractContextManager["Workers"]):
         chunks = (items[first : first + size] for first in range(0, len(items), size))
         for first, results in self.run_chunks(function, chunks, lost, ran_again=ran_again):
             yield from enumerate(results, start=first)
+
+    def start_beside(self) -> Executor | None:
+        """Start one process more, for what this process would do itself; return its executor.
+
+        None where one worker is to be all, or where the system lets no more processes start.
+        """
+        if self._beside is None:
+            self._beside = self._open_beside()
+        return self._beside
+
+    def begin_beside(
+        self, function: Callable[P, R], *args: P.args, **kw: P.kwargs
+    ) -> Callable[[], R]:
+        """Begin some work in the process beside this one; return what waits for its result.
+
+        Where that process was not started, or has died, the work is done here, and only then.
+        """
+        here = partial(function, *args, **kw)
+        if self._beside is None:
+            return here
+        try:
+            future: Future[R] = self._beside.submit(function, *args, **kw)
+        except BrokenExecutor:
+            return here
+
+        def result() -> R:
+            try:
+                return future.result()
+            except BrokenExecutor:
+                return here()
+
+        return result
 
     @property
     def here(self) -> bool:
@@ -210,6 +248,8 @@ class Workers(AbstractContextManager["Workers"]):
         """Close the executor; only where work was left behind does it hear of an exception."""
         left_behind = any(not future.done() for future in self._left)
         try:
+            if self._beside is not None:
+                self._beside.end()
             self._executor.__exit__(*(exception if left_behind else (None, None, None)))
         finally:
             if self._on_close is not None:
@@ -287,7 +327,14 @@ def open_workers(
                 return InProcess()
         return LocalProcesses(count, preload)
 
-    return Workers(processes, count, recycle_after=RECYCLE_AFTER, here_s=here_s)
+    def beside() -> LocalProcesses | None:
+        try:
+            check_threads(threads)
+        except UserError:
+            return None
+        return LocalProcesses(1)
+
+    return Workers(processes, count, recycle_after=RECYCLE_AFTER, here_s=here_s, open_beside=beside)
 
 
 def dask_workers(address: str) -> Workers:
@@ -349,9 +396,17 @@ class LocalProcesses(ProcessPoolExecutor):
     def __exit__(self, *exception: Any) -> bool | None:
         """Wait for the workers; when the program is to end at once, end them too."""
         if exception[0] is not None and not issubclass(exception[0], Exception):
-            for process in list((self._processes or {}).values()):
-                process.kill()
+            self._kill()
         return super().__exit__(*exception)
+
+    def end(self) -> None:
+        """End the workers, whatever they do: nobody waits for it."""
+        self._kill()
+        self.shutdown(wait=True, cancel_futures=True)
+
+    def _kill(self) -> None:
+        for process in list((self._processes or {}).values()):
+            process.kill()
 
 
 _endings: list[Callable[[], None]] = []
