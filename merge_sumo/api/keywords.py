@@ -86,6 +86,7 @@ class Settings(Setup, total=False):
         sampler: name of the sampler that chooses the cases.
         cases: number of cases; 800 by default.
         batch: cases per batch; by default as many as the sampler wants.
+        in_flight: most cases that run or wait while the sampler is asked, instead of batches.
         seed: same seed, same outcomes.
         v_vut0_mps: initial speed of the VUT; the scenario's by default.
         stop_after_converged: stop when less than this share of new coverage is expected.
@@ -96,6 +97,7 @@ class Settings(Setup, total=False):
     sampler: str
     cases: int
     batch: int | None
+    in_flight: int | None
     seed: int
     v_vut0_mps: float | None
     stop_after_converged: float | None

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.campaigns.in_flight import Flight, by_rounds, conduct_in_flight
 from merge_sumo.campaigns.ownership import FILES
-from merge_sumo.campaigns.prefetch import Prefetch, proposals
+from merge_sumo.campaigns.prefetch import ChunkResults, Prefetch, RunChunks, proposals
 from merge_sumo.campaigns.repeats import repeat, write_repeats
 from merge_sumo.campaigns.sampler_copy import search_on_two_cores
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
-from merge_sumo.campaigns.store import RAN_AGAIN, SETTINGS, Journal, Run, spread_failures
+from merge_sumo.campaigns.store import RAN_AGAIN, SETTINGS, Batch, Journal, Run, spread_failures
 from merge_sumo.campaigns.transfer import lessons
 from merge_sumo.engine.evaluate import (
     CaseResult,
@@ -114,9 +117,9 @@ def run_campaign(
     """
     check_new(folder)
     check_new(folder / SCENARIOS / case_name(settings.cases))
-    plan = _plan_in(folder, settings, plan)
+    plan = _plan_in(folder, settings, plan, workers)
     with workers_or_here(workers) as available:
-        open_simulators(plan, available)
+        open_simulators(plan, available, None if settings.in_flight is None else 1)
         record = record_of(settings, plan)
         with Journal.create(folder, record) as journal:
             return _run(settings, plan, record, journal, available, None, on_case, check)
@@ -153,12 +156,12 @@ def resume_campaign(
     """
     check_own(folder / SCENARIOS)
     journal, before, dropped = Journal.reopen(folder)
-    plan = _plan_in(folder, settings, plan)
+    plan = _plan_in(folder, settings, plan, workers)
     with journal, workers_or_here(workers) as available:
         record, changes, rewrite = _compared(before, settings, plan, force=force)
         if dropped:
             warn(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
-        open_simulators(plan, available)
+        open_simulators(plan, available, None if settings.in_flight is None else 1)
         if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
             record[FORCED] = [*_forced(before), *([forced] if changes else [])]
@@ -248,26 +251,18 @@ def _run(
     motions = None
     if before is not None and sampler.uses_predictions:
         motions = {o.index: before.trajectory(o.index).motion for o in history}
-    proposed = proposals(
-        make_sampler(settings.sampler, settings.pool, settings.seed),
-        *(history, settings.cases, settings.batch),
-    )
     noted, ended = _Noted(record), list(history)
-    run_chunks = partial(evaluate_chunks, plan, workers=workers)
-    missing = settings.cases - len(history)
-    chunk_size = workers.chunk_size
-    with Prefetch(run_chunks, workers.count, proposed, missing, chunk_size) as prefetch:
-        batches = conduct(
-            sampler,
-            lambda cases: noted.noting(prefetch.run(cases)),
-            settings.cases,
-            settings.batch,
-            on_case,
-            history,
-            motions,
-            settings.stopping_rule(),
+    run_all = noted.noting(partial(evaluate_chunks, plan, workers=workers))
+    if settings.in_flight is None:
+        search = _in_batches(settings, sampler, workers, run_all, on_case, history, motions)
+    else:
+        flight = Flight(
+            *(sampler, settings.cases, settings.in_flight, history, motions),
+            by_rounds(settings.stopping_rule(), settings.in_flight),
         )
-        for together in prefetch.together(batches):
+        search = conduct_in_flight(flight, run_all, workers.chunk_size, on_case)
+    with closing(search):
+        for together in search:
             journal.append(*together)
             ended += [outcome for batch in together for outcome, _ in batch]
             if noted.update(record):
@@ -284,6 +279,29 @@ def _run(
     return done
 
 
+def _in_batches(
+    settings: CampaignSettings,
+    sampler: Sampler,
+    workers: Workers,
+    run_chunks: RunChunks,
+    on_case: OnCase | None,
+    history: Sequence[Outcome],
+    motions: Mapping[int, FloatArray] | None,
+) -> Generator[list[Batch], None, None]:
+    """Run batch by batch what is missing of a campaign; yield batches that ended together."""
+    proposed = proposals(
+        make_sampler(settings.sampler, settings.pool, settings.seed),
+        *(history, settings.cases, settings.batch),
+    )
+    missing = settings.cases - len(history)
+    with Prefetch(run_chunks, workers.count, proposed, missing, workers.chunk_size) as prefetch:
+        batches = conduct(
+            *(sampler, prefetch.run, settings.cases, settings.batch),
+            *(on_case, history, motions, settings.stopping_rule()),
+        )
+        yield from prefetch.together(batches)
+
+
 class _Noted:
     """What the record of a campaign says of its cases: files that were loaded, runs again."""
 
@@ -291,13 +309,22 @@ class _Noted:
         self._files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
         self._ran_again = record.get(RAN_AGAIN, 0)
 
-    def noting(self, results: Iterable[tuple[int, CaseResult]]) -> Iterator[tuple[int, CaseResult]]:
-        """Pass results on, and note what they say."""
-        for place, result in results:
-            self._ran_again += result.again
-            for name, loaded in zip(FILES, (result.files, result.pov_files), strict=True):
-                self._files[name] = loaded | self._files[name]  # what was known stays
-            yield place, result
+    def noting(self, run_chunks: RunChunks) -> RunChunks:
+        """Return what runs chunks as `run_chunks` does, and notes what the results say."""
+
+        def run(chunks: Iterable[Sequence[Case]]) -> ChunkResults:
+            with closing(run_chunks(chunks)) as ran:
+                for first, results in ran:
+                    for result in results:
+                        self._note(result)
+                    yield first, results
+
+        return run
+
+    def _note(self, result: CaseResult) -> None:
+        self._ran_again += result.again
+        for name, loaded in zip(FILES, (result.files, result.pov_files), strict=True):
+            self._files[name] = loaded | self._files[name]  # what was known stays
 
     def update(self, record: dict[str, Any]) -> bool:
         """Bring a record up to date; return whether it was not."""
@@ -318,9 +345,13 @@ def _twin(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
     return Twin(settings.pool, plan.povs, settings.seed, others, plan.criterion, lines)
 
 
-def _plan_in(folder: Path, settings: CampaignSettings, plan: SimulationPlan) -> SimulationPlan:
+def _plan_in(
+    folder: Path, settings: CampaignSettings, plan: SimulationPlan, workers: Workers | None
+) -> SimulationPlan:
     """Return the plan of a campaign in its folder, where the log of its drivers is."""
     at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
+    if settings.in_flight is not None:
+        at_once = math.ceil(settings.in_flight / (1 if workers is None else workers.count))
     return plan.for_cases(at_once or settings.cases).with_log(folder.resolve() / LOG)
 
 

@@ -21,6 +21,7 @@ from merge_sumo.values.trajectory import Trajectory
 ONE: Final[dict[str, Any]] = {
     "cases": 1,
     "batch": 1,
+    "in_flight": None,
     "sampler": "uniform",
     "stop_after_converged": None,
 }

@@ -43,9 +43,8 @@ def proposals(
         first += len(proposed)
 
 
-RunChunks = Callable[
-    [Iterable[Sequence[Case]]], Generator[tuple[int, Sequence[CaseResult]], None, None]
-]
+ChunkResults = Generator[tuple[int, Sequence[CaseResult]], None, None]
+RunChunks = Callable[[Iterable[Sequence[Case]]], ChunkResults]
 """Runs chunks of cases; yields (place of the first case, results) in any order."""
 
 

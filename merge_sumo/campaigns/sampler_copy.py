@@ -15,7 +15,7 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.greedy import Proposal
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import FloatArray
+from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.score import Outcome
 
 WORTH_FROM: Final = 200
@@ -49,6 +49,10 @@ class CopyBeside:
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
         """Tell the copy outcomes."""
         self._call(_tell, outcomes, motions)
+
+    def pend(self, cases: Sequence[Case]) -> None:
+        """Tell the copy which cases run at present."""
+        self._call(_pend, cases)
 
     def begin(self, n: int) -> bool:
         """Have the copy begin to search a batch of `n` cases; return whether it does."""
@@ -86,6 +90,10 @@ def _begin(sampler: CoverageSampler) -> None:
 
 def _tell(outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
     _copies[0].tell(outcomes, motions)
+
+
+def _pend(cases: Sequence[Case]) -> None:
+    _copies[0].pend(cases)
 
 
 def _search(levels: Sequence[int], n: int) -> dict[int, Proposal]:

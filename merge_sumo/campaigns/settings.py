@@ -37,6 +37,7 @@ class CampaignSettings:
     sampler: str = DEFAULT_SAMPLER
     cases: int = DEFAULT_CASES
     batch: int | None = None
+    in_flight: int | None = None
     seed: int = 0
     v_vut0_mps: float | None = None
     stop_after_converged: float | None = None
@@ -67,14 +68,17 @@ class CampaignSettings:
                 levels = ", ".join(map(level_name, self.scenario.levels))
                 raise UserError(f"the levels are {list(self.levels)}: choose from {levels}")
         self._check_sampler()
-        for name in ("cases", "batch"):
+        for name in ("cases", "batch", "in_flight"):
             if (number := getattr(self, name)) is not None and number < 1:
-                raise UserError(f"--{name} is {number}: it must be 1 or more")
+                option = name.replace("_", "-")
+                raise UserError(f"--{option} is {number}: it must be 1 or more")
         if self.batch is not None and self.batch > self.cases:
             raise UserError(
                 f"--batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
                 "cases than the campaign"
             )
+        if self.in_flight is not None:
+            self._check_in_flight(self.in_flight)
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
         self.stopping_rule()
@@ -115,12 +119,29 @@ class CampaignSettings:
                 f"{' or '.join(able)}"
             )
 
+    def _check_in_flight(self, in_flight: int) -> None:
+        if self.batch is not None:
+            raise UserError(
+                f"--in-flight is {in_flight} and --batch is {self.batch}: a search runs in batches "
+                "or with cases in flight; leave one of them away"
+            )
+        if in_flight > self.cases:
+            raise UserError(
+                f"--in-flight is {in_flight} and --cases is {self.cases}: no more cases can be in "
+                "flight than the campaign has"
+            )
+        if not SAMPLERS[self.sampler].learns:
+            raise UserError(
+                f"--in-flight is for samplers that learn from outcomes: --sampler {self.sampler} "
+                "waits for none, and keeps all workers busy without it"
+            )
+
     def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
         """Return what says of the outcomes so far whether the search is over, if anything does."""
         if self.stop_after_converged is None:
             return None
         fresh = partial(make_sampler, self.sampler, self.pool, self.seed)
-        return StoppingRule(self.stop_after_converged, self.batch, fresh)
+        return StoppingRule(self.stop_after_converged, self.batch or self.in_flight, fresh)
 
     @property
     def criterion(self) -> Criterion:

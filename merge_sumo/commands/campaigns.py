@@ -16,7 +16,9 @@ from merge_sumo.errors import UserError
 if TYPE_CHECKING:
     from merge_sumo.api import CampaignRun, CaseRun, RunComparison
 
-SETTINGS: Final = ("vut", "level", "sampler", "cases", "batch", "seed", "learn_from", "v_vut0")
+SETTINGS: Final = (
+    *("vut", "level", "sampler", "cases", "batch", "in_flight", "seed", "learn_from", "v_vut0"),
+)
 COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
 SETUP_OF_A_CASE: Final = tuple(name for name in SETUP if name != "in_process")
 

@@ -23,8 +23,8 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("headway_behind", "only", "check"),
     ),
     "How many cases, and which": (
-        *("sampler", "samplers", "cases", "batch", "seed", "seeds", "radius", "truth_cases"),
-        *("dense", "quick", "distribution", "learn_from", "stop_after_converged"),
+        *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
+        *("truth_cases", "dense", "quick", "distribution", "learn_from", "stop_after_converged"),
     ),
     "Verdict": ("fail_when", "require", "gate", "tolerance", "rerun", "confidence"),
     "Where it runs, and what it writes": (
@@ -141,6 +141,13 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         None,
         "Cases per batch.",
         show_default="few, later more, for coverage; 40 for others",
+    ),
+    "in_flight": option(
+        int | None,
+        None,
+        "Most cases that run or wait for a worker while the sampler is asked for more, instead of "
+        "batches: for controllers that take seconds for a case. About twice the workers.",
+        metavar="N",
     ),
     "seed": option(int, 0, "Same seed, same outcomes."),
     "learn_from": option(

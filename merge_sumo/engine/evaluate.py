@@ -196,10 +196,11 @@ def evaluate_chunks(
     )
 
 
-def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
+def open_simulators(plan: SimulationPlan, workers: Workers, count: int | None = None) -> None:
     """Open the simulator of a plan in every worker; `UserError` where that cannot be.
 
-    A worker takes as long to start as to run hundreds of cases, so all of them start at once.
+    A worker takes as long to start as to run hundreds of cases, so all of them start at once; with
+    a `count`, so many: the others start with their first case, while these run some.
     """
 
     def died(_: None) -> None:
@@ -207,7 +208,8 @@ def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
         pov = "" if own is None else f" or the POV {own.spec}"
         raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
 
-    everywhere = [None] * (1 if workers.here else min(workers.count, plan.corridors))
+    most = count or min(workers.count, plan.corridors)
+    everywhere = [None] * (1 if workers.here else most)
     for _ in workers.run(partial(_open_simulator, plan), everywhere, died, chunk=1):
         pass
 

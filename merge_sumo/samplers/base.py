@@ -25,9 +25,9 @@ DEFAULT_BATCH: Final = 40
 class Sampler(ABC):
     """Proposes cases; knows nothing of SUMO and runs nothing.
 
-    `ask` is a pure function of the settings and of the outcomes told so far: two calls return the
-    same cases, and neither the order of `tell` nor a repeated `tell` matters. A campaign resumes by
-    telling its journal to a new sampler.
+    `ask` is a pure function of the settings, of the outcomes told so far, and of the pending cases:
+    two calls return the same cases, and neither the order of `tell` nor a repeated `tell` matters.
+    A campaign resumes by telling its journal to a new sampler.
     """
 
     about: ClassVar[str] = ""
@@ -38,6 +38,8 @@ class Sampler(ABC):
     """Whether proposals depend on the outcomes, and not only on their number."""
     uses_predictions: ClassVar[bool] = False
     """Whether proposals depend on predictions of a twin of the VUT."""
+    overlaps: ClassVar[bool] = False
+    """Whether it is asked while cases run, and counts these (`pend`)."""
 
     def __init__(self, pool: Pool, seed: int, predictor: Predictor | None = None) -> None:
         """Propose cases from `pool`; `seed` makes the proposals reproducible.
@@ -54,6 +56,7 @@ class Sampler(ABC):
         self._histories: dict[int, LevelHistory] = {}
         """Of the first outcomes of a level; later ones are added when it is asked for."""
         self._proposed: Counter[int] = Counter()
+        self._pending: list[Case] = []
 
     @abstractmethod
     def ask(self, n: int) -> list[Case]:
@@ -85,6 +88,18 @@ class Sampler(ABC):
         if self.predictor is not None and motions is not None:
             self.predictor.tell(outcomes, motions)
 
+    def pend(self, cases: Iterable[Case]) -> None:
+        """Take the cases that run at present, in place of those of the last call.
+
+        They count as proposed; a sampler that `overlaps` also keeps away from them.
+        """
+        self._pending = list(cases)
+
+    def pending(self, level: int) -> FloatArray:
+        """Return the pending cases of a level as points of its unit cube, (m, d)."""
+        cases = (case for case in self._pending if case.level == level)
+        return to_unit(cases, level, self.pool.scenario)
+
     def skip(self, cases: Iterable[Case]) -> None:
         """Count cases as proposed whose outcomes will not be told."""
         self._proposed.update(case.level for case in cases)
@@ -98,8 +113,12 @@ class Sampler(ABC):
         return list(self._observed.get(level, ()))
 
     def proposed(self, level: int | None = None) -> int:
-        """Return the number of cases told, with or without a verdict, of one level or of all."""
-        return self._proposed.total() if level is None else self._proposed[level]
+        """Return the number of cases told, with or without a verdict, or pending.
+
+        Of one level or of all.
+        """
+        pending = sum(level in (None, case.level) for case in self._pending)
+        return pending + (self._proposed.total() if level is None else self._proposed[level])
 
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays."""
@@ -120,11 +139,16 @@ class Sampler(ABC):
         return history.take(np.arange(len(observed)))
 
     def rng(self, *key: int) -> np.random.Generator:
-        """Return the generator of this proposal: seed, cases told so far, and a key.
+        """Return the generator of this proposal: seed, cases proposed so far, and a key.
 
         Cases without a verdict count, so that a batch that gave none is not proposed again.
         """
         return np.random.default_rng([self.seed, self.proposed(), *key])
+
+    def told_rng(self, *key: int) -> np.random.Generator:
+        """Return a generator that is the same whatever is pending."""
+        told = self.proposed() - len(self._pending)
+        return np.random.default_rng([self.seed, told, *key])
 
     def batch_rng(self, level: int, batch: int) -> np.random.Generator:
         """Return a generator that is the same whenever a batch of the past is replayed."""

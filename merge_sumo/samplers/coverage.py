@@ -8,7 +8,7 @@ the batch is picked from them greedily.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Protocol
 
 import numpy as np
@@ -18,7 +18,7 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.belief import Belief, Calibration, gap_m, has_gaps
 from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
 from merge_sumo.samplers.coverage_grid import CoverageGrid
-from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, greedy
+from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, covered_grid, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
 from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
@@ -60,6 +60,9 @@ class SamplerCopy(Protocol):
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
         """Tell it outcomes; see `Sampler.tell`."""
 
+    def pend(self, cases: Sequence[Case]) -> None:
+        """Tell it which cases run at present; see `Sampler.pend`."""
+
     def begin(self, n: int) -> bool:
         """Have it begin to search a batch of `n` cases; return whether it does."""
 
@@ -81,6 +84,7 @@ class CoverageSampler(Sampler):
     about = "asks for the batch that promises the most new coverage"
     colour = "#D55E00"
     uses_predictions = True
+    overlaps = True
     copy: SamplerCopy | None = None
 
     def tell(
@@ -90,6 +94,13 @@ class CoverageSampler(Sampler):
         super().tell(outcomes, motions)
         if self.copy is not None:
             self.copy.tell(outcomes, motions)
+
+    def pend(self, cases: Iterable[Case]) -> None:
+        """Take the cases that run at present; see `Sampler.pend`."""
+        pending = list(cases)
+        super().pend(pending)
+        if self.copy is not None:
+            self.copy.pend(pending)
 
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
@@ -177,20 +188,22 @@ class CoverageSampler(Sampler):
         return {level: proposals[level] for level in levels}
 
     def _propose(self, level: int, n: int) -> Asking[Proposal]:
-        history, rng = self.history(level), self.rng(level)
+        history, rng, pending = self.history(level), self.rng(level), self.pending(level)
         few = len(history.points) < FEWEST
         if self.predictor is None or not self.predictor.can_predict(level):
             if few:
                 chance = np.ones(n)
-                spread = spread_out(n, history.dims, rng)
+                # The next points of the sequence that the pending ones began.
+                begun = len(pending)
+                spread = spread_out(begun + n, history.dims, self.told_rng(level))[begun:]
                 return Proposal(spread, chance, chance, (None,) * n)
-            return _Search(history, rng, n).batch(n)
+            return _Search(history, pending, rng, n).batch(n)
         skill = yield from self._skill(level, history)
         if skill.is_worthless and not few:
-            batch = _Search(history, rng, n).batch(n)
+            batch = _Search(history, pending, rng, n).batch(n)
             gaps_m = yield Query(level, batch.points)
             return skill.annotated(batch, gaps_m)
-        return (yield from twin_guided_batch(history, n, rng, level, skill))
+        return (yield from twin_guided_batch(history, pending, n, rng, level, skill))
 
     def _skill(self, level: int, history: LevelHistory) -> Asking[PredictionSkill]:
         """Return the skill of the predictions so far, of all levels."""
@@ -224,10 +237,10 @@ class CoverageSampler(Sampler):
 class _Search:
     """One batch at one level."""
 
-    def __init__(self, history: LevelHistory, rng: np.random.Generator, n: int) -> None:
-        failing = history.points[history.failed]
-        self._grid = CoverageGrid(history.dims)
-        self._grid.cover(self._grid.balls(failing), 1.0)
+    def __init__(
+        self, history: LevelHistory, pending: FloatArray, rng: np.random.Generator, n: int
+    ) -> None:
+        self._grid = covered_grid(history, pending)
         limit, calibration = _limit(history), Calibration(history)
         belief = Belief(history, limit)
         candidates = of_belief(history, belief, rng, n)

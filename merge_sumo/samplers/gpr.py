@@ -63,6 +63,7 @@ class GprSampler(LevelwiseSampler):
 
     about = "chooses by a Gaussian process on the score: the paper's Algorithm 1"
     colour = "#0072B2"
+    overlaps = True
 
     def allocate(self, n: int) -> dict[int, int]:
         """Return equal shares first, then shares by the softmax of the last failure shares."""
@@ -81,16 +82,21 @@ class GprSampler(LevelwiseSampler):
         batches_before = len(np.unique(history.batch))
         epsilon = EPSILON0 * ALPHA**batches_before
         exploring = round(epsilon * n)
-        posterior = _Posterior(history, queries)
+        posterior = _Posterior(history, queries, self.pending(level))
         picks = [posterior.pick(*Z_EXPLOIT) for _ in range(n - exploring)]
         picks += [posterior.pick(*Z_EXPLORE) for _ in range(exploring)]
         return queries[picks]
 
 
 class _Posterior:
-    """The fitted surrogate at the queries, with a variance that knows the picks of the batch."""
+    """The fitted surrogate at the queries, with a variance that knows the picks of the batch.
 
-    def __init__(self, history: LevelHistory, queries: FloatArray) -> None:
+    Pending cases, (m, d), are picks of earlier batches.
+    """
+
+    def __init__(self, history: LevelHistory, queries: FloatArray, pending: FloatArray) -> None:
+        first = len(queries)
+        queries = np.concatenate([queries, pending])
         self._queries = queries
         failures = history.points[history.failed]
         history = most_telling(history, MAX_LEARNED)
@@ -106,6 +112,8 @@ class _Posterior:
         self._grid = CoverageGrid(queries.shape[1], fine=False)
         self._grid.cover(self._grid.balls(failures), 1.0)
         self._balls = self._grid.balls(queries)
+        for place in range(first, len(queries)):
+            self._take(place)
 
     def pick(self, z_badness: float, z_variance: float) -> int:
         """Take the query that maximises badness^z variance^z new, and condition on it."""
@@ -114,14 +122,19 @@ class _Posterior:
         quality += np.log(self._grid.new(self._balls) + FLOOR)
         quality[self._taken] = -np.inf
         best = int(np.argmax(quality))
+        self._take(best)
+        return best
+
+    def _take(self, best: int) -> None:
+        """Condition on the query at a place, and cover its ball."""
+        variance = max(float(self._variance[best]), 1e-12)
         self._taken[best] = True
         self._grid.cover(self._balls[best], 1.0)
         covariance = self._kernel(self._queries[[best]], self._queries)[0]
         covariance -= self._explained[:, best] @ self._explained
-        step = covariance / np.sqrt(variance[best] + NOISE)
+        step = covariance / np.sqrt(variance + NOISE)
         self._explained = np.vstack([self._explained, step])
         self._variance = self._variance - np.square(step)
-        return best
 
 
 def _fit(history: LevelHistory) -> Any:

@@ -8,11 +8,13 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.samplers.coverage_grid import CoverageGrid
+from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.prediction import Prediction
 
 PICKED: Final = 0.8
-"""Least share of a pick's ball that counts as covered for the later picks of the batch."""
+"""Least share of a pick's ball that counts as covered for the later picks of the batch, and the
+share of a pending case's ball that does."""
 EVEN_IF_COVERED: Final = 1e-3
 """Worth of a covered ball: the likeliest failures still come before the others."""
 
@@ -32,6 +34,18 @@ class Proposal:
     gain: FloatArray
     probability: FloatArray
     predictions: tuple[Prediction | None, ...]
+
+
+def covered_grid(history: LevelHistory, pending: FloatArray) -> CoverageGrid:
+    """Return the grid that is covered by the failures of a history, and by pending cases, (m, d).
+
+    A pending case is a pick of an earlier batch: most of its ball counts as covered.
+    """
+    grid = CoverageGrid(history.dims)
+    grid.cover(grid.balls(history.points[history.failed]), 1.0)
+    for ball in grid.balls(pending) if len(pending) else ():
+        grid.cover(ball, PICKED)
+    return grid
 
 
 def greedy(

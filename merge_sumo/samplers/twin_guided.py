@@ -16,8 +16,7 @@ from merge_sumo.samplers.candidates import (
     of_belief,
     spread_out,
 )
-from merge_sumo.samplers.coverage_grid import CoverageGrid
-from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, Proposal, greedy
+from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, Proposal, covered_grid, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
 from merge_sumo.values.case import FloatArray
@@ -48,6 +47,7 @@ EXPLORES_FROM: Final = 5
 
 def twin_guided_batch(
     history: LevelHistory,
+    pending: FloatArray,
     n: int,
     rng: np.random.Generator,
     level: int,
@@ -55,11 +55,13 @@ def twin_guided_batch(
 ) -> Asking[Proposal]:
     """Return a batch of `n` cases of a level that the predictor can predict.
 
+    `pending` are cases, (m, d), that run and have no outcome yet.
+
     P(fail) of a candidate is that of the twin and that of the surrogate, weighted by the skill of
     the predictions so far. Without outcomes at the level there is no surrogate, and half of the
     batch is spread over the cube.
     """
-    candidates = _Candidates(history, level, skill)
+    candidates = _Candidates(history, pending, level, skill)
     first_points = yield from _first_candidates(candidates, history, n, rng)
     yield from candidates.add(first_points)
     reach = REFINED_REACH * radius_for(history.dims)
@@ -90,17 +92,18 @@ class _Candidates:
     """Candidates of a batch with their predictions.
 
     Attributes:
-        grid: coverage by the failures so far.
+        grid: coverage by the failures so far, and by the pending cases.
         surrogate: None without outcomes at the level.
         points: candidates, (m, d).
         gaps_m: predicted gaps at M, (E, G, m).
         p_fail: P(fail) by twin and surrogate together, (m,).
     """
 
-    def __init__(self, history: LevelHistory, level: int, skill: PredictionSkill) -> None:
+    def __init__(
+        self, history: LevelHistory, pending: FloatArray, level: int, skill: PredictionSkill
+    ) -> None:
         self.level, self.skill = level, skill
-        self.grid = CoverageGrid(history.dims)
-        self.grid.cover(self.grid.balls(history.points[history.failed]), 1.0)
+        self.grid = covered_grid(history, pending)
         self.surrogate = Belief(history) if len(history.points) >= FEWEST else None
         self._calibration = Calibration(history) if skill.is_doubted else None
         self.points = np.empty((0, history.dims))

@@ -13,6 +13,7 @@ class UniformSampler(Sampler):
     about = "draws every case uniformly from the pool"
     colour = "#8a8a8a"
     learns = False
+    overlaps = True
 
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""

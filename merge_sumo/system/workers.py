@@ -180,8 +180,9 @@ class Workers(AbstractContextManager["Workers"]):
     ) -> Generator[tuple[int, Sequence[R]], None, None]:
         """Yield (place of the first item, results) as chunks end; raise as `run` does.
 
-        A chunk is only taken from `chunks` when a worker may want it. `ran_again` marks the results
-        of items that ran again because a worker had died.
+        A chunk is only taken from `chunks` when a worker may want it, and after an empty one the
+        next only when a chunk has ended. `ran_again` marks the results of items that ran again
+        because a worker had died.
         """
         fresh, blame = _in_a_row(chunks), Blame[range]()
         suspects: deque[_Chunk[T]] = deque()
@@ -192,7 +193,7 @@ class Workers(AbstractContextManager["Workers"]):
                 most, alone = (1, not running) if suspects else (2 * self.count, False)
                 while len(running) < most and self._ready(running):
                     next_chunk = suspects.popleft() if suspects else next(fresh, None)
-                    if next_chunk is None:
+                    if next_chunk is None or not next_chunk.items:
                         break
                     running[self._submit(function, next_chunk.items)] = next_chunk
                 if not running:

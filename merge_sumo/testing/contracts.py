@@ -194,6 +194,42 @@ class SamplerContract:
         resumed.tell([Outcome.from_json(line, self.pool.scenario) for line in lines])
         assert resumed.ask(9) == proposed
 
+    def test_proposes_other_cases_while_cases_run(self) -> None:
+        """Pending cases are proposed, and neither proposed again nor learned from."""
+        _, outcomes, proposed = self.played()
+        sampler, pending = self.fresh(), [o.case for o in outcomes if o.batch > 0]
+        sampler.pend(pending)
+        sampler.tell([o for o in outcomes if o.batch == 0])
+        assert sampler.proposed() == len(outcomes)
+        if not sampler.overlaps:  # it is not asked then
+            return
+        early = sampler.ask(9)
+        assert not {o.case for o in outcomes} & set(early)
+        assert early == sampler.ask(9)
+        assert not sampler.learns or early != proposed
+        resumed = self.fresh()
+        resumed.tell([o for o in outcomes if o.batch == 0])
+        resumed.pend(reversed(pending[:3]))
+        resumed.ask(2)
+        resumed.pend(pending)
+        assert early == resumed.ask(9)
+
+    def test_forgets_pending_cases_that_are_pending_no_more(self) -> None:
+        _, outcomes, proposed = self.played()
+        sampler = self.fresh()
+        sampler.pend([outcome.case for outcome in outcomes])
+        sampler.tell(outcomes)
+        sampler.pend([])
+        assert sampler.ask(9) == proposed
+
+    def test_proposes_cases_at_every_level_while_cases_run(self) -> None:
+        sampler, pending = self.fresh(), list[Case]()
+        if sampler.overlaps:
+            for _ in self.pool.levels:
+                pending += sampler.ask(1)
+                sampler.pend(pending)
+            assert {case.level for case in pending} == set(self.pool.levels)
+
     def test_proposes_other_cases_for_another_seed(self) -> None:
         _, outcomes, proposed = self.played()
         other = self.fresh(6)

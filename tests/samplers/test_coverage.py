@@ -288,7 +288,7 @@ def test_looks_where_cases_come_near_but_counts_on_failures_alone():
     nothing, batch = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=np.int64)
     history = LevelHistory(points, score, nothing, gap_m, batch)
     assert _limit(history) is not None
-    proposal = _Search(history, rng, 20).batch(20)
+    proposal = _Search(history, np.empty((0, 2)), rng, 20).batch(20)
     assert np.median(proposal.points[:, 0]) < 0.1
     assert proposal.gain.sum() < 2.0
 
