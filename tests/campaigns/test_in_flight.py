@@ -7,6 +7,7 @@ from __future__ import annotations
 import shutil
 import signal
 import time
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -138,7 +139,7 @@ def test_many_in_flight_are_batches_for_a_sampler_that_waits():
 class TestACampaign:
     def test_has_the_same_bytes_on_any_number_of_workers(self, whole, tmp_path):
         for count in (2, 5):
-            with Workers(lambda count=count: LocalProcesses(count), count) as workers:
+            with Workers(partial(LocalProcesses, count), count) as workers:
                 run_campaign(settings(), tmp_path / str(count), workers=workers)
             assert outcomes(tmp_path / str(count)) == outcomes(whole)
 
