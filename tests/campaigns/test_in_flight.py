@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import shutil
 import signal
-import time
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -233,31 +232,6 @@ def test_a_stopping_rule_is_asked_after_every_n_cases():
         assert not stop(known[:told], told)
     assert batches == [set(), {0}, {0, 1}]
     assert by_rounds(None, 10) is None
-
-
-def sleepy(vut: Path, case_s: float) -> str:
-    """Write a controller that takes some time for a case; return how it is named."""
-    vut.write_text(
-        "import time\n"
-        "class Sleepy:\n"
-        "    def reset(self, seen):\n"
-        f"        time.sleep({case_s})\n"
-        "    def act(self, seen):\n"
-        "        return 0.0\n"
-    )
-    return f"{vut}:Sleepy"
-
-
-@pytest.mark.slow
-def test_slow_cases_run_at_the_same_time(tmp_path):
-    """More workers than cores, because the cases wait."""
-    slow = settings(vut=sleepy(tmp_path / "sleepy.py", 0.4), sampler="gpr", cases=48, in_flight=24)
-    with open_workers(8) as workers:
-        run_campaign(slow, tmp_path / "first", workers=workers)
-        start_s = time.perf_counter()
-        run_campaign(slow, tmp_path / "second", workers=workers)
-        assert time.perf_counter() - start_s < 48 * 0.4 / 2
-    assert outcomes(tmp_path / "first") == outcomes(tmp_path / "second")
 
 
 @pytest.mark.parametrize(
