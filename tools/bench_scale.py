@@ -8,6 +8,8 @@
               which runs one case of a hundred in SUMO as well: CPU time per case, in turns
     campaign  the whole command of a uniform campaign of design2, from its start to the report, on
               one worker and on two, in turns
+    default   the whole command of the default campaign of design2, 800 cases by `coverage` at three
+              levels, on one worker and on two, in turns
     parent    cases per second that the process takes that asks, tells and keeps, where workers are
               no limit, and how many workers like the one above that feeds
     samplers  seconds that each sampler takes for a batch, after a history of that many cases
@@ -61,7 +63,8 @@ ROUNDS = 5
 CAMPAIGN_ROUNDS = 5
 PAIR_CASES = 2000
 BATCH = 20
-PARTS = ("truth", "workers", "engines", "campaign", "parent", "samplers", "files")
+DEFAULT_ROUNDS = 3
+PARTS = ("truth", "workers", "engines", "campaign", "default", "parent", "samplers", "files")
 
 
 def memory_mb() -> float:
@@ -175,11 +178,11 @@ def engines(cases: int, rounds: int) -> dict[str, list[float]]:
     return found
 
 
-def whole_campaigns(cases: int, rounds: int) -> dict[str, list[float]]:
+def whole_campaigns(rounds: int, *options: str) -> dict[str, list[float]]:
     """Return the seconds of whole commands on one worker and on two, and their ratio, by round."""
     found: dict[str, list[float]] = {"s_on_one": [], "s_on_two": [], "gain": []}
     command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", "design2"]
-    command += ["--sampler", "uniform", "--cases", str(cases), "--quiet"]
+    command += [*options, "--quiet"]
     with tempfile.TemporaryDirectory() as scratch:
         for number in range(rounds):
             spent = []
@@ -335,8 +338,12 @@ def main() -> None:
         result["engines"] = engines(CHUNK, ROUNDS)
         tell_spread("engines", result["engines"])
     if "campaign" in chosen.only:
-        result["campaign"] = whole_campaigns(chosen.campaign, CAMPAIGN_ROUNDS)
+        uniform = ("--sampler", "uniform", "--cases", str(chosen.campaign))
+        result["campaign"] = whole_campaigns(CAMPAIGN_ROUNDS, *uniform)
         tell_spread("campaign", result["campaign"])
+    if "default" in chosen.only:
+        result["default"] = whole_campaigns(DEFAULT_ROUNDS)
+        tell_spread("default", result["default"])
     if "parent" in chosen.only:
         taken = [parent(chosen.campaign) for _ in range(ROUNDS)]
         one = statistics.median(result["workers"]["cases_per_s_on_one"])

@@ -8,6 +8,7 @@ a process that is `rough` has Matern 1/2 along the first axis, where the margin 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import Final
 
@@ -37,6 +38,8 @@ TREND: Final = 4.0
 CLIPPED: Final = 2.0
 """Margins are clipped at this for the slope, which is sought near the failures."""
 ITERATIONS: Final = 25
+UNCHECKED: Final = {"check_finite": False}
+"""For LAPACK: all matrices are of finite numbers."""
 BLOCK: Final = 128
 """Queries per block of covariances: so many fit into the cache of a core."""
 
@@ -65,15 +68,15 @@ class Process:
         plane = trend * (1.0 + seen @ seen.T)
         self._variance, self._lengths = _learn_kernel(seen, values[some], plane, rough)
         gram = self._covariance(self._points) + NOISE * np.eye(len(points))
-        self._factor = cholesky(gram, lower=True)
-        self._alpha = cho_solve((self._factor, True), values)
+        self._factor = cholesky(gram, lower=True, **UNCHECKED)
+        self._alpha = cho_solve((self._factor, True), values, **UNCHECKED)
 
     def left_out(self) -> tuple[FloatArray, FloatArray]:
         """Return mean and variance at each case, (N,), as seen by all the others.
 
         Leave-one-out predictions in closed form: Rasmussen and Williams (2006), eq. (5.12).
         """
-        inverse = solve_triangular(self._factor, np.eye(len(self._factor)), lower=True)
+        inverse = solve_triangular(self._factor, np.eye(len(self._factor)), lower=True, **UNCHECKED)
         precision = np.square(inverse).sum(axis=0)
         return self._values - self._alpha / precision, 1.0 / precision
 
@@ -81,7 +84,7 @@ class Process:
         """Return mean and variance at queries, (m, d), as (m,)."""
         turned = queries @ self._rotation
         cross = self._covariance(turned)
-        explained = solve_triangular(self._factor, cross, lower=True)
+        explained = solve_triangular(self._factor, cross, lower=True, **UNCHECKED)
         prior = self._variance + self._trend * (1.0 + np.square(turned).sum(axis=1))
         return cross.T @ self._alpha, prior - np.square(explained).sum(axis=0)
 
@@ -89,7 +92,8 @@ class Process:
         covariance: FloatArray = np.empty((len(self._points), len(others)))
         for first in range(0, len(others), BLOCK):
             block = slice(first, first + BLOCK)
-            correlation, _ = _correlation(self._points, others[block], self._lengths, self._rough)
+            apart = _apart(self._points, others[block])
+            correlation, _ = _correlation(apart, self._lengths, self._rough)
             covariance[:, block] = self._variance * correlation
         if self._trend:
             covariance += self._trend * (1.0 + self._points @ others.T)
@@ -215,15 +219,18 @@ def _rotation(points: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(axes[:, :dims], dtype=np.float64)
 
 
+def _apart(points: FloatArray, others: FloatArray) -> list[FloatArray]:
+    """Return for each coordinate how far points are apart, (n, m)."""
+    return [np.abs(mine[:, None] - theirs) for mine, theirs in zip(points.T, others.T, strict=True)]
+
+
 def _correlation(
-    points: FloatArray, others: FloatArray, lengths: FloatArray, rough: bool
+    apart: Sequence[FloatArray], lengths: FloatArray, rough: bool
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the correlations, (n, m), and for each coordinate the scaled distances, (n, m)."""
     roots = np.where(rough & (np.arange(len(lengths)) == 0), 1.0, np.sqrt(3.0))
-    scaled = [
-        factor * np.abs(points[:, axis, None] - others[None, :, axis])
-        for axis, factor in enumerate((roots / lengths).tolist())
-    ]
+    factors = (roots / lengths).tolist()
+    scaled = [factor * distance for factor, distance in zip(factors, apart, strict=True)]
     correlation: FloatArray = np.exp(-reduce(np.add, scaled))
     for distance in scaled[rough:]:
         correlation *= 1.0 + distance
@@ -238,17 +245,18 @@ def _learn_kernel(
     `plane` is the covariance, (n, n), of the prior plane.
     """
     n, dims = points.shape
-    fixed = plane + NOISE * np.eye(n)
+    fixed, identity, apart = plane + NOISE * np.eye(n), np.eye(n), _apart(points, points)
     priors = np.array([LOG_PRIOR_VARIANCE, *[LOG_PRIOR_LENGTH] * dims])
     bounds = np.log([VARIANCE_BOUNDS, *[LENGTH_BOUNDS] * dims])
 
     def loss(logs: FloatArray) -> tuple[float, FloatArray]:
         """Rasmussen and Williams (2006), eq. (2.30) and (5.9), with the prior."""
-        correlation, scaled = _correlation(points, points, np.exp(logs[1:]), rough)
+        correlation, scaled = _correlation(apart, np.exp(logs[1:]), rough)
         covariance = np.exp(logs[0]) * correlation
-        factor = cholesky(covariance + fixed, lower=True)
-        alpha = cho_solve((factor, True), values)
-        weights = (cho_solve((factor, True), np.eye(n)) - np.outer(alpha, alpha)) * covariance
+        factor = cholesky(covariance + fixed, lower=True, **UNCHECKED)
+        alpha = cho_solve((factor, True), values, **UNCHECKED)
+        inverse = cho_solve((factor, True), identity, **UNCHECKED)
+        weights = (inverse - np.outer(alpha, alpha)) * covariance
         # d log k_j / d log l_j: u of Matern 1/2, u^2 / (1 + u) of Matern 3/2.
         steep = [u if rough and axis == 0 else u * u / (1.0 + u) for axis, u in enumerate(scaled)]
         slopes = [weights.sum(), *((weights * slope).sum() for slope in steep)]
