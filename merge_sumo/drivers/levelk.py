@@ -262,13 +262,17 @@ class LevelKDriver(Driver):
         self._scenarios: list[Scenario] = [US23]
         self._scenario = np.zeros(corridors, dtype=np.int64)
         """Which of them is a corridor's; a campaign has one."""
+        self._last: tuple[Scenario, int] = US23, 0
+        """The scenario of the last case, and its number."""
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the scenario and the social value orientation of the case."""
         self._svo_rad[corridor] = case.svo_rad or 0.0
-        if case.scenario not in self._scenarios:
-            self._scenarios.append(case.scenario)
-        self._scenario[corridor] = self._scenarios.index(case.scenario)
+        if case.scenario is not self._last[0]:  # to compare scenarios takes a while
+            if case.scenario not in self._scenarios:
+                self._scenarios.append(case.scenario)
+            self._last = case.scenario, self._scenarios.index(case.scenario)
+        self._scenario[corridor] = self._last[1]
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the held accelerations, decided anew where a decision is due."""

@@ -24,7 +24,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -329,8 +329,13 @@ def _latest_takeovers(stage: Stage, failures: Sequence[Trajectory]) -> list[int 
 
 
 def _counterfactual(failure: Trajectory, **other: Any) -> _Counterfactual:
-    same = {f.name: getattr(failure.case, f.name) for f in fields(failure.case)}
+    same = {name: getattr(failure.case, name) for name in _names(type(failure.case))}
     return _Counterfactual(**same, failure=failure, **other)
+
+
+@cache
+def _names(kind: type[Case]) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
 
 
 class Stage:
