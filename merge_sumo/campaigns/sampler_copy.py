@@ -45,18 +45,23 @@ class CopyBeside:
         # The executor pickles it later, when the sampler itself may have been told something.
         self._began = self._call(_begin, deepcopy(sampler))
         self._found: Future[dict[int, Proposal]] | None = None
+        self._told: list[Future[None] | None] = []
+        """What it was told since its last search."""
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
         """Tell the copy outcomes."""
-        self._call(_tell, outcomes, motions)
+        self._told.append(self._call(_tell, outcomes, motions))
 
     def pend(self, cases: Sequence[Case]) -> None:
         """Tell the copy which cases run at present."""
-        self._call(_pend, cases)
+        self._told.append(self._call(_pend, cases))
 
     def begin(self, n: int) -> bool:
         """Have the copy begin to search a batch of `n` cases; return whether it does."""
         if self._began is None or not self._began.done():
+            return False
+        if self._began.exception() is not None:  # what cannot travel is searched here
+            self._began = None
             return False
         self._found = self._call(_search, self.levels, n)
         return self._found is not None
@@ -65,7 +70,11 @@ class CopyBeside:
         """Return the batch of each of its levels; None where the process is gone."""
         assert self._found is not None, "it has begun"  # noqa: S101
         try:
-            return self._found.result()
+            found = self._found.result()
+            for told in filter(None, self._told):
+                told.result()  # it was told all: else it searches for another campaign
+            self._told.clear()
+            return found
         except BrokenExecutor:
             self._began = None
             return None
