@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from merge_sumo.analysis.audit import MissedShare, audit_cases, missed_share, missed_shares
 from merge_sumo.values.case import to_unit
 from merge_sumo.values.empty_ball import EmptyBall, largest_empty_ball
 from merge_sumo.values.fmc import fmc, regions
@@ -27,6 +28,8 @@ class LevelSummary:
         regions: groups of failures that are linked at a distance of 0.05.
         unseen: the largest ball of the level's unit cube that no case has entered, but for those
             that ended in an error; None without cases.
+        missed: bound on the share of the level that fails far from all failures found; None without
+            audit cases.
     """
 
     cases: int
@@ -36,29 +39,37 @@ class LevelSummary:
     fmc: float
     regions: int
     unseen: EmptyBall | None = None
+    missed: MissedShare | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What was found in all: totals, ends and severities of episodes by name, and each level."""
+    """What was found in all: totals, ends and severities of episodes by name, and each level.
+
+    `missed` is the bound for the pool as a whole; None without audit cases.
+    """
 
     cases: int
     failures: int
     ends: dict[str, int]
     severities: dict[str, int]
     levels: dict[int, LevelSummary]
+    missed: MissedShare | None = None
 
 
 def summarise(outcomes: Sequence[Outcome], levels: Sequence[int]) -> Summary:
     """Return the summary of outcomes, at the given levels and where else there are any."""
     every = sorted({*levels, *(outcome.case.level for outcome in outcomes)})
+    audited = audit_cases(outcomes)
+    missed = missed_shares(audited, every)
     ends = Counter(outcome.measures.end for outcome in outcomes)
     return Summary(
         cases=len(outcomes),
         failures=sum(outcome.failed for outcome in outcomes),
         ends={end.value: ends[end] for end in End if ends[end]},
         severities=severities_of(outcomes),
-        levels={level: _level(outcomes, level) for level in every},
+        levels={level: _level(outcomes, level, missed.get(level)) for level in every},
+        missed=missed_share(audited, levels),
     )
 
 
@@ -68,7 +79,7 @@ def severities_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
     return {severity.value: counts[severity] for severity in Severity if counts[severity]}
 
 
-def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
+def _level(outcomes: Sequence[Outcome], level: int, missed: MissedShare | None) -> LevelSummary:
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
     seen = to_unit((o.case for o in at_level if not o.measures.end.is_error), level)
     points = to_unit((outcome.case for outcome in at_level if outcome.failed), level)
@@ -80,4 +91,5 @@ def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
         unseen=largest_empty_ball(seen),
+        missed=missed,
     )

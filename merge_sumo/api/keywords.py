@@ -90,6 +90,7 @@ class Settings(Setup, total=False):
         seed: same seed, same outcomes.
         v_vut0_mps: initial speed of the VUT; the scenario's by default.
         stop_after_converged: stop when less than this share of new coverage is expected.
+        audit: uniform cases among them, which bound what the campaign missed; none by default.
         learn_from: folders of earlier campaigns to learn the VUT from.
     """
 
@@ -101,6 +102,7 @@ class Settings(Setup, total=False):
     seed: int
     v_vut0_mps: float | None
     stop_after_converged: float | None
+    audit: int | None
     learn_from: Sequence[Path | str] | None
 
 

@@ -209,6 +209,7 @@ class CampaignRun(Result):
         optional += [f"  {run.ran_again_in_words}"] if run.ran_again else []
         optional += [f"  note: {note}" for note in doubts(run.outcomes, run.criterion)]
         optional += [_level_line(level, summary) for level, summary in levels.items()]
+        optional += [] if self.summary.missed is None else [self.summary.missed.sentence]
         optional += [self.careful, f"report: {self.report_file}"]
         worst = failures(run.outcomes)[:1]
         folders = [run.folder / SCENARIOS / case_name(outcome.index) for outcome in worst]
@@ -222,10 +223,12 @@ class CampaignRun(Result):
 
     def _converged_line(self) -> str:
         cases, share = (self.settings[name] for name in ("cases", "stop_after_converged"))
+        caveat = " (this says nothing of regions that no case has come near)"
+        if self.summary.missed is not None:
+            caveat = ", and audit cases bound what was missed by less than that"
         return (
             f"stopped after {len(self._run.outcomes)} of {cases} cases: three times in a row the "
-            f"next batch was expected to add less than {share:.2%} to the coverage (this says "
-            "nothing of regions that no case has come near)"
+            f"next batch was expected to add less than {share:.2%} to the coverage{caveat}"
         )
 
     def __repr__(self) -> str:
@@ -254,6 +257,8 @@ def _level_line(level: int, summary: LevelSummary) -> str:
         return f"{title}: nothing was tested in {summary.cases} cases"
     ball = summary.unseen
     empty = "" if ball is None else f"; largest ball without a case: {ball.radius:.0%} of the axes"
+    if summary.missed is not None:
+        empty += f"; {summary.missed.in_short}"
     return (
         f"{title}: {counted(summary.failures, 'failure')} in {counted(summary.cases, 'case')}, "
         f"FMC {summary.fmc:.4f}, {counted(summary.regions, 'region')}{empty}"

@@ -197,8 +197,9 @@ def _compared(
     for name in FILES:
         record[name] = _files_now(recorded, name, record[name] or {}) or None
     cases = recorded.get("cases")
-    grown = isinstance(cases, int) and cases < settings.cases
-    if grown:  # which cases come next does not depend on how many there are to be
+    # Which cases come next does not depend on how many there are to be; audit cases do.
+    grown = isinstance(cases, int) and cases < settings.cases and settings.audit is None
+    if grown:
         recorded["cases"] = settings.cases
     changes = differences(RECORDED_BY_DEFAULT | recorded, record)
     if before.criterion != settings.criterion:
@@ -246,8 +247,9 @@ def _run(
 ) -> Run:
     """Run what is missing of a campaign, then some cases a second time; export the worst."""
     history = [] if before is None else before.outcomes
-    sampler = make_sampler(settings.sampler, settings.pool, settings.seed, _twin(settings, plan))
-    search_on_two_cores(sampler, workers, settings.cases - len(history))
+    picks = make_sampler(settings.sampler, settings.pool, settings.seed, _twin(settings, plan))
+    search_on_two_cores(picks, workers, settings.cases - len(history))
+    sampler, audit = settings.audited(picks), settings.audit_plan
     motions = None
     if before is not None and sampler.uses_predictions:
         motions = {o.index: before.trajectory(o.index).motion for o in history}
@@ -263,6 +265,8 @@ def _run(
         search = conduct_in_flight(flight, run_all, workers.chunk_size, on_case)
     with closing(search):
         for together in search:
+            if audit is not None:
+                together = audit.mark_batches(together, ended)  # noqa: PLW2901
             journal.append(*together)
             ended += [outcome for batch in together for outcome, _ in batch]
             if noted.update(record):
@@ -290,7 +294,7 @@ def _in_batches(
 ) -> Generator[list[Batch], None, None]:
     """Run batch by batch what is missing of a campaign; yield batches that ended together."""
     proposed = proposals(
-        make_sampler(settings.sampler, settings.pool, settings.seed),
+        settings.audited(make_sampler(settings.sampler, settings.pool, settings.seed)),
         *(history, settings.cases, settings.batch),
     )
     missing = settings.cases - len(history)

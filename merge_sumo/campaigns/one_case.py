@@ -24,6 +24,7 @@ ONE: Final[dict[str, Any]] = {
     "in_flight": None,
     "sampler": "uniform",
     "stop_after_converged": None,
+    "audit": None,
 }
 """Settings of a campaign that is one case."""
 DEBUG_DEADLINE_S: Final = 86_400.0

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.analysis.audit import CONFIDENCE, AuditCase, missed_share
+from merge_sumo.campaigns.audit import Audit, AuditedSampler
 from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.stopping import StoppingRule
 from merge_sumo.campaigns.store import SETTINGS, scenario_of
@@ -17,6 +19,7 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
+from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.system.records import RecordError, check_fields
 from merge_sumo.values.case import Pool
@@ -38,6 +41,7 @@ class CampaignSettings:
     cases: int = DEFAULT_CASES
     batch: int | None = None
     in_flight: int | None = None
+    audit: int | None = None
     seed: int = 0
     v_vut0_mps: float | None = None
     stop_after_converged: float | None = None
@@ -68,7 +72,7 @@ class CampaignSettings:
                 levels = ", ".join(map(level_name, self.scenario.levels))
                 raise UserError(f"the levels are {list(self.levels)}: choose from {levels}")
         self._check_sampler()
-        for name in ("cases", "batch", "in_flight"):
+        for name in ("cases", "batch", "in_flight", "audit"):
             if (number := getattr(self, name)) is not None and number < 1:
                 option = name.replace("_", "-")
                 raise UserError(f"--{option} is {number}: it must be 1 or more")
@@ -79,6 +83,11 @@ class CampaignSettings:
             )
         if self.in_flight is not None:
             self._check_in_flight(self.in_flight)
+        if self.audit is not None and self.audit > self.cases:
+            raise UserError(
+                f"--audit is {self.audit} and --cases is {self.cases}: audit cases are among the "
+                "cases of the campaign, and cannot be more"
+            )
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
         self.stopping_rule()
@@ -141,7 +150,49 @@ class CampaignSettings:
         if self.stop_after_converged is None:
             return None
         fresh = partial(make_sampler, self.sampler, self.pool, self.seed)
-        return StoppingRule(self.stop_after_converged, self.batch or self.in_flight, fresh)
+        rule = StoppingRule(
+            self.stop_after_converged, self.batch or self.in_flight, fresh, self._missed
+        )
+        self._check_audit_suffices(self.stop_after_converged)
+        return rule
+
+    @property
+    def audit_plan(self) -> Audit | None:
+        """Which cases are audit cases; None without any."""
+        return None if self.audit is None else Audit(self.audit, self.cases, self.pool, self.seed)
+
+    def audited(self, sampler: Sampler) -> Sampler:
+        """Return a sampler that was told nothing, with audit cases among its picks."""
+        audit = self.audit_plan
+        return sampler if audit is None else AuditedSampler(sampler, audit)
+
+    @property
+    def _missed(self) -> Callable[[Sequence[Outcome]], float] | None:
+        """What gives the share that audit cases leave open after outcomes."""
+        audit = self.audit_plan
+        if audit is None:
+            return None
+
+        def missed(outcomes: Sequence[Outcome]) -> float:
+            bound = audit.missed(outcomes)
+            return 1.0 if bound is None else bound.at_most
+
+        return missed
+
+    def _check_audit_suffices(self, share: float) -> None:
+        """Refuse audit cases that are too few for the search to end before its number of cases."""
+        audit = self.audit_plan
+        if audit is None:
+            return
+        indices = [index for index in range(self.cases) if index in audit]
+        clean = [AuditCase(index, audit.case(index).level, missed=False) for index in indices]
+        best = missed_share(clean, self.levels)
+        if best is not None and best.at_most >= share:
+            raise UserError(
+                f"--stop-after-converged is {share} and --audit is {self.audit}: at best, so many "
+                f"audit cases bound what was missed by {best.at_most:.2g} with {CONFIDENCE:.0%} "
+                "confidence; choose more audit cases, or a larger share"
+            )
 
     @property
     def criterion(self) -> Criterion:

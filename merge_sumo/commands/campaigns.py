@@ -34,7 +34,9 @@ def _vut_option(help: str, show_default: str) -> Shared:
     )
 
 
-@app.verb(options=(*SETTINGS, "stop_after_converged", *SETUP, "net", *RUNNING, "trust_vut"))
+@app.verb(
+    options=(*SETTINGS, "stop_after_converged", "audit", *SETUP, "net", *RUNNING, "trust_vut")
+)
 def campaign(
     given: Given,
     out: Annotated[

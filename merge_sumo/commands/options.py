@@ -25,6 +25,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "How many cases, and which": (
         *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
         *("truth_cases", "dense", "quick", "distribution", "learn_from", "stop_after_converged"),
+        "audit",
     ),
     "Verdict": ("fail_when", "require", "gate", "tolerance", "rerun", "confidence"),
     "Where it runs, and what it writes": (
@@ -164,6 +165,13 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Stop early when, three batches in a row, the next batch is expected to add less than this "
         "share to the coverage. Needs a sampler that can tell: coverage.",
         metavar="SHARE",
+    ),
+    "audit": option(
+        int | None,
+        None,
+        "Of the cases, so many are uniform, whatever was found: they bound, with confidence, the "
+        "share of the pool where the campaign has missed failures.",
+        metavar="N",
     ),
     "dense": option(
         bool | None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from merge_sumo.analysis.audit import MissedShare
 from merge_sumo.analysis.coordinates import Coordinate
 from merge_sumo.analysis.summary import LevelSummary
 from merge_sumo.analysis.surface import FEWEST_FAILURES
@@ -92,9 +93,20 @@ def _note(found: LevelSummary, axes: tuple[Coordinate, ...], *, learned: bool) -
         text += f"; {found.cases - found.tested} not tested"
     if found.unseen is not None:
         text += f". {_unseen(axes, found.unseen)}"
+    if found.missed is not None:
+        text += f". {_missed(found.missed)}"
     if not learned:
         text += f". No surrogate: it takes {FEWEST_FAILURES} failures to learn one"
     return text + "."
+
+
+def _missed(bound: MissedShare) -> str:
+    """Return in a clause what may have been missed."""
+    return (
+        f"{counted(bound.missed, 'missed failure')} in {counted(bound.cases, 'audit case')}: with "
+        f"{bound.confidence:.0%} confidence, at most {two_digits(bound.percent)} % of this level "
+        "fails farther than the radius of the FMC from every failure that was found"
+    )
 
 
 def _unseen(axes: tuple[Coordinate, ...], ball: EmptyBall) -> str:

@@ -61,7 +61,8 @@ WORST: Final = 20
 TWICE: Final = 100
 """Cases of a level that run twice: at most so many, and a quarter of them."""
 OF_A_SEARCH: Final = (
-    *("sampler", "cases", "batch", "in_flight", "seed", "stop_after_converged", "learn_from"),
+    *("sampler", "cases", "batch", "in_flight", "audit", "seed"),
+    *("stop_after_converged", "learn_from"),
     *("in_process", "policies"),
 )
 """Settings of a campaign that decide nothing here."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.records import convert, decode, record_type, to_plain
+from merge_sumo.values.audit_mark import AuditMark
 from merge_sumo.values.avoidability import last_avoidable_s
 from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import Case, FloatArray
@@ -159,6 +160,7 @@ class Outcome:
         prediction: what was predicted of it; None without a prediction.
         margin: how far it is from failing under the campaign's criterion, below 0 where it fails;
             None under the paper's, which has the score P, and after an error.
+        audit: mark of an audit case; None for the picks of the sampler.
     """
 
     index: int
@@ -167,6 +169,7 @@ class Outcome:
     measures: Measures
     prediction: Prediction | None = None
     margin: float | None = None
+    audit: AuditMark | None = None
 
     @property
     def score(self) -> float | None:
@@ -212,6 +215,8 @@ class Outcome:
             record["margin"] = self.margin
         if self.prediction is not None:
             record["foretold"] = to_plain(self.prediction)
+        if self.audit is not None:
+            record["audit"] = to_plain(self.audit)
         return record
 
     @classmethod
@@ -228,7 +233,8 @@ class Outcome:
             **{name: getattr(known, name) for name in measure_names},
             further=tuple((name, getattr(known, name)) for name in further_measures()),
         )
-        return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
+        told = known.foretold, known.margin, known.audit
+        return cls(known.index, known.batch, case, measures, *told)
 
 
 FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
@@ -252,7 +258,12 @@ def _record_fields(
     types = get_type_hints(kind.case_type) | get_type_hints(Measures) | {"index": int, "batch": int}
     required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
     further = [(name, float | None, None) for name in further_measures()]
-    optional = [*further, ("margin", float | None, None), ("foretold", Prediction | None, None)]
+    optional = [
+        *further,
+        ("margin", float | None, None),
+        ("foretold", Prediction | None, None),
+        ("audit", AuditMark | None, None),
+    ]
     return case_names, measure_names, record_type("outcome", [*required, *optional])
 
 

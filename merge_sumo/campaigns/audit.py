@@ -1,0 +1,138 @@
+"""Audit cases of a campaign: uniform cases among those that its sampler picks.
+
+Which cases of a campaign they are follows from its number of cases, and what they are from its
+seed: from no outcome. The sampler is told them as any case. `analysis/audit.py` says what follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.analysis.audit import AuditCase, MissedShare, audit_cases, missed_share
+from merge_sumo.campaigns.store import Batch
+from merge_sumo.samplers.base import Sampler
+from merge_sumo.values.audit_mark import AuditMark
+from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
+from merge_sumo.values.prediction import Prediction
+from merge_sumo.values.score import Outcome
+
+STREAM: Final = 0x61756469
+"""Key of the random stream: more than a campaign has cases, so that it is none of a sampler's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """Which cases of a campaign are audit cases, and what they are.
+
+    Attributes:
+        number: audit cases.
+        cases: cases of the campaign, over which they are spread evenly.
+        pool: where they are drawn from; its levels take turns.
+        seed: of the campaign.
+    """
+
+    number: int
+    cases: int
+    pool: Pool
+    seed: int
+
+    def __contains__(self, index: int) -> bool:
+        """Return whether the case of an index is one."""
+        return self._before(index + 1) > self._before(index)
+
+    def _before(self, index: int) -> int:
+        return index * self.number // self.cases
+
+    def case(self, index: int) -> Case:
+        """Return the audit case of an index."""
+        number = self._before(index)
+        level = self.pool.levels[number % len(self.pool.levels)]
+        rng = np.random.default_rng([self.seed, STREAM, number])
+        point = rng.random((1, len(self.pool.scenario.dimensions(level))))
+        return self.pool.cases(point, level)[0]
+
+    def mark(self, outcomes: Sequence[Outcome], before: Sequence[Outcome]) -> list[Outcome]:
+        """Return the outcomes of a batch with marks, by the failures of the batches before it."""
+        marked = list(outcomes)
+        for place, outcome in enumerate(outcomes):
+            if outcome.index in self:
+                level, scenario = outcome.case.level, self.pool.scenario
+                failing = [o.case for o in before if o.failed and o.case.level == level]
+                off = to_unit(failing, level, scenario) - to_unit([outcome.case], level, scenario)
+                distances = np.sqrt(np.square(off).sum(axis=1))
+                nearest = float(distances.min()) if len(distances) else None
+                marked[place] = replace(outcome, audit=AuditMark(nearest_failure=nearest))
+        return marked
+
+    def mark_batches(self, batches: Sequence[Batch], before: Sequence[Outcome]) -> list[Batch]:
+        """Return batches, in order, with marks."""
+        marked, so_far = [], list(before)
+        for batch in batches:
+            outcomes = self.mark([outcome for outcome, _ in batch], so_far)
+            so_far += outcomes
+            trajectories = (trajectory for _, trajectory in batch)
+            marked.append(list(zip(outcomes, trajectories, strict=True)))
+        return marked
+
+    def missed(self, outcomes: Sequence[Outcome]) -> MissedShare | None:
+        """Return the bound after outcomes that have a verdict; others count as missed failures."""
+        so_far: list[Outcome] = []
+        for batch in sorted({outcome.batch for outcome in outcomes}):
+            so_far += self.mark([o for o in outcomes if o.batch == batch], so_far)
+        known = {case.index: case for case in audit_cases(so_far)}
+        last = max((outcome.index for outcome in outcomes), default=-1)
+        cases = [
+            known.get(index) or AuditCase(index, self.case(index).level, missed=True)
+            for index in range(last + 1)
+            if index in self
+        ]
+        return missed_share(cases, self.pool.levels)
+
+
+class AuditedSampler(Sampler):
+    """A sampler among whose picks audit cases are."""
+
+    def __init__(self, sampler: Sampler, audit: Audit) -> None:
+        """Take a sampler that was told nothing."""
+        super().__init__(sampler.pool, sampler.seed)
+        self._sampler, self._audit = sampler, audit
+        self.learns, self.uses_predictions = sampler.learns, sampler.uses_predictions  # type: ignore[misc]
+        self._places: list[int | None] = []
+        """By the place in the last batch, the place among the sampler's own picks."""
+
+    def ask(self, n: int) -> list[Case]:
+        """Return the next `n` cases, audit cases in their places."""
+        first = self.proposed()
+        audited = {place for place in range(n) if first + place in self._audit}
+        own = self._sampler.ask(n - len(audited)) if len(audited) < n else []
+        numbers = iter(range(len(own)))
+        self._places = [None if place in audited else next(numbers) for place in range(n)]
+        return [
+            self._audit.case(first + place) if number is None else own[number]
+            for place, number in enumerate(self._places)
+        ]
+
+    def prediction(self, place: int) -> Prediction | None:
+        """Return the prediction of a case of the last batch; None for an audit case."""
+        number = self._places[place]
+        return None if number is None else self._sampler.prediction(number)
+
+    def batch_size(self) -> int:
+        """Return the preferred number of cases of the next batch."""
+        return self._sampler.batch_size()
+
+    def tell(
+        self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
+    ) -> None:
+        """Take outcomes, those of audit cases, too."""
+        super().tell(outcomes)
+        self._sampler.tell(outcomes, motions)
+
+    def skip(self, cases: Sequence[Case]) -> None:  # type: ignore[override]
+        """Count cases as proposed whose outcomes will not be told."""
+        super().skip(cases)
+        self._sampler.skip(cases)
