@@ -22,8 +22,9 @@ alone, as h is at least 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 from merge_sumo.system.printable import two_digits
@@ -127,28 +128,29 @@ def missed_share(cases: Sequence[AuditCase], levels: Sequence[int]) -> MissedSha
 
 
 def _bound(cases: Sequence[AuditCase], rounds: Sequence[Sequence[AuditCase]]) -> MissedShare:
-    counts = {}
+    counts = []
     for weight, first in ((ALL, 0), (1.0 - ALL, LATE)):
         counted = [one for one in rounds if one[0].index >= first]
         missed = sum(case.missed for one in counted for case in one)
         clean = sum(len(one) for one in counted if not any(case.missed for case in one))
-        counts[weight] = missed, clean
+        counts.append((weight, missed, clean))
     missed = sum(case.missed for case in cases)
-    return MissedShare(len(cases), missed, share_at_most(counts, 1.0 - CONFIDENCE))
+    return MissedShare(len(cases), missed, share_at_most(tuple(counts), 1.0 - CONFIDENCE))
 
 
-def share_at_most(counts: Mapping[float, tuple[int, int]], risk: float) -> float:
+@lru_cache(maxsize=1024)
+def share_at_most(counts: tuple[tuple[float, int, int], ...], risk: float) -> float:
     """Return the smallest share whose capital is 1 / risk: none above it is left.
 
     Args:
-        counts: by prior weight, which add up to 1, missed failures and cases without one.
+        counts: prior weights, which add up to 1, with missed failures and cases that are none.
         risk: chance of being wrong, at any time.
     """
     goal = math.log(1.0 / risk)
     low, high = 0.0, 1.0
     for _ in range(50):
         middle = (low + high) / 2.0
-        logs = [math.log(weight) + _log_capital(middle, *count) for weight, count in counts.items()]
+        logs = [math.log(weight) + _log_capital(middle, *count) for weight, *count in counts]
         if _log_sum(logs) < goal:
             low = middle
         else:

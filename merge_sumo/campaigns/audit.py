@@ -6,11 +6,12 @@ seed: from no outcome. The sampler is told them as any case. `analysis/audit.py`
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from merge_sumo.analysis.audit import AuditCase, MissedShare, audit_cases, missed_share
 from merge_sumo.campaigns.store import Batch
@@ -55,18 +56,21 @@ class Audit:
         point = rng.random((1, len(self.pool.scenario.dimensions(level))))
         return self.pool.cases(point, level)[0]
 
-    def mark(self, outcomes: Sequence[Outcome], before: Sequence[Outcome]) -> list[Outcome]:
+    def mark(self, outcomes: Sequence[Outcome], before: Iterable[Outcome]) -> list[Outcome]:
         """Return the outcomes of a batch with marks, by the failures of the batches before it."""
-        marked = list(outcomes)
-        for place, outcome in enumerate(outcomes):
-            if outcome.index in self:
-                level, scenario = outcome.case.level, self.pool.scenario
-                failing = [o.case for o in before if o.failed and o.case.level == level]
-                off = to_unit(failing, level, scenario) - to_unit([outcome.case], level, scenario)
-                distances = np.sqrt(np.square(off).sum(axis=1))
-                nearest = float(distances.min()) if len(distances) else None
-                marked[place] = replace(outcome, audit=AuditMark(nearest_failure=nearest))
-        return marked
+        audited = [o for o in outcomes if o.index in self and o.audit is None]
+        if not audited:
+            return list(outcomes)
+        failing = [outcome.case for outcome in before if outcome.failed]
+        marks = {}
+        for level in {outcome.case.level for outcome in audited}:
+            own = [outcome for outcome in audited if outcome.case.level == level]
+            points = to_unit((o.case for o in own), level, self.pool.scenario)
+            known = to_unit((c for c in failing if c.level == level), level, self.pool.scenario)
+            nearest = cKDTree(known).query(points)[0].tolist() if len(known) else [None] * len(own)
+            for outcome, distance in zip(own, nearest, strict=True):
+                marks[outcome.index] = AuditMark(nearest_failure=distance)
+        return [replace(o, audit=marks[o.index]) if o.index in marks else o for o in outcomes]
 
     def mark_batches(self, batches: Sequence[Batch], before: Sequence[Outcome]) -> list[Batch]:
         """Return batches, in order, with marks."""
@@ -79,11 +83,11 @@ class Audit:
         return marked
 
     def missed(self, outcomes: Sequence[Outcome]) -> MissedShare | None:
-        """Return the bound after outcomes that have a verdict; others count as missed failures."""
-        so_far: list[Outcome] = []
-        for batch in sorted({outcome.batch for outcome in outcomes}):
-            so_far += self.mark([o for o in outcomes if o.batch == batch], so_far)
-        known = {case.index: case for case in audit_cases(so_far)}
+        """Return the bound after marked outcomes that have a verdict.
+
+        Audit cases without one count as missed failures.
+        """
+        known = {case.index: case for case in audit_cases(outcomes)}
         last = max((outcome.index for outcome in outcomes), default=-1)
         cases = [
             known.get(index) or AuditCase(index, self.case(index).level, missed=True)
@@ -128,11 +132,12 @@ class AuditedSampler(Sampler):
     def tell(
         self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
     ) -> None:
-        """Take outcomes, those of audit cases, too."""
-        super().tell(outcomes)
+        """Take outcomes, of whole batches; those of audit cases are marked from here on."""
+        super().tell(self._audit.mark(outcomes, self._outcomes.values()))
         self._sampler.tell(outcomes, motions)
 
-    def skip(self, cases: Sequence[Case]) -> None:  # type: ignore[override]
+    def skip(self, cases: Iterable[Case]) -> None:
         """Count cases as proposed whose outcomes will not be told."""
-        super().skip(cases)
-        self._sampler.skip(cases)
+        skipped = list(cases)
+        super().skip(skipped)
+        self._sampler.skip(skipped)
