@@ -104,7 +104,8 @@ class AuditedSampler(Sampler):
         """Take a sampler that was told nothing."""
         super().__init__(sampler.pool, sampler.seed)
         self._sampler, self._audit = sampler, audit
-        self.learns, self.uses_predictions = sampler.learns, sampler.uses_predictions  # type: ignore[misc]
+        self.learns, self.overlaps = sampler.learns, sampler.overlaps  # type: ignore[misc]
+        self.uses_predictions = sampler.uses_predictions  # type: ignore[misc]
         self._places: list[int | None] = []
         """By the place in the last batch, the place among the sampler's own picks."""
 
@@ -135,6 +136,12 @@ class AuditedSampler(Sampler):
         """Take outcomes, of whole batches; those of audit cases are marked from here on."""
         super().tell(self._audit.mark(outcomes, self._outcomes.values()))
         self._sampler.tell(outcomes, motions)
+
+    def pend(self, cases: Iterable[Case]) -> None:
+        """Take the cases that run at present; later picks may keep away from audit cases."""
+        pending = list(cases)
+        super().pend(pending)
+        self._sampler.pend(pending)
 
     def skip(self, cases: Iterable[Case]) -> None:
         """Count cases as proposed whose outcomes will not be told."""

@@ -247,6 +247,19 @@ class TestACampaign:
         places = range(3, 48, 4)
         assert [cases[0][n] for n in places] == [cases[1][n] for n in places]
 
+    def test_has_the_same_audit_cases_with_cases_in_flight(self, tmp_path):
+        campaign(tmp_path / "a", audit=12)
+        campaign(tmp_path / "b", audit=12, in_flight=6)
+        runs = [Run(tmp_path / name).outcomes for name in "ab"]
+        audited = [[o.case for o in run if o.audit is not None] for run in runs]
+        assert audited[0] == audited[1]
+        assert len(audited[0]) == 12
+        before = (tmp_path / "b" / "outcomes.jsonl").read_bytes()
+        lines = before.splitlines(keepends=True)
+        (tmp_path / "b" / "outcomes.jsonl").write_bytes(b"".join(lines[:20]))
+        resume_campaign(tmp_path / "b")
+        assert (tmp_path / "b" / "outcomes.jsonl").read_bytes() == before
+
     def test_says_what_it_may_have_missed(self, run, tmp_path, command_line):
         out = tmp_path / "run"
         options = ("--vut", "design1", "--level", "0", "--cases", "30", "--audit", "15")
