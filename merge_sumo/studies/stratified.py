@@ -113,12 +113,12 @@ class Strata:
         best = math.inf
         for limits in [(), *product(SAFE_BELOW, FAILING_FROM)]:
             of_cell = np.searchsorted(limits, expected, side="right")
-            share = np.bincount(of_cell, mass, len(limits) + 1)
-            share /= share.sum()
+            share = _sums_by(of_cell, mass, len(limits) + 1)
+            share = share / share.sum()
             some = share > 0.0
             if limits and some.sum() == 1:
                 continue
-            mean = np.bincount(of_cell, mass * expected, len(share))[some] / share[some]
+            mean = _sums_by(of_cell, mass * expected, len(share))[some] / share[some]
             mean = np.clip(mean, 0.0, 1.0)
             numbers, width = allocated(share[some], mean, cases, confidence)
             if width < best:
@@ -146,6 +146,11 @@ class Strata:
             chances[of_level, :dims] = within / per_side
         weight = (self.share * len(cell) / self.cases)[stratum]
         return Draws(np.array(self._levels)[place], chances, stratum, weight)
+
+
+def _sums_by(group: IntArray, values: FloatArray, groups: int) -> FloatArray:
+    """Return the sum of the values of each group, (groups,)."""
+    return np.bincount(group, values, groups).astype(np.float64)
 
 
 def cells(dims: int, split: int = 1) -> FloatArray:
@@ -397,7 +402,8 @@ class _Order:
         from scipy.stats import binom
 
         self._cases = cases
-        found = _chernoff(share, failures[None, :] * 1.0, cases[None, :] * 1.0, risk)[0]
+        counts = np.array([failures, cases], dtype=np.float64)
+        found = _chernoff(share, counts[:1], counts[1:], risk)[0]
         self._numbers = [
             # Other numbers have no chance worth speaking of.
             np.arange(max(binom.ppf(NEVER, n, low), 0.0), binom.isf(NEVER, n, high) + 1.0)
