@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from bench_record import add_record_option, append_record
+from numpy.typing import NDArray
 
 from merge_sumo.analysis.exposure import read_distribution
 from merge_sumo.api import truths
@@ -42,6 +43,7 @@ PARTS = ("sets", "campaign")
 TRUTH_CASES = 1_000_000
 CAMPAIGN = CampaignSettings(vut="design1", levels=(0,), cases=200, seed=5, scenario=US23)
 CHUNK = 20_000
+Verdicts = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def measured(
     strata: Strata,
     probability: float,
     seeds: range,
-    verdicts: Callable[[list[Draws]], Iterator[FloatArray]],
+    verdicts: Callable[[list[Draws]], Iterator[Verdicts]],
 ) -> Row:
     """Draw from strata with each seed, and compare the intervals with those of plain cases."""
     draws = [strata.draw(np.random.default_rng([seed, STREAM])) for seed in seeds]
@@ -93,12 +95,8 @@ def sets(cases: int, seeds: range) -> Iterator[Row]:
         def beyond(points: FloatArray, middle: float, area: float = area) -> FloatArray:
             return np.abs(0.75 * points[:, 0] + points[:, 1] - middle) - area / 2.0
 
-        def fails(points: FloatArray, beyond: Callable[..., FloatArray] = beyond) -> FloatArray:
+        def fails(points: FloatArray, beyond: Callable[..., FloatArray] = beyond) -> Verdicts:
             return beyond(points, 0.875) < 0.0
-
-        def half_as_much(points: FloatArray, area: float = area) -> FloatArray:
-            known = points[:, 0] < 0.5
-            return np.asarray(fails(points) & known)
 
         where = cells(2)
         at, elsewhere = beyond(where, 0.875), beyond(where, 1.0 + area)
@@ -113,7 +111,9 @@ def sets(cases: int, seeds: range) -> Iterator[Row]:
         for name, chance in surrogates.items():
             strata = Strata({1: 1.0}, {1: chance}, US23, cases, CONFIDENCE)
 
-            def verdicts(draws: list[Draws], of: Callable[..., FloatArray] = fails) -> Iterator:
+            def verdicts(
+                draws: list[Draws], of: Callable[..., Verdicts] = fails
+            ) -> Iterator[Verdicts]:
                 return (of(one.chances[:, :2]) for one in draws)
 
             yield measured(f"band, known: {name}", strata, area, seeds, verdicts)
@@ -126,7 +126,7 @@ def campaign(cases: list[int], seeds: range) -> Iterator[Row]:
     plan = resolve(CAMPAIGN).with_engine(Engine.KINEMATIC)
     stated = read_distribution(None, CAMPAIGN.levels, CAMPAIGN.scenario)
 
-    def verdicts(draws: list[Draws]) -> Iterator[FloatArray]:
+    def verdicts(draws: list[Draws]) -> Iterator[Verdicts]:
         points = np.concatenate([one.chances[:, :2] for one in draws])
         of_points = CAMPAIGN.pool.cases(stated.points(0, points), 0)
         failed = np.empty(len(of_points), dtype=bool)

@@ -25,7 +25,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Final
 
 from merge_sumo.system.printable import two_digits
 from merge_sumo.values.fmc import radius_for
@@ -41,7 +41,8 @@ ALL: Final = 0.75
 """Prior weight of all audit cases together; the late ones alone have the rest."""
 
 
-class AuditCase(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class AuditCase:
     """An audit case, and whether it is a missed failure."""
 
     index: int

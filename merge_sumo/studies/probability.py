@@ -141,12 +141,16 @@ def strata_of(
     # One thread: rounding must not depend on the number of cores.
     with threadpool_limits(1):
         for level in stated.levels:
-            at_level = expected.at(level)
             dims = len(settings.scenario.dimensions(level))
-            chance[level] = of_cells(
-                dims, lambda chances, of=at_level, level=level: of(stated.points(level, chances))
-            )
+            chance[level] = of_cells(dims, _of_chances(stated, level, expected.at(level)))
     return Strata(stated.levels, chance, settings.scenario, cases, confidence)
+
+
+def _of_chances(
+    stated: Distribution, level: int, of_points: Callable[[FloatArray], FloatArray]
+) -> Callable[[FloatArray], FloatArray]:
+    """Return a function of points as one of chances of the distribution."""
+    return lambda chances: of_points(stated.points(level, chances))
 
 
 class _Expected:

@@ -1,3 +1,4 @@
+# mypy: no-strict-optional
 """Audit cases: uniform whatever was found, marked, and a bound that holds at any time."""
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from merge_sumo.analysis.audit import (
     share_at_most,
 )
 from merge_sumo.campaigns.audit import Audit, AuditedSampler
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.stopping import StoppingRule
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import make_sampler
@@ -298,6 +299,7 @@ class TestACampaign:
             sampler="coverage", scenario=US23,
         )  # fmt: skip
         stop, audit = settings.stopping_rule(), settings.audit_plan
+        assert isinstance(stop, StoppingRule)
         stop._expected = dict.fromkeys(range(100), 0.0)
         at = POOL.cases(np.array([[0.5, 0.5]]), 0)[0]
 
@@ -313,4 +315,3 @@ class TestACampaign:
         assert stop(ran(200))
         assert not stop(ran(200, missed=(101,)))
         assert not stop([o for o in ran(200) if o.index != 151]), "one without a verdict"
-        assert resolve(settings).vut is not None
