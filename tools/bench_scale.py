@@ -6,6 +6,10 @@
               computes, on one process and on two: what the machine itself can give
     engines   verdicts on uniform cases of design2 at level 2 by SUMO and by the kinematic engine,
               which runs one case of a hundred in SUMO as well: CPU time per case, in turns
+    in-flight the whole command of a campaign whose VUT sleeps --case-s for a case, with --in-flight
+              on sixteen workers and in batches on one, and cases to .9 of the truth of design2 with
+              both. One worker is computed from a run with a VUT that sleeps hardly at all, and the
+              computation is compared with a measurement on few cases
     campaign  the whole command of a uniform campaign of design2, from its start to the report, on
               one worker and on two, in turns
     default   the whole command of the default campaign of design2, 800 cases by `coverage` at three
@@ -51,7 +55,7 @@ from merge_sumo.engine.evaluate import CaseResult, CaseResults, CasesAt, evaluat
 from merge_sumo.engine.kinematic_simulator import CHUNK
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.studies.truth import _scores
+from merge_sumo.studies.truth import _scores, ground_truth
 from merge_sumo.system.workers import LocalProcesses, Workers
 from merge_sumo.values.case import Case, Pool, from_unit, to_unit
 from merge_sumo.values.fmc import fmc, regions
@@ -64,7 +68,22 @@ CAMPAIGN_ROUNDS = 5
 PAIR_CASES = 2000
 BATCH = 20
 DEFAULT_ROUNDS = 3
-PARTS = ("truth", "workers", "engines", "campaign", "default", "parent", "samplers", "files")
+FLIGHT, FLIGHT_WORKERS = 48, 16
+FLIGHT_SEEDS, SEARCHED = 5, 150
+HARDLY_S = 0.02
+SLEEPY = """
+import time
+class Sleepy:
+    def reset(self, seen):
+        time.sleep({case_s})
+    def act(self, seen):
+        near = abs(seen.x_pov_m - seen.x_vut_m) < 9
+        return 1.0 if seen.x_vut_m < -40 else -1.5 if near else 0.0
+"""
+PARTS = (
+    *("truth", "workers", "engines", "in-flight", "campaign", "default", "parent", "samplers"),
+    "files",
+)
 
 
 def memory_mb() -> float:
@@ -197,6 +216,71 @@ def whole_campaigns(rounds: int, *options: str) -> dict[str, list[float]]:
     return found
 
 
+def slow_campaign(folder: Path, case_s: float, cases: int, *options: str) -> tuple[float, int]:
+    """Return the seconds of a whole command whose VUT sleeps, and the number of cases that ran."""
+    folder.mkdir()
+    (folder / "sleepy.py").write_text(SLEEPY.format(case_s=case_s))
+    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", "sleepy.py:Sleepy"]
+    command += ["--cases", str(cases), "--quiet", "--out", "run", *options]
+    start = time.perf_counter()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)
+    spent = time.perf_counter() - start
+    twice = folder / "run" / "repeats.jsonl"  # some cases run a second time
+    return spent, cases + (len(twice.read_bytes().splitlines()) if twice.exists() else 0)
+
+
+def slow_controllers(case_s: float, cases: int) -> dict[str, list[float]]:
+    """Return seconds of whole commands with a slow controller, and the gain of many workers."""
+    few, one = 24, ("--workers", "1")
+    many = ("--workers", str(FLIGHT_WORKERS), "--in-flight", str(FLIGHT))
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        quick_s, ran = slow_campaign(folder / "quick", HARDLY_S, cases, *one)
+        few_quick_s, few_ran = slow_campaign(folder / "few-quick", HARDLY_S, few, *one)
+        few_s, _ = slow_campaign(folder / "few", case_s, few, *one)
+        many_s, _ = slow_campaign(folder / "many", case_s, cases, *many)
+    one_s = quick_s + ran * (case_s - HARDLY_S)
+    return {
+        "s_on_one": [one_s],
+        "s_on_one_computed_over_measured": [(few_quick_s + few_ran * (case_s - HARDLY_S)) / few_s],
+        "s_on_many": [many_s],
+        "gain": [one_s / many_s],
+    }
+
+
+def cases_to_most(in_flight: int | None, seed: int, levels: tuple[int, ...]) -> float:
+    """Return the cases until `coverage` has .9 of the truth of design2; infinite for not yet."""
+    settings = CampaignSettings(
+        vut="design2",
+        levels=levels,
+        scenario=US23,
+        cases=SEARCHED,
+        seed=seed,
+        in_flight=in_flight,
+    )
+    plan = resolve(settings)
+    target = 0.9 * sum(fmc(ground_truth(plan, level).failures) for level in levels)
+    with tempfile.TemporaryDirectory() as scratch:
+        found = run_campaign(settings, plan, Path(scratch) / "run").outcomes
+    for count in range(5, SEARCHED + 1, 5):
+        failing = [o.case for o in found[:count] if o.failed]
+        at = {level: [case for case in failing if case.level == level] for level in levels}
+        if sum(fmc(to_unit(at[level], level, scenario=US23)) for level in levels) >= target:
+            return float(count)
+    return float("inf")
+
+
+def cases_in_flight() -> dict[str, list[float]]:
+    """Return the cases to .9 of the truth by seed, in batches and in flight."""
+    return {
+        f"cases_to_0.9_at_{name}_{how}": [
+            cases_to_most(in_flight, seed, levels) for seed in range(FLIGHT_SEEDS)
+        ]
+        for name, levels in (("all_levels", (0, 1, 2)), ("level_1", (1,)))
+        for how, in_flight in (("in_batches", None), ("in_flight", FLIGHT))
+    }
+
+
 class Served:
     """Gives what became of cases as it comes from a worker process, with no work done for it."""
 
@@ -308,6 +392,8 @@ def main() -> None:
         "--most", type=int, default=100_000, help="uniform cases of the largest run"
     )
     parser.add_argument("--campaign", type=int, default=20_000, help="cases of whole campaigns")
+    parser.add_argument("--case-s", type=float, default=1.0, help="seconds of a slow case")
+    parser.add_argument("--flight-cases", type=int, default=800, help="cases of a slow campaign")
     parser.add_argument("--history", type=int, default=10_000, help="longest history of a sampler")
     parser.add_argument("--outcomes", type=int, default=1_000_000, help="outcomes of a report")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="what to measure")
@@ -337,6 +423,10 @@ def main() -> None:
     if "engines" in chosen.only:
         result["engines"] = engines(CHUNK, ROUNDS)
         tell_spread("engines", result["engines"])
+    if "in-flight" in chosen.only:
+        result["in_flight"] = cases_in_flight()
+        result["in_flight"] |= slow_controllers(chosen.case_s, chosen.flight_cases)
+        tell_spread("in-flight", result["in_flight"])
     if "campaign" in chosen.only:
         uniform = ("--sampler", "uniform", "--cases", str(chosen.campaign))
         result["campaign"] = whole_campaigns(CAMPAIGN_ROUNDS, *uniform)

@@ -156,11 +156,11 @@ def campaign(
         vut: vehicle under test: a spec, a class, a function, or an object.
         net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/<vut>-<date>` by default.
-        given: which cases are chosen (`level`, `sampler`, `cases`, `batch`, `seed`, `v_vut0_mps`,
-            `stop_after_converged`, `learn_from`), how a case is run and judged (`scenario`,
-            `follow_up_s`, `fail_when`, `require`, `policies`, `pov`, `vut_command`, `deadline_s`,
-            `vut_memory_gib`, `in_process`), where it runs (`workers`, `dask`), and who is told
-            (`progress`, `on_case`, `check`, `gates`, `junit`); see `CampaignKeywords`.
+        given: which cases are chosen (`level`, `sampler`, `cases`, `batch`, `in_flight`, `seed`,
+            `v_vut0_mps`, `stop_after_converged`, `learn_from`), how a case is run and judged
+            (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`, `vut_command`,
+            `deadline_s`, `vut_memory_gib`, `in_process`), where it runs (`workers`, `dask`), and
+            who is told (`progress`, `on_case`, `check`, `gates`, `junit`); see `CampaignKeywords`.
 
     An interrupted campaign goes on with `resume`.
     """

@@ -30,6 +30,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from multiprocessing.synchronize import Semaphore
 from numbers import Integral
 from typing import Any, Final, Generic, ParamSpec, TypeVar
 
@@ -380,13 +381,15 @@ class InProcess(Executor):
 class LocalProcesses(ProcessPoolExecutor):
     """Worker processes that leave Ctrl-C to their parent and do not outlive it.
 
-    They are spawned, because libsumo's simulation must not be forked.
+    They are spawned, because libsumo's simulation must not be forked. No more of them import their
+    modules at a time than there are cores: the first ones work while others wait for that.
     """
 
     def __init__(self, workers: int, preload: str | None = None) -> None:
         spawn = multiprocessing.get_context("spawn")
         with without_cwd():  # its locks have a process of their own
-            super().__init__(workers, spawn, _begin_worker, (preload,))
+            cores = spawn.Semaphore(os.cpu_count() or 1)
+            super().__init__(workers, spawn, _begin_worker, (cores, preload))
         self.submit(int)  # with the first task they start
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -427,18 +430,20 @@ def end_worker() -> None:
         _endings.pop()()
 
 
-def _begin_worker(preload: str | None) -> None:
-    """Set up a worker process."""
+def _begin_worker(cores: Semaphore, preload: str | None) -> None:
+    """Set up a worker process, when one of the cores is free for that."""
     forget_safe_path()
-    from threadpoolctl import threadpool_limits
-
     leave_signals_to_parent()
     # Processes of multiprocessing end without atexit.
     multiprocessing.util.Finalize(None, end_worker, exitpriority=100)
-    for module in filter(None, ("numpy", preload)):
-        import_module(module)
-    # As many threads as workers keep all cores busy. A library that is loaded later has no limit.
-    threadpool_limits(1)
+    with cores:
+        from threadpoolctl import threadpool_limits
+
+        for module in filter(None, ("numpy", preload)):
+            import_module(module)
+        # As many threads as workers keep all cores busy. A library that is loaded later has no
+        # limit.
+        threadpool_limits(1)
 
 
 def leave_signals_to_parent() -> None:
