@@ -115,7 +115,7 @@ from merge_sumo.system.folders import (
 )
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.workers import Workers, workers_or_cores
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
@@ -281,8 +281,9 @@ def _write_findings(
     if isinstance(plan.scenario, MergeScenario):
         note_avoidance(done, plan, workers=opened, check=checks, on_part=careful)
     link_latest(done.folder)
-    # Learned on another machine, surrogates may differ in a last bit.
-    local = opened if runner.dask is None else None
+    # Learned on another machine, surrogates may differ in a last bit. More workers than cores
+    # would learn each surrogate more often than that saves time.
+    local = opened if runner.dask is None and opened.count <= workers_or_cores(None) else None
     expected()
     write_report(done, result.summary, local, page)
 

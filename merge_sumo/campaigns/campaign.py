@@ -119,7 +119,7 @@ def run_campaign(
     check_new(folder / SCENARIOS / case_name(settings.cases))
     plan = _plan_in(folder, settings, plan, workers)
     with workers_or_here(workers) as available:
-        open_simulators(plan, available, None if settings.in_flight is None else 1)
+        open_simulators(plan, available, first=settings.in_flight is not None)
         record = record_of(settings, plan)
         with Journal.create(folder, record) as journal:
             return _run(settings, plan, record, journal, available, None, on_case, check)
@@ -161,7 +161,7 @@ def resume_campaign(
         record, changes, rewrite = _compared(before, settings, plan, force=force)
         if dropped:
             warn(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
-        open_simulators(plan, available, None if settings.in_flight is None else 1)
+        open_simulators(plan, available, first=settings.in_flight is not None)
         if before.settings.get(FORCED) or changes:
             forced = {"from_case": len(before.outcomes), "differs": changes}
             record[FORCED] = [*_forced(before), *([forced] if changes else [])]

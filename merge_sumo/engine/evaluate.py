@@ -196,11 +196,11 @@ def evaluate_chunks(
     )
 
 
-def open_simulators(plan: SimulationPlan, workers: Workers, count: int | None = None) -> None:
+def open_simulators(plan: SimulationPlan, workers: Workers, *, first: bool = False) -> None:
     """Open the simulator of a plan in every worker; `UserError` where that cannot be.
 
-    A worker takes as long to start as to run hundreds of cases, so all of them start at once; with
-    a `count`, so many: the others start with their first case, while these run some.
+    A worker takes as long to start as to run hundreds of cases, so all of them start at once. It
+    goes on when all have opened it, or the `first` one has.
     """
 
     def died(_: None) -> None:
@@ -208,10 +208,11 @@ def open_simulators(plan: SimulationPlan, workers: Workers, count: int | None = 
         pov = "" if own is None else f" or the POV {own.spec}"
         raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
 
-    most = count or min(workers.count, plan.corridors)
+    most = workers.count if first else min(workers.count, plan.corridors)
     everywhere = [None] * (1 if workers.here else most)
     for _ in workers.run(partial(_open_simulator, plan), everywhere, died, chunk=1):
-        pass
+        if first:
+            break
 
 
 def evaluation_workers(

@@ -67,6 +67,8 @@ CHUNK: Final = 250
 IN_SUMO: Final = 64
 """Failures that a worker takes at a time, and where they run in SUMO: enough to keep all corridors
 busy."""
+FEW: Final = 100
+"""Failures that take as long as what a worker has to load for them."""
 BLOCK_STEPS: Final = 10
 """Take-overs that are tried at a time, from the last one back. Chosen, not tuned."""
 CORRIDORS: Final = 1024
@@ -210,8 +212,8 @@ def avoidance(
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as processes:
         on_part(done := 0, len(failing))
-        chunk = CHUNK if plan.povs.own is None else IN_SUMO
-        size = min(chunk, math.ceil(len(failing) / processes.count))
+        few, chunk = (FEW, CHUNK) if plan.povs.own is None else (1, IN_SUMO)
+        size = min(chunk, max(few, math.ceil(len(failing) / processes.count)))
         chunks = (failing[first : first + size] for first in range(0, len(failing), size))
         run_some = partial(run_counterfactuals, plan)
         with closing(processes.run_chunks(run_some, chunks, _unknown)) as results:
