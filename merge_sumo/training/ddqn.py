@@ -35,10 +35,10 @@ SQUASH_BELOW: Final = -2.0
 class DdqnSettings:
     """What `train` does."""
 
-    transitions: int = 400_000  # size of the replay; every transition is kept
-    updates: int = 40_000  # gradient steps; the transitions are all in after `collecting` of them
+    transitions: int = 150_000  # size of the replay; every transition is kept
+    updates: int = 12_000  # gradient steps; the transitions are all in after `collecting` of them
     collecting: float = 0.6  # share of the updates during which transitions are collected
-    warm_up: int = 20_000  # transitions before the first update
+    warm_up: int = 10_000  # transitions before the first update
     batch: int = 512  # transitions per update
     width: int = 128  # units of each of the two hidden layers
     learning_rate: float = 1e-3  # at the start; falls to `last_learning_rate` along a cosine
@@ -132,7 +132,8 @@ def train(
     inputs = FEATURES + SVO_FEATURES * sees_svo
     online, target = make_network(inputs, s.width), make_network(inputs, s.width)
     target.load_state_dict(online.state_dict())
-    optimiser = torch.optim.Adam(online.parameters(), lr=s.learning_rate, fused=True)
+    weights, averages = list(online.parameters()), list(target.parameters())
+    optimiser = torch.optim.Adam(weights, lr=s.learning_rate, fused=True)
     replay = Replay(s.transitions)
     collector = _Collector(game, rng, s.midway, sees_svo=sees_svo)
     loss = torch.zeros(())
@@ -153,10 +154,10 @@ def train(
             loss = _loss(online, target, replay, s.batch, rng, game.role, sees_svo=sees_svo)
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(online.parameters(), s.gradient_norm)
+            nn.utils.clip_grad_norm_(weights, s.gradient_norm)
             optimiser.step()
             with torch.no_grad():
-                torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), s.polyak)
+                torch._foreach_lerp_(averages, weights, s.polyak)
             update += 1
             if on_progress and update % 1000 == 0:
                 fit = float(loss.detach())

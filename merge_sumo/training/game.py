@@ -94,13 +94,17 @@ class Game:
         svo_rad: FloatArray,
         policy: Policy,
         first: IntArray | None = None,
+        held: int = 1,
     ) -> FloatArray:
-        """Return the returns, (n,), of playing to the end, with `first` as the first actions."""
+        """Return the returns, (n,), of playing to the end.
+
+        Where `first` actions are given, they are held for a number of decisions.
+        """
         returns, index = np.zeros(len(state)), np.arange(len(state))
         actions = self.actions_mps2
-        for _ in range(self.max_decisions):
-            action = policy(state, svo_rad) if first is None else first
-            first = None
+        for decision in range(self.max_decisions):
+            holds = first is not None and decision < held
+            action = first[index] if holds else policy(state, svo_rad)
             state, reward, over = self.advance(state, svo_rad, actions[action])
             returns[index] += reward
             index, state, svo_rad = index[~over], state[~over], svo_rad[~over]
@@ -108,11 +112,16 @@ class Game:
                 break
         return returns
 
-    def action_returns(self, state: FloatArray, svo_rad: FloatArray, policy: Policy) -> FloatArray:
-        """Return what each action is worth, (n, 7), when the policy goes on after it."""
+    def action_returns(
+        self, state: FloatArray, svo_rad: FloatArray, policy: Policy, held: int = 1
+    ) -> FloatArray:
+        """Return what each action is worth, (n, 7), held for a number of decisions.
+
+        After them the policy goes on.
+        """
         repeated, psi = np.repeat(state, ACTIONS, axis=0), np.repeat(svo_rad, ACTIONS)
         first = np.tile(np.arange(ACTIONS), len(state))
-        return self.play(repeated, psi, policy, first).reshape(len(state), ACTIONS)
+        return self.play(repeated, psi, policy, first, held).reshape(len(state), ACTIONS)
 
     def improved(self, policy: Policy) -> Policy:
         """Return the policy that plays every action out before it chooses (Tesauro, 1996)."""

@@ -67,8 +67,9 @@ LOG: Final = ".training.jsonl"
 WEIGHTS: Final = ".safetensors"
 GAMES: Final = 64
 """Corridors in which transitions are collected."""
-REGRET_EVERY: Final = 5_000
-"""Updates of DDQN between two measurements of the regret, which costs a second."""
+REGRET_EVERY: Final = {"ddqn": 4_000, "refine": 4}
+"""Updates of DDQN, and rounds of refinement, between two measurements of the regret, which costs a
+second; it is measured after the last one too."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -81,12 +82,8 @@ class TrainingSettings:
 
 
 LEVEL_SETTINGS: Final = {
-    1: TrainingSettings(),
-    2: TrainingSettings(
-        refine=RefineSettings(
-            rounds=26, starts=2_500, midway=0.05, searched=600, kept_rounds=8, learning_rate=4e-4
-        )
-    ),
+    1: TrainingSettings(refine=RefineSettings(rounds=12)),
+    2: TrainingSettings(refine=RefineSettings(rounds=20, midway=0.05, searched=400)),
 }
 """Settings by the level of the driver. An opponent that reacts makes the game harder: level 2 takes
 more games, nearly all from the pool's own starts, and discards the returns of earlier policies.
@@ -300,9 +297,10 @@ def _train_one(task: _Task) -> _Trained:
     regret = QuickRegret(played_out, sees_svo=sees_svo)
     ddqn, refinement = task.settings.ddqn, task.settings.refine
 
-    def reporter(stage: str, total: int, regret_every: int) -> Callable[[Progress], None]:
+    def reporter(stage: str, total: int) -> Callable[[Progress], None]:
         def report(now: Progress) -> None:
-            bound = regret(now.network) if now.done % regret_every == 0 else None
+            due = now.done % REGRET_EVERY[stage] == 0 or now.done == total
+            bound = regret(now.network) if due else None
             values = (now.done, total, now.loss, now.mean_return, now.crash_share, bound)
             _reports.put(TrainingProgress(task.name, stage, *values))
 
@@ -315,11 +313,11 @@ def _train_one(task: _Task) -> _Trained:
         opponent = LevelKDriver(GAMES, task.opponent)
     game = MergeGame(task.role, opponent, task.reward, task.road)
     try:
-        report = reporter("ddqn", ddqn.updates, REGRET_EVERY)
+        report = reporter("ddqn", ddqn.updates)
         network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=report)
     finally:
         game.close()
-    report = reporter("refine", refinement.rounds, 1)
+    report = reporter("refine", refinement.rounds)
     network = refine(played_out, network, task.seed, refinement, report)
     seconds = time.perf_counter() - started
     check = check_network(task.name, network, task.opponent, task.reward, task.settings.check_cases)

@@ -5,11 +5,13 @@ regret of a driver with little to gain. But a level-k driver knows its opponent,
 is worth can be found by playing it out. Each round
 
 1. plays the present policy from many starts and searches, from some of them, for a better game;
-2. plays every action out in the states of all these games, with the policy going on after it
-   (Lagoudakis and Parr, 2003); where the game that was found is better, its return counts (a lower
-   bound of the best return, as that of any game that was played: He et al., 2016);
+   part of the latter are near those where the last search was most successful;
+2. plays every action out, held for one decision and for two, in the states of all these games that
+   are worth it (`_worth_labels`), with the policy going on after it (Lagoudakis and Parr, 2003);
+   where the game that was found is better, its return counts (a lower bound of the best return, as
+   that of any game that was played: He et al., 2016);
 3. trains the network so that the loss of return which its choice means is small, and that Q stays
-   near the returns.
+   near the returns. The average of its weights is the policy of the next round.
 
 The cost of a choice is what is trained, not the fit of Q: the 128 units spend themselves on where
 one action becomes better than another. The game is deterministic, and its reward is known.
@@ -24,6 +26,7 @@ from typing import Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from merge_sumo.drivers.levelk import ACTIONS, QNetwork
@@ -34,6 +37,8 @@ from merge_sumo.training.game import Game, IntArray, greedy, inputs_of
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import SVO
 
+BETTER: Final = 1e-3
+"""A game that was found is better than the policy's where its return is higher by more."""
 COST_CAP: Final = 1.0
 """A choice that costs more is wrong enough: what a crash costs must not drown the rest."""
 
@@ -46,14 +51,41 @@ class RefineSettings:
     starts: int = 1_500  # games per round
     midway: float = 0.25  # share of them that begin mid-way (`env.exploring_starts`)
     searched: int = 300  # starts from which a better game is searched for
+    hard: float = 0.5  # share of these that are near starts where the last search found most
+    near: float = 0.02  # how near, in standard deviations of the starts
     beam: int = 32  # width of that search
     exploration: float = 0.2  # share of random actions in a second game from every second start
-    kept_rounds: int = 16  # rounds whose states are trained on
-    updates: int = 2_500  # gradient steps per round
-    batch: int = 1_024  # states per update
-    learning_rate: float = 5e-4  # at the start; falls to 2 % of it along a cosine
+    unsure: float = 0.05  # lead of the best Q below which a state is always labelled
+    sure_share: float = 0.15  # share of the other states that are labelled
+    held: int = 2  # most decisions for which an action is held before the policy goes on
+    kept_rounds: int = 8  # rounds whose states are trained on
+    updates: int = 2_000  # gradient steps per round
+    batch: int = 512  # states per update
+    learning_rate: float = 1.5e-3  # at the start; falls to 2 % of it along a cosine
+    polyak: float = 0.005  # share of the weights that their average takes over per update
     temperature: float = 0.01  # of the softmax by which the cost of a choice is made differentiable
     value_share: float = 0.1  # weight of the fit of Q beside the cost of the choice
+
+
+@dataclass(frozen=True, slots=True)
+class _Starts:
+    """Where games begin: states, (n, 4), and psi, (n,)."""
+
+    state: FloatArray
+    svo_rad: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    """States of the games that are kept: what was done there, and the return from there on."""
+
+    state: FloatArray
+    svo_rad: FloatArray
+    action: IntArray
+    to_go: FloatArray
+    better: NDArray[np.bool_]  # whether the game was found, and is better than the policy's
+    hard: _Starts  # a quarter of the searched starts: those where the search found most
+    mean_return: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,58 +108,82 @@ def refine(
 
     s = settings or RefineSettings()
     rng = np.random.default_rng([seed, 1])
-    model = as_torch(network)
+    model, average = as_torch(network), as_torch(network)
     optimiser = torch.optim.Adam(model.parameters(), lr=s.learning_rate, fused=True)
     rounds: list[_Labelled] = []
+    hard: _Starts | None = None
     # One thread: rounding must not depend on the number of cores. One limit for all rounds: where
     # it ends, the BLAS beside libsumo gives torch its threads back, and they wait for each other.
     with threadpool_limits(1):
         torch.set_num_threads(1)
         for number in range(s.rounds):
-            labelled, mean_return = _label(game, network, rng, s)
-            rounds = [*rounds, labelled][-s.kept_rounds :]
-            cost = _fit(model, optimiser, rounds, rng, s, number)
-            network = export(model)
+            tried = _try(game, network, _starts(game, network, hard, rng, s), rng, s)
+            hard = tried.hard
+            rounds = [*rounds, _label(game, network, tried, rng, s)][-s.kept_rounds :]
+            cost = _fit(model, average, optimiser, rounds, rng, s, number)
+            network = export(average)
             if on_progress is not None:
-                on_progress(Progress(number + 1, cost, mean_return, None, network))
+                on_progress(Progress(number + 1, cost, tried.mean_return, None, network))
     return network
 
 
-def _label(
-    game: Game, network: QNetwork, rng: np.random.Generator, s: RefineSettings
-) -> tuple[_Labelled, float]:
-    """Return states of this round with the worth of each action, and the mean return."""
-    policy = greedy(network, game.scenario)
-    start = exploring_starts(s.starts, rng, s.midway, scenario=game.scenario)
+def _starts(
+    game: Game, network: QNetwork, hard: _Starts | None, rng: np.random.Generator, s: RefineSettings
+) -> _Starts:
+    """Return where the games of a round begin; the first of them are near hard starts, if any."""
+    state = exploring_starts(s.starts, rng, s.midway, scenario=game.scenario)
     svo_rad = rng.uniform(SVO.low, SVO.high, s.starts) * network.sees_svo
-    tried = _try(game, network, start, svo_rad, rng, s)
-    returns = game.action_returns(tried.state, tried.svo_rad, policy)
-    row = np.arange(len(returns))
-    returns[row, tried.action] = np.maximum(returns[row, tried.action], tried.to_go)
+    if hard is not None and len(hard.state):
+        which = rng.integers(0, len(hard.state), round(s.hard * s.searched))
+        # The VUT starts where it did: it is the POV's state and psi that make a case.
+        shift = rng.normal(size=(3, len(which))) * s.near
+        near = hard.state[which]
+        near[:, 0] += shift[0] * state[:, 0].std()
+        near[:, 1] = np.maximum(near[:, 1] + shift[1] * state[:, 1].std(), 0.0)
+        psi = hard.svo_rad[which] + shift[2] * svo_rad.std()
+        state[: len(which)] = near
+        svo_rad[: len(which)] = psi.clip(SVO.low, SVO.high) * network.sees_svo
+    return _Starts(state, svo_rad)
+
+
+def _label(
+    game: Game, network: QNetwork, tried: _Tried, rng: np.random.Generator, s: RefineSettings
+) -> _Labelled:
+    """Return states that were tried, with the worth of each action."""
+    policy = greedy(network, game.scenario)
     inputs = inputs_of(network, tried.state, tried.svo_rad, game.scenario)
-    return _Labelled(inputs.astype(np.float32), returns.astype(np.float32)), tried.mean_return
+    kept = _worth_labels(network.values_at_once(inputs), tried.better, rng, s)
+    state, svo_rad = tried.state[kept], tried.svo_rad[kept]
+    of_holds = [
+        game.action_returns(state, svo_rad, policy, decisions) for decisions in range(1, s.held + 1)
+    ]
+    returns = np.max(of_holds, axis=0)
+    row, action = np.arange(len(kept)), tried.action[kept]
+    returns[row, action] = np.maximum(returns[row, action], tried.to_go[kept])
+    return _Labelled(inputs[kept].astype(np.float32), returns.astype(np.float32))
 
 
-@dataclass(frozen=True, slots=True)
-class _Tried:
-    """States of the games that are kept: what was done there, and the return from there on."""
+def _worth_labels(
+    values: NDArray[np.float32],
+    better: NDArray[np.bool_],
+    rng: np.random.Generator,
+    s: RefineSettings,
+) -> IntArray:
+    """Return the places of the states that are labelled, by their Q, (n, 7).
 
-    state: FloatArray
-    svo_rad: FloatArray
-    action: IntArray
-    to_go: FloatArray
-    mean_return: float
+    A network changes its choice where two actions are nearly equal. So these states are labelled,
+    those of games that are better than the policy's, and a share of the others, (n,).
+    """
+    second, first = np.partition(values, -2, axis=1)[:, -2:].T
+    unsure = first - second < s.unsure
+    return np.flatnonzero(unsure | better | (rng.random(len(values)) < s.sure_share))
 
 
 def _try(
-    game: Game,
-    network: QNetwork,
-    start: FloatArray,
-    svo_rad: FloatArray,
-    rng: np.random.Generator,
-    s: RefineSettings,
+    game: Game, network: QNetwork, starts: _Starts, rng: np.random.Generator, s: RefineSettings
 ) -> _Tried:
     """Play by the policy, from half of the starts with random actions too, and what is found."""
+    start, svo_rad = starts.state, starts.svo_rad
     policy, searched = greedy(network, game.scenario), slice(s.searched)
     found = beam_search(game, start[searched], svo_rad[searched], network, s.beam)
     state = np.concatenate([start, start[::2], start[searched]])
@@ -150,30 +206,41 @@ def _try(
         index, state = index[~over], state[~over]
         if not index.size:
             break
+    gained = total[len(total) - len(found.plans) :] - total[searched]
+    better = np.zeros(len(total), dtype=bool)
+    better[len(total) - len(found.plans) :] = gained > BETTER
+    most = np.argsort(-gained, kind="stable")[: len(gained) // 4]
     index = np.concatenate([step[0] for step in steps])
     return _Tried(
         state=np.concatenate([step[1] for step in steps]),
         svo_rad=psi[index],
         action=np.concatenate([step[2] for step in steps]),
         to_go=total[index] - np.concatenate([step[3] for step in steps]),
+        better=better[index],
+        hard=_Starts(start[most], svo_rad[most]),
         mean_return=float(total[: len(start)].mean()),
     )
 
 
 def _fit(
     model: nn.Sequential,
+    average: nn.Sequential,
     optimiser: torch.optim.Adam,
     rounds: list[_Labelled],
     rng: np.random.Generator,
     s: RefineSettings,
     number: int,
 ) -> float:
-    """Train on the kept rounds; return the mean cost of a choice over the last updates."""
+    """Train on the kept rounds; return the mean cost of a choice over the last updates.
+
+    `average` follows the weights of the model.
+    """
     inputs = torch.from_numpy(np.concatenate([r.inputs for r in rounds]))
     returns = torch.from_numpy(np.concatenate([r.returns for r in rounds]))
     costs = (returns.max(dim=1, keepdim=True).values - returns).clamp(max=COST_CAP)
     values = squash(returns)
     last_costs = []
+    weights, averages = list(model.parameters()), list(average.parameters())
     for update in range(s.updates):
         done = (number * s.updates + update) / (s.rounds * s.updates)
         for group in optimiser.param_groups:
@@ -185,8 +252,10 @@ def _fit(
         loss = cost + s.value_share * nn.functional.smooth_l1_loss(q, values[rows])
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        nn.utils.clip_grad_norm_(weights, 1.0)
         optimiser.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(averages, weights, s.polyak)
         if update >= s.updates - 100:
             last_costs.append(float(cost.detach()))
     return float(np.mean(last_costs))

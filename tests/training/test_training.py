@@ -19,7 +19,13 @@ from merges import HALF, LIKE_A_ROUNDABOUT
 
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
-from merge_sumo.drivers.levelk import ACTIONS, FEATURES, QNetwork, actions_mps2
+from merge_sumo.drivers.levelk import (
+    ACTIONS,
+    FEATURES,
+    SVO_FEATURES,
+    QNetwork,
+    actions_mps2,
+)
 from merge_sumo.drivers.policies import MANIFEST, load_network, plays_as, read_manifest, scenario_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import to_toml
@@ -420,6 +426,20 @@ class TestGame:
         assert (after >= before - 1e-9).all()
         assert after.mean() > before.mean() + 0.1
 
+    def test_an_action_is_held_as_long_as_asked_before_the_policy_goes_on(self, policy):
+        game, held = Game("pov", None, REWARD), 3
+        start, svo_rad = pool_starts(4, np.random.default_rng(5), scenario=US23), np.zeros(4)
+        of_actions = game.action_returns(start, svo_rad, policy, held)
+        for action in range(ACTIONS):
+            state, gained = start, np.zeros(4)
+            for _ in range(held):
+                a_mps2 = np.full(4, game.actions_mps2[action])
+                state, reward_of_decision, over = game.advance(state, svo_rad, a_mps2)
+                gained += reward_of_decision
+                assert not over.any()
+            after = game.play(state, svo_rad, policy)
+            assert of_actions[:, action] == pytest.approx(gained + after, abs=1e-9)
+
     def test_the_plan_of_a_beam_search_has_the_return_that_it_states(self, policy):
         torch.manual_seed(2)
         agent = ddqn.export(ddqn.make_network(FEATURES, 16))
@@ -443,6 +463,30 @@ class TestRefinement:
         enough = dataclasses.replace(QUICK, starts=40, searched=10, beam=8, updates=200)
         before, after = map(regret, self.refined(seed=0, settings=enough))
         assert after < 0.5 * before
+
+    def test_states_are_labelled_where_two_actions_are_nearly_equal_or_a_better_game_was(self):
+        values = np.zeros((1000, ACTIONS), dtype=np.float32)
+        values[:, 2], values[:100, 4] = 1.0, 0.98
+        better = np.arange(1000) >= 900
+        rng = np.random.default_rng(0)
+        few = dataclasses.replace(QUICK, sure_share=0.0)
+        kept = refine._worth_labels(values, better, rng, few)
+        assert kept.tolist() == [*range(100), *range(900, 1000)]
+        kept = refine._worth_labels(values, better, rng, QUICK)
+        assert 0.1 < (len(kept) - 200) / 800 < 0.2
+
+    def test_some_searched_starts_are_near_those_where_the_last_search_found_most(self):
+        torch.manual_seed(0)
+        network = ddqn.export(ddqn.make_network(FEATURES + SVO_FEATURES, 32))
+        game, rng = Game("pov", None, REWARD), np.random.default_rng(0)
+        s = dataclasses.replace(QUICK, searched=20, starts=200, midway=0.0)
+        hard = refine._Starts(np.array([[-300.0, 30.0, -182.0, 18.0]]), np.array([0.7]))
+        starts = refine._starts(game, network, hard, rng, s)
+        near = np.abs(starts.state - hard.state)[:, :2] < [10.0, 0.5]
+        assert near[:10].all()
+        assert near[10:].all(axis=1).mean() < 0.1
+        assert (starts.state[:10, 2:] == hard.state[:, 2:]).all()
+        assert np.abs(starts.svo_rad[:10] - 0.7).max() < 0.1
 
     @pytest.mark.slow
     def test_same_seed_same_weights_and_another_seed_other_weights(self):
