@@ -83,12 +83,13 @@ class TrainingSettings:
 
 LEVEL_SETTINGS: Final = {
     1: TrainingSettings(refine=RefineSettings(rounds=12)),
-    2: TrainingSettings(refine=RefineSettings(rounds=20, midway=0.05, searched=400)),
+    2: TrainingSettings(
+        refine=RefineSettings(rounds=30, starts=2_000, midway=0.05, searched=400, updates=3_000)
+    ),
 }
 """Settings by the level of the driver. An opponent that reacts makes the game harder: level 2 takes
-more games, nearly all from the pool's own starts, and discards the returns of earlier policies.
-Level 1 is refined less: with more refinement, level 2 stayed farther from its own best response
-(`policies/README.md`)."""
+more games, nearly all from the pool's own starts, and more updates. Level 1 is refined less: with
+more refinement, level 2 stayed farther from its own best response (`policies/README.md`)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,9 +59,9 @@ class RefineSettings:
     sure_share: float = 0.15  # share of the other states that are labelled
     held: int = 2  # most decisions for which an action is held before the policy goes on
     kept_rounds: int = 8  # rounds whose states are trained on
-    updates: int = 2_000  # gradient steps per round
+    updates: int = 2_500  # gradient steps per round
     batch: int = 512  # states per update
-    learning_rate: float = 1.5e-3  # at the start; falls to 2 % of it along a cosine
+    learning_rate: float = 8e-4  # at the start; falls to 2 % of it along a cosine
     polyak: float = 0.005  # share of the weights that their average takes over per update
     temperature: float = 0.01  # of the softmax by which the cost of a choice is made differentiable
     value_share: float = 0.1  # weight of the fit of Q beside the cost of the choice
