@@ -189,7 +189,7 @@ class QuickRegret:
     """A lower bound of the mean regret that is quick enough to be watched while training.
 
     The best response is replaced by the network's own policy with every action played out before
-    it is chosen, from some starts of the pool.
+    it is chosen, or by level-0 behaviour where that is better, from some starts of the pool.
     """
 
     def __init__(self, game: Game, *, sees_svo: bool) -> None:
@@ -211,5 +211,5 @@ class QuickRegret:
         policy = greedy(network, self._game.scenario)
         reached = self._game.play(self._start, self._svo_rad, policy)
         improved = self._game.play(self._start, self._svo_rad, self._game.improved(policy))
-        best = np.maximum(reached, improved)
+        best = np.maximum(np.maximum(reached, improved), self._level0)
         return float((best - reached).mean() / (best - self._level0).mean())

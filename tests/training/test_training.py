@@ -464,6 +464,12 @@ class TestRefinement:
         before, after = map(regret, self.refined(seed=0, settings=enough))
         assert after < 0.5 * before
 
+    def test_the_regret_of_a_network_that_is_worse_than_level0_is_not_negative(self):
+        zeros = np.zeros((ACTIONS, FEATURES))
+        always_brakes = QNetwork([(zeros, (ACTIONS_MPS2 == -4.0).astype(float))])
+        regret = QuickRegret(Game("vut", None, REWARD), sees_svo=False)
+        assert regret(always_brakes) > 1.0
+
     def test_states_are_labelled_where_two_actions_are_nearly_equal_or_a_better_game_was(self):
         values = np.zeros((1000, ACTIONS), dtype=np.float32)
         values[:, 2], values[:100, 4] = 1.0, 0.98
