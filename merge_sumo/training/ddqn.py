@@ -132,7 +132,8 @@ def train(
     inputs = FEATURES + SVO_FEATURES * sees_svo
     online, target = make_network(inputs, s.width), make_network(inputs, s.width)
     target.load_state_dict(online.state_dict())
-    weights, averages = list(online.parameters()), list(target.parameters())
+    weights: list[Tensor] = list(online.parameters())
+    averages: list[Tensor] = list(target.parameters())
     optimiser = torch.optim.Adam(weights, lr=s.learning_rate, fused=True)
     replay = Replay(s.transitions)
     collector = _Collector(game, rng, s.midway, sees_svo=sees_svo)

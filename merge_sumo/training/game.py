@@ -103,8 +103,10 @@ class Game:
         returns, index = np.zeros(len(state)), np.arange(len(state))
         actions = self.actions_mps2
         for decision in range(self.max_decisions):
-            holds = first is not None and decision < held
-            action = first[index] if holds else policy(state, svo_rad)
+            if first is not None and decision < held:
+                action = first[index]
+            else:
+                action = policy(state, svo_rad)
             state, reward, over = self.advance(state, svo_rad, actions[action])
             returns[index] += reward
             index, state, svo_rad = index[~over], state[~over], svo_rad[~over]

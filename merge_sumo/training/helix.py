@@ -82,7 +82,7 @@ class TrainingSettings:
 
 
 LEVEL_SETTINGS: Final = {
-    1: TrainingSettings(refine=RefineSettings(rounds=12)),
+    1: TrainingSettings(),
     2: TrainingSettings(
         refine=RefineSettings(rounds=30, starts=2_000, midway=0.05, searched=400, updates=3_000)
     ),

@@ -27,7 +27,7 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from merge_sumo.drivers.levelk import ACTIONS, QNetwork
 from merge_sumo.training.best_response import beam_search
@@ -240,7 +240,8 @@ def _fit(
     costs = (returns.max(dim=1, keepdim=True).values - returns).clamp(max=COST_CAP)
     values = squash(returns)
     last_costs = []
-    weights, averages = list(model.parameters()), list(average.parameters())
+    weights: list[Tensor] = list(model.parameters())
+    averages: list[Tensor] = list(average.parameters())
     for update in range(s.updates):
         done = (number * s.updates + update) / (s.rounds * s.updates)
         for group in optimiser.param_groups:
