@@ -339,8 +339,13 @@ class TruthResult(Result):
         return sum(fmc(truth.failures) for truth in self.truths.values())
 
     @property
-    def real_regions(self) -> int:
-        """Number of failing regions with at least 3 % of the failures of their level."""
+    def real_regions(self) -> int | None:
+        """Number of failing regions with at least 3 % of the failures of their level.
+
+        None where the failures of a level are too few to tell regions.
+        """
+        if not all(truth.tells_regions for truth in self.truths.values()):
+            return None
         return sum(len(truth.real_regions()) for truth in self.truths.values())
 
     def to_record(self) -> dict[str, Any]:
@@ -353,7 +358,9 @@ class TruthResult(Result):
                 "failures": len(truth.failures),
                 "fmc": fmc(truth.failures),
                 "region_sizes": np.bincount(regions(truth.failures)).tolist(),
-                "real_regions": len(truth.real_regions()),
+                "real_regions": len(truth.real_regions()) if truth.tells_regions else None,
+                "fmc_growth": truth.growth,
+                "too_small": truth.is_small,
                 "fail_when": self.criterion.text,
                 "in_sumo": truth.in_sumo,
             }
@@ -367,16 +374,24 @@ class TruthResult(Result):
 
     def lines(self) -> list[str]:
         """Return a line for each level, and any criterion but the default one in words."""
-        lines = [
-            f"{self.vut} at level {level_name(level)}: {len(truth.failures)} failures in "
-            f"{len(truth.score)} cases, FMC {fmc(truth.failures):.4f}, "
-            f"{len(truth.real_regions())} regions with at least {REAL_REGION:.0%} of the failures"
-            f"{_engine_of(truth)}"
-            for level, truth in self.truths.items()
-        ]
+        lines = []
+        for level, truth in self.truths.items():
+            lines.append(
+                f"{self.vut} at level {level_name(level)}: {len(truth.failures)} failures in "
+                f"{len(truth.score)} cases, FMC {fmc(truth.failures):.4f}"
+                f"{_regions_of(truth)}{_engine_of(truth)}"
+            )
+            lines += [f"  {remark}" for remark in truth.remarks()]
         if not self.criterion.is_papers:
             lines.append(f"  a case fails when {self.criterion.words}")
         return lines
+
+
+def _regions_of(truth: Truth) -> str:
+    """Return in words how many regions there are; "" where too few failures tell them."""
+    if not truth.tells_regions:
+        return ""
+    return f", {len(truth.real_regions())} regions with at least {REAL_REGION:.0%} of the failures"
 
 
 def _engine_of(truth: Truth) -> str:

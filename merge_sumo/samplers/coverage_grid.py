@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from merge_sumo.values.ball_union import ball_volume
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.fmc import RADIUS, fmc, radius_for
+from merge_sumo.values.fmc import RADIUS, radius_for
 
 CELL: Final = {2: 0.01, 3: 0.0125}
 """Spacing of the grid, by the number of dimensions."""
@@ -39,9 +40,15 @@ class CoverageGrid:
         overlap: distance from which two balls share no node.
     """
 
-    def __init__(self, dims: int, *, fine: bool = True) -> None:
-        """Prepare an uncovered grid of `dims` dimensions."""
-        self._places = _places(dims, (FINE_CELL if fine else CELL).get(dims))
+    def __init__(self, dims: int, *, fine: bool = True, as_large_as_in_3d: bool = False) -> None:
+        """Prepare an uncovered grid of `dims` dimensions.
+
+        Above three of them a ball may also be as large as one of three, by volume.
+        """
+        cell, radius = (FINE_CELL if fine else CELL).get(dims), radius_for(dims)
+        if as_large_as_in_3d and dims > 3:
+            radius = (RADIUS**3 * ball_volume(3) / ball_volume(dims)) ** (1.0 / dims)
+        self._places = _places(dims, cell, radius)
         self.overlap: Final = self._places.overlap
         self._open = np.ones(self._places.count, dtype=np.float32)
 
@@ -107,12 +114,12 @@ class _Grid:
 class _Scattered:
     """The points of a sequence of low discrepancy."""
 
-    def __init__(self, dims: int) -> None:
+    def __init__(self, dims: int, radius: float) -> None:
         from scipy.stats.qmc import Halton
 
         self.per_ball, self.overlap = PLACES_PER_BALL, math.inf
-        margin = MARGIN * radius_for(dims)
-        density = self.per_ball / fmc(np.zeros((1, dims)))
+        margin = MARGIN * radius
+        density = self.per_ball / (ball_volume(dims) * radius**dims)
         self.count = round(density * (1.0 + 2.0 * margin) ** dims)
         sequence = Halton(dims, seed=np.random.default_rng(dims)).random(self.count)
         self._tree = cKDTree(sequence * (1.0 + 2.0 * margin) - margin)
@@ -122,5 +129,5 @@ class _Scattered:
 
 
 @lru_cache
-def _places(dims: int, cell: float | None) -> _Places:
-    return _Scattered(dims) if cell is None else _Grid(dims, cell)
+def _places(dims: int, cell: float | None, radius: float) -> _Places:
+    return _Scattered(dims, radius) if cell is None else _Grid(dims, cell)

@@ -12,12 +12,13 @@ from heapq import heappop, heapreplace
 from io import StringIO
 from itertools import accumulate, chain, count
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from merge_sumo.analysis.result import Result
+from merge_sumo.analysis.verdict import counted
 from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
@@ -29,7 +30,7 @@ from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_tru
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit
-from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.fmc import covered, fmc
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 
@@ -55,6 +56,8 @@ class Search:
 
 ORACLE_STEP: Final = 5
 """Cases between two points of the oracle's curve; divides all batch sizes that samplers choose."""
+MOST_PROBES: Final = 10_000
+"""Failures of a truth of which a covered share is one, at most: its error is then below .01."""
 COMPARED_BATCH: Final = 20
 """Cases of a batch by default, of samplers that choose none: that of Table II."""
 
@@ -121,22 +124,33 @@ Quartiles = tuple[float | None, float | None]
 class SamplerSummary:
     """One sampler over all seeds, as medians and as quartiles (25 % and 75 %).
 
-    Coverage is summed over the levels. `cases_to_50_percent` and `cases_to_90_percent` are cases
-    until that share of the truth's FMC, None where too few seeds reach it. `fmc_over_truth` is None
-    where the truth has no failure, and `fmc_over_limit` also where no limit was given.
+    FMC is summed over the levels. `covered_share` is the share of the truth's failures that lie
+    within a radius of a failure found (`covered`), the mean over the levels with any; None without.
+    `cases_to_50_percent_covered` and `cases_to_90_percent_covered` are cases until that share.
+    `cases_to_50_percent` and `cases_to_90_percent` are cases until that share of the truth's FMC.
+    All four are None where too few seeds reach it. What is divided by the truth's FMC is None where
+    the truth has no failure or is too small (`Truth.is_small`), and `fmc_over_limit` where no limit
+    was given. `regions_found` and `seeds_with_all_regions` are None where the truth is too small to
+    tell regions.
     """
 
     fmc_median: float
     fmc_quartiles: Quartiles
+    covered_share_median: float | None
+    covered_share_quartiles: Quartiles
     fmc_over_truth_median: float | None
     fmc_over_truth_quartiles: Quartiles
     fmc_over_limit_median: float | None
     fmc_over_limit_quartiles: Quartiles
     failures_median: float
     failures_quartiles: Quartiles
-    regions_found_median: float
+    regions_found_median: float | None
     regions_found_quartiles: Quartiles
-    seeds_with_all_regions: int
+    seeds_with_all_regions: int | None
+    cases_to_50_percent_covered_median: float | None
+    cases_to_50_percent_covered_quartiles: Quartiles
+    cases_to_90_percent_covered_median: float | None
+    cases_to_90_percent_covered_quartiles: Quartiles
     cases_to_50_percent_median: float | None
     cases_to_50_percent_quartiles: Quartiles
     cases_to_90_percent_median: float | None
@@ -145,6 +159,7 @@ class SamplerSummary:
     cases_by_batch: list[int]
     fmc_by_batch_median: list[float]
     fmc_by_batch_quartiles: tuple[list[float], list[float]]
+    covered_share_by_batch_median: list[float] | None
     levels: dict[int, LevelShare]
 
 
@@ -211,38 +226,48 @@ def limit_fmc(
 
 
 def compare(
-    searches: Sequence[Search], truths: Mapping[int, Truth], limit: float | None = None
+    searches: Sequence[Search],
+    truths: Mapping[int, Truth],
+    limit: float | None = None,
+    dense: Mapping[int, Truth] = MappingProxyType({}),
 ) -> SamplerSummary:
     """Compare what one sampler found, one search a seed, with the truth at each level.
 
-    `limit` is the coverage of all that is known to fail (`limit_fmc`).
+    `limit` is the coverage of all that is known to fail (`limit_fmc`). Where a level has a `dense`
+    truth, its failures are those of which the covered share is one.
     """
-    truth_fmc = sum(fmc(truth.failures) for truth in truths.values())
-    real = [(level, region) for level, truth in truths.items() for region in truth.real_regions()]
     curves = np.array([search.fmc for search in searches])
+    whole = None if any_small(truths.values()) else _truth_fmc(truths)
     share, of_limit = (
-        curves[:, -1] / whole if whole else np.full(len(curves), np.nan)
-        for whole in (truth_fmc, limit)
+        curves[:, -1] / divisor if divisor else np.full(len(curves), np.nan)
+        for divisor in (whole, limit)
     )
     failures = np.array([sum(o.failed for o in search.outcomes) for search in searches])
-    regions_found = np.array(
-        [sum(_found(s.failures(level), region) for level, region in real) for s in searches]
-    )
+    regions_found, seeds_with_all = _regions_found(searches, truths)
     after = _cases_by_batch(searches[0])
-    half, most = (_cases_to(part * truth_fmc, curves, after) for part in (0.5, 0.9))
+    half, most = (_cases_to(part * (whole or np.inf), curves, after) for part in (0.5, 0.9))
+    covered_shares = _covered_shares(searches, covered_of(truths, dense))
+    half_covered, most_covered = (_cases_to(part, covered_shares, after) for part in (0.5, 0.9))
     by_batch = [np.quantile(curves, part, axis=0).tolist() for part in (0.25, 0.75)]
+    is_known = not np.isnan(covered_shares).any()
     return SamplerSummary(
         fmc_median=float(np.median(curves[:, -1])),
         fmc_quartiles=_quartiles(curves[:, -1]),
+        covered_share_median=_quantile(covered_shares[:, -1], 0.5),
+        covered_share_quartiles=_quartiles(covered_shares[:, -1]),
         fmc_over_truth_median=_quantile(share, 0.5),
         fmc_over_truth_quartiles=_quartiles(share),
         fmc_over_limit_median=_quantile(of_limit, 0.5),
         fmc_over_limit_quartiles=_quartiles(of_limit),
         failures_median=float(np.median(failures)),
         failures_quartiles=_quartiles(failures),
-        regions_found_median=float(np.median(regions_found)),
+        regions_found_median=_quantile(regions_found, 0.5),
         regions_found_quartiles=_quartiles(regions_found),
-        seeds_with_all_regions=int((regions_found == len(real)).sum()),
+        seeds_with_all_regions=seeds_with_all,
+        cases_to_50_percent_covered_median=_quantile(half_covered, 0.5),
+        cases_to_50_percent_covered_quartiles=_quartiles(half_covered),
+        cases_to_90_percent_covered_median=_quantile(most_covered, 0.5),
+        cases_to_90_percent_covered_quartiles=_quartiles(most_covered),
         cases_to_50_percent_median=_quantile(half, 0.5),
         cases_to_50_percent_quartiles=_quartiles(half),
         cases_to_90_percent_median=_quantile(most, 0.5),
@@ -251,8 +276,64 @@ def compare(
         cases_by_batch=after,
         fmc_by_batch_median=np.median(curves, axis=0).tolist(),
         fmc_by_batch_quartiles=(by_batch[0], by_batch[1]),
+        covered_share_by_batch_median=(
+            np.median(covered_shares, axis=0).tolist() if is_known else None
+        ),
         levels={level: _level_share(searches, level) for level in truths},
     )
+
+
+def any_small(truths: Iterable[Truth]) -> bool:
+    """Return whether one of the truths is too small to be divided by."""
+    return any(truth.is_small for truth in truths)
+
+
+def _truth_fmc(truths: Mapping[int, Truth]) -> float:
+    return sum(fmc(truth.failures) for truth in truths.values())
+
+
+def covered_of(truths: Mapping[int, Truth], dense: Mapping[int, Truth]) -> dict[int, FloatArray]:
+    """Return by level the failing points of uniform cases of which the covered share is one.
+
+    They are those of the dense truth where there is one: the more, the smaller the error.
+    """
+    points = {level: dense.get(level, truth).failures for level, truth in truths.items()}
+    return {level: failing[:MOST_PROBES] for level, failing in points.items() if len(failing)}
+
+
+def _covered_shares(searches: Sequence[Search], failing: Mapping[int, FloatArray]) -> FloatArray:
+    """Return the covered share after each batch, (S, batches); NaN where no truth has failures."""
+    shares = np.full((len(searches), len(searches[0].fmc)), np.nan)
+    for row, search in zip(shares, searches, strict=True):
+        of_levels = [_covered_by_batch(search, level, points) for level, points in failing.items()]
+        if of_levels:
+            row[:] = np.mean(of_levels, axis=0)
+    return shares
+
+
+def _covered_by_batch(search: Search, level: int, points: FloatArray) -> FloatArray:
+    """Return the share of points, (m, d), that the failures of a level cover after each batch."""
+    failed = [o for o in search.outcomes if o.failed and o.case.level == level]
+    batches, places = np.array([o.batch for o in failed], dtype=int), search.failures(level)
+    numbers = np.unique([outcome.batch for outcome in search.outcomes])
+    first = np.full(len(points), np.inf)
+    for number in numbers[::-1]:
+        first[covered(points, places[batches == number])] = number
+    return np.array([(first <= number).mean() for number in numbers])
+
+
+def _regions_found(
+    searches: Sequence[Search], truths: Mapping[int, Truth]
+) -> tuple[FloatArray, int | None]:
+    """Return how many regions of the truths each search found, and how many searches found all.
+
+    NaN and None where a truth does not tell regions.
+    """
+    if not all(truth.tells_regions for truth in truths.values()):
+        return np.full(len(searches), np.nan), None
+    real = [(level, region) for level, truth in truths.items() for region in truth.real_regions()]
+    found = [sum(_found(s.failures(level), region) for level, region in real) for s in searches]
+    return np.array(found, dtype=np.float64), sum(number == len(real) for number in found)
 
 
 def _cases_by_batch(search: Search) -> list[int]:
@@ -293,10 +374,7 @@ def _level_share(searches: Sequence[Search], level: int) -> LevelShare:
 
 def _found(points: FloatArray, region: FloatArray) -> bool:
     """Return whether one of some failures, (m, d), lies in a region of the truth, (n, d)."""
-    if not len(points):
-        return False
-    distance, _ = cKDTree(region).query(points)
-    return bool((distance <= radius_for(points.shape[1])).any())
+    return bool(covered(points, region).any())
 
 
 def oracle(truths: Mapping[int, Truth], cases: int, batch: int | None) -> dict[int, float]:
@@ -419,12 +497,6 @@ class Study:
         )
 
 
-HEADINGS: Final = (
-    *("FMC / truth", "FMC / limit", "FMC", "failures", "regions"),
-    *("to 50 %", "to 90 %", "sampler s"),
-)
-
-
 @dataclass(frozen=True, repr=False)
 class Benchmark(Result):
     """Samplers beside each other, and beside the ground truth, over several seeds.
@@ -450,7 +522,12 @@ class Benchmark(Result):
     @property
     def truth_fmc(self) -> float:
         """Failure mode coverage of the truth, summed over the levels."""
-        return sum(fmc(truth.failures) for truth in self.truths.values())
+        return _truth_fmc(self.truths)
+
+    @property
+    def is_small(self) -> bool:
+        """Whether a truth is too small to be divided by."""
+        return any_small(self.truths.values())
 
     @classmethod
     def of(
@@ -463,7 +540,9 @@ class Benchmark(Result):
     ) -> Benchmark:
         """Compare searches of so many cases, by sampler, with the truths by level."""
         limit = limit_fmc(chain.from_iterable(searches.values()), truths, dense)
-        summaries = {name: compare(of_name, truths, limit) for name, of_name in searches.items()}
+        summaries = {
+            name: compare(of_name, truths, limit, dense) for name, of_name in searches.items()
+        }
         return cls(summaries, truths, dense, limit, oracle(truths, cases, batch), cases)
 
     def to_record(self) -> dict[str, Any]:
@@ -471,6 +550,8 @@ class Benchmark(Result):
         first = next(iter(self.samplers.values()))
         return {
             "truth_fmc": self.truth_fmc,
+            "truth_too_small": self.is_small,
+            "covered_of": sum(map(len, covered_of(self.truths, self.dense).values())),
             "limit_fmc": self.limit_fmc,
             "dense_levels": list(self.dense),
             "oracle_fmc_by_batch": [self.oracle_fmc[n] for n in first.cases_by_batch],
@@ -480,13 +561,37 @@ class Benchmark(Result):
     def lines(self) -> list[str]:
         """Return truth, limit and oracle, and a table of the samplers."""
         failures = sum(len(truth.failures) for truth in self.truths.values())
+        tells = all(truth.tells_regions for truth in self.truths.values())
         real = sum(len(truth.real_regions()) for truth in self.truths.values())
         return [
-            f"truth: FMC {self.truth_fmc:.4f}, {failures} failures, {real} regions",
+            f"truth: FMC {self.truth_fmc:.4f}, {counted(failures, 'failure')}"
+            + (f", {counted(real, 'region')}" if tells else ""),
+            *(
+                f"  at level {level_name(level)} {remark}"
+                for level, truth in self.truths.items()
+                for remark in truth.remarks()
+            ),
             f"limit: FMC {self.limit_fmc:.4f}, {self._limit_is()}",
             f"oracle: FMC {self.oracle_fmc[self.cases]:.4f} with {self.cases} cases",
-            *_table(self.samplers),
+            *_table(self.samplers, small=self.is_small),
+            *self._covered_is(),
             *([] if self.figure is None else [f"figure: {self.figure}"]),
+        ]
+
+    def _covered_is(self) -> list[str]:
+        """Return of what the covered share is one, and the interval of each sampler's median."""
+        failing = covered_of(self.truths, self.dense)
+        if not failing:
+            return []
+        counts = [len(points) for points in failing.values()]
+        errors = [
+            math.sqrt(sum(_half_width(one.covered_share_median or 0.0, n) ** 2 for n in counts))
+            / len(counts)
+            for one in self.samplers.values()
+        ]
+        return [
+            f"covered share: of {counted(sum(counts), 'failing uniform case')}, those within a "
+            f"radius of a failure found; to within {max(errors):.2f} (95 %)"
         ]
 
     def _limit_is(self) -> str:
@@ -498,31 +603,60 @@ class Benchmark(Result):
         )
 
 
-def _table(compared: Mapping[str, SamplerSummary]) -> list[str]:
-    """Return a line per sampler: medians, with the quartiles in brackets."""
+def _half_width(share: float, n: int) -> float:
+    """Return half the width of the 95 % interval of a binomial share (Wilson, 1927)."""
+    z = 1.96
+    return z / (1.0 + z**2 / n) * math.sqrt(share * (1.0 - share) / n + (z / (2.0 * n)) ** 2)
+
+
+def _table(compared: Mapping[str, SamplerSummary], *, small: bool) -> list[str]:
+    """Return a line per sampler: medians, with the quartiles in brackets.
+
+    Nothing is divided by the FMC of a `small` truth.
+    """
     from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, caption=r"medians \[quartiles]", caption_justify="left")
     table.add_column("sampler")
-    for heading in HEADINGS:
+    rows = {name: _columns(one, small=small) for name, one in compared.items()}
+    for heading in next(iter(rows.values()), {}):
         table.add_column(heading, justify="right", no_wrap=True)
-    for name, one in compared.items():
-        table.add_row(
-            name,
-            _spread(one.fmc_over_truth_median, one.fmc_over_truth_quartiles, ".3f"),
-            _spread(one.fmc_over_limit_median, one.fmc_over_limit_quartiles, ".3f"),
-            _spread(one.fmc_median, one.fmc_quartiles, ".4f"),
-            _spread(one.failures_median, one.failures_quartiles, ".0f"),
-            _spread(one.regions_found_median, one.regions_found_quartiles, ".1f"),
-            _spread(one.cases_to_50_percent_median, one.cases_to_50_percent_quartiles, ".0f"),
-            _spread(one.cases_to_90_percent_median, one.cases_to_90_percent_quartiles, ".0f"),
-            f"{one.sampler_s_median:.2f}",
-        )
+    for name, cells in rows.items():
+        table.add_row(name, *cells.values())
     text = StringIO()
     # As wide as it is: a line of a table that is read by a program must not be broken.
-    Console(width=200, highlight=False, soft_wrap=True, file=text).print(table)
+    Console(width=220, highlight=False, soft_wrap=True, file=text).print(table)
     return [line.rstrip() for line in text.getvalue().splitlines()]
+
+
+def _columns(one: SamplerSummary, *, small: bool) -> dict[str, str]:
+    """Return the cells of a sampler by heading."""
+
+    def cell(name: str, form: str) -> str:
+        return _spread(getattr(one, f"{name}_median"), getattr(one, f"{name}_quartiles"), form)
+
+    covered_share, sampler_s = cell("covered_share", ".3f"), f"{one.sampler_s_median:.2f}"
+    if small:
+        return {
+            "covered share": covered_share,
+            "50 % covered": cell("cases_to_50_percent_covered", ".0f"),
+            "90 % covered": cell("cases_to_90_percent_covered", ".0f"),
+            "FMC": cell("fmc", ".4f"),
+            "failures": cell("failures", ".0f"),
+            "sampler s": sampler_s,
+        }
+    return {
+        "FMC / truth": cell("fmc_over_truth", ".3f"),
+        "FMC / limit": cell("fmc_over_limit", ".3f"),
+        "covered share": covered_share,
+        "FMC": cell("fmc", ".4f"),
+        "failures": cell("failures", ".0f"),
+        "regions": cell("regions_found", ".1f"),
+        "to 50 %": cell("cases_to_50_percent", ".0f"),
+        "to 90 %": cell("cases_to_90_percent", ".0f"),
+        "sampler s": sampler_s,
+    }
 
 
 def _spread(median: float | None, quartiles: Quartiles, form: str) -> str:

@@ -157,7 +157,8 @@ class ColumnResult:
         column: the column.
         truth_fmc: FMC of the truth.
         truth_failures: failures of the truth.
-        truth_regions: its regions with a real share of them.
+        truth_regions: its regions with a real share of them; None where it is too small for them.
+        truth_remarks: for what it is too small, in clauses.
         dense_fmc: FMC of a dense truth, if there is one.
         limit_fmc: coverage of all that is known to fail.
         compared: each sampler over all seeds.
@@ -169,7 +170,8 @@ class ColumnResult:
     column: Column
     truth_fmc: float
     truth_failures: int
-    truth_regions: int
+    truth_regions: int | None
+    truth_remarks: list[str]
     dense_fmc: float | None
     limit_fmc: float
     compared: dict[str, SamplerSummary]
@@ -244,7 +246,8 @@ def _column(column: Column, scale: Scale, study: Study) -> ColumnResult:
         column=column,
         truth_fmc=found.truth_fmc,
         truth_failures=len(truth.failures),
-        truth_regions=len(truth.real_regions()),
+        truth_regions=len(truth.real_regions()) if truth.tells_regions else None,
+        truth_remarks=truth.remarks(),
         dense_fmc=fmc(dense[level].failures) if dense else None,
         limit_fmc=found.limit_fmc,
         compared=found.samplers,
@@ -372,8 +375,13 @@ def table_markdown(columns: Mapping[str, ColumnResult]) -> str:
         # A quarter of all cases, or where a batch ended next.
         cases = next(number for number in after if number >= after[-1] / 4)
         early = [(r.compared[name].fmc_by_batch_median[after.index(cases)], r) for r in results]
-        shares = [median / r.truth_fmc if r.truth_fmc else None for median, r in early]
+        shares = [
+            None if r.compared[name].fmc_over_truth_median is None else median / r.truth_fmc
+            for median, r in early
+        ]
         add(f"{name} / truth after {cases} cases", [_or_dash(share, ".2f") for share in shares])
+    for title, result in columns.items():
+        lines += [f"\nThe truth of {title} is {remark}." for remark in result.truth_remarks]
     return "\n".join(lines) + "\n"
 
 

@@ -23,6 +23,8 @@ def compared(end: float) -> SamplerSummary:
     return SamplerSummary(
         fmc_median=end,
         fmc_quartiles=(end, end),
+        covered_share_median=0.5,
+        covered_share_quartiles=(0.5, 0.5),
         fmc_over_truth_median=None,
         fmc_over_truth_quartiles=(None, None),
         fmc_over_limit_median=None,
@@ -32,6 +34,10 @@ def compared(end: float) -> SamplerSummary:
         regions_found_median=1.0,
         regions_found_quartiles=(1.0, 1.0),
         seeds_with_all_regions=1,
+        cases_to_50_percent_covered_median=None,
+        cases_to_50_percent_covered_quartiles=(None, None),
+        cases_to_90_percent_covered_median=None,
+        cases_to_90_percent_covered_quartiles=(None, None),
         cases_to_50_percent_median=None,
         cases_to_50_percent_quartiles=(None, None),
         cases_to_90_percent_median=None,
@@ -40,6 +46,7 @@ def compared(end: float) -> SamplerSummary:
         cases_by_batch=[20, 40],
         fmc_by_batch_median=[end / 2.0, end],
         fmc_by_batch_quartiles=([0.0, end / 2.0], [end, 2.0 * end]),
+        covered_share_by_batch_median=[0.4, 0.5],
         levels={0: LevelShare(40.0, 1.0, end)},
     )
 

@@ -17,7 +17,7 @@ from plans import key_of, plan_for
 from vut_contract import factory
 
 from merge_sumo.errors import UserError
-from merge_sumo.studies.benchmark import Search, compare, limit_fmc, oracle, search
+from merge_sumo.studies.benchmark import Benchmark, Search, compare, limit_fmc, oracle, search
 from merge_sumo.studies.truth import Truth, ground_truth, known_truth
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
@@ -140,7 +140,12 @@ def test_a_comparison_says_what_samplers_found_of_the_truth(truth):
     assert result.cases_by_batch == [20, 40, 50]
     assert len(result.fmc_by_batch_median) == 3
     assert result.fmc_by_batch_median == sorted(result.fmc_by_batch_median)
-    assert result.fmc_over_truth_median == pytest.approx(result.fmc_median / fmc(truth.failures))
+    assert truth.is_small
+    assert result.fmc_over_truth_median is None
+    assert result.cases_to_90_percent_median is None
+    assert result.covered_share_by_batch_median == sorted(result.covered_share_by_batch_median)
+    low, high = result.covered_share_quartiles
+    assert 0.0 < low <= result.covered_share_median <= high <= 1.0
     low, high = result.fmc_quartiles
     assert low <= result.fmc_median <= high
     assert result.levels[0].cases_median == 50
@@ -168,8 +173,14 @@ def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float 
     return Search(outcomes, curve, sampler_s)
 
 
+def dense_truth(points: list[list[float]]) -> Truth:
+    """Return a truth with two failures at each of some points, so that it is large enough."""
+    failures = np.array([*points, *points])
+    return Truth(failures, np.full(len(failures), -600.0))
+
+
 class TestAComparisonByHand:
-    truth = Truth(np.array([[0.2, 0.2], [0.8, 0.8], [0.5, 0.5]]), np.array([-600.0, -700.0, -1.0]))
+    truth = dense_truth([[0.2, 0.2], [0.8, 0.8]])
     half = searched([[], [(0.2, 0.24)]], 1.0)  # 1 case, then 3
     most = searched([[(0.2, 0.2)], [(0.8, 0.8)]], 3.0)  # 2 cases, then 4
 
@@ -212,6 +223,50 @@ class TestAComparisonByHand:
         assert json.dumps(asdict(found), allow_nan=False)
 
 
+class TestTheCoveredShare:
+    half, most = TestAComparisonByHand.half, TestAComparisonByHand.most
+    small = Truth(np.array([[0.2, 0.2], [0.8, 0.8], [0.5, 0.5]]), np.array([-600.0, -700.0, -1.0]))
+
+    def test_is_that_of_the_failures_of_the_truth_near_one_found(self):
+        found = compare([self.half], {0: self.small})
+        assert found.covered_share_by_batch_median == [0.0, 0.5]
+        assert found.covered_share_median == 0.5
+        assert found.cases_to_50_percent_covered_median == 3.0
+        assert found.cases_to_90_percent_covered_median is None
+        assert compare([self.most], {0: self.small}).cases_to_90_percent_covered_median == 4.0
+
+    def test_is_of_the_dense_truth_where_there_is_one(self):
+        dense = {0: dense_truth([[0.2, 0.2], [0.8, 0.8], [0.5, 0.5], [0.9, 0.1]])}
+        assert compare([self.half], {0: self.small}, None, dense).covered_share_median == 0.25
+
+    def test_of_levels_is_the_mean_over_those_with_failures(self):
+        none = Truth(np.array([[0.5, 0.5]]), np.array([-1.0]))
+        other = dense_truth([[0.2, 0.2]])
+        assert compare([self.half], {0: self.small, 1: none}).covered_share_median == 0.5
+        assert compare([self.half], {0: self.small, 1: other}).covered_share_median == 0.25
+        assert compare([self.half], {0: none}).covered_share_median is None
+
+    def test_is_shown_in_place_of_shares_of_a_truth_that_is_too_small(self):
+        found = Benchmark.of({"uniform": [self.half]}, {0: self.small}, {}, 3, None)
+        text = "\n".join(found.lines())
+        assert "at level 0 too small to be divided by: as many cases again could add up to" in text
+        assert "too small for regions: 100% of the failures have no other one within 0.05" in text
+        assert "covered share: of 2 failing uniform cases" in text
+        assert "FMC / truth" not in text
+        assert "90 % covered" in text
+        record = found.to_record()
+        assert record["truth_too_small"]
+        assert record["uniform"]["fmc_over_truth_median"] is None
+        assert record["uniform"]["seeds_with_all_regions"] is None
+
+    def test_is_shown_beside_those_of_a_large_one(self):
+        truth = TestAComparisonByHand.truth
+        text = "\n".join(Benchmark.of({"uniform": [self.half]}, {0: truth}, {}, 3, None).lines())
+        assert "too small" not in text
+        assert "FMC / truth" in text
+        assert "covered share: of 4 failing" in text
+
+
 class TestTheLimit:
     truth = TestAComparisonByHand.truth
     near = searched([[(0.2, 0.24)]])
@@ -237,7 +292,7 @@ class TestTheLimit:
         assert limit == pytest.approx(4.0 * fmc(one.failures))
 
     def test_is_never_passed_although_the_truth_is(self):
-        truth = Truth(np.array([[0.2, 0.2]]), np.array([-600.0]))
+        truth = dense_truth([[0.2, 0.2]])
         search = searched([[(0.2, 0.2), (0.8, 0.2)]])
         found = compare([search], {0: truth}, limit_fmc([search], {0: truth}, {}))
         assert found.fmc_over_truth_median == pytest.approx(2.0)

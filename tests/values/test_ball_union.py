@@ -11,19 +11,23 @@ from scipy.spatial import cKDTree
 from scipy.special import betainc
 
 from merge_sumo.values import ball_union
-from merge_sumo.values.ball_union import cell_volume, star_volume
+from merge_sumo.values.ball_union import ball_volume, cell_volume, star_volume
 from merge_sumo.values.fmc import RADIUS, fmc, fmc_and_error, radius_for, regions
 
 FloatArray = np.ndarray
-BALL = 4 / 3 * math.pi * RADIUS**3
 SIX = pytest.param(6, marks=pytest.mark.long)
 DIMENSIONS = pytest.mark.parametrize("dimension", some([4, 5, 6], 4))
+
+
+def ball(dimension: int) -> float:
+    """Volume of one ball."""
+    return ball_volume(dimension) * radius_for(dimension) ** dimension
 
 
 def lens(distance: float, dimension: int) -> float:
     """Volume common to two balls: two caps, each a share of a ball (Li, 2011)."""
     half = distance / 2.0 / radius_for(dimension)
-    return BALL * float(betainc((dimension + 1) / 2.0, 0.5, 1.0 - half**2))
+    return ball(dimension) * float(betainc((dimension + 1) / 2.0, 0.5, 1.0 - half**2))
 
 
 def row(count: int, distance: float, dimension: int) -> FloatArray:
@@ -43,12 +47,13 @@ def monte_carlo(points: FloatArray, samples: int = 200_000) -> tuple[float, floa
     return box * share, box * math.sqrt(share * (1 - share) / samples)
 
 
-def test_the_radius_is_that_of_a_ball_as_large_as_the_one_of_three_dimensions():
+def test_the_radius_is_that_of_a_ball_whose_disc_is_as_large_as_the_one_of_three_dimensions():
     assert [radius_for(d) for d in (1, 2, 3)] == [RADIUS] * 3
-    assert radius_for(4) == pytest.approx((BALL / (math.pi**2 / 2)) ** (1 / 4), rel=1e-12)
-    assert radius_for(5) == pytest.approx((BALL / (8 * math.pi**2 / 15)) ** (1 / 5), rel=1e-12)
-    assert radius_for(6) == pytest.approx((BALL / (math.pi**3 / 6)) ** (1 / 6), rel=1e-12)
-    assert [round(radius_for(d), 3) for d in (4, 5, 6)] == [0.101, 0.158, 0.216]
+    disc = math.pi * RADIUS**2
+    assert 4 / 3 * math.pi * radius_for(4) ** 3 == pytest.approx(disc, rel=1e-12)
+    assert math.pi**2 / 2 * radius_for(5) ** 4 == pytest.approx(disc, rel=1e-12)
+    assert 8 * math.pi**2 / 15 * radius_for(6) ** 5 == pytest.approx(disc, rel=1e-12)
+    assert [round(radius_for(d), 3) for d in (4, 5, 6)] == [0.123, 0.2, 0.272]
 
 
 class TestClosedForms:
@@ -59,14 +64,14 @@ class TestClosedForms:
     @DIMENSIONS
     def test_one_ball_is_exact(self, dimension):
         volume, error = fmc_and_error(np.full((1, dimension), 0.4))
-        assert volume == pytest.approx(BALL, rel=1e-12)
+        assert volume == pytest.approx(ball(dimension), rel=1e-12)
         assert error == 0.0
 
     @DIMENSIONS
     @pytest.mark.parametrize("times", [2.0, 2.0 + 1e-9, 3.0, 50.0])
     def test_touching_and_distant_balls_add_up(self, dimension, times):
         volume, error = fmc_and_error(row(5, times * radius_for(dimension), dimension))
-        assert volume == pytest.approx(5 * BALL, rel=1e-9)
+        assert volume == pytest.approx(5 * ball(dimension), rel=1e-9)
         assert error < 1e-9
 
     @DIMENSIONS
@@ -74,7 +79,7 @@ class TestClosedForms:
     def test_two_overlapping_balls(self, dimension, times):
         distance = times * radius_for(dimension)
         volume, error = fmc_and_error(row(2, distance, dimension))
-        expected = 2 * BALL - lens(distance, dimension)
+        expected = 2 * ball(dimension) - lens(distance, dimension)
         assert error < 2e-3 * expected
         assert abs(volume - expected) < 5 * error + 1e-9 * expected
 
@@ -83,7 +88,7 @@ class TestClosedForms:
     def test_a_row_of_balls(self, dimension, times):
         distance = times * radius_for(dimension)
         volume, error = fmc_and_error(row(30, distance, dimension))
-        expected = 30 * BALL - 29 * lens(distance, dimension)
+        expected = 30 * ball(dimension) - 29 * lens(distance, dimension)
         assert error < 1e-3 * expected
         assert abs(volume - expected) < 5 * error
 
@@ -163,7 +168,7 @@ class TestWhatMustNotMatter:
         gains = np.diff([volume for volume, _ in figures])
         slack = 6 * max(error for _, error in figures)
         assert gains.min() > -slack
-        assert gains.max() < BALL + slack
+        assert gains.max() < ball(dimension) + slack
 
     def test_the_points_are_left_alone(self):
         points = np.random.default_rng(12).random((20, 5))

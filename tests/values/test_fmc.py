@@ -14,7 +14,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from merge_sumo.values import fmc as fmc_module
-from merge_sumo.values.fmc import RADIUS, fmc, radius_for, regions
+from merge_sumo.values.fmc import (
+    RADIUS,
+    covered,
+    fmc,
+    growth_bound,
+    has_neighbour,
+    radius_for,
+    regions,
+)
 
 Points = NDArray[np.float64]
 
@@ -376,3 +384,60 @@ class TestRegions:
         firsts = [int(np.flatnonzero(labels == label)[0]) for label in range(len(sizes))]
         order = list(zip(-sizes, firsts, strict=True))
         assert order == sorted(order)
+
+
+class TestCovered:
+    def test_is_within_the_radius_of_a_failure_inclusively(self):
+        points = [[0.5, 0.5 + RADIUS], [0.5, 0.5 + 1.001 * RADIUS], [0.9, 0.9]]
+        assert covered(points, [[0.5, 0.5], [0.1, 0.1]]).tolist() == [True, False, False]
+
+    def test_of_nothing_and_by_nothing_is_nothing(self):
+        assert covered(np.zeros((0, 2)), [[0.5, 0.5]]).tolist() == []
+        assert covered([[0.5, 0.5]], np.zeros((0, 2))).tolist() == [False]
+
+    @pytest.mark.parametrize("dimension", [2, 4, 5])
+    def test_share_is_that_of_the_volume_where_all_fails(self, dimension):
+        points = np.random.default_rng(dimension).random((20_000, dimension))
+        radius = radius_for(dimension)
+        share = covered(points, np.full((1, dimension), 0.5)).mean()
+        assert share == pytest.approx(fmc(np.full((1, dimension), 0.5)), rel=0.2)
+        assert covered(points, points[:50], 2.0 * radius).mean() > share
+
+
+class TestANeighbour:
+    def test_is_another_point_within_the_radius(self):
+        points = [[0.1, 0.1], [0.1, 0.1 + RADIUS], [0.5, 0.5]]
+        assert has_neighbour(points).tolist() == [True, True, False]
+        assert has_neighbour([[0.1, 0.1]]).tolist() == [False]
+        assert has_neighbour([]).tolist() == []
+
+
+class TestTheBoundOfGrowth:
+    def test_is_1_where_no_balls_overlap_and_0_where_all_are_double(self):
+        assert growth_bound([[0.1, 0.1], [0.9, 0.9]]) == 1.0
+        assert growth_bound([[0.1, 0.1], [0.1, 0.1 + 1e-9]]) == pytest.approx(0.0, abs=1e-3)
+        assert growth_bound(np.zeros((0, 2))) == growth_bound([]) == 0.0
+
+    def test_of_two_balls_is_the_share_outside_of_their_lens(self):
+        distance = RADIUS
+        lens = 2 * RADIUS**2 * math.acos(0.5) - distance / 2 * math.sqrt(3) * RADIUS
+        union = 2 * math.pi * RADIUS**2 - lens
+        bound = growth_bound([[0.1, 0.1], [0.1, 0.1 + distance]])
+        assert bound == pytest.approx(1.0 - lens / union, abs=0.01)
+
+    @pytest.mark.parametrize("dimension", [2, 3, 4])
+    def test_is_no_less_than_what_as_many_cases_again_add_on_average(self, dimension):
+        rng = np.random.default_rng(dimension)
+        bounds, growths = [], []
+        for _ in range(20):
+            points = rng.random((4000, dimension))
+            fails = np.abs(points.sum(axis=1) - dimension / 2) < 0.02
+            before, after = fmc(points[:2000][fails[:2000]]), fmc(points[fails])
+            bounds.append(growth_bound(points[:2000][fails[:2000]]) * before)
+            growths.append(after - before)
+        assert np.mean(growths) <= np.mean(bounds)
+        assert np.mean(growths) >= 0.4 * np.mean(bounds)
+
+    def test_does_not_depend_on_the_order(self):
+        points = np.random.default_rng(0).random((30, 2))
+        assert growth_bound(points) == growth_bound(points[::-1])
