@@ -24,8 +24,9 @@ class LevelSummary:
         tested: cases in which the VUT reached the merge point.
         failures: cases that fail under the criterion.
         severities: cases by severity, those that occur.
-        fmc: failure mode coverage, M(s, 0.05, -500), in the level's unit cube.
-        regions: groups of failures that are linked at a distance of 0.05.
+        fmc: failure mode coverage in the level's unit cube; M(s, 0.05, -500) under the paper's
+            criterion and in up to three coordinates.
+        regions: groups of failures that are linked at the radius of FMC.
         unseen: the largest ball of the level's unit cube that no case has entered, but for those
             that ended in an error; None without cases.
         missed: bound on the share of the level that fails far from all failures found; None without

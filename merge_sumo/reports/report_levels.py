@@ -12,9 +12,11 @@ from merge_sumo.analysis.surface import FEWEST_FAILURES
 from merge_sumo.analysis.verdict import counted
 from merge_sumo.reports.report_maps import pairs_of
 from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.studies.truth import Truth
 from merge_sumo.system.printable import two_digits
+from merge_sumo.values.case import to_unit
 from merge_sumo.values.empty_ball import EmptyBall
-from merge_sumo.values.fmc import fmc
+from merge_sumo.values.fmc import covered, fmc, radius_for
 from merge_sumo.values.scenario import OWN
 
 
@@ -66,6 +68,9 @@ def levels_of(model: ReportModel) -> tuple[list[Level], float]:
 def _level(model: ReportModel, level: int, found: LevelSummary) -> Level:
     surface, truth = model.surfaces[level], model.truths[level]
     axes = model.coordinates_of(level)
+    note = _note(found, axes, learned=surface is not None)
+    if truth is not None and len(truth.failures):
+        note += f" {_of_truth(model, level, truth)}"
     return Level(
         level=level,
         found=found,
@@ -73,7 +78,7 @@ def _level(model: ReportModel, level: int, found: LevelSummary) -> Level:
         about=model.run.scenario.level_about.get(level, ""),
         plausible=None if surface is None else surface.plausible_fmc(),
         truth=None if truth is None else fmc(truth.failures),
-        note=_note(found, axes, learned=surface is not None),
+        note=note,
         axes=axes,
         pairs=[
             " × ".join(axes[axis].name for axis in pair.axes)
@@ -107,6 +112,18 @@ def _missed(bound: MissedShare) -> str:
         f"{bound.confidence:.0%} confidence, at most {two_digits(bound.percent)} % of this level "
         "fails farther than the radius of the FMC from every failure that was found"
     )
+
+
+def _of_truth(model: ReportModel, level: int, truth: Truth) -> str:
+    """Return the covered share of a truth with failures, and for what it is too small."""
+    cases = (o.case for o in model.run.outcomes if o.failed and o.case.level == level)
+    found, failing = to_unit(cases, level), truth.failures
+    near = int(covered(failing, found).sum())
+    text = (
+        f"Of {counted(len(failing), 'failure')} of the truth, {near} lie within "
+        f"{radius_for(failing.shape[1]):.2f} of a failure found ({near / len(failing):.0%})"
+    )
+    return ". The truth is ".join([text, *truth.remarks()]) + "."
 
 
 def _unseen(axes: tuple[Coordinate, ...], ball: EmptyBall) -> str:

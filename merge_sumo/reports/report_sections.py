@@ -189,8 +189,8 @@ def _radii(dims_of_levels: Set[int]) -> str:
         return ""
     parts = [f"{radius_for(dims):.2f} for {dims} coordinates" for dims in more]
     return (
-        f"It is {in_words(parts)}: there a ball is as large as in three. Then the volume is "
-        "integrated by quasi-Monte Carlo, to within some tenths of a percent."
+        f"It is {in_words(parts)}: there a ball covers as much of a layer of failures as in three. "
+        "Then the volume is integrated by quasi-Monte Carlo, to within some tenths of a percent."
     )
 
 

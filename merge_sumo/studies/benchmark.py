@@ -567,7 +567,7 @@ class Benchmark(Result):
             f"truth: FMC {self.truth_fmc:.4f}, {counted(failures, 'failure')}"
             + (f", {counted(real, 'region')}" if tells else ""),
             *(
-                f"  at level {level_name(level)} {remark}"
+                f"  at level {level_name(level)} it is {remark}"
                 for level, truth in self.truths.items()
                 for remark in truth.remarks()
             ),

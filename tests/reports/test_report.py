@@ -337,6 +337,7 @@ class TestTheTruth:
         assert (values[:, :half] == 255).all()
         assert (values[:, -half:] == 0).all()
         assert f"{fmc(cached(None, 0, 0).failures):.4f}" in text_of(page)
+        assert "lie within 0.05 of a failure found" in text_of(page)
 
     def test_of_a_pool_with_a_range_of_speeds_is_drawn_too(self, tmp_path, cached):
         net, ranged = road_of().sha256, replace(US23, v_vut0_mps=(14.0, 22.0))

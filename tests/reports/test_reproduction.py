@@ -86,12 +86,24 @@ class TestATinyReproduction:
             cases_by_batch=[20],
             fmc_by_batch_median=[0.09],
         )
-        of_one = ColumnResult(TABLE_II[0], 0.08, 7, 1, None, 0.1, dict.fromkeys(SAMPLERS, found))
+        compared = dict.fromkeys(SAMPLERS, found)
+        of_one = ColumnResult(TABLE_II[0], 0.08, 7, 1, [], None, 0.1, compared)
         of_two = replace(of_one, dense_fmc=0.095)
         markdown = table_markdown({"one": of_one, "two": of_two})
         assert "| dense truth | - (-) | 0.0950 (-) |" in markdown
         assert "| coverage / dense truth | - | 0.947 |" in markdown
         assert "dense" not in table_markdown({"one": of_one})
+
+    def test_divides_by_no_truth_that_is_too_small(self, tiny):
+        index, _ = tiny
+        record = json.loads((index.parent / "table2.json").read_text())
+        assert record["columns"][2]["truth_regions"] is None
+        assert record["columns"][2]["samplers"]["gpr"]["fmc_over_truth_median"] is None
+        markdown = (index.parent / "table2.md").read_text()
+        assert (
+            "The truth of level-2 POV, design 2 is too small to be divided by: as many" in markdown
+        )
+        assert "it is too small to be divided by" in index.read_text()
 
     def test_says_how_far_it_is(self, tiny):
         _, said = tiny

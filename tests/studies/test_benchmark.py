@@ -249,7 +249,10 @@ class TestTheCoveredShare:
     def test_is_shown_in_place_of_shares_of_a_truth_that_is_too_small(self):
         found = Benchmark.of({"uniform": [self.half]}, {0: self.small}, {}, 3, None)
         text = "\n".join(found.lines())
-        assert "at level 0 too small to be divided by: as many cases again could add up to" in text
+        assert (
+            "at level 0 it is too small to be divided by: as many cases again could add up to"
+            in text
+        )
         assert "too small for regions: 100% of the failures have no other one within 0.05" in text
         assert "covered share: of 2 failing uniform cases" in text
         assert "FMC / truth" not in text
