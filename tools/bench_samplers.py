@@ -6,7 +6,7 @@
     python tools/bench_samplers.py --per-case
     python tools/bench_samplers.py --trials --seeds 10 --first 1000
     python tools/bench_samplers.py --dense --vut design1 --level 0 --seeds 10 --first 1000
-    python tools/bench_samplers.py --dense --vut design1 --learned-from 'my_older.py:Vut' --level 0
+    python tools/bench_samplers.py --dense --cases 100 --batch 2 --learned-from old.py:Vut
 
 The first prints medians of FMC / truth after 100, 200 and 400 cases, `coverage` in batches of its
 own and the others in batches of 20; the second does so for `gpr` with one of its choices changed
@@ -138,29 +138,30 @@ MOST = 0.9
 LEARNED_CASES = 100
 
 
-def print_dense(
-    vut: str, level: int, names: Sequence[str], seeds: Sequence[int], learned_from: str | None
-) -> dict[str, Any]:
+def print_dense(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
     """Print and return how soon samplers find the failures of a dense truth."""
+    vut, level, cases = options.vut, options.level, options.cases
+    learned_from = options.learned_from
     plan = resolve(CampaignSettings(vut=vut, levels=(level,), scenario=US23)).with_engine(
         Engine.KINEMATIC
     )
     truth = ground_truth(plan, level, DENSE_CASES).failures
-    whole, (best, _) = fmc(truth), greedy_cover(truth, max(SOON))
+    soon = [n for n in SOON if n <= cases]
+    whole, (best, _) = fmc(truth), greedy_cover(truth, cases)
     oracle = _cases_to(MOST * whole, best, np.arange(len(best)), len(best))
     figures: dict[str, Any] = {"FMC": whole, "oracle": oracle}
-    after = " ".join(f"{f'N={n}':>6s}" for n in SOON)
+    after = " ".join(f"{f'N={n}':>6s}" for n in soon)
     print(f"{vut}, level {level}: dense FMC {whole:.4f}, oracle {oracle:.0f} cases to {MOST:.0%}")
     print(
         f"{'median FMC / dense FMC':30s}{after}  cases to {MOST:.0%} [quartiles]  ratio to oracle"
     )
     for name in names:
         shares, needed = [], []
-        for seed in seeds:
+        for seed in range(options.first, options.first + options.seeds):
             others = [] if learned_from is None else _motions(learned_from, level, seed)
-            points, index = _failures(plan, name, level, seed, others)
-            shares.append([fmc(points[index < n]) / whole for n in SOON])
-            needed.append(_cases_to(MOST * whole, points, index, max(SOON)))
+            points, index = _failures(plan, name, level, seed, others, options.batch, cases)
+            shares.append([fmc(points[index < n]) / whole for n in soon])
+            needed.append(_cases_to(MOST * whole, points, index, cases))
         low, median, high = np.quantile(needed, (0.25, 0.5, 0.75), method="nearest").tolist()
         by_cases = np.median(shares, axis=0).tolist()
         figures[name] = {"shares": by_cases, "cases": needed, "ratio": median / oracle}
@@ -173,13 +174,19 @@ def print_dense(
 
 
 def _failures(
-    plan: SimulationPlan, name: str, level: int, seed: int, others: Sequence[Any]
+    plan: SimulationPlan,
+    name: str,
+    level: int,
+    seed: int,
+    others: Sequence[Any],
+    batch: int | None,
+    cases: int,
 ) -> tuple[Any, Any]:
     """Return the failures that a sampler finds, (m, d), and their indices, (m,)."""
     pool = Pool(levels=(level,), scenario=US23)
     sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed, others))
-    batch = None if sampler.predictor else BATCH
-    batches = conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), max(SOON), batch)
+    batch = batch or (None if sampler.predictor else BATCH)
+    batches = conduct(sampler, lambda asked: enumerate(run_cases(plan, asked)), cases, batch)
     failed = [outcome for ran in batches for outcome, _ in ran if outcome.failed]
     points = to_unit([outcome.case for outcome in failed], level, scenario=US23)
     return points, np.array([outcome.index for outcome in failed], dtype=np.int64)
@@ -320,6 +327,8 @@ def main() -> None:
     )
     parser.add_argument("--dense", action="store_true", help="beside a dense truth and an oracle")
     parser.add_argument("--learned-from", metavar="VUT", help="of --dense: an earlier version")
+    parser.add_argument("--batch", type=int, help="of --dense: cases of a batch")
+    parser.add_argument("--cases", type=int, default=max(SOON), help="of --dense: cases in all")
     parser.add_argument("--time", action="store_true", help="time batches up to N = 5,000")
     parser.add_argument("--per-case", action="store_true", help="CPU time per case of coverage")
     add_record_option(parser)
@@ -330,8 +339,7 @@ def main() -> None:
     elif options.per_case:
         append_record(options.record, "samplers, per case", print_cost_per_case())
     elif options.dense:
-        seeds = range(options.first, options.first + options.seeds)
-        figures = print_dense(options.vut, options.level, names, seeds, options.learned_from)
+        figures = print_dense(options, names)
         what = f"samplers, {options.vut}, level {options.level}, dense"
         append_record(options.record, what, figures)
     elif options.trials is not None:

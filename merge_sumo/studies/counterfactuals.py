@@ -24,7 +24,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -331,13 +331,8 @@ def _latest_takeovers(stage: Stage, failures: Sequence[Trajectory]) -> list[int 
 
 
 def _counterfactual(failure: Trajectory, **other: Any) -> _Counterfactual:
-    same = {name: getattr(failure.case, name) for name in _names(type(failure.case))}
+    same = {field.name: getattr(failure.case, field.name) for field in fields(failure.case)}
     return _Counterfactual(**same, failure=failure, **other)
-
-
-@cache
-def _names(kind: type[Case]) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind))
 
 
 class Stage:

@@ -206,7 +206,7 @@ def test_a_path_works_or_is_too_long_before_the_first_case(tmp_path, monkeypatch
     left = size - len(os.fsencode(folder)) - 2
     folder = folder / ("r" * (left // 2)) / ("r" * (left - left // 2))
     assert len(os.fsencode(folder)) == size
-    monkeypatch.setattr(conductor, "open_simulators", lambda *_: 1 / 0)
+    monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: 1 / 0)
     settings = CampaignSettings(vut="design1", levels=(0,), cases=99_999, scenario=US23)
     with pytest.raises((UserError, ZeroDivisionError)) as error:
         run_campaign(settings, folder)

@@ -149,7 +149,7 @@ def no_cases(monkeypatch) -> None:
     def stop(*_: object, **_options: object) -> None:
         raise UserError(STOP)
 
-    monkeypatch.setattr(conductor, "open_simulators", lambda *_: None)
+    monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: None)
     for name in ("evaluate", "evaluate_chunks"):
         monkeypatch.setattr(conductor, name, stop)
     monkeypatch.setattr(reproduction, "_column", stop)
@@ -296,7 +296,7 @@ class TestANameOfNothing:
             folders.check_new(Path(name))
 
     def test_is_refused_before_the_vut_is_opened(self, world, guarded, monkeypatch):
-        monkeypatch.setattr(conductor, "open_simulators", lambda *_: 1 / 0)
+        monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: 1 / 0)
         for name in NAMELESS:
             with pytest.raises(UserError, match="--out is"):
                 ms.campaign("design1", level=0, cases=2, out=name)
@@ -403,7 +403,7 @@ def moved_behind_a_link(path: Path, elsewhere: Path) -> None:
 class TestAReceivedFolder:
     @pytest.mark.parametrize("name", [SETTINGS, OUTCOMES, TRAJECTORIES, SCENARIOS])
     def test_with_a_link_is_not_gone_on_with(self, received, tmp_path, name, monkeypatch):
-        monkeypatch.setattr(conductor, "open_simulators", lambda *_: 1 / 0)
+        monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: 1 / 0)
         cut_to_one_batch(received)
         moved_behind_a_link(received / name, tmp_path / "ours")
         before = tree(tmp_path)
@@ -415,7 +415,7 @@ class TestAReceivedFolder:
     def test_with_a_link_among_its_trajectories_is_not_gone_on_with(
         self, received, tmp_path, monkeypatch, target
     ):
-        monkeypatch.setattr(conductor, "open_simulators", lambda *_: 1 / 0)
+        monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: 1 / 0)
         cut_to_one_batch(received)
         (received / TRAJECTORIES / "00002.npz").unlink()
         (received / TRAJECTORIES / "00002.npz").symlink_to(target)

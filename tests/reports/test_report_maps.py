@@ -155,7 +155,7 @@ class TestWords:
         assert len(zero.axes) != 3
 
     def test_say_how_large_a_ball_is_where_it_is_not_the_papers(self, words):
-        assert "0.10 for 4 coordinates and 0.16 for 5 coordinates" in words["radii"]
+        assert "0.12 for 4 coordinates and 0.20 for 5 coordinates" in words["radii"]
 
     def test_speak_of_headways_and_of_when_the_other_cars_are_due(self, words):
         features = " ".join(words["sentences"])
