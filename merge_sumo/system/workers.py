@@ -411,6 +411,11 @@ class LocalProcesses(ProcessPoolExecutor):
     def _kill(self) -> None:
         for process in list((self._processes or {}).values()):
             process.kill()
+        # Before 3.11.5 and 3.12, Python waits for ever to write what no worker reads any more:
+        # https://github.com/python/cpython/issues/94777
+        queue: Any = getattr(self, "_call_queue", None)
+        if queue is not None:
+            queue._reader.close()
 
 
 _endings: list[Callable[[], None]] = []

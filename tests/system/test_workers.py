@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import sysconfig
+import threading
 import time
 from dataclasses import replace
 from functools import partial
@@ -161,7 +162,20 @@ class TestAWorkerThatDies:
         assert End.SIM_ERROR not in ends[:2] + ends[3:]
 
 
+def asleep(_):
+    time.sleep(60.0)
+
+
 class TestLocalProcesses:
+    def test_end_at_once_while_they_are_given_more_than_a_pipe_holds(self):
+        workers = LocalProcesses(1)
+        for _ in range(3):
+            workers.submit(asleep, bytes(3_000_000))
+        ending = threading.Thread(target=workers.end, daemon=True)
+        ending.start()
+        ending.join(30.0)
+        assert not ending.is_alive()
+
     @pytest.mark.slow
     def test_are_replaced_after_a_number_of_chunks(self):
         with Workers(lambda: LocalProcesses(1), 1, recycle_after=2) as workers:
