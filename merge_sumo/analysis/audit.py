@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
-from merge_sumo.system.printable import two_digits
+from merge_sumo.system.printable import counted, two_digits
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.score import Outcome
 
@@ -69,24 +69,19 @@ class MissedShare:
     @property
     def in_short(self) -> str:
         """Return the bound in a clause."""
-        share = two_digits(self.percent)
-        return f"{self.missed} missed in {self.cases} audit cases, at most {share} %"
+        return f"{self.missed} missed in {counted(self.cases, 'audit case')}, at most {self._share}"
 
-    @property
-    def percent(self) -> float:
-        """The bound in percent."""
-        return 100.0 * self.at_most
-
-    @property
-    def sentence(self) -> str:
-        """Return the bound for the pool in a sentence, without a full stop."""
-        failures = "failure" if self.missed == 1 else "failures"
-        cases = "case" if self.cases == 1 else "cases"
+    def sentence(self, of: str) -> str:
+        """Return the bound for the pool, or for a level, in a sentence without a full stop."""
         return (
-            f"audit: {self.missed} missed {failures} in {self.cases} uniform {cases}; with "
-            f"{self.confidence:.0%} confidence at most {two_digits(self.percent)} % of the pool "
-            "fails farther than the radius of the FMC from every failure that was found"
+            f"{counted(self.missed, 'missed failure')} in {counted(self.cases, 'audit case')}: "
+            f"with {self.confidence:.0%} confidence, at most {self._share} of {of} fails farther "
+            "than the radius of the FMC from every failure that was found"
         )
+
+    @property
+    def _share(self) -> str:
+        return f"{two_digits(100.0 * self.at_most)} %"
 
 
 def audit_cases(outcomes: Iterable[Outcome]) -> list[AuditCase]:

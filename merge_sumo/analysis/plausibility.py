@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from merge_sumo.analysis.verdict import counted
+from merge_sumo.system.printable import counted
 from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.criterion import Criterion, condition_of, values_of
 from merge_sumo.values.expression import AllOf, AnyOf, Comparison, Condition, Negation, names_of

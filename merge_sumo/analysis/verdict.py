@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from merge_sumo.analysis.summary import Summary
 from merge_sumo.errors import UserError
-from merge_sumo.system.printable import printable
+from merge_sumo.system.printable import counted, printable
 from merge_sumo.values.scenario import Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
@@ -191,11 +191,6 @@ def message_of(outcome: Outcome) -> str:
 def shortened(text: str, characters: int) -> str:
     """Return a text, or its beginning where it is longer."""
     return text if len(text) <= characters else text[: characters - 3] + "..."
-
-
-def counted(number: int, what: str) -> str:
-    """Return a number of things in words."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def in_counts(errors: int, timeouts: int, failures: int) -> list[str]:

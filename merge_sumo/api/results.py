@@ -19,7 +19,6 @@ from merge_sumo.analysis.verdict import (
     MESSAGE_CHARACTERS,
     GateResult,
     Verdict,
-    counted,
     judge,
     parse_gates,
     shortened,
@@ -33,7 +32,7 @@ from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.stratified import Estimate
 from merge_sumo.studies.truth import REAL_REGION, Truth
-from merge_sumo.system.printable import quoted
+from merge_sumo.system.printable import counted, quoted
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23, level_name
@@ -209,7 +208,9 @@ class CampaignRun(Result):
         optional += [f"  {run.ran_again_in_words}"] if run.ran_again else []
         optional += [f"  note: {note}" for note in doubts(run.outcomes, run.criterion)]
         optional += [_level_line(level, summary) for level, summary in levels.items()]
-        optional += [] if self.summary.missed is None else [self.summary.missed.sentence]
+        optional += (
+            [] if self.summary.missed is None else [self.summary.missed.sentence("the pool")]
+        )
         optional += [self.careful, f"report: {self.report_file}"]
         worst = failures(run.outcomes)[:1]
         folders = [run.folder / SCENARIOS / case_name(outcome.index) for outcome in worst]

@@ -196,9 +196,15 @@ def _compared(
     # What was loaded while it ran must be the same, too, although it is not loaded yet.
     for name in FILES:
         record[name] = _files_now(recorded, name, record[name] or {}) or None
-    cases = recorded.get("cases")
-    # Which cases come next does not depend on how many there are to be; audit cases do.
-    grown = isinstance(cases, int) and cases < settings.cases and settings.audit is None
+    cases, audit = recorded.get("cases"), recorded.get("audit")
+    if (cases, audit) != (settings.cases, settings.audit) and (audit or settings.audit):
+        # What was drawn for one plan would be drawn again for the other.
+        raise UserError(
+            f"{before.folder} was begun with {cases} cases, {audit or 0} of them audit cases, "
+            "which are spread over all: leave --cases and --audit as they were, or begin another campaign"
+        )
+    # Which cases come next does not depend on how many there are to be.
+    grown = isinstance(cases, int) and cases < settings.cases
     if grown:
         recorded["cases"] = settings.cases
     changes = differences(RECORDED_BY_DEFAULT | recorded, record)

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from merge_sumo.analysis.diagnosis import MEANING, Kind
 from merge_sumo.analysis.summary import Summary
-from merge_sumo.analysis.verdict import Verdict, counted, in_words
+from merge_sumo.analysis.verdict import Verdict, in_words
+from merge_sumo.system.printable import counted
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import HARSH_MPS2
 from merge_sumo.values.scenario import level_name

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.analysis.audit import MissedShare
 from merge_sumo.analysis.coordinates import Coordinate
 from merge_sumo.analysis.summary import LevelSummary
 from merge_sumo.analysis.surface import FEWEST_FAILURES
-from merge_sumo.analysis.verdict import counted
 from merge_sumo.reports.report_maps import pairs_of
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.studies.truth import Truth
-from merge_sumo.system.printable import two_digits
+from merge_sumo.system.printable import counted, two_digits
 from merge_sumo.values.case import to_unit
 from merge_sumo.values.empty_ball import EmptyBall
 from merge_sumo.values.fmc import covered, fmc, radius_for
@@ -99,19 +97,10 @@ def _note(found: LevelSummary, axes: tuple[Coordinate, ...], *, learned: bool) -
     if found.unseen is not None:
         text += f". {_unseen(axes, found.unseen)}"
     if found.missed is not None:
-        text += f". {_missed(found.missed)}"
+        text += f". {found.missed.sentence('this level')}"
     if not learned:
         text += f". No surrogate: it takes {FEWEST_FAILURES} failures to learn one"
     return text + "."
-
-
-def _missed(bound: MissedShare) -> str:
-    """Return in a clause what may have been missed."""
-    return (
-        f"{counted(bound.missed, 'missed failure')} in {counted(bound.cases, 'audit case')}: with "
-        f"{bound.confidence:.0%} confidence, at most {two_digits(bound.percent)} % of this level "
-        "fails farther than the radius of the FMC from every failure that was found"
-    )
 
 
 def _of_truth(model: ReportModel, level: int, truth: Truth) -> str:

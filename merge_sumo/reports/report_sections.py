@@ -17,7 +17,7 @@ from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
 from merge_sumo.analysis.plausibility import notes_on
 from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
-from merge_sumo.analysis.verdict import counted, in_words
+from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns import repeats
 from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
@@ -33,7 +33,7 @@ from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
 from merge_sumo.studies.counterfactuals import in_a_sentence
 from merge_sumo.studies.truth import TRUTH_CASES
-from merge_sumo.system.printable import printable, two_digits
+from merge_sumo.system.printable import counted, printable
 from merge_sumo.system.registry import Registry
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import MergeScenario, level_name
@@ -121,7 +121,6 @@ def _numbers(model: ReportModel) -> dict[str, Any]:
         "avoidable": avoidable_text(model.worst, crash_m),
         "after": harmful_merges_text(outcomes, crash_m),
         "before": overlaps_before_m_text(outcomes),
-        "two_digits": two_digits,
         "batches": len({o.batch for o in outcomes}),
         "recorded": _recorded(model.run),
         "driven": _duration(sum(o.measures.t_end_s for o in outcomes)),

@@ -16,14 +16,14 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.diagnosis import Kind
-from merge_sumo.analysis.verdict import counted, in_words
+from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns.store import Run
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.static_map import map_of
 from merge_sumo.studies.history import History, LevelOfVersion, RegionChange
 from merge_sumo.studies.versions import Change, ComparedCase, RunComparison
 from merge_sumo.system.folders import write_new
-from merge_sumo.system.printable import quoted
+from merge_sumo.system.printable import counted, quoted
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Outcome

@@ -18,7 +18,6 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.analysis.result import Result
-from merge_sumo.analysis.verdict import counted
 from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
@@ -27,6 +26,7 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth
+from merge_sumo.system.printable import counted
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit

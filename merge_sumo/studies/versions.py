@@ -18,7 +18,7 @@ from operator import itemgetter
 from typing import Any, Final
 
 from merge_sumo.analysis.result import Result
-from merge_sumo.analysis.verdict import counted, judge
+from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.repeats import cause
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
@@ -29,6 +29,7 @@ from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.system.hashing import changed
+from merge_sumo.system.printable import counted
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc

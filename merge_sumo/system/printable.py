@@ -23,6 +23,11 @@ def two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):.12g}"
 
 
+def counted(number: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def quoted(argument: str | Path) -> str:
     """Return an argument of a command that a person may paste into a shell.
 

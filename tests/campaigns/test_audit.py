@@ -238,8 +238,10 @@ class TestACampaign:
         again = Run(tmp_path / "run").outcomes
         assert again == run.outcomes
         # A campaign of twice the cases would have its audit cases elsewhere.
-        with pytest.raises(UserError, match="cases differs"):
-            resume_campaign(tmp_path / "run", {"cases": 96})
+        for change in ({"cases": 96}, {"audit": 24}):
+            for force in (False, True):
+                with pytest.raises(UserError, match="48 cases, 12 of them audit cases"):
+                    resume_campaign(tmp_path / "run", change, force=force)
 
     def test_has_the_same_audit_cases_whatever_the_batches(self, tmp_path):
         campaign(tmp_path / "a", audit=12, sampler="uniform")
