@@ -228,7 +228,7 @@ def with_criterion(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of `CampaignSettings` with a criterion, by default the scenario's."""
     if fields.get("require") is not None:
         return dict(fields)
-    return {"fail_when": fields["scenario"].default_criterion, **fields}
+    return {"fail_when": fields["scenario"].criterion, **fields}
 
 
 def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSettings, Runner]:

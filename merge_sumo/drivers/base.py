@@ -25,6 +25,8 @@ class Scene(NamedTuple):
         v_mps: speeds, (A, K).
         facing: row of the car that counts as POV for who knows one car only, (K,); None for the
             POV itself everywhere.
+        merged: whether the VUT is on the mainline, (K,); None where there is no acceleration lane:
+            it then is from M on.
     """
 
     active: NDArray[np.bool_]
@@ -32,6 +34,7 @@ class Scene(NamedTuple):
     x_m: FloatArray
     v_mps: FloatArray
     facing: NDArray[np.int64] | None = None
+    merged: NDArray[np.bool_] | None = None
 
     @classmethod
     def of_pair(
@@ -87,7 +90,8 @@ class Scene(NamedTuple):
             pair[POV, :VUT], pair[POV, VUT:] = values[:VUT], values[VUT + 1 :]
             pair[VUT] = values[VUT]
         active, step = (np.concatenate([each] * cars) for each in (self.active, self.step))
-        return Scene(active, step, *state.reshape(2, 2, -1))
+        merged = None if self.merged is None else np.concatenate([self.merged] * cars)
+        return Scene(active, step, *state.reshape(2, 2, -1), merged=merged)
 
 
 class VutLostError(Exception):
@@ -121,6 +125,13 @@ class PovLostError(VutLostError):
 NO_SIGNALS: Final[Mapping[int, Left]] = {}
 
 
+NO_WISH: Final = -1
+STAY: Final = 0
+MERGE: Final = 1
+"""Wishes of a VUT that drives on an acceleration lane. One without a wish only accelerates, and
+merges at M."""
+
+
 class Driver(ABC):
     """Drives the same vehicle in K corridors at once; the corridors are independent."""
 
@@ -141,6 +152,13 @@ class Driver(ABC):
 
     def reason(self, corridor: int) -> str | None:
         """Return why the last answer for a corridor was not finite, if the driver knows."""
+        return None
+
+    def wishes(self) -> NDArray[np.int8] | None:
+        """Return what the last answers wish, (K,), `NO_WISH`, `STAY` or `MERGE`; None for no wish.
+
+        A wish is granted in the next step from where the acceleration lane begins.
+        """
         return None
 
     def signals(self) -> Mapping[int, Left]:

@@ -173,7 +173,7 @@ def plan_key(
         "folder": str(Path.cwd()) if code else None,
         "policies_sha256": dict(policies_sha256),
         "road_sha256": road_sha256,
-        "scenario": asdict(scenario),
+        "scenario": scenario.to_record(),
         "criterion": asdict(criterion),
         "versions": dict(versions),
     }

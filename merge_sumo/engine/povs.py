@@ -186,7 +186,7 @@ class PovLibrary(Driver):
         for level in levels:
             mine = scene.active & (self._level == level)
             if mine.any():
-                of_level = Scene(mine, scene.step, scene.x_m, scene.v_mps)
+                of_level = scene._replace(active=mine)
                 acceleration[mine] = self._drivers[level].act(of_level)[mine]
         return acceleration
 
@@ -233,7 +233,7 @@ class PovAdapter(Driver):
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the driver's answers; raises `PovLostError`."""
-        other = Scene(scene.active, scene.step, scene.x_m[::-1], scene.v_mps[::-1])
+        other = scene._replace(x_m=scene.x_m[::-1], v_mps=scene.v_mps[::-1])
         try:
             return self._driver.act(other)
         except VutLostError as lost:

@@ -144,6 +144,9 @@ class Corridor:
     """Length behind M in the file; from there on the last lane is continued straight on."""
     surroundings: tuple[tuple[Point, ...], ...]
     """Shapes of the other lanes near M, for drawings."""
+    lane_m: tuple[float, float] | None = None
+    """Where the acceleration lane begins and ends, on which the ramp runs beside the mainline's;
+    None where both paths meet in one point, M."""
 
     @property
     def is_one_path(self) -> bool:

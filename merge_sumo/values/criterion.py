@@ -81,7 +81,7 @@ class Criterion:
         if self.is_papers and not isinstance(scenario, MergeScenario):
             raise UserError(
                 f"--fail-when {PAPER} is of merges, and {scenario.name} is of kind "
-                f"{scenario.kind}: choose {scenario.default_criterion}, or a condition"
+                f"{scenario.kind}: choose {scenario.criterion}, or a condition"
             )
         if self.require is not None:
             try_formula(self.require)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 from msgspec import Meta
 
@@ -115,6 +115,7 @@ RANGES: Final[dict[str, Bounds]] = {
     "level0_v_mps": _SPEED_MPS,
     "reach_m": (0.0, 5000.0),
     "v_start_max_mps": _SPEED_MPS,
+    "lane_m": (-2000.0, 2000.0),
 }
 """What a road and its cars can have, by field: 360 km/h, 2 g, 5 km. Beyond, nothing is computed."""
 
@@ -248,6 +249,11 @@ class Scenario:
         return kind | asdict(self)
 
     @property
+    def criterion(self) -> str:
+        """The criterion of a campaign that names none."""
+        return self.default_criterion
+
+    @property
     def _before_m(self) -> str:
         return f"metres before M, -{self.reach_m:g} to 0, low < high"
 
@@ -336,6 +342,10 @@ class MergeScenario(Scenario):
             distance of their front bumpers is the headway times the POV's speed, which is also
             that of the car. A coordinate of the pool; None where there is no such car.
         headway_behind_s: the same of a car behind the POV; given with the other, or not at all.
+        lane_m: where the acceleration lane begins and ends, around M, which is where a merge is
+            expected; None where M is the only place to merge.
+        lane_end: what the end of that lane does to a VUT that has not merged: "merge" moves it to
+            the mainline, "stop" brakes it to a stand before the end.
     """
 
     kind: ClassVar[str] = "merge"
@@ -363,6 +373,8 @@ class MergeScenario(Scenario):
     v_pov0_mps: Bounds = (25.0, 35.0)
     headway_ahead_s: Bounds | None = None
     headway_behind_s: Bounds | None = None
+    lane_m: Bounds | None = None
+    lane_end: Literal["merge", "stop"] = "merge"
 
     def _checks(self) -> Iterator[tuple[str, bool, str]]:
         """Yield (field, whether it fits with the others, what would)."""
@@ -380,8 +392,24 @@ class MergeScenario(Scenario):
             yield name, fits, apart
         near = f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
         yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
+        begin_m, end_m = self.lane_m or (0.0, 0.0)
+        around = "where the lane begins and ends: from x_vut0_m to 0, and more than 0"
+        fits = self.lane_m is None or self.x_vut0_m <= begin_m <= 0.0 < end_m
+        yield "lane_m", fits, around
         # No zero-argument super(): `slots` makes another class of this one.
         yield from Scenario._checks(self)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the scenario as JSON keeps it; without a lane, nothing is said of one."""
+        record = Scenario.to_record(self)
+        if self.lane_m is None:
+            del record["lane_m"], record["lane_end"]
+        return record
+
+    @property
+    def criterion(self) -> str:
+        """The criterion of a campaign that names none: where bodies are on a lane, not the paper's."""
+        return "unsafe" if self.lane_m is not None else self.default_criterion
 
     @property
     def vehicles(self) -> int:
