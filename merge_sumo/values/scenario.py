@@ -408,7 +408,7 @@ class MergeScenario(Scenario):
 
     @property
     def criterion(self) -> str:
-        """The criterion of a campaign that names none: where bodies are on a lane, not the paper's."""
+        """The criterion of a campaign that names none; on a lane, not the paper's, which is of M."""
         return "unsafe" if self.lane_m is not None else self.default_criterion
 
     @property
