@@ -453,6 +453,11 @@ US23: Final = MergeScenario()
 """The paper's."""
 
 
+def lane_of(scenario: Scenario) -> Bounds | None:
+    """Return where the acceleration lane of a scenario begins and ends; None without one."""
+    return scenario.lane_m if isinstance(scenario, MergeScenario) else None
+
+
 def as_merge(scenario: Scenario) -> MergeScenario:
     """Return a scenario that is a merge; `UserError` for another kind."""
     if not isinstance(scenario, MergeScenario):

@@ -17,14 +17,15 @@ from types import FrameType, TracebackType
 from typing import Any, Final, NamedTuple, Self, TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
 from merge_sumo.drivers.following import car_met
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT
+from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT, Bounds, lane_of
 from merge_sumo.values.signals import Left, as_signals
 from merge_sumo.values.trajectory import as_reason
 from merge_sumo.vuts.blame_cell import NO_CORRIDOR, current_call
@@ -114,6 +115,9 @@ class Seen(NamedTuple):
     the VUT is there, if the car kept its speed and the VUT drove the scenario's level-0 profile
     (`drivers.following.car_met`). `others` has all cars.
 
+    On a road with an acceleration lane the lane begins at `lane_begin_m` and ends at `lane_end_m`;
+    M is where a merge is expected. Elsewhere both are 0, and the VUT merges at M.
+
     Attributes:
         t_s: time since the episode began.
         x_pov_m: distance of the POV's front bumper to M along its lane, negative before M.
@@ -139,6 +143,29 @@ class Seen(NamedTuple):
         cars = (car for row, car in enumerate(self.vehicles) if row != VUT)
         return tuple(sorted(cars, reverse=True))
 
+    @property
+    def lane_begin_m(self) -> float:
+        """Where the acceleration lane begins; 0 where there is none."""
+        return 0.0
+
+    @property
+    def lane_end_m(self) -> float:
+        """Where it ends; 0 where there is none."""
+        return 0.0
+
+    @property
+    def merged(self) -> bool:
+        """Whether the VUT is on the mainline; without an acceleration lane it is from M on."""
+        return self.x_vut_m >= 0.0
+
+    @property
+    def may_merge(self) -> bool:
+        """Whether a wish to merge, now, puts the VUT on the mainline in the next step.
+
+        False after the merge, and where there is no acceleration lane.
+        """
+        return False
+
 
 class SeenInTraffic(Seen):
     """What a VUT sees where more than one car drives on the mainline."""
@@ -151,13 +178,54 @@ class SeenInTraffic(Seen):
         return self._vehicles
 
 
-def seen_in(t_s: float, met: int, x_m: Sequence[float], v_mps: Sequence[float]) -> Seen:
-    """Return what a VUT sees of vehicles by their rows; `met` is the row that counts as POV."""
+class SeenOnLane(SeenInTraffic):
+    """What a VUT sees on a road with an acceleration lane."""
+
+    _lane_m: Bounds = (0.0, 0.0)
+    _merged: bool = False
+
+    @property
+    def lane_begin_m(self) -> float:
+        """Where the acceleration lane begins."""
+        return self._lane_m[0]
+
+    @property
+    def lane_end_m(self) -> float:
+        """Where it ends."""
+        return self._lane_m[1]
+
+    @property
+    def merged(self) -> bool:
+        """Whether the VUT is on the mainline."""
+        return self._merged
+
+    @property
+    def may_merge(self) -> bool:
+        """Whether a wish to merge, now, puts the VUT on the mainline in the next step."""
+        return not self._merged and self.x_vut_m + self.v_vut_mps * DT_S >= self._lane_m[0]
+
+
+def seen_in(
+    t_s: float,
+    met: int,
+    x_m: Sequence[float],
+    v_mps: Sequence[float],
+    lane_m: Bounds | None = None,
+    *,
+    merged: bool = False,
+) -> Seen:
+    """Return what a VUT sees of vehicles by their rows.
+
+    `met` is the row that counts as POV, `lane_m` the acceleration lane, None without one, and
+    `merged` whether the VUT has left it.
+    """
     state = t_s, x_m[met], v_mps[met], x_m[VUT], v_mps[VUT]
-    if len(x_m) == 2:
+    if lane_m is None and len(x_m) == 2:
         return Seen(*state)
-    seen = SeenInTraffic(*state)
+    seen = SeenInTraffic(*state) if lane_m is None else SeenOnLane(*state)
     seen._vehicles = tuple(map(Car, x_m, v_mps))
+    if isinstance(seen, SeenOnLane) and lane_m is not None:
+        seen._lane_m, seen._merged = lane_m, merged
     return seen
 
 
@@ -168,7 +236,7 @@ def seen_at_start(case: Case) -> Seen:
     if len(x_m) > 2:
         x, v = np.array([x_m, v_mps])[..., None]
         met = int(car_met(x, v, case.scenario.level0_a_mps2, case.scenario.level0_v_mps)[0])
-    return seen_in(0.0, met, x_m, v_mps)
+    return seen_in(0.0, met, x_m, v_mps, lane_of(case.scenario))
 
 
 class DeadlineExceeded(BaseException):
@@ -294,6 +362,8 @@ class PerCorridor(Driver):
         self._reasons: list[str | None] = [None] * corridors
         self._renew_first = [False] * corridors
         self._signals: dict[int, Left] = {}
+        self._lanes_m: list[Bounds | None] = [None] * corridors
+        self._wishes: NDArray[np.int8] | None = None
 
     @abstractmethod
     def renew(self, corridor: int) -> None:
@@ -304,12 +374,16 @@ class PerCorridor(Driver):
         """Begin an episode for the controller of a corridor."""
 
     @abstractmethod
-    def answer(self, corridor: int, seen: Seen) -> float:
-        """Return the acceleration in one corridor, m/s2; raises what the controller raises."""
+    def answer(self, corridor: int, seen: Seen) -> Any:
+        """Return the acceleration in one corridor, m/s2, or it and whether to merge.
+
+        Raises what the controller raises.
+        """
 
     def begin(self, corridor: int, case: Case) -> None:
         """Reset the controller of a corridor; an error is kept as the reason of its answer."""
         self._reasons[corridor] = None
+        self._lanes_m[corridor] = lane_of(case.scenario)
         activity = self.renewal
         try:
             with self._deadline as deadline:
@@ -323,9 +397,11 @@ class PerCorridor(Driver):
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
-        self._signals = {}
+        self._signals, self._wishes = {}, None
         answers = [0.0] * self.corridors
+        wishes: dict[int, int] = {}
         met = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
+        merged = [False] * self.corridors if scene.merged is None else scene.merged.tolist()
         rows = (scene.active, scene.step, scene.x_m.T, scene.v_mps.T)
         states = zip(*(row.tolist() for row in rows), met, strict=True)
         with self._deadline as deadline:
@@ -336,12 +412,23 @@ class PerCorridor(Driver):
                     answers[k] = math.nan
                     continue
                 try:
-                    seen = seen_in(round(step * DT_S, 1), row, x_m, v_mps)
-                    answers[k] = deadline.call(k, self._number, k, seen)
+                    t_s, lane_m = round(step * DT_S, 1), self._lanes_m[k]
+                    seen = seen_in(t_s, row, x_m, v_mps, lane_m, merged=merged[k])
+                    answers[k], wish = deadline.call(k, self._checked, k, seen)
+                    if wish != NO_WISH:
+                        wishes[k] = wish
                 except BaseException as error:
                     self._fault(k, deadline.reason(error))
                     answers[k] = math.nan
+        if wishes:
+            self._wishes = np.array(
+                [wishes.get(k, NO_WISH) for k in range(self.corridors)], dtype=np.int8
+            )
         return np.array(answers)
+
+    def wishes(self) -> NDArray[np.int8] | None:
+        """Return what the last answers wish, (K,); None where none of them says."""
+        return self._wishes
 
     def reason(self, corridor: int) -> str | None:
         """Return what the controller of a corridor did wrong."""
@@ -355,8 +442,8 @@ class PerCorridor(Driver):
         """Return what the controllers left with their last answers, by corridor."""
         return self._signals
 
-    def _number(self, corridor: int, seen: Seen) -> float:
-        return as_number(self.answer(corridor, seen))
+    def _checked(self, corridor: int, seen: Seen) -> tuple[float, int]:
+        return as_answer(self.answer(corridor, seen))
 
     def renew_next(self, corridor: int) -> None:
         """Have the controller of a corridor made anew before the next episode."""
@@ -368,7 +455,18 @@ class PerCorridor(Driver):
 
 
 class WrongAnswerError(Exception):
-    """A VUT answered something that is no acceleration."""
+    """A VUT answered something that is no acceleration, or no wish."""
+
+
+def as_answer(answer: Any) -> tuple[float, int]:
+    """Return an answer as an acceleration and a wish, `NO_WISH` where it says nothing of one.
+
+    Raises `WrongAnswerError` for what is neither one real number nor (number, whether to merge).
+    """
+    if isinstance(answer, tuple | list) and len(answer) == 2:
+        acceleration, merge = answer
+        return as_number(acceleration), as_wish(merge)
+    return as_number(answer), NO_WISH
 
 
 def as_number(answer: Any) -> float:
@@ -379,5 +477,17 @@ def as_number(answer: Any) -> float:
         return float(answer)
     if isinstance(answer, np.ndarray) and answer.shape == () and answer.dtype.kind in "fiu":
         return float(answer)
-    text = text_of(answer, repr)[:60]
-    raise WrongAnswerError(f"answered {text} ({type(answer).__name__}) instead of a number")
+    raise WrongAnswerError(f"answered {_shown(answer)} instead of a number, or (number, merge)")
+
+
+def as_wish(merge: Any) -> int:
+    """Return `MERGE` or `STAY`; raises `WrongAnswerError` for what is not True, False, 1 or 0."""
+    value = merge.item() if isinstance(merge, np.ndarray) and merge.shape == () else merge
+    is_number = isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating))
+    if is_number and value in (0, 1):
+        return MERGE if value else STAY
+    raise WrongAnswerError(f"wishes {_shown(merge)} instead of True or False, to merge or not")
+
+
+def _shown(answer: Any) -> str:
+    return f"{text_of(answer, repr)[:60]} ({type(answer).__name__})"

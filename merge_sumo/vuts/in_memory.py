@@ -20,22 +20,25 @@ from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.vuts.base import Seen, Vut, VutOptions, text_of
 from merge_sumo.vuts.python import SeenBatch, is_code, vut_of
 
+Answer = SupportsFloat | tuple[SupportsFloat, bool]
+"""An acceleration, or it and whether to merge."""
+
 
 class Acts(Protocol):
     """A controller of one corridor."""
 
-    def act(self, seen: Seen, /) -> SupportsFloat:
-        """Return the acceleration for the next 0.1 s, in m/s2."""
+    def act(self, seen: Seen, /) -> Answer:
+        """Return the acceleration for the next 0.1 s, in m/s2, or it and whether to merge."""
 
 
 class ActsInBatches(Protocol):
     """A controller of all K corridors at once."""
 
     def act_batch(self, seen: SeenBatch, /) -> Any:
-        """Return the accelerations for the next 0.1 s, in m/s2, (K,)."""
+        """Return accelerations for 0.1 s, in m/s2, (K,), or these and whether to merge, (2, K)."""
 
 
-AnyVut = str | type[Any] | Callable[[Seen], SupportsFloat] | Acts | ActsInBatches
+AnyVut = str | type[Any] | Callable[[Seen], Answer] | Acts | ActsInBatches
 """A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
 HERE: Final = "here"
 """The part of their specs before the colon."""

@@ -18,11 +18,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, VUT
+from merge_sumo.values.scenario import DT_S, VUT, lane_of
 from merge_sumo.vuts.base import (
     Deadline,
     PerCorridor,
@@ -161,8 +161,9 @@ class PythonVut(PerCorridor):
 class BatchedVut(Driver):
     """Drives by one object that acts in all corridors at once.
 
-    It is made with the number of corridors K, has `act_batch(scene)`, which returns K
-    accelerations, and perhaps `reset(corridor, seen)` and `close()`.
+    It is made with the number of corridors K, has `act_batch(seen)`, which returns K
+    accelerations, (K,), or these and whether to merge, (2, K), and perhaps `reset(corridor, seen)`
+    and `close()`.
     """
 
     def __init__(self, corridors: int, make: Callable[[], Any], deadline_s: float) -> None:
@@ -172,14 +173,18 @@ class BatchedVut(Driver):
         self._object = make()
         self._renew_first = False
         self._raised: str | None = None
-        self._reset_raised: dict[int, str] = {}
+        self._wrong: dict[int, str] = {}
+        """What is wrong in a corridor alone: its reset raised something, or its wish is none."""
+        self._lanes_m = np.zeros((2, corridors))
+        self._wishes: NDArray[np.int8] | None = None
 
     def begin(self, corridor: int, case: Case) -> None:
         """Call `reset`, if there is one; an error is kept as the reason of the answer.
 
         After an act that failed all episodes begin, and the object is made anew for the first.
         """
-        self._reset_raised.pop(corridor, None)
+        self._wrong.pop(corridor, None)
+        self._lanes_m[:, corridor] = lane_of(case.scenario) or (0.0, 0.0)
         try:
             with self._deadline as deadline:
                 if self._renew_first:
@@ -189,23 +194,22 @@ class BatchedVut(Driver):
                 if reset is not None:
                     deadline.call(corridor, reset, corridor, seen_at_start(case))
         except BaseException as error:
-            self._reset_raised[corridor] = f"reset: {self._deadline.reason(error)}"
+            self._wrong[corridor] = f"reset: {self._deadline.reason(error)}"
 
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
 
         Raises `VutLostError` when it fails and several episodes run: the one at fault is unknown.
         """
-        self._raised = None
+        self._raised = self._wishes = None
+        seen, k = _batch(scene, self._lanes_m), self.corridors
         try:
             with self._deadline as deadline:
-                answer = np.asarray(
-                    deadline.call(ALL_CORRIDORS, self._object.act_batch, _batch(scene))
-                )
-            if answer.shape != (self.corridors,) or answer.dtype.kind not in "fiu":
+                answer = np.asarray(deadline.call(ALL_CORRIDORS, self._object.act_batch, seen))
+            if answer.shape not in ((k,), (2, k)) or answer.dtype.kind not in "fiu":
                 raise WrongAnswerError(
-                    f"answered shape {answer.shape} of {answer.dtype} instead of "
-                    f"{self.corridors} numbers"
+                    f"answered shape {answer.shape} of {answer.dtype} instead of {k} numbers, or "
+                    f"these and {k} wishes"
                 )
         except BaseException as error:
             self._raised = self._deadline.reason(error)
@@ -214,12 +218,27 @@ class BatchedVut(Driver):
                 raise VutLostError(self._raised, final=True) from None
             return np.full(self.corridors, np.nan)
         answer = answer.astype(np.float64)
-        answer[list(self._reset_raised)] = np.nan
+        if answer.ndim == 2:
+            answer, wishes = answer
+            self._take(wishes, scene.active)
+        answer[list(self._wrong)] = np.nan
         return answer
+
+    def _take(self, wishes: FloatArray, active: NDArray[np.bool_]) -> None:
+        """Take whether to merge, 1 or 0, (K,), where an episode runs."""
+        known = (wishes == MERGE) | (wishes == STAY)
+        self._wishes = np.where(active & known, wishes == MERGE, NO_WISH).astype(np.int8)
+        for corridor in np.flatnonzero(active & ~known).tolist():
+            wrong = f"wishes {wishes[corridor]} instead of 1 or 0, to merge or not"
+            self._wrong.setdefault(corridor, wrong)
+
+    def wishes(self) -> NDArray[np.int8] | None:
+        """Return what the last answers wish, (K,); None where they do not say."""
+        return self._wishes
 
     def reason(self, corridor: int) -> str | None:
         """Return what went wrong in a corridor."""
-        return self._reset_raised.get(corridor) or self._raised
+        return self._wrong.get(corridor) or self._raised
 
     def close(self) -> None:
         """Call `close`, if there is one."""
@@ -231,7 +250,8 @@ class SeenBatch:
     """What a batched VUT sees: like `Seen`, with arrays over the K corridors, (K,).
 
     In a corridor that is not `active` the numbers mean nothing. The arrays are copies. Of all cars
-    of the mainline, the one in front first, `x_others_m` and `v_others_mps` are (cars, K).
+    of the mainline, the one in front first, `x_others_m` and `v_others_mps` are (cars, K). Where
+    there is no acceleration lane `lane_begin_m` and `lane_end_m` are 0.
     """
 
     active: NDArray[np.bool_]
@@ -242,15 +262,37 @@ class SeenBatch:
     v_vut_mps: FloatArray
     x_others_m: FloatArray
     v_others_mps: FloatArray
+    lane_begin_m: FloatArray
+    lane_end_m: FloatArray
+    merged: NDArray[np.bool_]
+
+    @property
+    def may_merge(self) -> NDArray[np.bool_]:
+        """Whether a wish to merge, now, puts the VUT on the mainline in the next step, (K,)."""
+        has_lane = self.lane_begin_m < self.lane_end_m
+        next_m = self.x_vut_m + self.v_vut_mps * DT_S
+        may: NDArray[np.bool_] = has_lane & ~self.merged & (next_m >= self.lane_begin_m)
+        return may
 
 
-def _batch(scene: Scene) -> SeenBatch:
-    columns = (scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps)
-    t_s = np.round(scene.step * DT_S, 1)
+def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
+    """Return what a VUT sees of a scene; the lanes, (2, K), begin and end there."""
     x_m, v_mps = np.delete(scene.x_m, VUT, axis=0), np.delete(scene.v_mps, VUT, axis=0)
     order = np.argsort(-x_m, axis=0, kind="stable")
-    others = (np.take_along_axis(values, order, axis=0) for values in (x_m, v_mps))
-    return SeenBatch(scene.active.copy(), t_s, *(column.copy() for column in columns), *others)
+    begin_m, end_m = lanes_m.copy()
+    return SeenBatch(
+        active=scene.active.copy(),
+        t_s=np.round(scene.step * DT_S, 1),
+        x_pov_m=scene.x_pov_m.copy(),
+        v_pov_mps=scene.v_pov_mps.copy(),
+        x_vut_m=scene.x_vut_m.copy(),
+        v_vut_mps=scene.v_vut_mps.copy(),
+        x_others_m=np.take_along_axis(x_m, order, axis=0),
+        v_others_mps=np.take_along_axis(v_mps, order, axis=0),
+        lane_begin_m=begin_m,
+        lane_end_m=end_m,
+        merged=scene.x_vut_m >= 0.0 if scene.merged is None else scene.merged.copy(),
+    )
 
 
 def _made(target: type, spec: str, *arguments: int) -> Any:

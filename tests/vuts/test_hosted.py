@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS
-from merge_sumo.values.scenario import US23
+from merge_sumo.values.case import MergeCase
+from merge_sumo.values.scenario import US23, lane_of
 from merge_sumo.values.trajectory import as_reason
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.host import wire
@@ -288,10 +290,37 @@ class TestTheWire:
 
     def test_answers_are_unpacked_as_they_were_packed(self):
         packed = wire.pack_answers(np.array([1.0, np.nan]), {1: "\ud800 no"})
-        answers, reasons, _ = wire.unpack_answers(packed, 2)
+        answers, reasons, _, wishes = wire.unpack_answers(packed, 2)
         assert answers.tolist()[0] == 1.0
         assert np.isnan(answers[1])
         assert reasons == {1: "\ud800 no"}
+        assert wishes is None
+        packed = wire.pack_answers(np.zeros(3), {}, wishes=np.array([-1, 0, 1], dtype=np.int8))
+        assert wire.unpack_answers(packed, 3).wishes.tolist() == [-1, 0, 1]
+
+    @pytest.mark.parametrize(
+        "wishes",
+        ["1", "[]", "[1]", "[1, 2]", "[1, true]", "[1, 1.0]", '[0, "yes"]', "{}", "[0, NaN]"],
+    )
+    def test_wishes_that_are_none_are_a_wire_error(self, wishes):
+        said = f'{{"reasons": {{}}, "signals": {{}}, "wishes": {wishes}}}'
+        with pytest.raises(WireError):
+            wire.unpack_answers(bytes(16) + said.encode(), 2)
+
+    def test_the_lane_and_who_has_merged_travel_and_the_rest_of_the_case_does_not(self):
+        lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
+        cases = [
+            MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=scenario)
+            for scenario in (US23, lane)
+        ]
+        merged = np.array([False, True])
+        sent = scene(2)._replace(merged=merged)
+        begun, told = wire.unpack_scene(wire.pack_scene(list(enumerate(cases)), sent))
+        assert told.merged.tolist() == [False, True]
+        assert told.facing is None
+        assert [lane_of(case.scenario) for _, case in begun] == [None, (-70.0, 130.0)]
+        assert begun[1][1].scenario.lane_end == "merge"
+        assert wire.unpack_scene(wire.pack_scene([], scene(2)))[1].merged is None
 
 
 def test_a_flood_of_frames_of_others_does_not_hold_the_deadline_up(spec):

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
@@ -304,6 +305,7 @@ class HostedVut(Driver):
         self._begun: list[tuple[int, Case]] = []
         self._reasons: dict[int, str] = {}
         self._signals: dict[int, Left] = {}
+        self._wishes: NDArray[np.int8] | None = None
         self._files: set[Path] = set()
         self._host = _first(self._started)
 
@@ -335,6 +337,7 @@ class HostedVut(Driver):
                 raise VutLostError(str(wire.from_json(answer.content, str)), final=True)
             answers = wire.unpack_answers(answer.content, self.corridors)
             self._reasons, self._signals = answers.reasons, answers.signals
+            self._wishes = answers.wishes
         except HostDiedError as died:
             own = died.corridor if (died.corridor or 0) < self.corridors else None
             how = {"final": died.hung, "killed": died.killed}
@@ -347,6 +350,10 @@ class HostedVut(Driver):
     def signals(self) -> Mapping[int, Left]:
         """Return what the VUT left with its last answers."""
         return self._signals
+
+    def wishes(self) -> NDArray[np.int8] | None:
+        """Return what the VUT's last answers wish, (K,); None where none of them says."""
+        return self._wishes
 
     def reason(self, corridor: int) -> str | None:
         """Return what the VUT did wrong in a corridor."""

@@ -134,7 +134,7 @@ class _Hosting:
         answers = driver.act(scene)
         wrong = np.flatnonzero(~np.isfinite(answers) & scene.active).tolist()
         reasons = {k: reason for k in wrong if (reason := driver.reason(k)) is not None}
-        return wire.pack_answers(answers, reasons, driver.signals())
+        return wire.pack_answers(answers, reasons, driver.signals(), driver.wishes())
 
 
 def _hear_signals() -> None:

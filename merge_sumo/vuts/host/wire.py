@@ -7,6 +7,7 @@ answer with the same number.
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,10 +16,11 @@ from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import NO_SIGNALS, Scene
+from merge_sumo.drivers.base import MERGE, NO_SIGNALS, NO_WISH, STAY, Scene
 from merge_sumo.values.case import Case, FloatArray, ToldCase
-from merge_sumo.values.scenario import RANGES, US23, Scenario
+from merge_sumo.values.scenario import RANGES, US23, Bounds, Scenario, lane_of
 from merge_sumo.values.signals import Left, as_signals
 
 
@@ -89,11 +91,13 @@ def from_json(content: bytes, kind: type[Any]) -> Any:
 
 
 _TOLD: Final = ("x_vut0_m", "level0_a_mps2", "level0_v_mps", "a_min_mps2", "a_max_mps2")
-"""What a VUT is told of its scenario."""
-_BEGIN: Final = struct.Struct(f"<I{len(_TOLD)}d")
+"""What a VUT is told of its scenario, besides the acceleration lane."""
+_NO_LANE: Final = (math.nan, math.nan)
+_BEGIN: Final = struct.Struct(f"<I{len(_TOLD) + len(_NO_LANE)}d")
 """Corridor, and what is told; position and speed of each vehicle follow."""
-_HEAD: Final = struct.Struct("<IIII")
-"""Episodes that begin, corridors, vehicles, and whether the cars that are met are told."""
+_HEAD: Final = struct.Struct("<IIIII")
+"""Episodes that begin, corridors, vehicles, whether the cars that are met are told, and whether
+VUTs have merged."""
 
 
 def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
@@ -102,61 +106,74 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
     Of a case only what its VUT may know travels.
     """
     vehicles, corridors = scene.x_m.shape
-    parts = [_HEAD.pack(len(begun), corridors, vehicles, scene.facing is not None)]
+    optional = (scene.facing, scene.merged)
+    tells = (array is not None for array in optional)
+    parts = [_HEAD.pack(len(begun), corridors, vehicles, *tells)]
     for corridor, case in begun:
         told = (getattr(case.scenario, name) for name in _TOLD)
-        parts.append(_BEGIN.pack(corridor, *told))
+        parts.append(_BEGIN.pack(corridor, *told, *(lane_of(case.scenario) or _NO_LANE)))
         parts.append(np.array(case.starts(), dtype=np.float64).tobytes())
-    arrays = [scene.active, scene.step, scene.x_m, scene.v_mps]
-    if scene.facing is not None:
-        arrays.append(scene.facing)
-    parts += [np.ascontiguousarray(array).tobytes() for array in arrays]
+    arrays = (scene.active, scene.step, scene.x_m, scene.v_mps, *optional)
+    parts += [np.ascontiguousarray(array).tobytes() for array in arrays if array is not None]
     return b"".join(parts)
 
 
 @lru_cache(maxsize=8)
-def _any_scenario(*told: float) -> Scenario:
+def _any_scenario(lane_m: Bounds | None, *told: float) -> Scenario:
     """Return a scenario with what a VUT is told of its own; of the rest it is told nothing."""
     known: dict[str, Any] = dict(zip(_TOLD, told, strict=True))
-    return replace(US23, **known, reach_m=RANGES["reach_m"][1])
+    return replace(US23, **known, reach_m=RANGES["reach_m"][1], lane_m=lane_m)
 
 
 def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     """Return what `pack_scene` packed; level and orientation of the cases are not in it."""
-    count, k, vehicles, tells_met = _HEAD.unpack_from(content)
+    count, k, vehicles, tells_met, tells_merged = _HEAD.unpack_from(content)
     at = _HEAD.size
     begun: list[tuple[int, Case]] = []
     for _ in range(count):
-        corridor, *told = _BEGIN.unpack_from(content, at)
+        corridor, *told, begin_m, end_m = _BEGIN.unpack_from(content, at)
         at += _BEGIN.size
         starts = np.frombuffer(content, np.float64, 2 * vehicles, at).reshape(vehicles, 2)
         at += starts.nbytes
         rows = tuple((x_m, v_mps) for x_m, v_mps in starts.tolist())
-        begun.append((corridor, ToldCase(level=0, scenario=_any_scenario(*told), told=rows)))
+        lane_m = None if math.isnan(begin_m) else (begin_m, end_m)
+        scenario = _any_scenario(lane_m, *told)
+        begun.append((corridor, ToldCase(level=0, scenario=scenario, told=rows)))
     active = np.frombuffer(content, np.bool_, k, at)
     step = np.frombuffer(content, np.int64, k, at + k)
     at += 9 * k
     x_m, v_mps = np.frombuffer(content, np.float64, 2 * vehicles * k, at).reshape(2, vehicles, k)
     at += x_m.nbytes + v_mps.nbytes
     met = np.frombuffer(content, np.int64, k, at) if tells_met else None
-    return begun, Scene(active, step, x_m, v_mps, met)
+    at += 8 * k if tells_met else 0
+    merged = np.frombuffer(content, np.bool_, k, at) if tells_merged else None
+    return begun, Scene(active, step, x_m, v_mps, met, merged)
 
 
 class Answers(NamedTuple):
-    """Accelerations, (K,), and by corridor why one is not finite, and what was left with it."""
+    """Accelerations, (K,), and by corridor why one is not finite, and what was left with it.
+
+    `wishes` is (K,), None where no answer has one.
+    """
 
     a_mps2: FloatArray
     reasons: dict[int, str]
     signals: dict[int, Left]
+    wishes: NDArray[np.int8] | None = None
 
 
 def pack_answers(
-    answers: FloatArray, reasons: Mapping[int, str], signals: Mapping[int, Left] = NO_SIGNALS
+    answers: FloatArray,
+    reasons: Mapping[int, str],
+    signals: Mapping[int, Left] = NO_SIGNALS,
+    wishes: NDArray[np.int8] | None = None,
 ) -> bytes:
-    """Return accelerations, (K,), the reasons of those that are not finite, and signals."""
-    more = {"reasons": reasons, "signals": signals}
+    """Return accelerations, (K,), the reasons of those that are not finite, signals and wishes."""
+    more: dict[str, Any] = {"reasons": reasons, "signals": signals}
+    if wishes is not None:
+        more["wishes"] = wishes.tolist()
     return np.ascontiguousarray(answers, dtype=np.float64).tobytes() + (
-        to_json(more) if reasons or signals else b""
+        to_json(more) if any(more.values()) else b""
     )
 
 
@@ -174,4 +191,17 @@ def unpack_answers(content: bytes, k: int) -> Answers:
     reasons = {int(corridor): str(reason) for corridor, reason in said["reasons"].items()}
     # Who wrote this runs a stranger's code: what it left is checked here, too.
     left = {int(corridor): as_signals(values) for corridor, values in said["signals"].items()}
-    return Answers(answers, reasons, {c: values for c, values in left.items() if 0 <= c < k})
+    signals = {c: values for c, values in left.items() if 0 <= c < k}
+    return Answers(answers, reasons, signals, _wishes(said.get("wishes"), k))
+
+
+def _wishes(said: Any, k: int) -> NDArray[np.int8] | None:
+    """Return the wishes that JSON says; `WireError` for what are none of `k` corridors."""
+    if said is None:
+        return None
+    known = (NO_WISH, STAY, MERGE)
+    if not isinstance(said, list) or len(said) != k:
+        raise WireError("it has another number of wishes")
+    if not all(type(wish) is int and wish in known for wish in said):
+        raise WireError("a wish is none")
+    return np.array(said, dtype=np.int8)

@@ -1,0 +1,249 @@
+"""What VUTs see of an acceleration lane, and how they say when to merge."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import some
+from vut_contract import factory, in_process
+
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene, VutLostError
+from merge_sumo.values.case import MergeCase
+from merge_sumo.values.scenario import US23
+from merge_sumo.vuts.base import Seen, VutOptions, seen_at_start, seen_in
+from merge_sumo.vuts.host.hosted import HostedVut
+from merge_sumo.vuts.in_memory import vut_of_object
+from merge_sumo.vuts.registry import FINDER
+
+LANE = replace(US23, lane_m=(-70.0, 130.0), follow_up_s=5.0)
+CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=LANE)
+POINT = replace(CASE, scenario=US23)
+
+
+def scene(x_vut_m, merged=None, v_vut_mps=20.0) -> Scene:
+    """Return a scene of VUTs on their way, each with a POV 30 m behind it."""
+    x_m = np.asarray(x_vut_m, dtype=np.float64)
+    count = len(x_m)
+    active, step = np.ones(count, dtype=bool), np.full(count, 7)
+    state = x_m - 30.0, np.full(count, 30.0), x_m, np.full(count, v_vut_mps)
+    known = None if merged is None else np.array(merged)
+    return Scene.of_pair(active, step, *state)._replace(merged=known)
+
+
+def begun(vut, corridors, case=CASE, **options):
+    """Return a driver with an episode in each corridor."""
+    driver = factory(vut, **options)(corridors) if isinstance(vut, str) else vut
+    for corridor in range(corridors):
+        driver.begin(corridor, case)
+    return driver
+
+
+@pytest.fixture
+def spec(tmp_path):
+    """Return a function that writes a source and returns its spec."""
+
+    def write(source: str) -> str:
+        (tmp_path / "my_vut.py").write_text(source, encoding="utf-8")
+        return f"{tmp_path / 'my_vut.py'}:Vut"
+
+    return write
+
+
+def test_it_sees_the_lane_and_whether_a_wish_would_be_granted():
+    seen = [
+        seen_in(0.0, 0, [x - 30.0, x], [30.0, 20.0], (-70.0, 130.0), merged=merged)
+        for x, merged in ((-72.01, False), (-72.0, False), (100.0, False), (-60.0, True))
+    ]
+    assert [s.may_merge for s in seen] == [False, True, True, False]
+    assert [s.merged for s in seen] == [False, False, False, True]
+    assert {(s.lane_begin_m, s.lane_end_m) for s in seen} == {(-70.0, 130.0)}
+    assert all(isinstance(s, Seen) for s in seen)
+    assert seen[0][1:] == (-102.01, 30.0, -72.01, 20.0)
+    assert [car.x_m for car in seen[0].others] == [-102.01]
+    start = seen_at_start(CASE)
+    assert (start.lane_begin_m, start.may_merge, start.merged) == (-70.0, False, False)
+
+
+def test_without_a_lane_it_sees_none_and_has_merged_from_m_on():
+    before, past = (seen_in(0.0, 0, [0.0, x], [30.0, 20.0]) for x in (-1e-9, 0.0))
+    assert type(before) is Seen
+    assert (before.lane_begin_m, before.lane_end_m, before.may_merge) == (0.0, 0.0, False)
+    assert (before.merged, past.merged, past.may_merge) == (False, True, False)
+    traffic = seen_in(0.0, 0, [0.0, -5.0, 9.0, -9.0], [30.0] * 4)
+    assert (traffic.may_merge, traffic.merged, len(traffic.others)) == (False, False, 3)
+
+
+OF_EACH = """
+class Vut:
+    def reset(self, seen):
+        self.lane = seen.lane_begin_m, seen.lane_end_m
+    def act(self, seen):
+        assert self.lane == (seen.lane_begin_m, seen.lane_end_m), self.lane
+        if seen.merged:
+            return 0.5
+        return (1.0, seen.may_merge) if seen.x_vut_m > -100.0 else 1
+"""
+OF_ALL = """
+import numpy as np
+class Vut:
+    def __init__(self, corridors):
+        pass
+    def reset(self, corridor, seen):
+        assert (seen.lane_begin_m, seen.lane_end_m) == (-70.0, 130.0)
+    def act_batch(self, seen):
+        assert seen.lane_begin_m[0] == -70.0 and seen.lane_end_m[0] == 130.0
+        return np.where(seen.merged, 0.5, 1.0), seen.may_merge
+"""
+
+
+@pytest.mark.parametrize("process", ["this", "own"])
+def test_a_controller_answers_an_acceleration_or_it_and_a_wish(spec, process):
+    driver = begun(spec(OF_EACH), 4, in_process=process == "this")
+    try:
+        answer = driver.act(scene([-150.0, -90.0, -71.0, -50.0], [False, False, False, True]))
+        assert answer.tolist() == [1.0, 1.0, 1.0, 0.5]
+        assert driver.wishes().tolist() == [NO_WISH, STAY, MERGE, NO_WISH]
+        assert driver.wishes().dtype == np.int8
+        driver.act(scene([-150.0] * 4, [False] * 4))
+        assert driver.wishes() is None
+    finally:
+        driver.close()
+
+
+@pytest.mark.parametrize("process", ["this", "own"])
+def test_a_batched_controller_answers_one_row_or_two(spec, process):
+    driver = begun(spec(OF_ALL), 3, in_process=process == "this")
+    try:
+        idle = scene([-90.0, -71.0, -50.0], [False, False, True])
+        idle = idle._replace(active=np.array([True, True, False]))
+        assert driver.act(idle).tolist() == [1.0, 1.0, 0.5]
+        assert driver.wishes().tolist() == [STAY, MERGE, NO_WISH]
+    finally:
+        driver.close()
+    one_row = begun(in_process(spec(OF_ALL.replace(", seen.may_merge", "")))(3), 3)
+    assert one_row.act(scene([-90.0, -71.0, -50.0], [False] * 3)).tolist() == [1.0] * 3
+    assert one_row.wishes() is None
+
+
+def test_an_object_of_a_notebook_answers_wishes():
+    def wants(seen):
+        return 1.0, seen.may_merge
+
+    vut = vut_of_object(wants, "wants", VutOptions())
+    driver = begun(vut.make(2, None), 2)
+    assert driver.act(scene([-90.0, -71.0], [False, False])).tolist() == [1.0, 1.0]
+    assert driver.wishes().tolist() == [STAY, MERGE]
+
+
+WISHES = {
+    "True": MERGE,
+    "False": STAY,
+    "1": MERGE,
+    "0.0": STAY,
+    "np.bool_(True)": MERGE,
+    "np.array(1)": MERGE,
+}
+WRONG = {
+    "(1.0, float('nan'))": "wishes nan (float) instead of True or False",
+    "(1.0, 'yes')": "wishes 'yes' (str) instead of True or False",
+    "(1.0, None)": "wishes None (NoneType) instead of True or False",
+    "(1.0, -1)": "wishes -1 (int) instead of True or False",
+    "(1.0, 0.5)": "wishes 0.5 (float) instead of True or False",
+    "(1.0, np.array([1, 0]))": "wishes array([1, 0]) (ndarray) instead of True or False",
+    "(True, True)": "answered True (bool) instead of a number, or (number, merge)",
+    "('1', True)": "answered '1' (str) instead of a number",
+    "(1.0, True, 2)": "answered (1.0, True, 2) (tuple) instead of a number, or (number, merge)",
+    "()": "answered () (tuple) instead of a number",
+    "np.array([1.0, 1.0])": "answered array([1., 1.]) (ndarray) instead of a number",
+    "Pair((1.0, True))": "ZeroDivisionError: division by zero",
+}
+ANSWERS = """
+import numpy as np
+class Pair(tuple):
+    def __iter__(self):
+        1 / 0
+def Vut(seen):
+    return {} if seen.x_vut_m > -80.0 else 1.0
+"""
+
+
+@pytest.mark.parametrize("wish", WISHES)
+def test_a_wish_is_true_or_false(spec, wish):
+    driver = begun(in_process(spec(ANSWERS.format(f"(1, {wish})")))(1), 1)
+    assert driver.act(scene([-71.0], [False])).tolist() == [1.0]
+    assert driver.wishes().tolist() == [WISHES[wish]]
+
+
+@pytest.mark.parametrize("answer", WRONG)
+@pytest.mark.parametrize("process", some(["this", "own"], "this"))
+def test_another_answer_is_an_error_of_its_own_corridor(spec, answer, process):
+    driver = begun(spec(ANSWERS.format(answer)), 2, in_process=process == "this")
+    try:
+        assert np.isnan(driver.act(scene([-71.0, -90.0], [False] * 2))).tolist() == [True, False]
+        assert WRONG[answer] in driver.reason(0)
+        assert driver.reason(1) is None
+    finally:
+        driver.close()
+
+
+@pytest.mark.parametrize("process", some(["this", "own"], "own"))
+def test_an_acceleration_that_is_none_is_one_whatever_is_wished(spec, process):
+    source = "def Vut(seen):\n    return float('nan'), True\n"
+    driver = begun(spec(source), 1, in_process=process == "this")
+    try:
+        assert np.isnan(driver.act(scene([-71.0], [False])))[0]
+        assert driver.wishes().tolist() == [MERGE]
+    finally:
+        driver.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ("np.zeros((3, 2))", "shape (3, 2) of float64 instead of 2 numbers, or these and 2 wishes"),
+        ("np.zeros((2, 3))", "shape (2, 3)"),
+        ("np.zeros((1, 2))", "shape (1, 2)"),
+        ("([1.0, 1.0], [True])", "ValueError"),
+        ("([1.0, 1.0], ['yes', 'no'])", "of <U"),
+        ("np.ones(2, dtype=bool)", "of bool"),
+        ("(np.zeros(2), None)", "ValueError"),
+    ],
+)
+def test_a_batch_of_another_shape_is_an_error_of_all(spec, answer, said):
+    source = OF_ALL.replace("np.where(seen.merged, 0.5, 1.0), seen.may_merge", answer)
+    driver = begun(in_process(spec(source))(2), 2)
+    with pytest.raises(VutLostError, match=r".*") as lost:
+        driver.act(scene([-71.0, -90.0], [False, False]))
+    assert said in lost.value.reason
+
+
+def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(spec):
+    wishes = "np.where(seen.x_vut_m > -80.0, np.nan, 0.0)"
+    driver = begun(in_process(spec(OF_ALL.replace("seen.may_merge", wishes)))(3), 3)
+    idle = scene([-71.0, -90.0, -71.0], [False] * 3)
+    idle = idle._replace(active=np.array([True, True, False]))
+    assert np.isnan(driver.act(idle)).tolist() == [True, False, False]
+    assert driver.reason(0) == "wishes nan instead of 1 or 0, to merge or not"
+    assert driver.wishes().tolist() == [NO_WISH, STAY, NO_WISH]
+
+
+def test_a_process_that_forges_wishes_loses_its_episodes_and_no_more(spec):
+    source = """
+import json, os
+import merge_sumo.vuts.host.wire as wire
+wire.pack_answers = lambda answers, *more: answers.tobytes() + json.dumps(
+    {"reasons": {}, "signals": {}, "wishes": [7] * len(answers)}).encode()
+def Vut(seen):
+    return 1.0, True
+"""
+    driver = HostedVut(2, FINDER, spec(source), VutOptions(deadline_s=1.0))
+    try:
+        begun(driver, 2)
+        with pytest.raises(VutLostError, match="broke the channel to its process"):
+            driver.act(scene([-71.0, -71.0], [False, False]))
+    finally:
+        driver.close()
