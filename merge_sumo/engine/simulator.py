@@ -17,7 +17,7 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.system.resources import resource
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import Scenario
+from merge_sumo.values.scenario import MergeScenario, Scenario
 from merge_sumo.values.trajectory import Trajectory
 
 
@@ -102,6 +102,7 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
     if net is None and scenario.net is not None:
         # Where a path says nothing of folders, the net is one that the package brings.
         net = resource("sumo_net") / scenario.net
-    road = road_of(net, scenario.pov_edges, scenario.vut_edges, scenario.room_after_m)
+    lane_m = scenario.lane_m if isinstance(scenario, MergeScenario) else None
+    road = road_of(net, scenario.pov_edges, scenario.vut_edges, scenario.room_after_m, lane_m)
     road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)
     return road

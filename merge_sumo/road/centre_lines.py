@@ -10,12 +10,12 @@ from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray
 
-_found: Final[dict[tuple[str, tuple[str, ...], tuple[str, ...]], CentreLines]] = {}
+_found: Final[dict[tuple[object, ...], CentreLines]] = {}
 
 
 def centre_lines(road: Corridor) -> CentreLines:
     """Return the centre lines of both paths of a road; they are found once in a process."""
-    key = road.sha256, road.mainline_edges, road.ramp_edges
+    key = road.sha256, road.mainline_edges, road.ramp_edges, road.lane_m
     if key not in _found:
         _found[key] = CentreLines.of(_line(road.mainline), _line(road.ramp))
     return _found[key]

@@ -4,7 +4,9 @@ Where both vehicles drive on one lane all the way, the paths are equal.
 
 Each path has its own coordinate: the distance of the front bumper along its lanes from the merge
 point M, in metres, negative before M. The lanes inside of junctions belong to the paths, so the
-coordinate is continuous, and M is where the first lane begins that both paths have.
+coordinate is continuous, and M is where the first lane begins that both paths have. On a ramp with
+an acceleration lane M is where a merge is expected along it: both lanes have one coordinate there,
+and the paths become one where the acceleration lane ends.
 """
 
 from __future__ import annotations

@@ -12,13 +12,13 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.system.resources import resource
-from merge_sumo.values.scenario import ROOM_AFTER_M
+from merge_sumo.values.scenario import ROOM_AFTER_M, Bounds
 
 MAINLINE_EDGES: Final = ("main_in", "main_out")
 RAMP_EDGES: Final = ("ramp", "main_out")
 """Of the shipped net."""
 
-_found: dict[tuple[Path, str, tuple[str, ...], tuple[str, ...], float], Corridor] = {}
+_found: dict[tuple[object, ...], Corridor] = {}
 
 
 def default_net_path() -> Path:
@@ -31,18 +31,20 @@ def road_of(
     mainline: Sequence[str] = MAINLINE_EDGES,
     ramp: Sequence[str] = RAMP_EDGES,
     room_after_m: float = ROOM_AFTER_M,
+    lane_m: Bounds | None = None,
 ) -> Corridor:
     """Return the merge of two sequences of edges in a net file, by default the shipped one.
 
-    Where the file ends nearer than `room_after_m` behind M, the road goes straight on. What is
-    searched once is kept until the file changes. Raises `UserError` when the file is no
-    plain file, is no SUMO net, or has no such merge.
+    Where the file ends nearer than `room_after_m` behind M, the road goes straight on; `lane_m` is
+    the acceleration lane of a scenario. What is searched once is kept until the file changes.
+    Raises `UserError` when the file is no plain file, is no SUMO net, or has no such merge.
     """
     path = net or default_net_path()
     content = received.read_bytes(path, "the net", follow_links=True, limit=received.MAX_NET_BYTES)
-    key = (path, hashlib.sha256(content).hexdigest(), tuple(mainline), tuple(ramp), room_after_m)
+    edges = tuple(mainline), tuple(ramp)
+    key = (path, hashlib.sha256(content).hexdigest(), *edges, room_after_m, lane_m)
     if key not in _found:
         received.check_text(content, f"the net {path}")
         net_file = NetFile(path, content)
-        _found[key] = find_corridor(net_file, mainline, ramp, room_after_m=room_after_m)
+        _found[key] = find_corridor(net_file, *edges, room_after_m=room_after_m, lane_m=lane_m)
     return _found[key]

@@ -43,6 +43,11 @@ class Lane:
     open_to_cars: bool
 
     @property
+    def is_internal(self) -> bool:
+        """Whether the lane lies inside of a junction."""
+        return self.id.startswith(":")
+
+    @property
     def drawn_m(self) -> float:
         """Length of the shape."""
         return sum(math.dist(a, b) for a, b in pairwise(self.shape))

@@ -3,6 +3,8 @@
 A copy of a corridor has an edge for every lane of its paths: as long as that lane, with its speed
 limit and its shape, and at M with the rules and the right of way of the junction. Lanes beside the
 paths, other roads at junctions, and traffic lights are left out: nothing there could interfere.
+An acceleration lane and the mainline beside it are two lanes of one edge, whatever their number of
+edges in the file; the acceleration lane leads nowhere, so a driver has to change, and may anywhere.
 Copies lie on top of each other in the plane; SUMO's drivers see along lanes and links only.
 """
 
@@ -10,18 +12,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, groupby, pairwise
 from typing import Final, NamedTuple
 
 from lxml import etree
 
-from merge_sumo.road.corridor import Approach, Corridor, Piece
+from merge_sumo.road.corridor import Approach, Corridor, LanePath, Piece
 from merge_sumo.road.netfile import Point
+from merge_sumo.values.scenario import Bounds
 
 COPY: Final = "@"
 """Stands in an id for the number of the copy."""
 AT_M: Final = f"M{COPY}"
+"""Where the paths become one, which is the end of the acceleration lane on a road with one."""
+GORE: Final = f"gore{COPY}"
 END: Final = f"end{COPY}"
+LANE: Final = f"lane{COPY}"
+"""The edge of an acceleration lane and of the mainline beside it."""
 KEPT_TYPES: Final = (
     *("priority", "priority_stop", "allway_stop", "zipper", "unregulated"),
     *("right_before_left", "left_before_right"),
@@ -33,24 +40,25 @@ STATES: Final = "MmZ=sw"
 
 @dataclass(frozen=True, slots=True)
 class HostedPath:
-    """The edges of a path in the hosted net, one for each lane, and where they begin."""
+    """The lanes of a path in the hosted net, each of another edge, and where they begin."""
 
-    edges: tuple[str, ...]
+    lane_ids: tuple[str, ...]
     starts_m: tuple[float, ...]
 
     def lanes(self, copy: int) -> list[str]:
         """Return the ids of the lanes in a copy."""
-        return [_numbered(f"{edge}_0", copy) for edge in self.edges]
+        return [_numbered(lane, copy) for lane in self.lane_ids]
 
     def route(self, copy: int) -> list[str]:
         """Return the ids of the edges of a route in a copy."""
-        return [_numbered(edge, copy) for edge in self.edges if not edge.startswith(":")]
+        edges = (lane.rpartition("_")[0] for lane in self.lane_ids)
+        return [_numbered(edge, copy) for edge in edges if not edge.startswith(":")]
 
 
 def hosted_paths(road: Corridor) -> tuple[HostedPath, HostedPath]:
     """Return the paths of mainline and ramp."""
     main, ramp = (
-        HostedPath(tuple(at.edge for at in lanes), tuple(at.piece.start_m for at in lanes))
+        HostedPath(tuple(at.lane for at in lanes), tuple(at.piece.start_m for at in lanes))
         for lanes in _hosted_lanes(road)
     )
     return main, ramp
@@ -80,10 +88,14 @@ class _HostedLane(NamedTuple):
     junction: str
     """Behind the lane, or around it when it is internal."""
     piece: Piece
+    number: int = 0
+    """Among the lanes of its edge, from the right."""
+    leads_on: bool = True
+    """Whether a connection leads from it to the next lane of its path."""
 
     @property
     def lane(self) -> str:
-        return f"{self.edge}_0"
+        return f"{self.edge}_{self.number}"
 
 
 class _Hop(NamedTuple):
@@ -95,22 +107,30 @@ class _Hop(NamedTuple):
 
 
 def _hosted_lanes(road: Corridor) -> tuple[list[_HostedLane], list[_HostedLane]]:
-    """Return the lanes of mainline and ramp; those behind M are the same, or all of them."""
+    """Return the lanes of mainline and ramp; where the paths are one they are the same."""
     ramp_name = "main" if road.is_one_path else "ramp"
+    begin_m, end_m = road.lane_m or (0.0, 0.0)
+    first = GORE if road.lane_m else AT_M
     main, ramp = (
         [
-            *_named(name, [piece for piece in path.pieces if piece.start_m < 0.0], AT_M),
-            *_named("out", [piece for piece in path.pieces if piece.start_m >= 0.0], END),
+            *_named(name, [piece for piece in path.pieces if piece.start_m < begin_m], first),
+            *([_beside(path, road.lane_m, on_ramp=on_ramp)] if road.lane_m else []),
+            *_named("out", [piece for piece in path.pieces if piece.start_m >= end_m], END, AT_M),
         ]
-        for name, path in (("main", road.mainline), (ramp_name, road.ramp))
+        for name, path, on_ramp in (
+            ("main", road.mainline, False),
+            (ramp_name, road.ramp, True),
+        )
     )
     return main, ramp
 
 
-def _named(name: str, pieces: Sequence[Piece], last: str) -> Iterator[_HostedLane]:
-    """Yield lanes with ids; `last` is the junction behind the last road."""
+def _named(
+    name: str, pieces: Sequence[Piece], last: str, before: str = ""
+) -> Iterator[_HostedLane]:
+    """Yield lanes with ids, between the junctions `before` and `last`."""
     roads = sum(not piece.is_internal for piece in pieces)
-    junction, road = "", 0
+    junction, road = before, 0
     for number, piece in enumerate(pieces):
         if piece.is_internal:
             # SUMO finds the junction between the colon and the last underscore.
@@ -121,59 +141,85 @@ def _named(name: str, pieces: Sequence[Piece], last: str) -> Iterator[_HostedLan
             yield _HostedLane(f"{name}{road}{COPY}", junction, piece)
 
 
+def _beside(path: LanePath, lane_m: Bounds, *, on_ramp: bool) -> _HostedLane:
+    """Return the lane of a path between gore and end of the acceleration lane, in one piece."""
+    begin_m, end_m = lane_m
+    pieces = [piece for piece in path.pieces if begin_m <= piece.start_m < end_m]
+    shape = [point for point, _ in groupby(chain(*(piece.shape for piece in pieces)))]
+    # What its driver is about to see: a ramp's limit may rise along the lane.
+    limit_mps = pieces[-1].speed_limit_mps
+    piece = Piece(pieces[0].lane, begin_m, end_m - begin_m, limit_mps, tuple(shape))
+    return _HostedLane(LANE, AT_M, piece, number=0 if on_ramp else 1, leads_on=not on_ramp)
+
+
 def _hops(lanes: Sequence[_HostedLane]) -> Iterator[_Hop]:
     roads = [number for number, lane in enumerate(lanes) if not lane.piece.is_internal]
     for here, following in pairwise([*roads, len(lanes)]):
-        target = lanes[following] if following < len(lanes) else None
-        yield _Hop(lanes[here], lanes[here + 1 : following], target)
+        if following < len(lanes) and lanes[here].leads_on:
+            yield _Hop(lanes[here], lanes[here + 1 : following], lanes[following])
+        else:
+            yield _Hop(lanes[here], [], None)
 
 
 def _elements(road: Corridor) -> list[etree._Element]:
     """Return the edges, junctions and connections of one copy, in any order."""
     elements: list[etree._Element] = []
-    at_m: list[_Hop] = []
+    edges: dict[str, etree._Element] = {}
+    arriving: dict[str, list[_Hop]] = {}
     main, ramp = _hosted_lanes(road)
-    paths: list[tuple[str, list[_HostedLane], Approach | None]] = [("main", main, None)]
-    if not road.is_one_path:
-        paths = [("ramp", ramp, road.ramp_approach), ("main", main, road.mainline_approach)]
-    seen: set[str] = set()
-    for name, lanes, approach in paths:
-        begin = behind = f"{name}-begin{COPY}"
-        elements.append(_junction(begin, "dead_end", lanes[0].piece.shape[0], []))
+    for name, lanes in [("main", main)] if road.is_one_path else [("ramp", ramp), ("main", main)]:
+        behind = f"{name}-begin{COPY}"
+        elements.append(_junction(behind, "dead_end", lanes[0].piece.shape[0], []))
         for hop in _hops(lanes):
             source = hop.source
-            if source.edge in seen:
+            hops = arriving.setdefault(source.junction, [])
+            if any(other.source.lane == source.lane for other in hops):
                 break
-            seen.add(source.edge)
-            elements.append(_edge(source, {"from": behind, "to": source.junction}))
-            elements += [_edge(via, {"function": "internal"}) for via in hop.via]
+            hops.append(hop)
+            ends = {"from": behind, "to": source.junction}
+            edges.setdefault(source.edge, _edge(source, ends)).append(_lane(source))
+            for via in hop.via:
+                edges[via.edge] = _edge(via, {"function": "internal"})
+                edges[via.edge].append(_lane(via))
             behind = source.junction
-            if source.junction == AT_M:
-                at_m.append(hop)
-            else:
-                kind = "priority" if hop.target else "dead_end"
-                elements.append(_junction(source.junction, kind, source.piece.shape[-1], [hop]))
-            elements += _connections(hop, approach if source.junction == AT_M else None)
-    kept = road.junction_type in KEPT_TYPES and not road.is_one_path
-    kind = road.junction_type if kept else "priority"
-    yields = [approach is not None and approach.yields for _, _, approach in paths]
-    elements.append(_junction(AT_M, kind, at_m[0].source.piece.shape[-1], at_m, yields))
-    return elements
+    for name, hops in arriving.items():
+        elements += _crossed(name, hops, road)
+    return [*edges.values(), *elements]
+
+
+def _crossed(name: str, hops: Sequence[_Hop], road: Corridor) -> Iterator[etree._Element]:
+    """Yield a junction and its connections."""
+    place = hops[0].source.piece.shape[-1]
+    links = [hop for hop in hops if hop.target is not None]
+    if len({hop.target for hop in links}) == len(links):
+        yield _junction(name, "priority" if links else "dead_end", place, hops)
+        for hop in links:
+            yield from _connections(hop, None)
+        return
+    # Ramp and mainline lead to one lane: the rules of the road decide.
+    approaches = (road.ramp_approach, road.mainline_approach)
+    kind = road.junction_type if road.junction_type in KEPT_TYPES else "priority"
+    yield _junction(name, kind, place, hops, [approach.yields for approach in approaches])
+    for hop, approach in zip(hops, approaches, strict=True):
+        yield from _connections(hop, approach)
 
 
 def _edge(lane: _HostedLane, attributes: dict[str, str]) -> etree._Element:
-    edge = etree.Element("edge", {"id": lane.edge, **attributes})
+    return etree.Element("edge", {"id": lane.edge, **attributes})
+
+
+def _lane(lane: _HostedLane) -> etree._Element:
     piece = lane.piece
     numbers = {"length": f"{piece.length_m!r}", "speed": f"{piece.speed_limit_mps!r}"}
     shape = " ".join(",".join(map(repr, point)) for point in piece.shape)
-    etree.SubElement(edge, "lane", {"id": lane.lane, "index": "0", **numbers, "shape": shape})
-    return edge
+    attributes = {"id": lane.lane, "index": str(lane.number), **numbers, "shape": shape}
+    return etree.Element("lane", attributes | ({} if lane.leads_on else {"acceleration": "1"}))
 
 
 def _junction(
-    name: str, kind: str, place: Point, hops: Sequence[_Hop], yields: Sequence[bool] = (False,)
+    name: str, kind: str, place: Point, hops: Sequence[_Hop], yields: Sequence[bool] | None = None
 ) -> etree._Element:
-    """Return a junction for hops; `yields` says which of two yields to the other."""
+    """Return a junction for hops; `yields` says of two to one lane which yields to the other."""
     x, y, _ = place
     junction = etree.Element(
         "junction",
@@ -185,10 +231,11 @@ def _junction(
         intLanes=" ".join(hop.via[0].lane for hop in hops if hop.via),
         shape=f"{x!r},{y!r}",
     )
-    for index, must_yield in enumerate(yields if kind != "dead_end" else ()):
+    links = sum(hop.target is not None for hop in hops)
+    for index in range(links):
         # One character for each link, the first link last.
-        foes = "0" if len(hops) == 1 else ("10", "01")[index]
-        response = foes if must_yield else "0" * len(hops)
+        foes = "0" * links if yields is None else ("10", "01")[index]
+        response = foes if yields is not None and yields[index] else "0" * links
         request = {"index": str(index), "response": response, "foes": foes, "cont": "0"}
         etree.SubElement(junction, "request", request)
     return junction
@@ -200,7 +247,8 @@ def _connections(hop: _Hop, approach: Approach | None) -> Iterator[etree._Elemen
         return
     sources = [hop.source, *hop.via]
     for number, source in enumerate(sources):
-        attributes = {"from": source.edge, "to": hop.target.edge, "fromLane": "0", "toLane": "0"}
+        lanes = {"fromLane": str(source.number), "toLane": str(hop.target.number)}
+        attributes = {"from": source.edge, "to": hop.target.edge, **lanes}
         if number < len(hop.via):
             attributes["via"] = hop.via[number].lane
         state = "M"

@@ -1,0 +1,272 @@
+"""Acceleration lanes: found beside the mainline, hosted as lanes of one edge, driven by eq. (4)."""
+
+from __future__ import annotations
+
+import bisect
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_nets import (
+    FOREIGN,
+    edge,
+    lane,
+    lane_drop,
+    node,
+    plain,
+)
+
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.finder import find_corridor
+from merge_sumo.road.netfile import NetFile
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
+from merge_sumo.sumo.hosting import hosted_net, hosted_paths
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+
+EXACT = 1e-9
+MAX_SPEED = "200"
+
+
+def two_edges(folder: Path) -> Path:
+    """A curved acceleration lane of two edges, with a sidewalk beside it and internal lanes."""
+    bend = "-200,0 -120,6 -60,16 0,30"
+    return plain(
+        folder,
+        node("a", -900, 0) + node("g", -200, 0) + node("h", 0, 30) + node("e", 120, 70)
+        + node("b", 700, 200) + node("r", -500, -90),
+        edge("in", "a", "g", 2, 33, priority=9) + edge("out", "e", "b", 2, 33, priority=9)
+        + edge("acc1", "g", "h", 3, 33, priority=9, shape=bend, sidewalkWidth=2)
+        + edge("acc2", "h", "e", 3, 33, priority=9) + edge("ramp", "r", "g", 1, 17, priority=3),
+        lane("ramp", 0, "acc1", 1) + lane("in", 0, "acc1", 2) + lane("in", 1, "acc1", 3)
+        + lane("acc1", 1, "acc2", 0) + lane("acc1", 2, "acc2", 1) + lane("acc1", 3, "acc2", 2)
+        + lane("acc2", 1, "out", 0) + lane("acc2", 2, "out", 1),
+    )  # fmt: skip
+
+
+LANES = {
+    "two edges": (two_edges, "in acc1 acc2 out", "ramp acc1 acc2 out"),
+    "lane drop": FOREIGN["lane drop"],
+    "OSM": FOREIGN["OSM"],
+    "zipper": FOREIGN["zipper with an auxiliary lane"],
+}
+LANE_M = (-30.0, 60.0)
+
+
+@pytest.fixture(scope="module")
+def road(tmp_path_factory):
+    """Return a function that finds the acceleration lane of a net, of which LANE_M is a part."""
+    found = {"us23-lane": road_for(named_scenario("us23-lane"))}
+
+    def get(name: str) -> Corridor:
+        if name not in found:
+            build, mainline, ramp = LANES[name]
+            net = NetFile(build(tmp_path_factory.mktemp("net")))
+            found[name] = find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
+        return found[name]
+
+    return get
+
+
+@pytest.fixture
+def simulation(tmp_path):
+    """Return a function that starts SUMO on two copies of a road; the second one is driven in."""
+    libsumo = load_libsumo()
+
+    def start(road: Corridor, vtype: str) -> object:
+        (tmp_path / "net.xml").write_bytes(hosted_net(road, 2))
+        (tmp_path / "types.xml").write_text(f'<additional><vType id="car" {vtype}/></additional>')
+        files = ("-n", str(tmp_path / "net.xml"), "-a", str(tmp_path / "types.xml"))
+        libsumo.start(["sumo", *files, *SUMO_OPTIONS])
+        for name, path in zip(("main", "ramp"), hosted_paths(road), strict=True):
+            libsumo.route.add(name, path.route(1))
+            libsumo.vehicle.add(name, name, typeID="car", departPos="0", departSpeed="0")
+        libsumo.simulation.step()
+        return libsumo
+
+    yield start
+    libsumo.close()
+
+
+class TestTheShippedRoad:
+    def test_has_m_at_a_share_of_035_of_200_m(self, road):
+        us23 = road("us23-lane")
+        assert us23.lane_m == (-70.0, 130.0)
+        names = ("ramp_0", -425.0), ("lane_0", -70.0), ("main_out_0", 130.0)
+        assert tuple((piece.lane, piece.start_m) for piece in us23.ramp.pieces) == names
+        names = ("main_in_0", -1000.0), ("lane_1", -70.0), ("main_out_0", 130.0)
+        assert tuple((piece.lane, piece.start_m) for piece in us23.mainline.pieces) == names
+        assert us23.lane_point(0.0, on_ramp=False) == ("lane_1", 70.0, 0.0, 0.0, 90.0)
+        assert us23.lane_point(0.0, on_ramp=True) == ("lane_0", 70.0, 0.0, -3.2, 90.0)
+
+    def test_and_its_traffic_differ_from_us23_in_the_lane_alone(self):
+        for name in ("us23", "us23-traffic"):
+            ours, lane = (named_scenario(n) for n in (name, name.replace("us23", "us23-lane")))
+            assert lane.dimensions(2) == ours.dimensions(2)
+            own = ("name", "net", "mainline", "ramp", "lane_m", "lane_end", "follow_up_s")
+            records = (
+                {k: v for k, v in s.to_record().items() if k not in own} for s in (ours, lane)
+            )
+            assert next(records) == next(records)
+
+
+class TestTheWindow:
+    @pytest.mark.parametrize("name", LANES)
+    def test_ends_where_the_scenario_says_and_begins_at_the_gore(self, road, name):
+        own = road(name)
+        begin_m, end_m = own.lane_m
+        assert end_m == LANE_M[1]
+        for path in (own.mainline, own.ramp):
+            assert {begin_m, end_m} <= set(path.starts_m)
+            for one, other in pairwise(path.pieces):
+                assert one.start_m + one.length_m == pytest.approx(other.start_m, abs=EXACT)
+        # Both are drawn a lane's width apart, and are at the same place along it.
+        for x_m in np.linspace(begin_m + 1.0, end_m - 1.0, 9).tolist():
+            main, ramp = (own.lane_point(x_m, on_ramp=on_ramp) for on_ramp in (False, True))
+            assert np.hypot(main.x_m - ramp.x_m, main.y_m - ramp.y_m) == pytest.approx(3.2, abs=0.1)
+
+    def test_of_several_edges_holds_the_junctions_between_them(self, road):
+        own = road("two edges")
+        inside = [p.lane for p in own.ramp.pieces if own.lane_m[0] <= p.start_m < own.lane_m[1]]
+        assert [inside[0], inside[-1], len(inside)] == ["acc1_1", "acc2_0", 3]
+        assert own.lane_m[1] - own.lane_m[0] == pytest.approx(222.4 + 2.53 + 121.57)
+
+    def test_shifts_all_and_changes_nothing_else(self, tmp_path):
+        net = NetFile(lane_drop(tmp_path))
+        edges = ["in", "acc", "out"], ["ramp", "acc", "out"]
+        point = find_corridor(net, *edges)
+        one, other = (find_corridor(net, *edges, lane_m=(end - 50, end)) for end in (50.0, 90.0))
+        assert point.lane_m is None
+        crossing_m = point.mainline.pieces[-2].length_m
+        for own, end_m in ((one, 50.0), (other, 90.0)):
+            shift_m = end_m + crossing_m
+            assert own.ramp.before_m == pytest.approx(point.ramp.before_m - shift_m)
+            for x_m in (-300.0, -100.0, 20.0):
+                at = point.lane_point(x_m, on_ramp=False)
+                shifted = own.lane_point(x_m + shift_m, on_ramp=False)
+                assert (shifted.lane, *shifted[1:]) == (at.lane, *map(pytest.approx, at[1:]))
+
+    @pytest.mark.parametrize(
+        ("lane_m", "said"),
+        [
+            (
+                (-150.0, 130.0),
+                r"is -150 to 130, 280 m, .* 215\.4 m long: write lane_m = \[-75\.4, 139\.9\]$",
+            ),
+            ((-1.0, 400.0), r"is -1 to 400, 401 m, .* write lane_m = \[-75\.4, 139\.9\]$"),
+        ],
+    )
+    def test_that_is_longer_than_the_lane_is_refused(self, tmp_path, lane_m, said):
+        net = NetFile(lane_drop(tmp_path))
+        with pytest.raises(UserError, match=said) as error:
+            find_corridor(net, ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=lane_m)
+        assert "\n" not in str(error.value)
+
+    @pytest.mark.parametrize("name", ["priority", "OSM without an auxiliary lane", "roundabout"])
+    def test_is_refused_on_a_road_without_such_a_lane(self, tmp_path, name):
+        build, mainline, ramp = FOREIGN[name]
+        net = NetFile(build(tmp_path))
+        with pytest.raises(UserError, match=r"meet in one point, .* leave lane_m out"):
+            find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
+
+
+class Commanded:
+    """A vehicle that SUMO moves as it is told, and that is moved from lane to lane."""
+
+    def __init__(self, vehicle, name, own, other, seed):
+        self.vehicle, self.name, self.rng = vehicle, name, np.random.default_rng(seed)
+        self.own, self.other = own, other
+        self.begin()
+        vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
+        vehicle.setLaneChangeMode(name, 0)
+
+    def begin(self, begin_m=-60.0, end_m=60.0):
+        self.path, self.v_mps = self.own, self.rng.uniform(0.0, 40.0)
+        self.put(float(self.rng.uniform(begin_m, end_m)))
+
+    def put(self, x_m):
+        self.x_m = x_m
+        place = bisect.bisect_right(self.path.starts_m, x_m) - 1
+        position_m = x_m - self.path.starts_m[place]
+        self.vehicle.moveTo(self.name, self.path.lanes(1)[place], position_m)
+
+    def tell(self):
+        self.vehicle.setPreviousSpeed(self.name, self.v_mps)
+        self.vehicle.setSpeed(self.name, self.v_mps)
+
+    def change(self, path):
+        self.path = path
+        self.put(self.x_m)
+
+    def follow(self):
+        """Advance by eq. (4), after SUMO."""
+        self.x_m += self.v_mps * DT_S
+        a_mps2 = self.rng.uniform(A_MIN_MPS2, A_MAX_MPS2)
+        self.v_mps = max(self.v_mps + a_mps2 * DT_S, 0.0)
+
+    def off_m(self):
+        starts_m = dict(zip(self.path.lanes(1), self.path.starts_m, strict=True))
+        lane, position_m = (
+            self.vehicle.getLaneID(self.name),
+            self.vehicle.getLanePosition(self.name),
+        )
+        return abs(starts_m[lane] + position_m - self.x_m)
+
+
+@pytest.mark.parametrize("name", ["us23-lane", *LANES])
+def test_commanded_vehicles_follow_eq_4_on_both_paths_and_where_they_are_moved_aside(
+    road, simulation, name
+):
+    own = road(name)
+    (begin_m, end_m), (main, ramp) = own.lane_m, hosted_paths(own)
+    libsumo = simulation(own, 'maxSpeed="200" minGap="0"')
+    cars = [
+        Commanded(libsumo.vehicle, "main", main, ramp, 1),
+        Commanded(libsumo.vehicle, "ramp", ramp, main, 2),
+    ]
+    changes = forced = 0
+    for step in range(3000):
+        for car in cars:
+            if step % 150 == 0 or car.x_m > 300.0:
+                car.begin(begin_m - 60.0, end_m)
+            car.tell()
+        libsumo.simulation.step()
+        for car in cars:
+            car.follow()
+            if car.path is ramp and car.x_m >= end_m:
+                car.change(main)
+                forced += 1
+            elif begin_m <= car.x_m < end_m and car.rng.random() < 0.05:
+                car.change(ramp if car.path is main else main)
+                changes += 1
+            assert car.off_m() < EXACT
+    assert changes > 50
+    assert forced > 10
+
+
+@pytest.mark.parametrize("name", ["us23-lane", "two edges"])
+def test_a_driver_of_sumo_waits_for_a_gap_and_then_changes_to_the_mainline(road, simulation, name):
+    own = road(name)
+    libsumo = simulation(own, 'maxSpeed="28" carFollowModel="IDM"')
+    vehicle, seen = libsumo.vehicle, list[tuple[str, float]]()
+    # Side by side; the car of the mainline keeps 22 m/s.
+    for who, path, beside in zip(
+        *(("main", "ramp"), hosted_paths(own), ("lane.1_1", "lane.1_0")), strict=True
+    ):
+        assert beside in path.lanes(1)
+        vehicle.moveTo(who, beside, 5.0)
+        vehicle.setPreviousSpeed(who, 20.0)
+    vehicle.setSpeedMode("main", SPEED_MODE_COMMANDED)
+    vehicle.setSpeed("main", 22.0)
+    while not seen or not seen[-1][0].startswith("out"):
+        libsumo.simulation.step()
+        assert libsumo.simulation.getStartingTeleportNumber() == 0
+        seen.append((vehicle.getLaneID("ramp"), vehicle.getLanePosition("ramp")))
+        assert len(seen) < 900
+    lanes = [name for name, _ in seen]
+    assert list(dict.fromkeys(lanes))[:2] == ["lane.1_0", "lane.1_1"]
+    assert lanes[-1] == "out1.1_0"
+    assert seen[lanes.index("lane.1_1")][1] > 20.0, "beside a car it stays"
