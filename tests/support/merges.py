@@ -30,7 +30,7 @@ def times(scenario: MergeScenario, factor: float, units: tuple[str, ...]) -> Mer
     def multiplied(value: Any) -> Any:
         if isinstance(value, tuple):
             return tuple(factor * x for x in value)
-        return factor * value
+        return None if value is None else factor * value
 
     changed = {
         field.name: multiplied(getattr(scenario, field.name))
