@@ -1,6 +1,7 @@
 """Build an FMU that drives as the level-0 VUT, by FMI 2.0 or 3.0: for tests and the benchmark.
 
-`python tools/build_fmu.py level0.fmu [2.0|3.0]`. It needs a C compiler, gcc or g++.
+`python tools/build_fmu.py level0.fmu [2.0|3.0] [number|boolean]`. With the last word it has an
+output `merge`, which wishes to merge from 50 m before M on. It needs a C compiler, gcc or g++.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ static int step(Unit* u) {
     u->steps++;
     if (u->steps == 4 && u->v[1] > 30.0) { FAULT }
     u->v[4] = fmin(fmax((28.0 - u->v[3]) / 0.1, 0.0), 1.0);
+    u->v[5] = u->v[2] >= -50.0 ? 1.0 : 0.0;
     return 0;
 }
 static int clear(Unit* u) { Unit none = {{0}, 0}; *u = none; return 0; }
@@ -40,6 +42,10 @@ int fmi2EnterInitializationMode(Unit* u) { return 0; }
 int fmi2ExitInitializationMode(Unit* u) { return 0; }
 int fmi2SetReal(Unit* u, const unsigned* r, size_t n, const double* v) { return set(u, r, n, v); }
 int fmi2GetReal(Unit* u, const unsigned* r, size_t n, double* v) { return get(u, r, n, v); }
+int fmi2GetBoolean(Unit* u, const unsigned* r, size_t n, int* v) {
+    for (size_t i = 0; i < n; i++) v[i] = u->v[r[i]] != 0.0;
+    return 0;
+}
 int fmi2DoStep(Unit* u, double t, double h, int a) { return step(u); }
 int fmi2Reset(Unit* u) { return clear(u); }
 int fmi2Terminate(Unit* u) { return 0; }
@@ -56,6 +62,10 @@ int fmi3SetFloat64(Unit* u, const unsigned* r, size_t n, const double* v, size_t
 int fmi3GetFloat64(Unit* u, const unsigned* r, size_t n, double* v, size_t m) {
     return get(u, r, n, v);
 }
+int fmi3GetBoolean(Unit* u, const unsigned* r, size_t n, bool* v, size_t m) {
+    for (size_t i = 0; i < n; i++) v[i] = u->v[r[i]] != 0.0;
+    return 0;
+}
 int fmi3DoStep(Unit* u, double t, double h, bool a, bool* b, bool* c, bool* d, double* e) {
     *b = *c = *d = false;
     *e = t + h;
@@ -68,9 +78,22 @@ void fmi3FreeInstance(Unit* u) { free(u); }
 NAMES = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps", "acceleration_mps2")
 
 
-def description(version: str, names: Sequence[str]) -> str:
-    """Return the modelDescription.xml of four inputs and an output."""
+WISHES = {"number": ("Real", "Float64"), "boolean": ("Boolean", "Boolean")}
+"""Types of an output `merge`, by FMI 2.0 and 3.0."""
+
+
+def description(version: str, names: Sequence[str], wish: str = "") -> str:
+    """Return the modelDescription.xml of four inputs and an output, and perhaps a wish."""
     causality = ["input"] * 4 + ["output"]
+    merge = outputs = ""
+    if wish:
+        of_2, of_3 = WISHES[wish]
+        variability = ' variability="discrete"' if wish == "boolean" else ""
+        merge = f'name="merge" valueReference="5" causality="output"{variability}'
+        if version == "2.0":
+            merge, outputs = f"<ScalarVariable {merge}><{of_2}/></ScalarVariable>", "6"
+        else:
+            merge, outputs = f"<{of_3} {merge}/>", "5"
 
     def start(place: int) -> str:
         return ' start="0"' if place < 4 else ""
@@ -84,8 +107,9 @@ def description(version: str, names: Sequence[str]) -> str:
         return (
             '<fmiModelDescription fmiVersion="2.0" modelName="vut" guid="{vut}">'
             '<CoSimulation modelIdentifier="vut"/><ModelVariables>'
-            f'{variables}</ModelVariables><ModelStructure><Outputs><Unknown index="5"/></Outputs>'
-            "</ModelStructure></fmiModelDescription>"
+            f'{variables}{merge}</ModelVariables><ModelStructure><Outputs><Unknown index="5"/>'
+            + (f'<Unknown index="{outputs}"/>' if outputs else "")
+            + "</Outputs></ModelStructure></fmiModelDescription>"
         )
     variables = "".join(
         f'<Float64 name="{n}" valueReference="{i}" causality="{c}"{start(i)}/>'
@@ -96,8 +120,9 @@ def description(version: str, names: Sequence[str]) -> str:
         '<CoSimulation modelIdentifier="vut"/><ModelVariables>'
         '<Float64 name="time" valueReference="9" causality="independent" '
         'variability="continuous"/>'
-        f'{variables}</ModelVariables><ModelStructure><Output valueReference="4"/>'
-        "</ModelStructure></fmiModelDescription>"
+        f'{variables}{merge}</ModelVariables><ModelStructure><Output valueReference="4"/>'
+        + (f'<Output valueReference="{outputs}"/>' if outputs else "")
+        + "</ModelStructure></fmiModelDescription>"
     )
 
 
@@ -117,9 +142,16 @@ def compiler() -> str | None:
 
 
 def build_fmu(
-    path: Path, version: str = "2.0", names: Sequence[str] = NAMES, fault: str = ""
+    path: Path,
+    version: str = "2.0",
+    names: Sequence[str] = NAMES,
+    fault: str = "",
+    wish: str = "",
 ) -> Path:
-    """Write the FMU; `fault` is C that runs in the fourth step of an episode with v_POV > 30."""
+    """Write the FMU; `fault` is C that runs in the fourth step of an episode with v_POV > 30.
+
+    `wish` is the type of an output `merge`, "number" or "boolean"; "" for no such output.
+    """
     found = compiler()
     if found is None:
         raise RuntimeError("gcc is not on the PATH")
@@ -130,11 +162,12 @@ def build_fmu(
             [found, "-shared", "-fPIC", "-w", "-o", str(library), str(source), "-lm"], check=True
         )
         with zipfile.ZipFile(path, "x") as archive:
-            archive.writestr("modelDescription.xml", description(version, names))
+            archive.writestr("modelDescription.xml", description(version, names, wish))
             binaries = "linux64" if version == "2.0" else "x86_64-linux"
             archive.write(library, f"binaries/{binaries}/vut.so")
     return path
 
 
 if __name__ == "__main__":
-    print(build_fmu(Path(sys.argv[1]), *sys.argv[2:3]))
+    file, fmi, kind = [*sys.argv[1:], *("2.0", "")[len(sys.argv) - 2 :]]
+    print(build_fmu(Path(file), fmi, wish=kind))

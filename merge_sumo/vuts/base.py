@@ -489,5 +489,16 @@ def as_wish(merge: Any) -> int:
     raise WrongAnswerError(f"wishes {_shown(merge)} instead of True or False, to merge or not")
 
 
+MERGES_ABOVE: Final = 0.5
+"""A number that says whether to merge, as of a network or a unit, wishes it above this."""
+
+
+def as_merge(number: float) -> bool:
+    """Return whether a number wishes to merge; raises `WrongAnswerError` for one that is none."""
+    if not math.isfinite(number):
+        raise WrongAnswerError(f"wishes {number} instead of a number, to merge or not")
+    return number > MERGES_ABOVE
+
+
 def _shown(answer: Any) -> str:
     return f"{text_of(answer, repr)[:60]} ({type(answer).__name__})"

@@ -11,24 +11,29 @@ from typing import Any, Final
 from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.suggestions import either
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, split_options
+from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, as_merge, split_options
 from merge_sumo.vuts.blame_cell import current_call
 
 INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 OUTPUT: Final = "acceleration_mps2"
+MERGE: Final = "merge"
+"""An output that a unit need not have: whether to merge."""
+NAMES: Final = (*INPUTS, OUTPUT, MERGE)
 _FLOATS: Final = ("Real", "Float64")
+_BOOLEAN: Final = "Boolean"
 
 
 def fmu_vut(argument: str, options: VutOptions) -> Vut:
     """Return the VUT of `fmu:FILE?x_vut_m=NAME&...`; `UserError` for one that cannot be."""
     spec = f"fmu:{argument}"
     file, names = split_options(argument, spec)
-    unknown = set(names) - {*INPUTS, OUTPUT}
+    unknown = set(names) - set(NAMES)
     if unknown:
         raise UserError(
             f"--vut {spec}: there is no variable {unknown.pop()!r} to name: choose from "
-            f"{', '.join((*INPUTS, OUTPUT))}"
+            f"{', '.join(NAMES)}"
         )
     unit = Unit(Path(file), names)
 
@@ -43,7 +48,7 @@ class Unit:
     """The checked description of an FMU; `UserError` when the file is no such unit.
 
     An input that the unit does not have is not set, if at least one is there and none of the
-    missing ones was named; the output must be there.
+    missing ones was named; the acceleration must be there, and whether to merge may be.
     """
 
     def __init__(self, path: Path, names: dict[str, str]) -> None:
@@ -85,20 +90,27 @@ class Unit:
                 f"fmu:{path}?v_vut_mps=NAME"
             )
         output = self._checked(variables, names.get(OUTPUT, OUTPUT))
+        wish = None
+        if MERGE in names or _is_output(variables.get(MERGE)):
+            wish = self._checked(variables, names.get(MERGE, MERGE), (*_FLOATS, _BOOLEAN))
         self.input_places = [place for place, _ in inputs]
         self.input_references = [variable.valueReference for _, variable in inputs]
         self.output_references = [output.valueReference]
+        self.wish_references = [] if wish is None else [wish.valueReference]
+        self.wish_is_number = wish is not None and wish.type in _FLOATS
 
-    def _checked(self, variables: dict[str, Any], name: str) -> Any:
-        """Return a variable that is one 64-bit float; `UserError` when it is not."""
+    def _checked(
+        self, variables: dict[str, Any], name: str, types: tuple[str, ...] = _FLOATS
+    ) -> Any:
+        """Return a variable that is of one of some types; `UserError` when it is not."""
         variable = variables.get(name)
         if variable is None:
             names = ", ".join(sorted(variables)[:12])
             raise UserError(f"{self._path} has no variable {name!r}; it has {names}")
-        if variable.type not in _FLOATS:
+        if variable.type not in types:
             raise UserError(
-                f"the variable {name!r} of {self._path} is a {variable.type}: it must be a Real "
-                "or Float64"
+                f"the variable {name!r} of {self._path} is a {variable.type}: it must be a "
+                f"{either(types)}"
             )
         return variable
 
@@ -168,13 +180,18 @@ class FmuVut(PerCorridor):
         self._set(instance, seen)
         instance.exitInitializationMode()
 
-    def answer(self, corridor: int, seen: Seen) -> float:
-        """Return the output after a step with the state held."""
+    def answer(self, corridor: int, seen: Seen) -> float | tuple[float, bool]:
+        """Return the outputs after a step with the state held."""
         instance, unit = self._instances[corridor], self._unit
         self._set(instance, seen)
         instance.doStep(seen.t_s, DT_S)
         read = instance.getReal if unit.version == "2" else instance.getFloat64
-        return float(read(unit.output_references)[0])
+        acceleration = float(read(unit.output_references)[0])
+        if not unit.wish_references:
+            return acceleration
+        if unit.wish_is_number:
+            return acceleration, as_merge(float(read(unit.wish_references)[0]))
+        return acceleration, bool(instance.getBoolean(unit.wish_references)[0])
 
     def close(self) -> None:
         """Free the instances and remove the unpacked unit."""
@@ -187,6 +204,10 @@ class FmuVut(PerCorridor):
         values = [seen[1 + place] for place in unit.input_places]
         write = instance.setReal if unit.version == "2" else instance.setFloat64
         write(unit.input_references, values)
+
+
+def _is_output(variable: Any) -> bool:
+    return variable is not None and variable.causality == "output"
 
 
 def _free(instance: Any) -> None:

@@ -1,4 +1,7 @@
-"""A VUT as an ONNX network: the state goes in, an acceleration or action values come out."""
+"""A VUT as an ONNX network: the state goes in, an acceleration or action values come out.
+
+One number more is whether to merge, on a road with an acceleration lane.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,16 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, split_options
+from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, as_merge, split_options
 
 PERIOD: Final = "decision_period_s"
-"""Metadata of a network, or option: it decides this often and holds its acceleration."""
+"""Metadata of a network, or option: it decides this often and holds its decision."""
 STATE: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 """The columns of a network's one input, (1, 4)."""
+WISH: Final = 1
+"""Numbers of an output that say whether to merge: the last one, if there."""
+Decision = float | tuple[float, bool]
+"""An acceleration, or it and whether to merge."""
 WEIGHTED: Final = ("Gemm", "MatMul", "Conv", "ConvTranspose", "LSTM", "GRU", "RNN")
 """Nodes whose constant inputs are weights."""
 _DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
@@ -80,10 +87,11 @@ class Network:
             )
         self._input, self._dtype = inputs[0].name, _DTYPES[inputs[0].type]
         outputs = self.run((0.0, 0.0, 0.0, 0.0))
-        if outputs.size not in (1, ACTIONS):
+        if outputs.size not in (1, ACTIONS, 1 + WISH, ACTIONS + WISH):
             raise UserError(
                 f"{path} gives {outputs.size} numbers: a VUT gives one acceleration, or "
-                f"{ACTIONS} values of actions, from the hardest braking to the hardest acceleration"
+                f"{ACTIONS} values of actions, from the hardest braking to the hardest "
+                "acceleration, and perhaps one number more, which is whether to merge"
             )
         metadata = self._session.get_modelmeta().custom_metadata_map
         text = period_s or metadata.get(PERIOD) or str(DT_S)
@@ -99,14 +107,20 @@ class Network:
         fed = np.array([state], dtype=self._dtype)
         return np.asarray(self._session.run(None, {self._input: fed})[0]).ravel()
 
-    def acceleration_mps2(self, state: tuple[float, ...], of_actions: FloatArray) -> float:
-        """Return the acceleration, or that of the action of the highest value."""
+    def decision(self, state: tuple[float, ...], of_actions: FloatArray) -> Decision:
+        """Return the acceleration, or that of the action of the highest value, and any wish."""
         output = self.run(state)
-        if output.size == 1:
-            return float(output[0])
-        if not np.isfinite(output).all():
-            return float("nan")
-        return float(of_actions[int(output.argmax())])
+        if output.size in (1, ACTIONS):
+            return _acceleration_mps2(output, of_actions)
+        return _acceleration_mps2(output[:-WISH], of_actions), as_merge(float(output[-WISH]))
+
+
+def _acceleration_mps2(output: np.ndarray[Any, Any], of_actions: FloatArray) -> float:
+    if output.size == 1:
+        return float(output[0])
+    if not np.isfinite(output).all():
+        return float("nan")
+    return float(of_actions[int(output.argmax())])
 
 
 def _check_weights(path: Path) -> None:
@@ -148,7 +162,7 @@ class OnnxVut(PerCorridor):
     def __init__(self, corridors: int, network: Network, deadline_s: float) -> None:
         super().__init__(corridors, deadline_s)
         self._network = network
-        self._held = [0.0] * corridors
+        self._held: list[Decision] = [0.0] * corridors
         self._of_actions: list[FloatArray] = [np.empty(0)] * corridors
 
     def begin(self, corridor: int, case: Case) -> None:
@@ -162,10 +176,8 @@ class OnnxVut(PerCorridor):
     def reset(self, corridor: int, seen: Seen) -> None:
         """Do nothing: the first step is a decision."""
 
-    def answer(self, corridor: int, seen: Seen) -> float:
-        """Return the held acceleration, decided anew where a decision is due."""
+    def answer(self, corridor: int, seen: Seen) -> Decision:
+        """Return the held decision, made anew where one is due."""
         if round(seen.t_s / DT_S) % self._network.period_steps == 0:
-            self._held[corridor] = self._network.acceleration_mps2(
-                seen[1:], self._of_actions[corridor]
-            )
+            self._held[corridor] = self._network.decision(seen[1:], self._of_actions[corridor])
         return self._held[corridor]

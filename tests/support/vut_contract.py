@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from plans import plan_for
 
+from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.case import Case, MergeCase, from_unit
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import VutOptions
@@ -19,6 +22,26 @@ class Level0:
     def act(self, seen):
         return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
 """
+
+
+LANE = replace(US23, lane_m=(-70.0, 130.0), follow_up_s=5.0)
+"""The paper's ramp with an acceleration lane."""
+ON_LANE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=LANE)
+
+
+def on_lane(x_vut_m: Sequence[float], merged: Sequence[bool] | None = None) -> Scene:
+    """Return a scene of VUTs at 20 m/s, each with a POV at 30 m/s 30 m behind it."""
+    count, x_m = len(x_vut_m), np.array(x_vut_m)
+    active, step = np.ones(count, dtype=bool), np.full(count, 7)
+    state = x_m - 30.0, np.full(count, 30.0), x_m, np.full(count, 20.0)
+    known = np.zeros(count, dtype=bool) if merged is None else np.array(merged)
+    return Scene.of_pair(active, step, *state)._replace(merged=known)
+
+
+def begin(driver: Driver, case: Case = ON_LANE) -> None:
+    """Begin an episode in each corridor."""
+    for corridor in range(driver.corridors):
+        driver.begin(corridor, case)
 
 
 def cases_of(count: int, seed: int = 0) -> list[Case]:

@@ -11,8 +11,17 @@ import numpy as np
 import pytest
 from build_fmu import NAMES, build_fmu, compiler
 from conftest import require, some
-from vut_contract import LEVEL0_CLASS, cases_of, factory, in_process, run_cases
+from vut_contract import (
+    LEVEL0_CLASS,
+    begin,
+    cases_of,
+    factory,
+    in_process,
+    on_lane,
+    run_cases,
+)
 
+from merge_sumo.drivers.base import MERGE, STAY
 from merge_sumo.errors import UserError
 from merge_sumo.values.trajectory import End
 
@@ -25,8 +34,9 @@ def unit(tmp_path_factory):
     require(compiler() is not None, "gcc is not on the PATH")
     folder = tmp_path_factory.mktemp("fmu")
 
-    def build(version="2.0", names=NAMES, fault="") -> Path:
-        return build_fmu(folder / f"{len(list(folder.iterdir()))}.fmu", version, names, fault)
+    def build(version="2.0", names=NAMES, fault="", wish="") -> Path:
+        path = folder / f"{len(list(folder.iterdir()))}.fmu"
+        return build_fmu(path, version, names, fault, wish)
 
     return build
 
@@ -115,3 +125,36 @@ def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
         with pytest.raises(UserError, match=r"fmu|FMU") as refused:
             in_process(f"fmu:{spec}")
         assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("wish", some(["number", "boolean"], "boolean"))
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_an_output_merge_is_whether_to_merge(unit, version, wish):
+    vut = in_process(f"fmu:{unit(version, wish=wish)}")(2)
+    begin(vut)
+    assert vut.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
+    assert vut.wishes().tolist() == [STAY, MERGE]
+    vut.close()
+
+
+def test_an_output_merge_may_have_another_name_and_must_be_a_number_or_a_boolean(unit):
+    vut = in_process(f"fmu:{unit()}?merge=acceleration_mps2")(1)
+    begin(vut)
+    vut.act(on_lane([-51.0]))
+    assert vut.wishes().tolist() == [MERGE]
+    vut.close()
+    nan = unit(fault="u->v[5] = NAN; u->v[4] = 0.0; return 0;", wish="number")
+    vut = in_process(f"fmu:{nan}")(1)
+    begin(vut)
+    for _ in range(4):
+        answer = vut.act(on_lane([-51.0])._replace(v_mps=np.array([[31.0], [20.0]])))
+    assert np.isnan(answer)[0]
+    assert vut.reason(0) == "WrongAnswerError: wishes nan instead of a number, to merge or not"
+    vut.close()
+    without = in_process(f"fmu:{unit()}")(1)
+    begin(without)
+    without.act(on_lane([-51.0]))
+    assert without.wishes() is None
+    without.close()
+    with pytest.raises(UserError, match="has no variable 'nothing'"):
+        in_process(f"fmu:{unit()}?merge=nothing")

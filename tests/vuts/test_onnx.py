@@ -11,9 +11,10 @@ import pytest
 from merges import HALF, SMALLER
 from plans import plan_for
 from typer.testing import CliRunner
-from vut_contract import cases_of, in_process, run_cases
+from vut_contract import begin, cases_of, in_process, on_lane, run_cases
 
 from merge_sumo.cli import app
+from merge_sumo.drivers.base import MERGE, STAY
 from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.policies import NETWORKS, load_network
 from merge_sumo.errors import UserError
@@ -101,6 +102,24 @@ def test_one_number_is_an_acceleration_and_seven_are_values_of_actions(tmp_path,
         assert (trajectory.a_vut_mps2[:-1] == expected).all()
 
 
+def test_one_number_more_is_whether_to_merge_and_is_held_as_the_acceleration(tmp_path):
+    for name, answer, wish, a_mps2 in (
+        ("two", [0.5, 0.51], MERGE, 0.5),
+        ("stays", [0.5, 0.5], STAY, 0.5),
+        ("eight", [0, 0, 0, 0, 0, 3, 1, 9], MERGE, 1.0),
+    ):
+        path = network(tmp_path / f"{name}.onnx", answer=answer)
+        vut = in_process(f"onnx:{path}?decision_period_s=0.5")(1)
+        begin(vut)
+        for step in (5, 6):
+            assert vut.act(on_lane([-51.0])._replace(step=np.array([step]))).tolist() == [a_mps2]
+            assert vut.wishes().tolist() == [wish]
+    wrong = in_process(f"onnx:{network(tmp_path / 'nan.onnx', answer=[0.5, np.inf])}")(1)
+    begin(wrong)
+    assert np.isnan(wrong.act(on_lane([-51.0])))[0]
+    assert wrong.reason(0) == "WrongAnswerError: wishes inf instead of a number, to merge or not"
+
+
 def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
     path = network(tmp_path / "here.onnx", answer=[0.5])
     model = onnx.load(path)
@@ -173,13 +192,13 @@ def test_infinity_as_a_limit_is_no_weight(tmp_path):
 def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "text.onnx").write_text("no network")
     network(tmp_path / "wide.onnx", answer=[0.0], width=5)
-    network(tmp_path / "two.onnx", answer=[0.0, 1.0])
+    network(tmp_path / "three.onnx", answer=[0.0, 1.0, 0.0])
     good = network(tmp_path / "good.onnx", answer=[0.0])
     for spec, said in {
         tmp_path / "nothing.onnx": "there is no ONNX file",
         tmp_path / "text.onnx": "is no ONNX network that can be run",
         tmp_path / "wide.onnx": "a VUT has one of floats",
-        tmp_path / "two.onnx": "gives 2 numbers",
+        tmp_path / "three.onnx": "gives 3 numbers",
         f"{good}?decision_period_s=0": "decision_period_s is '0'",
         f"{good}?decision_period_s=often": "decision_period_s is 'often'",
         f"{good}?period=1": "there is no option 'period'",

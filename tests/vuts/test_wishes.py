@@ -4,41 +4,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from conftest import some
-from vut_contract import factory, in_process
+from vut_contract import ON_LANE, begin, factory, in_process, on_lane
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene, VutLostError
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import US23
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, VutLostError
 from merge_sumo.vuts.base import Seen, VutOptions, seen_at_start, seen_in
 from merge_sumo.vuts.host.hosted import HostedVut
 from merge_sumo.vuts.in_memory import vut_of_object
 from merge_sumo.vuts.registry import FINDER
 
-LANE = replace(US23, lane_m=(-70.0, 130.0), follow_up_s=5.0)
-CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=LANE)
-POINT = replace(CASE, scenario=US23)
 
-
-def scene(x_vut_m, merged=None, v_vut_mps=20.0) -> Scene:
-    """Return a scene of VUTs on their way, each with a POV 30 m behind it."""
-    x_m = np.asarray(x_vut_m, dtype=np.float64)
-    count = len(x_m)
-    active, step = np.ones(count, dtype=bool), np.full(count, 7)
-    state = x_m - 30.0, np.full(count, 30.0), x_m, np.full(count, v_vut_mps)
-    known = None if merged is None else np.array(merged)
-    return Scene.of_pair(active, step, *state)._replace(merged=known)
-
-
-def begun(vut, corridors, case=CASE, **options):
+def begun(vut, corridors, **options):
     """Return a driver with an episode in each corridor."""
     driver = factory(vut, **options)(corridors) if isinstance(vut, str) else vut
-    for corridor in range(corridors):
-        driver.begin(corridor, case)
+    begin(driver)
     return driver
 
 
@@ -64,7 +45,7 @@ def test_it_sees_the_lane_and_whether_a_wish_would_be_granted():
     assert all(isinstance(s, Seen) for s in seen)
     assert seen[0][1:] == (-102.01, 30.0, -72.01, 20.0)
     assert [car.x_m for car in seen[0].others] == [-102.01]
-    start = seen_at_start(CASE)
+    start = seen_at_start(ON_LANE)
     assert (start.lane_begin_m, start.may_merge, start.merged) == (-70.0, False, False)
 
 
@@ -104,11 +85,11 @@ class Vut:
 def test_a_controller_answers_an_acceleration_or_it_and_a_wish(spec, process):
     driver = begun(spec(OF_EACH), 4, in_process=process == "this")
     try:
-        answer = driver.act(scene([-150.0, -90.0, -71.0, -50.0], [False, False, False, True]))
+        answer = driver.act(on_lane([-150.0, -90.0, -71.0, -50.0], [False, False, False, True]))
         assert answer.tolist() == [1.0, 1.0, 1.0, 0.5]
         assert driver.wishes().tolist() == [NO_WISH, STAY, MERGE, NO_WISH]
         assert driver.wishes().dtype == np.int8
-        driver.act(scene([-150.0] * 4, [False] * 4))
+        driver.act(on_lane([-150.0] * 4, [False] * 4))
         assert driver.wishes() is None
     finally:
         driver.close()
@@ -118,14 +99,14 @@ def test_a_controller_answers_an_acceleration_or_it_and_a_wish(spec, process):
 def test_a_batched_controller_answers_one_row_or_two(spec, process):
     driver = begun(spec(OF_ALL), 3, in_process=process == "this")
     try:
-        idle = scene([-90.0, -71.0, -50.0], [False, False, True])
+        idle = on_lane([-90.0, -71.0, -50.0], [False, False, True])
         idle = idle._replace(active=np.array([True, True, False]))
         assert driver.act(idle).tolist() == [1.0, 1.0, 0.5]
         assert driver.wishes().tolist() == [STAY, MERGE, NO_WISH]
     finally:
         driver.close()
     one_row = begun(in_process(spec(OF_ALL.replace(", seen.may_merge", "")))(3), 3)
-    assert one_row.act(scene([-90.0, -71.0, -50.0], [False] * 3)).tolist() == [1.0] * 3
+    assert one_row.act(on_lane([-90.0, -71.0, -50.0], [False] * 3)).tolist() == [1.0] * 3
     assert one_row.wishes() is None
 
 
@@ -135,7 +116,7 @@ def test_an_object_of_a_notebook_answers_wishes():
 
     vut = vut_of_object(wants, "wants", VutOptions())
     driver = begun(vut.make(2, None), 2)
-    assert driver.act(scene([-90.0, -71.0], [False, False])).tolist() == [1.0, 1.0]
+    assert driver.act(on_lane([-90.0, -71.0], [False, False])).tolist() == [1.0, 1.0]
     assert driver.wishes().tolist() == [STAY, MERGE]
 
 
@@ -174,7 +155,7 @@ def Vut(seen):
 @pytest.mark.parametrize("wish", WISHES)
 def test_a_wish_is_true_or_false(spec, wish):
     driver = begun(in_process(spec(ANSWERS.format(f"(1, {wish})")))(1), 1)
-    assert driver.act(scene([-71.0], [False])).tolist() == [1.0]
+    assert driver.act(on_lane([-71.0], [False])).tolist() == [1.0]
     assert driver.wishes().tolist() == [WISHES[wish]]
 
 
@@ -183,7 +164,7 @@ def test_a_wish_is_true_or_false(spec, wish):
 def test_another_answer_is_an_error_of_its_own_corridor(spec, answer, process):
     driver = begun(spec(ANSWERS.format(answer)), 2, in_process=process == "this")
     try:
-        assert np.isnan(driver.act(scene([-71.0, -90.0], [False] * 2))).tolist() == [True, False]
+        assert np.isnan(driver.act(on_lane([-71.0, -90.0], [False] * 2))).tolist() == [True, False]
         assert WRONG[answer] in driver.reason(0)
         assert driver.reason(1) is None
     finally:
@@ -195,7 +176,7 @@ def test_an_acceleration_that_is_none_is_one_whatever_is_wished(spec, process):
     source = "def Vut(seen):\n    return float('nan'), True\n"
     driver = begun(spec(source), 1, in_process=process == "this")
     try:
-        assert np.isnan(driver.act(scene([-71.0], [False])))[0]
+        assert np.isnan(driver.act(on_lane([-71.0], [False])))[0]
         assert driver.wishes().tolist() == [MERGE]
     finally:
         driver.close()
@@ -217,14 +198,14 @@ def test_a_batch_of_another_shape_is_an_error_of_all(spec, answer, said):
     source = OF_ALL.replace("np.where(seen.merged, 0.5, 1.0), seen.may_merge", answer)
     driver = begun(in_process(spec(source))(2), 2)
     with pytest.raises(VutLostError, match=r".*") as lost:
-        driver.act(scene([-71.0, -90.0], [False, False]))
+        driver.act(on_lane([-71.0, -90.0], [False, False]))
     assert said in lost.value.reason
 
 
 def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(spec):
     wishes = "np.where(seen.x_vut_m > -80.0, np.nan, 0.0)"
     driver = begun(in_process(spec(OF_ALL.replace("seen.may_merge", wishes)))(3), 3)
-    idle = scene([-71.0, -90.0, -71.0], [False] * 3)
+    idle = on_lane([-71.0, -90.0, -71.0], [False] * 3)
     idle = idle._replace(active=np.array([True, True, False]))
     assert np.isnan(driver.act(idle)).tolist() == [True, False, False]
     assert driver.reason(0) == "wishes nan instead of 1 or 0, to merge or not"
@@ -244,6 +225,6 @@ def Vut(seen):
     try:
         begun(driver, 2)
         with pytest.raises(VutLostError, match="broke the channel to its process"):
-            driver.act(scene([-71.0, -71.0], [False, False]))
+            driver.act(on_lane([-71.0, -71.0], [False, False]))
     finally:
         driver.close()
