@@ -201,7 +201,8 @@ def _compared(
         # What was drawn for one plan would be drawn again for the other.
         raise UserError(
             f"{before.folder} was begun with {cases} cases, {audit or 0} of them audit cases, "
-            "which are spread over all: leave --cases and --audit as they were, or begin another campaign"
+            "which are spread over all: leave --cases and --audit as they were, or begin another "
+            "campaign"
         )
     # Which cases come next does not depend on how many there are to be.
     grown = isinstance(cases, int) and cases < settings.cases

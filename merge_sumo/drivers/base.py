@@ -91,7 +91,8 @@ class Scene(NamedTuple):
             pair[VUT] = values[VUT]
         active, step = (np.concatenate([each] * cars) for each in (self.active, self.step))
         merged = None if self.merged is None else np.concatenate([self.merged] * cars)
-        return Scene(active, step, *state.reshape(2, 2, -1), merged=merged)
+        x_m, v_mps = state.reshape(2, 2, -1)
+        return Scene(active, step, x_m, v_mps, merged=merged)
 
 
 class VutLostError(Exception):

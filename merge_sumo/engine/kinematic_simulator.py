@@ -25,7 +25,7 @@ from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import VUT
+from merge_sumo.values.scenario import VUT, lane_of
 from merge_sumo.values.trajectory import Trajectory
 
 CHECKED_SHARE: Final = 0.01
@@ -73,7 +73,8 @@ class KinematicSimulator(Simulator):
     def _close_calls(self, ended: Mapping[int, Trajectory]) -> set[int]:
         """Return the places where a rounding error could turn the verdict or end another step.
 
-        For the end the VUT is put forward and back by one, in the last step and the one before.
+        For the end the VUT is put forward and back by one, in the last step and the one before; so
+        it is at M, and where the acceleration lane begins.
         """
         if not ended:
             return set()
@@ -86,7 +87,10 @@ class KinematicSimulator(Simulator):
             shifted_m = x_m.copy()
             shifted_m[VUT] += shift_m
             by_shift.append(self._plan.scenario.has_ended(shifted_m, v_mps))
-        unclear = np.logical_or.reduceat(by_shift[0] != by_shift[1], starts)
+        differ = by_shift[0] != by_shift[1]
+        begin_m, _ = lane_of(self._plan.scenario) or (0.0, 0.0)
+        differ |= (np.abs(x_m[VUT] - begin_m) <= ROUNDING) | (np.abs(x_m[VUT]) <= ROUNDING)
+        unclear = np.logical_or.reduceat(differ, starts)
         return {
             place
             for (place, one), of_end in zip(ended.items(), unclear.tolist(), strict=True)

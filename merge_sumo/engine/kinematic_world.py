@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.world import PARKING_M
@@ -53,7 +54,10 @@ class EquationWorld:
     def advance(self) -> None:
         """Do nothing: `command` makes the whole step."""
 
-    def command(self, a_mps2: FloatArray) -> None:
-        """Move all vehicles by one step of eq. (4) with accelerations, (A, corridors)."""
+    def command(self, a_mps2: FloatArray, merged: NDArray[np.bool_] | None = None) -> None:
+        """Move all vehicles by one step of eq. (4) with accelerations, (A, corridors).
+
+        Both lanes of a merge have one coordinate, so `merged` changes nothing here.
+        """
         self.x_m = self.x_m + self.v_mps * DT_S
         self.v_mps = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)

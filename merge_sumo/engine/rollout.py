@@ -9,15 +9,17 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import Following, keep_behind_vut
+from merge_sumo.drivers.lane import Merging
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.system.blame import Blame
 from merge_sumo.system.pulse import Pulse
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT, lane_of
 from merge_sumo.values.signals import Left, series
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -126,6 +128,8 @@ class _Rollout:
         # One row per step of the world: x, v, a of every vehicle. An episode lies in one piece.
         self.ends_as = End(world.scenario.ends_as)
         self.follow_steps = round(world.scenario.follow_up_s / DT_S)
+        has_lane = lane_of(world.scenario) is not None
+        self.merging = Merging(corridors, world.scenario) if has_lane else None
         self.ring = RING_ROWS + self.follow_steps
         self.record = np.zeros((corridors, self.ring, vehicles, 3))
         self.row = 0
@@ -144,7 +148,8 @@ class _Rollout:
             self.observe()
             try:
                 world.advance()
-                world.command(self.ask_drivers())
+                acceleration = self.ask_drivers()
+                world.command(acceleration, self.merged_next())
             except VutLostError as lost:
                 yield from self.begin_anew(lost, paused=self.was_paused())
                 continue
@@ -158,7 +163,7 @@ class _Rollout:
             if self.errors and self.was_paused() and self.excuse():
                 continue
             self.step += 1
-            arrived = world.scenario.has_ended(world.x_m, world.v_mps) & self.active
+            arrived = self.has_arrived() & self.active
             # In most steps no episode ends.
             if np.count_nonzero(arrived) or self.row >= self.next_timeout or self.errors:
                 ended = arrived | (self.row >= self.timeout_at)
@@ -174,6 +179,18 @@ class _Rollout:
                             corridor, self.ends_as if arrived[corridor] else End.TIMEOUT
                         )
                 self.refill(corridors)
+
+    def merged_next(self) -> NDArray[np.bool_] | None:
+        """Return which VUTs are on the mainline after this step, (K,); None without a lane."""
+        if self.merging is None:
+            return None
+        return self.merging.step(self.world.x_m, self.world.v_mps)
+
+    def has_arrived(self) -> NDArray[np.bool_]:
+        """Return in which corridors the VUT has merged, or the scenario has come to its end."""
+        if self.merging is not None:
+            return self.merging.merged
+        return self.world.scenario.has_ended(self.world.x_m, self.world.v_mps)
 
     def goes_on(self, corridor: int, *, arrived: bool) -> bool:
         """Return whether an episode goes on behind M; note where that begins."""
@@ -283,6 +300,8 @@ class _Rollout:
             self.pov.begin(car * self.world.corridors + corridor, case)
         if self.following is not None:
             self.following.begin(corridor, case)
+        if self.merging is not None:
+            self.merging.begin(corridor)
         try:
             self.vut.begin(corridor, case)
         except WRONGS as error:
@@ -299,17 +318,20 @@ class _Rollout:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
         x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
         _check_finite(x_m, v_mps)
-        scene = Scene(self.active, self.step, x_m, v_mps)
+        merged = None if self.merging is None else self.merging.merged
+        scene = Scene(self.active, self.step, x_m, v_mps, merged=merged)
         cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
         if following is not None:
-            scene = Scene(self.active, self.step, x_m, v_mps, following.met(x_m, v_mps))
+            scene = scene._replace(facing=following.met(x_m, v_mps))
         answer = np.concatenate((cars[:VUT], self.ask_vut(scene)[None], cars[VUT:]))
         # Before the limits of car following, which would turn an infinite answer into a number.
         if not math.isfinite(np.vdot(answer, answer)):
             answer = self.only_numbers(answer)
         if following is not None:
             following.limit(answer, x_m, v_mps)
-        if self.follow_steps:
+        if self.merging is not None:
+            self.merging.take(self.vut.wishes(), answer, x_m, v_mps)
+        elif self.follow_steps:
             keep_behind_vut(answer, x_m, v_mps, self.world.scenario)
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
         self.now[..., 2] = acceleration.T

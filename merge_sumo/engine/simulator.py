@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any, Self
 
 from merge_sumo.drivers.base import Driver
+from merge_sumo.drivers.lane import LanePov
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.povs import PovLibrary
+from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.world import World
 from merge_sumo.system.resources import resource
 from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import MergeScenario, Scenario
+from merge_sumo.values.scenario import Scenario, lane_of
 from merge_sumo.values.trajectory import Trajectory
 
 
@@ -67,7 +68,7 @@ class Simulator:
         self.world = world
         self.vut = plan.vut(world.corridors, sumo)
         opened.callback(self.vut.close)
-        self.pov = PovLibrary(world.corridors * (world.vehicles - 1), plan.povs, sumo)
+        self.pov = povs_for(plan.scenario, plan.povs, world.corridors, sumo)
         opened.callback(self.pov.close)
         self._opened = opened.pop_all()
 
@@ -94,6 +95,12 @@ class Simulator:
         self.close()
 
 
+def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None = None) -> Driver:
+    """Return the drivers of the mainline of a scenario, for the cars of K `corridors`."""
+    library = PovLibrary(corridors * (scenario.vehicles - 1), povs, sumo)
+    return library if lane_of(scenario) is None else LanePov(library)
+
+
 def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
     """Return the road of a scenario, or another net with the same edges.
 
@@ -102,7 +109,7 @@ def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
     if net is None and scenario.net is not None:
         # Where a path says nothing of folders, the net is one that the package brings.
         net = resource("sumo_net") / scenario.net
-    lane_m = scenario.lane_m if isinstance(scenario, MergeScenario) else None
-    road = road_of(net, scenario.pov_edges, scenario.vut_edges, scenario.room_after_m, lane_m)
+    edges = scenario.pov_edges, scenario.vut_edges
+    road = road_of(net, *edges, scenario.room_after_m, lane_of(scenario))
     road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)
     return road

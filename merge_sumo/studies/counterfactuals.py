@@ -29,16 +29,17 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.campaigns.store import Run, failures
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.levelk import DECISION_STEPS
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.engine.evaluate import opened_simulator, workers_or_here
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.simulator import povs_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.world import World
@@ -283,7 +284,7 @@ def run_counterfactuals(plan: SimulationPlan, failing: Sequence[Failure]) -> lis
             return list(avoidances(Stage(plan, ground.world, ground.pov), failing))
     plan.check_software()
     world = EquationWorld(CORRIDORS, plan.road, plan.scenario)
-    with closing(PovLibrary(CORRIDORS * (world.vehicles - 1), plan.povs)) as povs:
+    with closing(povs_for(plan.scenario, plan.povs, CORRIDORS)) as povs:
         return list(avoidances(Stage(plan, world, povs), failing))
 
 
@@ -385,11 +386,15 @@ class _Substitutes(Driver):
         self._by = np.zeros(corridors, dtype=np.int64)
         self._until = np.zeros(corridors, dtype=np.int64)
         self._recorded = np.zeros((steps + 1, corridors))
+        self._merges_at = np.zeros(corridors, dtype=np.int64)
+        """Step after which the VUT of the failure was on the mainline."""
+        self._wishes = np.zeros(corridors, dtype=np.int8)
 
     def begin(self, corridor: int, case: Case) -> None:
         assert isinstance(case, _Counterfactual), "only counterfactuals run here"  # noqa: S101
         self._by[corridor] = list(self._drivers).index(case.by)
         self._until[corridor] = case.until - case.first
+        self._merges_at[corridor] = len(case.failure.motion) - 2 - case.first
         recorded_mps2 = case.recorded_mps2()
         self._recorded[: len(recorded_mps2), corridor] = recorded_mps2
         self._drivers[case.by].begin(corridor, case)
@@ -403,7 +408,14 @@ class _Substitutes(Driver):
             if drives.any():
                 answer[drives] = driver.act(scene)[drives]
                 driver.forget(recorded)
+        # On an acceleration lane: where the VUT did, then as who only accelerates.
+        at_m = scene.x_vut_m + scene.v_vut_mps * DT_S >= 0.0
+        merges = np.where(recorded, scene.step >= self._merges_at, at_m)
+        self._wishes = np.where(merges, MERGE, STAY).astype(np.int8)
         return answer
+
+    def wishes(self) -> NDArray[np.int8]:
+        return self._wishes
 
 
 class _Mainline(Driver):

@@ -30,6 +30,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 from lxml import etree
+from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
@@ -42,7 +43,7 @@ from merge_sumo.sumo.binding import (
 )
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
+from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario
 
 PARKING_M: Final = 182.0
 """Distance to M at which the vehicles of an idle corridor stand, or where their path begins."""
@@ -111,12 +112,15 @@ class World:
         self._paths = [ramp if row == VUT else mainline for row in range(self.vehicles)]
         self._parking_m = [max(-PARKING_M, path.starts_m[0]) for path in self._paths]
         self._lanes = [[path.lanes(k) for k in range(corridors)] for path in self._paths]
+        self._mainline_lanes = [frozenset(lanes) for lanes in self._lanes[POV]]
         self._start_m_of_lane = {
             lane: start_m
             for path in self._paths
             for k in range(corridors)
             for lane, start_m in zip(path.lanes(k), path.starts_m, strict=True)
         }
+        self._merged: NDArray[np.bool_] = np.zeros(corridors, dtype=np.bool_)
+        """Whether SUMO has the VUT on the mainline's lane of a road with an acceleration lane."""
         self._start_m: FloatArray = np.zeros((self.vehicles, corridors))
         """Lane coordinates at which the lanes begin on which the vehicles are."""
         self._start()
@@ -190,6 +194,7 @@ class World:
         `starts` are (x in m, v in m/s) of the vehicles in the order of their rows; `own` is whether
         the cars of the mainline are the tester's own.
         """
+        self._merged[corridor] = False
         for row, (x, v) in enumerate(starts):
             name = self._ids[row * self.corridors + corridor]
             lane, start_m = self._lane_at(row, corridor, x)
@@ -202,7 +207,7 @@ class World:
                 self._obeys[row, corridor] = not by_sumo
             self._move_to(name, lane, x - start_m)
             self._set_previous_speed(name, v, 0.0)
-            if renewed:
+            if renewed and not (by_sumo and row == VUT and self.road.lane_m is not None):
                 self._set_lane_change_mode(name, 0)
             if not by_sumo:
                 if renewed:
@@ -219,7 +224,12 @@ class World:
         self.place(corridor, [(x_m, 0.0) for x_m in self._parking_m])
 
     def _lane_at(self, row: int, corridor: int, x_m: float) -> tuple[str, float]:
-        """Return the lane at a coordinate of a vehicle's path, and where that lane begins."""
+        """Return the lane at a coordinate of a vehicle's path, and where that lane begins.
+
+        The path of a VUT that has merged is the mainline's.
+        """
+        if row == VUT and self._merged[corridor]:
+            row = POV
         starts_m = self._paths[row].starts_m
         number = bisect.bisect_right(starts_m, x_m) - 1
         if number < 0:
@@ -256,14 +266,24 @@ class World:
         names = [name for row in rows for name in self._ids[row * k : (row + 1) * k]]
         return np.fromiter(map(self._get_speed, names), float, len(names))
 
-    def command(self, a_mps2: FloatArray) -> None:
+    def wants_to_merge(self) -> NDArray[np.bool_]:
+        """Return which VUTs SUMO's own lane-change models put on the mainline in its step, (K,)."""
+        names = self._ids[VUT * self.corridors : (VUT + 1) * self.corridors]
+        lanes = map(self._get_lane, names)
+        return np.array([lane in of for lane, of in zip(lanes, self._mainline_lanes, strict=True)])
+
+    def command(self, a_mps2: FloatArray, merged: NDArray[np.bool_] | None = None) -> None:
         """Set the speeds that follow from accelerations, (A, corridors), and read the state.
 
-        Comes after `advance`; the two are one step. Raises `SimulationError`.
+        `merged` says which VUTs are on the mainline after the step, (corridors,), where the road
+        has an acceleration lane. Comes after `advance`; the two are one step. Raises
+        `SimulationError`.
         """
         v_mps: FloatArray = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
         expected_m = self.x_m + self.v_mps * DT_S
         try:
+            if merged is not None:
+                self._change_lanes(merged, expected_m[VUT], v_mps[VUT])
             if self.vut_type is not None or self.car_type is not None:
                 self._put_driven(expected_m, v_mps, a_mps2)
             # A vehicle that keeps its speed needs no command: SUMO holds the last one.
@@ -275,6 +295,19 @@ class World:
             self.x_m, self.v_mps = self._read_x_m(expected_m), v_mps
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
+
+    def _change_lanes(self, merged: NDArray[np.bool_], x_m: FloatArray, v_mps: FloatArray) -> None:
+        """Put VUTs that merge on the mainline, by their next states, (corridors,).
+
+        SUMO stops a vehicle that would leave the end of the acceleration lane in a step, so one
+        that is forced to merge by that step is moved before it.
+        """
+        assert self.road.lane_m is not None, "a road with a lane"  # noqa: S101
+        leaves = x_m + v_mps * DT_S >= self.road.lane_m[1]
+        for k in np.flatnonzero((merged | leaves) & ~self._merged).tolist():
+            self._merged[k] = True
+            lane, start_m = self._lane_at(VUT, k, float(x_m[k]))
+            self._move_to(self._ids[VUT * self.corridors + k], lane, float(x_m[k]) - start_m)
 
     def _put_driven(self, x_m: FloatArray, v_mps: FloatArray, a_mps2: FloatArray) -> None:
         """Put the vehicles that SUMO drives where eq. (4) leads."""

@@ -63,11 +63,11 @@ class TwinRollout:
         """Return whether the POV of a level is known, and not a program of a person's own.
 
         A rollout is of a merge and ends at M: none is possible of other kinds of scenarios, or
-        where what happens behind M counts.
+        where what happens behind M counts, or where the VUT chooses the place.
         """
         known = level == 0 or level in self._networks
-        is_merge = isinstance(self._scenario, MergeScenario)
-        return known and is_merge and (self._criterion.is_papers or not self._scenario.follow_up_s)
+        at_m = isinstance(self._scenario, MergeScenario) and self._scenario.lane_m is None
+        return known and at_m and (self._criterion.is_papers or not self._scenario.follow_up_s)
 
     def _starts(self, points: FloatArray, level: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""

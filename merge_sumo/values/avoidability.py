@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from merge_sumo.values.merge import place_of_merge_m
 from merge_sumo.values.scenario import DT_S, VUT
 from merge_sumo.values.trajectory import Trajectory
 
@@ -13,9 +14,11 @@ def last_avoidable_s(trajectory: Trajectory) -> float | None:
 
     The POV never moves backwards, so of all ways to arrive at M the first and the last possible
     decide: the VUT passes in front at full acceleration, or waits at full braking. Both are
-    rolled out from every step of the record at once. In traffic every car has to be avoided, and
+    rolled out from every step of the record at once. On an acceleration lane it is about the place
+    where the VUT merged. In traffic every car has to be avoided, and
     gaps between cars are left out.
     """
+    place_m = place_of_merge_m(trajectory)
     cars, scenario = np.delete(trajectory.motion, VUT, axis=1), trajectory.case.scenario
     steps = np.arange(1, scenario.max_steps + 1)[:, None]
     beyond = steps * (cars[-1, :, 1] * DT_S) + cars[-1, :, 0]
@@ -28,7 +31,7 @@ def last_avoidable_s(trajectory: Trajectory) -> float | None:
         for ahead in range(1, scenario.max_steps + 1):
             x = x + v * DT_S
             v = np.maximum(v + acceleration * DT_S, 0.0)
-            arrived = driving & (x >= 0.0)
+            arrived = driving & (x >= place_m)
             dx = x_cars[starts[arrived] + ahead] - x[arrived, None]
             avoidable[arrived] |= (np.abs(dx) >= scenario.dx_crash_m).all(axis=1)
             driving &= ~arrived

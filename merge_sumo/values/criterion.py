@@ -21,8 +21,8 @@ from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.criteria import CRITERIA, PAPER
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
 from merge_sumo.values.measures import MEASURES
-from merge_sumo.values.scenario import VEHICLES, VUT, MergeScenario, Scenario
-from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, Verdict, measure
+from merge_sumo.values.scenario import VEHICLES, VUT, MergeScenario, Scenario, lane_of
+from merge_sumo.values.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, Verdict, measure
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.temporal import check_formula, formula_range, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
@@ -93,6 +93,11 @@ class Criterion:
             raise UserError(
                 f"--fail-when speaks of {min(named)}, which is measured behind M: say how long "
                 "with --follow-up SECONDS"
+            )
+        if lane_of(scenario) is None and (named := spoken.intersection(ON_LANE)):
+            raise UserError(
+                f"--fail-when speaks of {min(named)}, and {scenario.name} has no acceleration "
+                "lane: choose a scenario with one, such as us23-lane"
             )
         if (why := self._emptiness(Speeds.possible(scenario), scenario)) is not None:
             raise UserError(f"--fail-when {printable(self.words[:80])!r}: {why}")

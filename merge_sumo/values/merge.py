@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import VUT, Scenario
+from merge_sumo.values.scenario import DT_S, VUT, Scenario, lane_of
 from merge_sumo.values.trajectory import End, Trajectory
 
 REACTION_S: Final = 0.75
@@ -22,6 +22,8 @@ REACTION_S: Final = 0.75
 No. 157 takes (`drivers/reference.py`)."""
 
 
+STANDS_MPS: Final = 0.1
+"""A slower VUT stands."""
 HARSH_MPS2: Final = 3.0
 """The most that a lane change may ask of a vehicle that approaches from behind: UN Regulation
 No. 79, 5.6.4.7."""
@@ -46,6 +48,45 @@ def neighbours(trajectory: Trajectory) -> list[tuple[float, float]]:
         else:
             found.append((x_vut - x - scenario.vut_length_m, v - v_vut))
     return found
+
+
+def place_of_merge_m(trajectory: Trajectory) -> float:
+    """Return where the VUT merges: at M, or where it left the acceleration lane."""
+    on_road = lane_of(trajectory.case.scenario) is not None
+    return float(trajectory.x_vut_m[-1]) if on_road else 0.0
+
+
+def on_lane(trajectory: Trajectory) -> dict[str, float | None]:
+    """Return the measures of a merge from an acceleration lane by name; none without a lane.
+
+    The place of the merge and its share of the lane, the bumper gaps and time gaps to the cars
+    ahead of and behind the VUT at that moment, and for how long it stood on the lane.
+    """
+    scenario, lane_m = trajectory.case.scenario, lane_of(trajectory.case.scenario)
+    if lane_m is None:
+        return {}
+    before = trajectory.motion[:, VUT]
+    stands = (before[:, 0] >= lane_m[0]) & (before[:, 1] < STANDS_MPS)
+    found: dict[str, float | None] = {"stood_s": round(DT_S * int(stands.sum()), 1)}
+    if trajectory.end is not End.MERGED:
+        return found
+    x_vut, v_vut = trajectory.motion[-1, VUT, :2].tolist()
+    found |= {"x_merge_m": x_vut, "lane_share": (x_vut - lane_m[0]) / (lane_m[1] - lane_m[0])}
+    cars = np.delete(trajectory.motion[-1], VUT, axis=0)[:, :2].tolist()
+    ahead = [x - x_vut - scenario.pov_length_m for x, _ in cars if x >= x_vut]
+    behind = [(x_vut - x - scenario.vut_length_m, v) for x, v in cars if x < x_vut]
+    if ahead:
+        found["gap_ahead_m"] = min(ahead)
+        found["time_gap_ahead_s"] = _time_gap_s(min(ahead), v_vut)
+    if behind:
+        gap_m, v_mps = min(behind)
+        found |= {"gap_behind_m": gap_m, "time_gap_behind_s": _time_gap_s(gap_m, v_mps)}
+    return found
+
+
+def _time_gap_s(gap_m: float, v_mps: float) -> float | None:
+    """Return the time in which a follower drives a gap; None where it stands."""
+    return gap_m / v_mps if v_mps > 0.0 else None
 
 
 def needed_braking_mps2(gap_m: float, closing_mps: float) -> float:

@@ -408,7 +408,7 @@ class MergeScenario(Scenario):
 
     @property
     def criterion(self) -> str:
-        """The criterion of a campaign that names none; on a lane, not the paper's, which is of M."""
+        """The criterion of a campaign that names none; the paper's is not for a lane."""
         return "unsafe" if self.lane_m is not None else self.default_criterion
 
     @property
@@ -444,8 +444,12 @@ class MergeScenario(Scenario):
         return ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad", *headways)
 
     def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return in which corridors the VUT is at M or past it in states (A, K), (K,)."""
-        arrived: NDArray[np.bool_] = x_m[VUT] >= 0.0
+        """Return in which corridors the VUT has to be on the mainline in states (A, K), (K,).
+
+        It is there from M on, or from the end of the acceleration lane on.
+        """
+        end_m = 0.0 if self.lane_m is None else self.lane_m[1]
+        arrived: NDArray[np.bool_] = x_m[VUT] >= end_m
         return arrived
 
 

@@ -23,7 +23,14 @@ from merge_sumo.values.avoidability import last_avoidable_s
 from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.measures import OURS, Further, further_measures, further_of
-from merge_sumo.values.merge import brake_after_mps2, closest_after_m, followed_up, neighbours
+from merge_sumo.values.merge import (
+    brake_after_mps2,
+    closest_after_m,
+    followed_up,
+    neighbours,
+    on_lane,
+    place_of_merge_m,
+)
 from merge_sumo.values.migration import upgrade_from_0_1
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import (
@@ -35,6 +42,7 @@ from merge_sumo.values.scenario import (
     MergeScenario,
     Scenario,
     Vehicle,
+    lane_of,
 )
 from merge_sumo.values.severity import Severity, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
@@ -96,6 +104,13 @@ class Measures:
     after_gap_m: float | None = None
     after_ttc_s: float | None = None
     after_drac_mps2: float | None = None
+    x_merge_m: float | None = None
+    lane_share: float | None = None
+    gap_ahead_m: float | None = None
+    gap_behind_m: float | None = None
+    time_gap_ahead_s: float | None = None
+    time_gap_behind_s: float | None = None
+    stood_s: float = 0.0
     further: Further = ()
 
     @classmethod
@@ -239,22 +254,31 @@ class Outcome:
 
 FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
 """Measures of the follow-up."""
+ON_LANE: Final = (
+    *("x_merge_m", "lane_share", "gap_ahead_m", "gap_behind_m"),
+    *("time_gap_ahead_s", "time_gap_behind_s", "stood_s"),
+)
+"""Measures of a merge from an acceleration lane."""
 
 
 def record_fields(scenario: Scenario) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
     """Return the fields of a case and of measures that a record has, and the type of the record."""
     kind: Any = type(scenario)
-    case_fields, in_traffic = scenario.case_fields, scenario.vehicles > 2
-    return _record_fields(kind, case_fields, in_traffic, scenario.follow_up_s > 0.0)
+    left_out = {
+        *(() if scenario.vehicles > 2 else ("nearest",)),
+        *(() if scenario.follow_up_s > 0.0 else FOLLOWED_UP),
+        *(ON_LANE if lane_of(scenario) is None else ()),
+    }
+    return _record_fields(kind, scenario.case_fields, frozenset(left_out))
 
 
 @cache
 def _record_fields(
-    kind: type[Scenario], case_fields: tuple[str, ...], traffic: bool, followed: bool
+    kind: type[Scenario], case_fields: tuple[str, ...], left_out: frozenset[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
     case_names = ("level", *case_fields)
-    left_out = {"further", *(() if traffic else ("nearest",)), *(() if followed else FOLLOWED_UP)}
-    measure_names = tuple(name for name in Measures.__slots__ if name not in left_out)
+    not_fields = {"further", *left_out}
+    measure_names = tuple(name for name in Measures.__slots__ if name not in not_fields)
     types = get_type_hints(kind.case_type) | get_type_hints(Measures) | {"index": int, "batch": int}
     required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
     further = [(name, float | None, None) for name in further_measures()]
@@ -382,6 +406,7 @@ def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> 
         after_gap_m=followed[0],
         after_ttc_s=_finite(followed[1]),
         after_drac_mps2=_finite(followed[2]),
+        **on_lane(trajectory),
     )
 
 
@@ -425,7 +450,7 @@ def _task(trajectory: Trajectory) -> float:
 
 
 def _crossing_time_s(x: FloatArray, v: FloatArray) -> float | None:
-    """Return when a vehicle passed M; eq. (4) moves it at constant speed within a step."""
+    """Return when a vehicle passed 0; eq. (4) moves it at constant speed within a step."""
     step = int(np.argmax(x >= 0.0))
     if x[step] < 0.0:
         return None
@@ -435,13 +460,15 @@ def _crossing_time_s(x: FloatArray, v: FloatArray) -> float | None:
 
 
 def _post_encroachment_time(trajectory: Trajectory) -> float | None:
-    t_vut = _crossing_time_s(trajectory.x_vut_m, trajectory.v_vut_mps)
-    t_pov = _crossing_time_s(trajectory.x_pov_m, trajectory.v_pov_mps)
+    place_m = place_of_merge_m(trajectory)
+    x_pov_m, x_vut_m = trajectory.x_pov_m - place_m, trajectory.x_vut_m - place_m
+    t_vut = _crossing_time_s(x_vut_m, trajectory.v_vut_mps)
+    t_pov = _crossing_time_s(x_pov_m, trajectory.v_pov_mps)
     if t_pov is None:
         v_end = float(trajectory.v_pov_mps[-1])
         if v_end <= 0.0:
             return None
-        t_pov = trajectory.t_end_s - float(trajectory.x_pov_m[-1]) / v_end
+        t_pov = trajectory.t_end_s - float(x_pov_m[-1]) / v_end
     assert t_vut is not None, "only called once the VUT has arrived"  # noqa: S101
     return abs(t_pov - t_vut)
 

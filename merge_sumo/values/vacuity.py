@@ -21,7 +21,7 @@ from merge_sumo.values.bodies import WIDTH_M
 from merge_sumo.values.expression import AllOf, AnyOf, Comparison, Condition, Equality, Negation
 from merge_sumo.values.measures import further_measures
 from merge_sumo.values.merge import REACTION_S
-from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario
+from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.values.score import MU_CRASH, MU_SAFETY, MU_TASK
 from merge_sumo.values.trajectory import End
 
@@ -67,9 +67,10 @@ class Speeds:
         """Return those that no vehicle of a scenario can pass, whatever drives it."""
         a_mps2, time_s = scenario.a_max_mps2, scenario.timeout_s
         v_vut0, v_car0 = scenario.v_start_max_mps, scenario.fastest_start_mps
-        vut_mps = _after_mps(scenario, v_vut0, -scenario.x_vut0_m)
+        vut_mps = _after_mps(scenario, v_vut0, _last_merge_m(scenario) - scenario.x_vut0_m)
         # Bodies touch where the car is at most a length, and a second's way, from M.
-        near_m = scenario.farthest_start_m + 2.0 * _length_m(scenario) + vut_mps * REACTION_S
+        near_m = scenario.farthest_start_m + _last_merge_m(scenario)
+        near_m += 2.0 * _length_m(scenario) + vut_mps * REACTION_S
         impact_mps = vut_mps + _after_mps(scenario, v_car0, near_m)
         car_mps, added_mps = v_car0 + a_mps2 * time_s + ROUNDING, a_mps2 * scenario.follow_up_s
         if added_mps:  # a body may be hit far behind M
@@ -84,6 +85,11 @@ class Speeds:
             *(scenario.v_hw_max_mps, scenario.level0_v_mps),
         )
         return cls(v_mps, v_mps, v_mps, 0.0)
+
+
+def _last_merge_m(scenario: Scenario) -> float:
+    """Return the last place at which the VUT can merge."""
+    return (lane_of(scenario) or (0.0, 0.0))[1]
 
 
 def _length_m(scenario: Scenario) -> float:
@@ -109,12 +115,14 @@ def measure_ranges(scenario: Scenario, speeds: Speeds) -> dict[str, Range]:
     """
     length_m, inf = _length_m(scenario), math.inf
     deepest_m = length_m + WIDTH_M + speeds.impact_mps * REACTION_S
+    farthest_m = scenario.farthest_start_m + _last_merge_m(scenario)
+    begin_m, _ = lane_of(scenario) or (0.0, 0.0)
     return {
         "ttc_s": Range(ABOVE_0, inf),
         "clearance_m": Range(-deepest_m, inf),
         "before_clearance_m": Range(-(length_m + WIDTH_M), inf),
         "bumper_gap_m": Range(-length_m, inf),
-        "dx_m": Range(-(scenario.farthest_start_m + speeds.vut_mps * DT_S + ROUNDING), inf),
+        "dx_m": Range(-(farthest_m + speeds.vut_mps * DT_S + ROUNDING), inf),
         "dv_mps": Range(-speeds.vut_mps, speeds.car_mps),
         "drac_mps2": NOT_NEGATIVE,
         "brake_after_mps2": NOT_NEGATIVE,
@@ -129,6 +137,13 @@ def measure_ranges(scenario: Scenario, speeds: Speeds) -> dict[str, Range]:
         "after_gap_m": Range(-length_m, inf),
         "after_ttc_s": NOT_NEGATIVE,
         "after_drac_mps2": NOT_NEGATIVE,
+        "x_merge_m": Range(begin_m, inf),
+        "lane_share": NOT_NEGATIVE,
+        "gap_ahead_m": Range(-length_m, inf),
+        "gap_behind_m": Range(-length_m, inf),
+        "time_gap_ahead_s": ANY,
+        "time_gap_behind_s": ANY,
+        "stood_s": NOT_NEGATIVE,
         **dict.fromkeys(further_measures(), ANY),
     }
 
