@@ -284,6 +284,8 @@ class _Rollout:
         """Begin an episode in a corridor, or park it."""
         self.active[corridor] = case is not None
         self.step[corridor] = self.clipped[corridor] = 0
+        if self.merging is not None:
+            self.merging.begin(corridor)
         if case is None:
             self.episodes[corridor] = None
             self.world.park(corridor)
@@ -300,8 +302,6 @@ class _Rollout:
             self.pov.begin(car * self.world.corridors + corridor, case)
         if self.following is not None:
             self.following.begin(corridor, case)
-        if self.merging is not None:
-            self.merging.begin(corridor)
         try:
             self.vut.begin(corridor, case)
         except WRONGS as error:

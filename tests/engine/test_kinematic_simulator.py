@@ -122,8 +122,8 @@ class TestTheCheck:
     def test_stops_in_a_sentence_where_sumo_says_otherwise(self, monkeypatch, off_m):
         command = EquationWorld.command
 
-        def drift(world: EquationWorld, a_mps2: np.ndarray) -> None:
-            command(world, a_mps2)
+        def drift(world: EquationWorld, a_mps2: np.ndarray, merged: None) -> None:
+            command(world, a_mps2, merged)
             world.x_m[VUT] += off_m / 80.0
 
         monkeypatch.setattr(EquationWorld, "command", drift)

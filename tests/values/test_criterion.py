@@ -259,7 +259,8 @@ class TestMeasures:
 
 class TestRecords:
     def test_hold_every_measure_that_a_criterion_may_name(self):
-        followed = replace(CASE, scenario=replace(US23, follow_up_s=3.0))
+        lane = replace(US23, follow_up_s=3.0, lane_m=(-70.0, 130.0))
+        followed = replace(CASE, scenario=lane)
         after = np.array([[[20.0, 30.0, 0.0], [0.0, 26.0, 0.0]]])
         episode = replace(ending(20.0), case=followed, after=after)
         record = PAPER_CRITERION.outcome(0, 0, episode).to_record()

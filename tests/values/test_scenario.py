@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -177,7 +177,7 @@ class TestACampaign:
         assert elsewhere.outcomes[0].measures.t_end_s == pytest.approx(float(due_s), abs=0.11)
 
     def test_records_its_scenario_and_is_read_with_it(self, elsewhere):
-        assert elsewhere.settings["scenario"] == json.loads(json.dumps(asdict(OTHER)))
+        assert elsewhere.settings["scenario"] == json.loads(json.dumps(OTHER.to_record()))
         assert elsewhere.settings["v_vut0_mps"] == 10.0
         assert Run(elsewhere.folder).scenario == OTHER
         assert all(outcome.case.scenario == OTHER for outcome in Run(elsewhere.folder).outcomes)
@@ -211,7 +211,8 @@ class TestACampaign:
 
 
 def test_a_campaign_of_the_paper_is_recorded_with_all_numbers(run):
-    assert {field.name for field in fields(MergeScenario)} == set(run.settings["scenario"])
+    names = {field.name for field in fields(MergeScenario)} - {"lane_m", "lane_end"}
+    assert names == set(run.settings["scenario"])
     assert run.scenario == US23
 
 

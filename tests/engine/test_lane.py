@@ -1,0 +1,214 @@
+"""Merging from an acceleration lane: wishes, cars beside and behind, and SUMO's two lanes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plans import plan_for
+from test_kinematic_simulator import uniform
+
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
+from merge_sumo.drivers.lane import LanePov, Merging, acc_mps2, idm_mps2
+from merge_sumo.engine.evaluate import run_cases
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import FloatArray, MergeCase
+from merge_sumo.values.scenario import DT_S, US23, VUT, MergeScenario
+from merge_sumo.values.score import measure
+from merge_sumo.values.trajectory import End, Trajectory
+
+LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
+LATE = """
+class Late:
+    "Merges at a place of its own, by where the POV starts."
+
+    def reset(self, seen):
+        self.place_m = -90.0 + (-seen.x_pov_m * 7.0) % 240.0
+
+    def act(self, seen):
+        return 0.5, seen.x_vut_m >= self.place_m
+"""
+
+
+class TestAWish:
+    """Of the VUT: granted from the lane's begin on, in the next step; at its end it is forced."""
+
+    def step(self, x_m: float, wish: int | None, scenario: MergeScenario = LANE) -> bool:
+        merging = Merging(1, scenario)
+        merging.begin(0)
+        state = np.array([[-500.0], [x_m]]), np.full((2, 1), 20.0)
+        wishes = None if wish is None else np.array([wish], dtype=np.int8)
+        merging.take(wishes, np.zeros((2, 1)), *state)
+        return bool(merging.step(*state)[0])
+
+    @pytest.mark.parametrize(
+        ("x_m", "wish", "merged"),
+        [
+            (-72.1, MERGE, False),
+            (-72.0, MERGE, True),
+            (100.0, STAY, False),
+            (127.9, STAY, False),
+            (128.0, STAY, True),
+            (-2.1, NO_WISH, False),
+            (-2.0, NO_WISH, True),
+            (-2.0, None, True),
+        ],
+    )
+    def test_by_hand(self, x_m, wish, merged):
+        assert self.step(x_m, wish) is merged
+
+    def test_of_a_point_is_granted_where_it_is_forced(self):
+        at_m = replace(LANE, lane_m=None)
+        for x_m, wish in ((-2.1, MERGE), (-2.1, None), (-2.0, STAY), (-2.0, None)):
+            assert self.step(x_m, wish, at_m) is (x_m == -2.0)
+
+    def test_once_stated_is_not_taken_for_granted(self):
+        merging = Merging(1, LANE)
+        state = np.array([[-500.0], [50.0]]), np.full((2, 1), 20.0)
+        merging.take(np.array([STAY], dtype=np.int8), np.zeros((2, 1)), *state)
+        merging.take(np.array([NO_WISH], dtype=np.int8), np.zeros((2, 1)), *state)
+        assert not merging.step(*state)[0]
+
+    def test_is_final(self):
+        merging = Merging(1, LANE)
+        state = np.array([[-500.0], [50.0]]), np.full((2, 1), 20.0)
+        for wish in (MERGE, STAY):
+            merging.take(np.array([wish], dtype=np.int8), np.zeros((2, 1)), *state)
+            assert merging.step(*state)[0]
+
+    def test_that_never_comes_stops_before_the_end(self):
+        merging = Merging(1, replace(LANE, lane_end="stop"))
+        x_m, v_mps = np.array([[-500.0], [60.0]]), np.full((2, 1), 22.0)
+        hardest = 0.0
+        for _ in range(200):
+            answer = np.full((2, 1), 2.0)
+            merging.take(np.array([STAY], dtype=np.int8), answer, x_m, v_mps)
+            assert not merging.step(x_m, v_mps)[0]
+            a = np.clip(answer, -4.0, 2.0)
+            hardest = min(hardest, float(answer[VUT, 0]))
+            x_m, v_mps = x_m + v_mps * DT_S, np.maximum(v_mps + a * DT_S, 0.0)
+        assert v_mps[VUT, 0] == pytest.approx(0.0, abs=1e-9)
+        assert 128.0 < x_m[VUT, 0] < 130.0
+        assert hardest >= -4.0 - 1e-9
+
+
+class TestTheCarBehind:
+    def test_follows_as_published(self):
+        # Equilibrium of IDM: the gap is (s0 + v T) / sqrt(1 - (v / v0)^4).
+        gap = (2.0 + 20.0) / np.sqrt(1.0 - (20.0 / 30.0) ** 4)
+        state = np.array([gap]), np.array([20.0]), np.array([20.0])
+        assert idm_mps2(*state, np.array([30.0]))[0] == pytest.approx(0.0, abs=1e-12)
+        assert acc_mps2(*state, np.zeros(1), np.array([30.0]))[0] == pytest.approx(0.0, abs=1e-12)
+
+    def test_is_calm_where_a_leader_cuts_in_at_its_own_speed(self):
+        # Half a second behind a leader of the same speed: IDM brakes hard, ACC hardly.
+        state = np.array([15.0]), np.array([30.0]), np.array([30.0])
+        idm = idm_mps2(*state, np.array([30.0]))[0]
+        acc = acc_mps2(*state, np.zeros(1), np.array([30.0]))[0]
+        assert idm == pytest.approx(-1.5 * (32.0 / 15.0) ** 2)
+        assert acc == pytest.approx(0.01 * idm + 0.99 * 2.0 * np.tanh(idm / 2.0))
+
+    def test_brakes_as_a_leader_that_brakes_asks(self):
+        state = np.array([10.0]), np.array([20.0]), np.array([20.0])
+        idm = idm_mps2(*state, np.array([30.0]))[0]
+        acc = acc_mps2(*state, np.array([-4.0]), np.array([30.0]))[0]
+        cah = -4.0 * 400.0 / (400.0 + 2.0 * 10.0 * 4.0)
+        assert acc == pytest.approx(0.01 * idm + 0.99 * (cah + 2.0 * np.tanh((idm - cah) / 2.0)))
+
+
+class _Fixed(Driver):
+    """Brakes by 4 m/s2, and notes where it sees the VUT."""
+
+    def act(self, scene: Scene) -> FloatArray:
+        self.seen_m = scene.x_vut_m.copy()
+        return np.full(self.corridors, -4.0)
+
+
+class TestAPov:
+    @pytest.mark.parametrize(
+        ("x_pov", "x_vut", "merged", "answer", "seen_m"),
+        [
+            (-80.0, -50.0, False, -4.0, -50.0),  # before M: the game at M
+            (-30.0, 20.0, False, -4.0, -110.0),  # behind M: the game at the lane's end
+            (30.0, 20.0, False, 1.0, -110.0),  # past the VUT: back to the first speed
+            (30.0, 20.0, True, 1.0, 20.0),  # ahead of a VUT that has merged
+        ],
+    )
+    def test_by_hand(self, x_pov, x_vut, merged, answer, seen_m):
+        driver = _Fixed(1)
+        pov = LanePov(driver)
+        pov.begin(0, MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE))
+        scene = Scene(
+            np.array([True]),
+            np.array([10]),
+            np.array([[x_pov], [x_vut]]),
+            np.array([[25.0], [20.0]]),
+            merged=np.array([merged]),
+        )
+        assert pov.act(scene)[0] == answer
+        assert driver.seen_m[0] == seen_m
+
+
+@pytest.fixture
+def late(tmp_path):
+    (tmp_path / "late.py").write_text(LATE)
+    return f"{tmp_path / 'late.py'}:Late"
+
+
+class TestSumo:
+    @pytest.mark.parametrize("scenario", ["us23-lane", "us23-lane-traffic"])
+    @pytest.mark.parametrize("vut", ["design2", "level0"])
+    def test_moves_as_the_equations(self, scenario, vut):
+        road, level = named_scenario(scenario), 1
+        plan, cases = plan_for(vut, scenario=road), uniform(60, level, road)
+        sumo, kinematic = run_cases(plan, cases), run_cases(plan.with_engine("kinematic"), cases)
+        for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
+            assert one.end is other.end is End.MERGED
+            np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
+            np.testing.assert_allclose(one.after, other.after, rtol=0.0, atol=1e-9)
+
+    def test_has_the_vut_on_the_mainline_from_the_merge_on(self, late, monkeypatch):
+        """Anywhere on the lane, also where the step crosses its end."""
+        road = named_scenario("us23-lane")
+        lanes: list[tuple[float, bool]] = []
+        command = World.command
+
+        def noted(world: World, a_mps2: FloatArray, merged: FloatArray) -> None:
+            command(world, a_mps2, merged)
+            wants = world.wants_to_merge()
+            active = world.x_m[VUT] > -100.0
+            lanes.extend(zip(world.x_m[VUT, active], (wants == merged)[active], strict=True))
+
+        monkeypatch.setattr(World, "command", noted)
+        results = run_cases(plan_for(late, scenario=road), uniform(60, 0, road))
+        places = [one.motion[-1, VUT, 0] for one in results.trajectories]
+        assert min(places) < -65.0
+        assert max(places) >= 130.0
+        at_end = [agrees for x_m, agrees in lanes if not 125.0 < x_m < 131.0]
+        assert all(at_end)
+
+
+class TestAnEpisode:
+    def merged(self, x_pov: float, v_pov: float, x_vut: float, v_vut: float) -> Trajectory:
+        case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
+        before = [[x_pov - v_pov * DT_S, v_pov, 0.0], [x_vut - v_vut * DT_S, v_vut, 0.0]]
+        motion = np.array([before, [[x_pov, v_pov, 0.0], [x_vut, v_vut, 0.0]]])
+        return Trajectory(case, motion, End.MERGED, after=motion[1:])
+
+    def test_is_measured_at_the_place_of_the_merge(self):
+        measures = measure(self.merged(40.0, 30.0, 30.0, 20.0))
+        assert measures.x_merge_m == 30.0
+        assert measures.lane_share == 0.5
+        assert (measures.gap_ahead_m, measures.time_gap_ahead_s) == (5.0, 0.25)
+        assert (measures.gap_behind_m, measures.time_gap_behind_s) == (None, None)
+        assert measures.dx_m == 10.0
+
+    def test_is_measured_with_a_car_behind(self):
+        measures = measure(self.merged(10.0, 30.0, 30.0, 20.0))
+        assert (measures.gap_behind_m, measures.time_gap_behind_s) == (15.0, 0.5)
+        assert measures.gap_ahead_m is None
+        assert measures.pet_s == pytest.approx(20.0 / 30.0)
+        # 10 m/s, 15 m less the way of the reaction: 7.5 m.
+        assert measures.brake_after_mps2 == pytest.approx(100.0 / 15.0)
