@@ -63,7 +63,14 @@ from merge_sumo.campaigns.campaign import (
 )
 from merge_sumo.campaigns.one_case import DEBUG_DEADLINE_S, ONE, Ended, case_of, run_one
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.scenario_suggestion import about, suggested, unseen
+from merge_sumo.campaigns.scenario_suggestion import (
+    about,
+    beside_the_lane,
+    kind_of_merge,
+    suggested,
+    suggested_lane_m,
+    unseen,
+)
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
@@ -949,14 +956,19 @@ def scenarios() -> Shown:
     return Shown({name: scenario.to_record() for name, scenario in shipped.items()}, lines)
 
 
-def new_scenario(file: AnyPath, *, net: AnyPath, mainline: str, ramp: str) -> Shown:
+def new_scenario(
+    file: AnyPath, *, net: AnyPath, mainline: str, ramp: str, point: bool = False
+) -> Shown:
     """Write a scenario for a merge in a net, and a picture of the road; as `scenario new`.
+
+    On a ramp with an acceleration lane the VUT chooses on it where to merge.
 
     Args:
         file: new TOML file to write.
         net: SUMO net, or a map of which netconvert makes one beside `file`: .osm, .xodr.
         mainline: edges of the mainline, past M: "e1 e2".
         ramp: edges of the ramp, past M.
+        point: make M a point, also where the ramp has an acceleration lane.
     """
     file, net = Path(file), Path(net)
     if file.suffix != SUFFIX:
@@ -977,14 +989,16 @@ def new_scenario(file: AnyPath, *, net: AnyPath, mainline: str, ramp: str) -> Sh
             raise UserError(f"{error}; to look at its edges: `{command_for(map_file)}`") from error
         write_new(net, converted, "FILE")
     road = road_of(net, *edges)
-    scenario = suggested(road, file.stem)
+    if not point:
+        road = road_of(net, *edges, lane_m=suggested_lane_m(road))
+    scenario, found = suggested(road, file.stem), [*about(road), *kind_of_merge(road)]
     relative = os.path.relpath(net.resolve(), file.parent.resolve())
     write_new(picture, road_svg(road, scenario), "FILE")
-    text = to_toml(replace(scenario, net=relative), about(road))
+    text = to_toml(replace(scenario, net=relative), found)
     write_new(file, text.encode(), "FILE")
     made_of = "" if map_file is None else f", and its net {net}, made of {map_file}"
-    lines = [*about(road), f"written: {file}, and its picture {picture}{made_of}"]
-    return Shown({"about": about(road), "written": list(map(str, written))}, lines)
+    lines = [*found, f"written: {file}, and its picture {picture}{made_of}"]
+    return Shown({"about": found, "written": list(map(str, written))}, lines)
 
 
 def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None) -> Shown:
@@ -997,7 +1011,9 @@ def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None
     folder = None if policies is None else policies_in(policies)
     checked = scenario_of(scenario)
     name = checked.name if isinstance(scenario, Scenario) else str(scenario)
-    road, differing = about(road_for(checked)), unseen(checked, folder)
+    found = road_for(checked)
+    road, differing = about(found), unseen(checked, folder)
+    warnings = beside_the_lane(checked, found)
     lines = ["the learned drivers (levels 1 and 2) were trained on such starts, or on like ones"]
     if not isinstance(checked, MergeScenario):
         lines = []
@@ -1009,7 +1025,8 @@ def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None
             f"train them: merge-sumo train --scenario {quoted(name)} --out {made}",
             f"then add to a campaign: --policies {made}",
         ]
-    return Shown({"about": road, "unseen": differing}, [*road, *lines])
+    said = [*road, *(f"warning: {sentence}" for sentence in warnings), *lines]
+    return Shown({"about": road, "warnings": warnings, "unseen": differing}, said)
 
 
 def train(

@@ -11,8 +11,8 @@ import numpy as np
 
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
-from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.values.scenario import US23, V_VUT0_MPS, MergeScenario, Scenario, as_merge
+from merge_sumo.road.corridor import MIN_LANE_M, Corridor, LanePath, lane_around_m
+from merge_sumo.values.scenario import US23, V_VUT0_MPS, Bounds, MergeScenario, Scenario, as_merge
 from merge_sumo.values.scenario_scale import Units
 
 MARGIN: Final = 0.15
@@ -21,16 +21,63 @@ SLOWEST: Final = 0.7
 """Of the speed limit: the mainline drives at least so fast."""
 ROOM: Final = 0.98
 """Of the length of a path that is used."""
+BEFORE_GORE_M: Final = 50.0
+"""A VUT starts at least so far before an acceleration lane, where the ramp allows: 2 to 3 s."""
+FOLLOW_UP_S: Final = 5.0
+"""How long the traffic behind a merge on a lane is followed."""
+
+
+def suggested_lane_m(road: Corridor) -> Bounds | None:
+    """Return where a scenario on a road has the acceleration lane, around the expected merge.
+
+    None where the road has none on which a driver chooses where to merge.
+    """
+    lane = road.acceleration_lane
+    return lane_around_m(lane.length_m) if lane is not None and lane.gives_a_choice else None
+
+
+def kind_of_merge(road: Corridor) -> list[str]:
+    """Return which kind of merge a road is taken for, and why, in sentences."""
+    lane = road.acceleration_lane
+    if lane is None:
+        why = (
+            "the lane that ends is that of the mainline"
+            if road.lane_drop
+            else "ramp and mainline have no lanes side by side before it"
+        )
+        return [f"kind: merge at the point M, because {why}"]
+    beside = (
+        f"lane {lane.lane} of the ramp runs beside lane {lane.beside} for {lane.length_m:.1f} m"
+    )
+    if road.lane_m is not None:
+        mark = ", and the net marks it" if lane.is_marked else ""
+        lines = [f"kind: acceleration lane, because {beside}{mark}; `--point` makes M a point"]
+    elif lane.gives_a_choice:
+        lines = [f"kind: merge at the point M, as asked for, although {beside}"]
+    else:
+        lines = [
+            f"kind: merge at the point M, because {beside} only, which the net does not mark and "
+            f"which is less than {MIN_LANE_M:g} m"
+        ]
+    if lane.exits:
+        lines.append(
+            f"weaving: the lane goes on to {' and '.join(lane.exits)}; the VUT has to leave it "
+            "before, and traffic that leaves there is not simulated"
+        )
+    return lines
 
 
 def suggested(road: Corridor, name: str) -> MergeScenario:
     """Return a scenario for a road: limits and lengths from the road, the rest as in the paper.
 
-    The VUT starts as far from M as in the paper, or as the ramp allows; the POV where, at some
-    speed that the mainline drives at, it is at M about when a VUT on the level-0 profile is.
+    The VUT starts as far from M as in the paper, or as the ramp allows, and before an acceleration
+    lane; the POV where, at some speed that the mainline drives at, it is at M about when a VUT on
+    the level-0 profile is.
     """
     limit_mps = min(limit_at(road.mainline, -1.0), US23.v_hw_max_mps)
-    x_vut0_m = max(US23.x_vut0_m, _down(-ROOM * road.ramp.before_m))
+    gore_m = road.lane_m[0] if road.lane_m else 0.0
+    far_m = min(US23.x_vut0_m, gore_m - BEFORE_GORE_M)
+    x_vut0_m = _down(max(far_m, gore_m - ROOM * (road.ramp.before_m + gore_m)))
     v_vut0_mps = round(min(V_VUT0_MPS, limit_at(road.ramp, x_vut0_m)), 1)
     level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
     due_s = float(
@@ -53,7 +100,9 @@ def suggested(road: Corridor, name: str) -> MergeScenario:
         v_hw_max_mps=fast,
         v_min_mps=round(min(US23.v_min_mps, 0.5 * v_vut0_mps), 1),
         level0_v_mps=level0_v_mps,
-        reach_m=max(US23.reach_m, float(math.ceil(-low))),
+        reach_m=max(US23.reach_m, float(math.ceil(-low)), float(math.ceil(-x_vut0_m))),
+        lane_m=road.lane_m and suggested_lane_m(road),
+        follow_up_s=FOLLOW_UP_S if road.lane_m else US23.follow_up_s,
     )
 
 
@@ -83,9 +132,18 @@ def about(road: Corridor) -> list[str]:
             if start_m < 0.0
         )
         lines.append(f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; limits: {limits}")
-    m = road.lane_point(0.0, on_ramp=True)
+    m = road.lane_point(0.0, on_ramp=road.lane_m is None)
     if road.is_one_path:
         return [*lines, f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"]
+    if road.lane_m is not None and (lane := road.acceleration_lane) is not None:
+        ends = f"from {lane.begin_m:.1f} m, the gore, to {lane.end_m:.1f} m"
+        share = -lane.begin_m / lane.length_m
+        return [
+            *lines,
+            f"acceleration lane: {lane.lane}, {ends}",
+            f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), where a merge is expected, at a "
+            f"share of {share:.2f} of the acceleration lane",
+        ]
     lines.append(f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), junction {road.junction_type}")
     first = "ramp" if road.mainline_approach.yields else "mainline"
     yields = road.mainline_approach.yields or road.ramp_approach.yields
@@ -93,6 +151,25 @@ def about(road: Corridor) -> list[str]:
     if road.lane_drop:
         lines.append("one path comes to M on a lane that ends")
     return lines
+
+
+def beside_the_lane(scenario: Scenario, road: Corridor) -> list[str]:
+    """Return what a scenario leaves out of a road with an acceleration lane, in sentences."""
+    lane = road.acceleration_lane
+    if road.lane_m is not None or lane is None or not lane.gives_a_choice:
+        return []
+    sentences = [
+        f"the ramp has an acceleration lane, {lane.lane}, of {lane.length_m:.0f} m, and M is a "
+        "point at its end: `merge-sumo scenario new` writes a scenario in which the VUT chooses "
+        "where to merge on it"
+    ]
+    on_lane_m = scenario.x_vut0_m - lane.begin_m
+    if on_lane_m > 0.0:
+        sentences.append(
+            f"the VUT starts on that lane, {on_lane_m:.0f} m behind its gore, which is at "
+            f"{lane.begin_m:.1f} m"
+        )
+    return sentences
 
 
 ALIKE: Final = 0.25

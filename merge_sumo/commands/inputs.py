@@ -80,6 +80,9 @@ def list_scenarios(given: Given) -> None:
         ),
         "mainline": option(str, ..., 'Edges of the mainline, past M: "e1 e2".'),
         "ramp": option(str, ..., 'Edges of the ramp, past M: "r1 e2".'),
+        "point": option(
+            bool, False, "Make M a point, also where the ramp has an acceleration lane.", "--point"
+        ),
     },
 )
 def new_scenario(
@@ -87,6 +90,7 @@ def new_scenario(
 ) -> None:
     """Write a scenario for a merge in a net of your own, with a suggested pool.
 
+    On a ramp with an acceleration lane the VUT chooses on it where to merge.
     A picture of the road is written beside it, as SVG.
 
     Example:  merge-sumo scenario new my-ramp.toml --net my.net.xml --mainline "a b" --ramp "r b"

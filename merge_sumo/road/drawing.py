@@ -1,4 +1,7 @@
-"""A road as an SVG picture: its lanes, the two paths, M, and where vehicles start."""
+"""A road as an SVG picture: its lanes, the two paths, M, and where vehicles start.
+
+An acceleration lane is drawn in a colour, with its gore and its end.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +15,25 @@ from merge_sumo.values.scenario import MergeScenario
 WIDTH_PX = 1000
 LANE_M = 3.2
 STEP_M = 5.0
+AFTER_M = 120.0
+"""How far behind M, or the end of the lane, the paths are drawn."""
+LANE_COLOUR = "#009e73"
 
 
 def road_svg(road: Corridor, scenario: MergeScenario) -> bytes:
     """Return the picture of a road with the starts of a scenario on it."""
     low_m = min(scenario.x_pov0_m[0], scenario.x_vut0_m)
+    lane_m = scenario.lane_m or (0.0, 0.0)
     paths = {
-        on_ramp: [
-            road.lane_point(x_m, on_ramp=on_ramp)[2:4]
-            for x_m in _steps(max(low_m, path.pieces[0].start_m), min(120.0, path.after_m))
-        ]
+        on_ramp: _line_of(
+            road,
+            max(low_m, path.pieces[0].start_m),
+            min(lane_m[1] + AFTER_M, path.after_m),
+            on_ramp,
+        )
         for on_ramp, path in ((False, road.mainline), (True, road.ramp))
     }
-    window = [road.lane_point(x_m, on_ramp=False)[2:4] for x_m in _steps(*scenario.x_pov0_m)]
+    window = _line_of(road, *scenario.x_pov0_m, on_ramp=False)
     points = [*paths[False], *paths[True]]
     left, right = min(x for x, _ in points) - 20.0, max(x for x, _ in points) + 20.0
     bottom, top = min(y for _, y in points) - 20.0, max(y for _, y in points) + 20.0
@@ -42,19 +51,31 @@ def road_svg(road: Corridor, scenario: MergeScenario) -> bytes:
     _line(root, paths[False], "#c9c7c1", LANE_M)
     _line(root, paths[True], "#c9c7c1", LANE_M)
     _line(root, window, "#e69f00", LANE_M / 2.0)
-    vut = road.lane_point(scenario.x_vut0_m, on_ramp=True)[2:4]
-    m = road.lane_point(0.0, on_ramp=True)[2:4]
-    for (x, y), colour, name in (
-        (vut, "#0072b2", "VUT"),
-        (m, "#d55e00", "M"),
-        (window[0], "#e69f00", "POV"),
-    ):
+    marks = [
+        (scenario.x_vut0_m, True, "#0072b2", "VUT"),
+        (0.0, scenario.lane_m is None, "#d55e00", "M"),
+        (scenario.x_pov0_m[0], False, "#e69f00", "POV"),
+    ]
+    if scenario.lane_m is not None:
+        begin_m, end_m = scenario.lane_m
+        _line(root, _line_of(road, begin_m, end_m, on_ramp=True), LANE_COLOUR, LANE_M / 2.0)
+        marks += [(begin_m, True, LANE_COLOUR, "gore"), (end_m, True, LANE_COLOUR, "end of lane")]
+    for x_m, on_ramp, colour, name in marks:
+        x, y = road.lane_point(x_m, on_ramp=on_ramp)[2:4]
         etree.SubElement(root, "circle", cx=f"{x:.1f}", cy=f"{-y:.1f}", r="3", fill=colour)
         text = etree.SubElement(
             root, "text", {"x": f"{x + 4.0:.1f}", "y": f"{-y - 4.0:.1f}", "font-size": "9"}
         )
         text.text = name
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
+
+
+def _line_of(
+    road: Corridor, low_m: float, high_m: float, on_ramp: bool
+) -> list[tuple[float, float]]:
+    """Return the points of a part of a path."""
+    points = (road.lane_point(x_m, on_ramp=on_ramp) for x_m in _steps(low_m, high_m))
+    return [(point.x_m, point.y_m) for point in points]
 
 
 def _steps(low_m: float, high_m: float) -> list[float]:

@@ -18,15 +18,19 @@ from functools import cache
 from itertools import pairwise, permutations, product
 from typing import Final, NamedTuple
 
-from merge_sumo.road.corridor import Approach, Corridor, LanePath, Piece
+from merge_sumo.road.corridor import (
+    AccelerationLane,
+    Approach,
+    Corridor,
+    LanePath,
+    Piece,
+    lane_around_m,
+)
 from merge_sumo.road.netfile import Lane, Link, NetFile, Point
 from merge_sumo.values.scenario import ROOM_AFTER_M, Bounds
 
 SURROUNDINGS_M: Final = 500.0
 """How near to M a lane beside the paths is drawn."""
-EXPECTED_SHARE: Final = 0.35
-"""Of an acceleration lane, up to M: on three German ramps with lanes of 186 to 199 m cars merge
-after a mean share of .32, .46 and .33 (Li et al. 2023, arXiv 2303.11531, 3,430 merges)."""
 POINT_M: Final = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
 
@@ -50,12 +54,13 @@ def find_corridor(
     or the road has no such lane.
     """
     meeting, before, onward = _paths(net, tuple(mainline), tuple(ramp), edge_at_m)
+    apart, along = _acceleration_lane(meeting, before)
+    length_m = _length_m(along[0])
     beside: list[list[Lane]] = [[], []]
     begin_m = end_m = 0.0
     if lane_m is not None:
-        before, beside = _acceleration_lane(meeting, before)
-        begin_m, end_m = _window_m(net, meeting, _length_m(beside[0]), lane_m)
-        onward = [*meeting.mainline.via, *onward]
+        begin_m, end_m = _window_m(net, meeting, length_m, lane_m)
+        before, beside, onward = apart, along, [*meeting.mainline.via, *onward]
     paths = []
     for own, side in zip(before, beside, strict=True):
         pieces = _placed(net, own, begin_m - _length_m(own))
@@ -87,18 +92,8 @@ def find_corridor(
         drawn_after_m=end_m + _length_m(onward),
         surroundings=_surroundings(net, paths, shared[0].shape[0]),
         lane_m=lane_m and (begin_m, end_m),
+        acceleration_lane=_lane_of_road(net, meeting, along, end_m if lane_m else None),
     )
-
-
-def acceleration_lane_m(net: NetFile, mainline: Sequence[str], ramp: Sequence[str]) -> float:
-    """Return how long the ramp's lane runs beside the mainline's, in m; 0 without such a lane.
-
-    Raises `UserError` as `find_corridor`.
-    """
-    meeting, before, _ = _paths(net, tuple(mainline), tuple(ramp))
-    if meeting.drop is meeting.mainline:
-        return 0.0
-    return _length_m(_acceleration_lane(meeting, before)[1][0])
 
 
 _Edges = tuple[str, ...]
@@ -162,6 +157,25 @@ def _acceleration_lane(
     return [main[:on_main], ramp[:on_ramp]], [*beside]
 
 
+def _lane_of_road(
+    net: NetFile, meeting: _Meeting, along: list[list[Lane]], end_m: float | None
+) -> AccelerationLane | None:
+    """Return the acceleration lane of a road; by default it ends before the junction at M."""
+    main, ramp = along
+    if not ramp or meeting.drop is meeting.mainline:
+        return None
+    if end_m is None:
+        end_m = -_length_m(meeting.ramp.via)
+    return AccelerationLane(
+        begin_m=end_m - _length_m(main),
+        end_m=end_m,
+        lane=ramp[-1].id,
+        beside=main[-1].id,
+        is_marked=any(lane.is_marked for lane in ramp),
+        exits=tuple(edge for edge in net.edges_from(ramp[-1]) if edge != meeting.target.edge),
+    )
+
+
 def _window_m(net: NetFile, meeting: _Meeting, length_m: float, lane_m: Bounds) -> Bounds:
     """Return where a lane begins and ends, if that of a scenario, `lane_m`, is on it."""
     if meeting.drop is meeting.mainline:
@@ -174,18 +188,12 @@ def _window_m(net: NetFile, meeting: _Meeting, length_m: float, lane_m: Bounds) 
         )
     begin_m, end_m = lane_m
     if begin_m < end_m - length_m:
-        low, high = suggested_lane_m(length_m)
+        low, high = lane_around_m(length_m)
         raise net.broken(
             f"lane_m is {begin_m:g} to {end_m:g}, {end_m - begin_m:g} m, and the acceleration lane "
             f"is {length_m:.1f} m long: write lane_m = [{low:.1f}, {high:.1f}]"
         )
     return end_m - length_m, end_m
-
-
-def suggested_lane_m(length_m: float) -> Bounds:
-    """Return where a lane begins and ends around the expected place of a merge, M."""
-    end_m = math.floor((1.0 - EXPECTED_SHARE) * length_m * 10.0) / 10.0
-    return math.ceil((end_m - length_m) * 10.0) / 10.0, end_m
 
 
 def _split(
@@ -262,7 +270,8 @@ def _meeting(
             return _Meeting(*links, place=place + 1)
     raise net.broken(
         f"mainline and ramp have no lane in common up to the end of edge {tail[-1]}; name the edge "
-        "that follows on both"
+        "that follows on both, or there is no merge where the ramp's lane goes on beside the "
+        "mainline"
     )
 
 

@@ -41,6 +41,8 @@ class Lane:
     speed_limit_mps: float
     shape: tuple[Point, ...]
     open_to_cars: bool
+    is_marked: bool
+    """Whether the net says that it is an acceleration lane."""
 
     @property
     def is_internal(self) -> bool:
@@ -136,6 +138,12 @@ class NetFile:
             if connection.get("to") == edge
         }
         return sorted(name for name in sources if not name.startswith(":"))
+
+    def edges_from(self, lane: Lane) -> list[str]:
+        """Return the edges to which a connection leads from a lane."""
+        elements = self._connections.get((lane.edge, str(lane.index)), ())
+        names = {str(element.get("to")) for element in elements if _open_to_cars(element)}
+        return sorted(name for name in names if not name.startswith(":"))
 
     def junction_id(self, source: Lane) -> str:
         """Return the id of the junction at the end of a lane; `UserError` where there is none."""
@@ -281,6 +289,7 @@ def _lane(lane: etree._Element) -> Lane:
         speed_limit_mps=numbers[1],
         shape=shape,
         open_to_cars=_open_to_cars(lane),
+        is_marked=lane.get("acceleration") in ("1", "true"),
     )
 
 

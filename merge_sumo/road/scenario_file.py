@@ -112,6 +112,8 @@ COMMENTS: Final = {
     "level0_v_mps": "up to this speed",
     "reach_m": "no vehicle starts farther from M than this,",
     "v_start_max_mps": "nor faster than this",
+    "lane_m": "where the acceleration lane begins, at the gore or behind it, and ends",
+    "lane_end": 'its end moves a VUT to the mainline; "stop" brakes it to a stand before it',
 }
 """What stands beside a value in a file that we write."""
 
@@ -119,9 +121,10 @@ COMMENTS: Final = {
 def to_toml(scenario: Scenario, found: Sequence[str]) -> str:
     """Return a scenario as a commented file; `found` is what was found out, in lines."""
     lines = [*(f"# {line}" for line in found), ""]
+    recorded = scenario.to_record()
     for field in fields(scenario):
         value = getattr(scenario, field.name)
-        if value is None:
+        if value is None or field.name not in recorded:
             continue
         comment = COMMENTS.get(field.name)
         text = f"{field.name} = {_toml(value)}"
