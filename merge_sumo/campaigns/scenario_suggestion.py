@@ -47,7 +47,8 @@ def kind_of_merge(road: Corridor) -> list[str]:
         )
         return [f"kind: merge at the point M, because {why}"]
     beside = (
-        f"lane {lane.lane} of the ramp runs beside lane {lane.beside} for {lane.length_m:.1f} m"
+        f"{' '.join(lane.lanes)} of the ramp runs beside {' '.join(lane.beside)} of the mainline "
+        f"for {lane.length_m:.1f} m"
     )
     if road.lane_m is not None:
         mark = ", and the net marks it" if lane.is_marked else ""
@@ -140,7 +141,7 @@ def about(road: Corridor) -> list[str]:
         share = -lane.begin_m / lane.length_m
         return [
             *lines,
-            f"acceleration lane: {lane.lane}, {ends}",
+            f"acceleration lane: {' '.join(lane.lanes)}, {ends}",
             f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), where a merge is expected, at a "
             f"share of {share:.2f} of the acceleration lane",
         ]
@@ -159,8 +160,8 @@ def beside_the_lane(scenario: Scenario, road: Corridor) -> list[str]:
     if road.lane_m is not None or lane is None or not lane.gives_a_choice:
         return []
     sentences = [
-        f"the ramp has an acceleration lane, {lane.lane}, of {lane.length_m:.0f} m, and M is a "
-        "point at its end: `merge-sumo scenario new` writes a scenario in which the VUT chooses "
+        f"the ramp has an acceleration lane, {' '.join(lane.lanes)}, of {lane.length_m:.0f} m; M "
+        "is a point at its end: `merge-sumo scenario new` writes a scenario in which the VUT chooses "
         "where to merge on it"
     ]
     on_lane_m = scenario.x_vut0_m - lane.begin_m

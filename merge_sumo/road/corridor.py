@@ -139,9 +139,9 @@ class AccelerationLane:
     begin_m: float
     """Lane coordinates of its begin, the gore, and of its end."""
     end_m: float
-    lane: str
-    """The ids of its last lane in the net file and of that beside it."""
-    beside: str
+    lanes: tuple[str, ...]
+    """Its ids in the net file, one for each edge, and those of the lanes beside it."""
+    beside: tuple[str, ...]
     is_marked: bool
     """Whether the net marks it, as netconvert marks those that it makes or is told of."""
     exits: tuple[str, ...]

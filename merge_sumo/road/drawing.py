@@ -5,6 +5,7 @@ An acceleration lane is drawn in a colour, with its gore and its end.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from lxml import etree
@@ -57,7 +58,8 @@ def road_svg(road: Corridor, scenario: MergeScenario) -> bytes:
         (scenario.x_pov0_m[0], False, "#e69f00", "POV"),
     ]
     if scenario.lane_m is not None:
-        begin_m, end_m = scenario.lane_m
+        # At its very end the path of the ramp is on the mainline.
+        begin_m, end_m = scenario.lane_m[0], math.nextafter(scenario.lane_m[1], -math.inf)
         _line(root, _line_of(road, begin_m, end_m, on_ramp=True), LANE_COLOUR, LANE_M / 2.0)
         marks += [(begin_m, True, LANE_COLOUR, "gore"), (end_m, True, LANE_COLOUR, "end of lane")]
     for x_m, on_ramp, colour, name in marks:

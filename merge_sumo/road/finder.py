@@ -169,8 +169,8 @@ def _lane_of_road(
     return AccelerationLane(
         begin_m=end_m - _length_m(main),
         end_m=end_m,
-        lane=ramp[-1].id,
-        beside=main[-1].id,
+        lanes=tuple(lane.id for lane in ramp if not lane.is_internal),
+        beside=tuple(lane.id for lane in main if not lane.is_internal),
         is_marked=any(lane.is_marked for lane in ramp),
         exits=tuple(edge for edge in net.edges_from(ramp[-1]) if edge != meeting.target.edge),
     )

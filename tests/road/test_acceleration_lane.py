@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import bisect
+import re
+import shutil
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from foreign_nets import (
     plain,
 )
 
+from merge_sumo import api
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
@@ -25,7 +28,7 @@ from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S
+from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MergeScenario
 
 EXACT = 1e-9
 MAX_SPEED = "200"
@@ -270,3 +273,125 @@ def test_a_driver_of_sumo_waits_for_a_gap_and_then_changes_to_the_mainline(road,
     assert list(dict.fromkeys(lanes))[:2] == ["lane.1_0", "lane.1_1"]
     assert lanes[-1] == "out1.1_0"
     assert seen[lanes.index("lane.1_1")][1] > 20.0, "beside a car it stays"
+
+
+class TestAScenario:
+    @staticmethod
+    def new(
+        folder: Path, build, mainline: str, ramp: str, **more
+    ) -> tuple[MergeScenario, list[str]]:
+        file = folder / "mine.toml"
+        lines = api.new_scenario(
+            file, net=build(folder), mainline=mainline, ramp=ramp, **more
+        ).lines()
+        scenario = named_scenario(str(file))
+        assert isinstance(scenario, MergeScenario)
+        return scenario, lines
+
+    def test_for_a_marked_lane_begins_before_the_gore_and_has_m_at_a_share_of_035(self, tmp_path):
+        scenario, lines = self.new(tmp_path, *LANES["lane drop"])
+        assert scenario.lane_m == (-75.4, 139.9)  # of 215.36 m
+        assert (scenario.x_vut0_m, scenario.follow_up_s, scenario.lane_end) == (
+            -182.0,
+            5.0,
+            "merge",
+        )
+        (kind,) = (line for line in lines if line.startswith("kind"))
+        assert kind == (
+            "kind: acceleration lane, because acc_0 of the ramp runs beside acc_1 of the mainline "
+            "for 215.4 m, and the net marks it; `--point` makes M a point"
+        )
+        checked = api.check_scenario(scenario)
+        assert checked.record["warnings"] == []
+        picture = (tmp_path / "mine.svg").read_text()
+        assert all(
+            f">{name}</text>" in picture for name in ("VUT", "POV", "M", "gore", "end of lane")
+        )
+
+    def test_for_a_long_lane_begins_farther_from_m(self, tmp_path):
+        # 700 m of lane, so the gore is at -245 m: farther than the paper's start of the VUT.
+        def build(folder):
+            return Path(shutil.copy(stretched(lane_drop(folder), 700.0), folder / "long.net.xml"))
+
+        scenario, _ = self.new(tmp_path, build, *LANES["lane drop"][1:])
+        assert scenario.lane_m == (-245.0, 455.0)
+        assert scenario.x_vut0_m == -295.0
+
+    @pytest.mark.parametrize(
+        ("length_m", "kind", "lane_m"),
+        [
+            (
+                49.9,
+                "merge at the point M, because .* only, .* not mark and .* less than 50 m",
+                None,
+            ),
+            (50.0, "acceleration lane, because .* for 50.0 m; ", (-17.5, 32.5)),
+        ],
+    )
+    def test_for_an_unmarked_lane_has_a_choice_from_50_m_on(self, tmp_path, length_m, kind, lane_m):
+        def build(folder):
+            return stretched(lane_drop(folder), length_m, 'acceleration="1"')
+
+        scenario, lines = self.new(tmp_path, build, *LANES["lane drop"][1:])
+        assert scenario.lane_m == lane_m
+        assert re.search(f"^kind: {kind}", "\n".join(lines), re.MULTILINE)
+
+    def test_at_a_point_on_such_a_road_warns_and_says_where_its_vut_starts(self, tmp_path):
+        scenario, lines = self.new(tmp_path, *LANES["lane drop"], point=True)
+        assert (scenario.lane_m, scenario.follow_up_s) == (None, 0.0)
+        assert "lane_end" not in (tmp_path / "mine.toml").read_text()
+        assert any(line.startswith("kind: merge at the point M, as asked for") for line in lines)
+        lane, start = api.check_scenario(scenario).record["warnings"]
+        assert re.match(r"the ramp has an acceleration lane, acc_0, of 215 m; M is a point", lane)
+        # The gore is 215.36 + 8 m before M.
+        assert start == "the VUT starts on that lane, 41 m behind its gore, which is at -223.4 m"
+
+    def test_on_a_lane_that_goes_on_to_an_exit_says_so(self, tmp_path):
+        scenario, lines = self.new(tmp_path, weaving, "in acc out", "ramp acc out")
+        assert scenario.lane_m is not None
+        (weaves,) = (line for line in lines if line.startswith("weaving"))
+        assert weaves.startswith("weaving: the lane goes on to exit; ")
+
+    def test_where_the_lane_never_ends_there_is_none(self, tmp_path):
+        with pytest.raises(
+            UserError, match="no merge where the ramp's lane goes on beside the main"
+        ):
+            self.new(tmp_path, added_lane, "in acc out", "ramp acc out")
+
+
+def stretched(net: Path, length_m: float, without: str = "\0") -> Path:
+    """Give the lanes of edge acc another length, and take a text out of the file."""
+    text = re.sub(r'(id="acc_\d" [^>]*length=)"[\d.]+"', rf'\1"{length_m}"', net.read_text())
+    net.write_text(text.replace(without, ""))
+    return net
+
+
+NODES = (
+    node("a", -800, 0) + node("n", -200, 0) + node("d", 100, 0) + node("b", 700, 0)
+    + node("r", -500, -90) + node("x", 500, -90)
+)  # fmt: skip
+
+
+def weaving(folder: Path) -> Path:
+    """A lane from a ramp to an exit."""
+    return plain(
+        folder,
+        NODES,
+        edge("in", "a", "n", 2, 30, priority=9) + edge("acc", "n", "d", 3, 30, priority=9)
+        + edge("out", "d", "b", 2, 30, priority=9) + edge("ramp", "r", "n", 1, 22, priority=3)
+        + edge("exit", "d", "x", 1, 22, priority=3),
+        lane("in", 0, "acc", 1) + lane("in", 1, "acc", 2) + lane("ramp", 0, "acc", 0)
+        + lane("acc", 0, "exit", 0) + lane("acc", 1, "out", 0) + lane("acc", 2, "out", 1),
+    )  # fmt: skip
+
+
+def added_lane(folder: Path) -> Path:
+    """A mainline to which a ramp adds a lane for good."""
+    return plain(
+        folder,
+        NODES,
+        edge("in", "a", "n", 2, 30, priority=9) + edge("acc", "n", "d", 3, 30, priority=9)
+        + edge("out", "d", "b", 3, 30, priority=9) + edge("ramp", "r", "n", 1, 22, priority=3),
+        lane("in", 0, "acc", 1) + lane("in", 1, "acc", 2) + lane("ramp", 0, "acc", 0)
+        + "".join(lane("acc", number, "out", number) for number in range(3)),
+    )  # fmt: skip
