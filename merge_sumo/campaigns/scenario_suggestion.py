@@ -161,8 +161,8 @@ def beside_the_lane(scenario: Scenario, road: Corridor) -> list[str]:
         return []
     sentences = [
         f"the ramp has an acceleration lane, {' '.join(lane.lanes)}, of {lane.length_m:.0f} m; M "
-        "is a point at its end: `merge-sumo scenario new` writes a scenario in which the VUT chooses "
-        "where to merge on it"
+        "is a point at its end: `merge-sumo scenario new` writes a scenario in which the VUT "
+        "chooses where to merge on it"
     ]
     on_lane_m = scenario.x_vut0_m - lane.begin_m
     if on_lane_m > 0.0:

@@ -19,7 +19,7 @@ from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
         *("vut", "vut_command", "level", "pov", "policies", "scenario", "net", "v_vut0"),
-        *("mainline", "ramp", "follow_up", "case", "at", "x", "v", "psi", "headway_ahead"),
+        *("mainline", "ramp", "point", "follow_up", "case", "at", "x", "v", "psi", "headway_ahead"),
         *("headway_behind", "only", "check"),
     ),
     "How many cases, and which": (
