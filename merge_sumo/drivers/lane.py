@@ -7,7 +7,7 @@ as that can be played, and then drives as cars do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -77,6 +77,10 @@ def acc_mps2(
     return np.where(idm >= cah, idm, tempered)
 
 
+Following = Callable[[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+"""Gives accelerations by gaps, speeds, speeds and accelerations of leaders, and desired speeds."""
+
+
 class LanePov(Driver):
     """Drives cars of the mainline beside an acceleration lane by a driver that knows a merge at M.
 
@@ -86,10 +90,10 @@ class LanePov(Driver):
     POV of a person's own decides for itself until then.
     """
 
-    def __init__(self, driver: Driver) -> None:
-        """Take the driver of all cars."""
+    def __init__(self, driver: Driver, follow: Following = acc_mps2) -> None:
+        """Take the driver of all cars, and how they follow a VUT that has merged."""
         super().__init__(driver.corridors)
-        self._driver = driver
+        self._driver, self._follow = driver, follow
         self._v_first_mps = np.zeros(driver.corridors)
         self._end_m = np.zeros(driver.corridors)
         self._pov_length_m = np.full(driver.corridors, US23.pov_length_m)
@@ -123,7 +127,7 @@ class LanePov(Driver):
         follows = merged & (x_pov < x_vut)
         if follows.any():
             gap_m, a_vut = x_vut - self._vut_length_m - x_pov, (v_vut - self._v_vut_mps) / DT_S
-            most = acc_mps2(gap_m, v_pov, v_vut, a_vut, self._v_first_mps)
+            most = self._follow(gap_m, v_pov, v_vut, a_vut, self._v_first_mps)
             answer = np.where(follows, np.minimum(answer, most), answer)
         self._v_vut_mps = v_vut.copy()
         return answer

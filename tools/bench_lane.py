@@ -1,0 +1,125 @@
+"""How well a POV that knows a merge at M plays beside an acceleration lane: its regret.
+
+    python tools/bench_lane.py [--cases 300] [--seed 1]
+
+First what the POV gains before the merge:
+
+The VUT drives the level-0 profile and merges at a place that the POV does not know: where the lane
+begins, at M, in the middle of the rest, at the lane's end. The POV is that of level 1 by the rule
+of `merge_sumo/drivers/lane.py`. Its return up to the merge is compared with the exact best response
+of a driver that knows the place. Regret is a share of what that driver gains over one that keeps
+its speed; for M it is that of the point merge.
+
+Then how hard cars brake in the 5 s after merges at M that need at most 1 m/s2 of the car behind, at
+level 0: by ACC, as they do, and by IDM.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
+from merge_sumo.drivers.lane import LanePov, acc_mps2, idm_mps2
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
+from merge_sumo.drivers.policies import load_driver
+from merge_sumo.engine.kinematic_world import EquationWorld
+from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.training.best_response import best_response
+from merge_sumo.training.check import returns_of
+from merge_sumo.training.game import Game
+from merge_sumo.training.reward import Reward
+from merge_sumo.values.case import Case, FloatArray, from_unit
+from merge_sumo.values.merge import brake_after_mps2
+from merge_sumo.values.scenario import DT_S, US23, Bounds, as_merge
+from merge_sumo.values.trajectory import Trajectory
+
+
+class MergesAt(Level0Vut):
+    """The level-0 profile, with a wish to merge from a place on."""
+
+    def __init__(self, corridors: int, place_m: float) -> None:
+        """Take the place."""
+        super().__init__(corridors)
+        self._place_m = place_m
+        self._wishes = np.zeros(corridors, dtype=np.int8)
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the accelerations, (K,)."""
+        next_m = scene.x_vut_m + scene.v_vut_mps * DT_S
+        self._wishes = np.where(next_m >= self._place_m, MERGE, STAY).astype(np.int8)
+        return super().act(scene)
+
+    def wishes(self) -> NDArray[np.int8]:
+        """Return the wishes, (K,)."""
+        return self._wishes
+
+
+def played(cases: Sequence[Case], pov: Driver, vut: Driver) -> list[Trajectory]:
+    """Return what happens in cases of one scenario, in their order."""
+    scenario = cases[0].scenario
+    world = EquationWorld(pov.corridors, road_for(scenario), scenario)
+    ended = dict(rollout(world, pov, vut, cases))
+    return [ended[place] for place in range(len(cases))]
+
+
+def idm(
+    gap_m: FloatArray, v: FloatArray, v_leader: FloatArray, _: FloatArray, v_desired: FloatArray
+) -> FloatArray:
+    """Return accelerations as `acc_mps2` does, by IDM."""
+    return idm_mps2(gap_m, v, v_leader, v_desired)
+
+
+def _print_regret(cases: Sequence[Case], lane_m: Bounds) -> None:
+    k, reward = len(cases), Reward.of(US23)
+    starts = np.array([[x for start in case.starts() for x in start] for case in cases])
+    print(f"POV-1, {k} cases; VUT: level 0, merges at")
+    print("place m   mean regret   p99 regret   within 6 m   of the best response")
+    for place_m in (lane_m[0], 0.0, 0.5 * lane_m[1], lane_m[1]):
+        vut = MergesAt(k, place_m)
+        reached, unmoved = (
+            returns_of(played(cases, LanePov(pov), vut), reward)
+            for pov in (load_driver("pov1", k), Level0Pov(k))
+        )
+        shifted = starts - np.array([place_m, 0.0, place_m, 0.0])
+        best = best_response(Game("pov", None, reward), shifted)
+        got, kept = (parts.of("pov", np.zeros(k)) for parts in (reached, unmoved))
+        regret = (best - got) / (best - kept).mean()
+        crash = -reward.weights.crash / 2
+        print(
+            f"{place_m:7.0f} {regret.mean():12.1%} {np.quantile(regret, 0.99):12.1%}"
+            f"{reached.collided.mean():13.1%} {(best < crash).mean():13.1%}"
+        )
+
+
+def _print_braking(cases: Sequence[Case]) -> None:
+    print("followers   merges that need at most 1 m/s2   harder than 3 m/s2 after them")
+    for name, follow in (("ACC", acc_mps2), ("IDM", idm)):
+        pov = LanePov(Level0Pov(len(cases)), follow)
+        merges = played(cases, pov, MergesAt(len(cases), 0.0))
+        easy = [one for one in merges if 0.0 < brake_after_mps2(one) <= 1.0]
+        hard = [one for one in easy if one.after is not None and one.after[:, 0, 2].min() < -3.0]
+        print(f"{name:9} {len(easy):12} {len(hard):12}")
+
+
+def main() -> None:
+    """Print the regret by the place of the merge, and the braking after it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    scenario = as_merge(named_scenario("us23-lane"))
+    assert scenario.lane_m is not None, "a lane"  # noqa: S101
+    points = np.random.default_rng(arguments.seed).random((arguments.cases, 2))
+    cases = from_unit(points, 1, scenario=scenario)
+    _print_regret(cases, scenario.lane_m)
+    _print_braking(cases)
+
+
+if __name__ == "__main__":
+    main()
