@@ -229,8 +229,9 @@ _RECORDED: Final = {
     "type": _WHO,
     "lane": matching(
         "(?:main_in|main_out|ramp)_0"
-        r"|(?::(?:M|end|(?:main|ramp|out)[0-9]{1,4}-end)\.0_(?:main|ramp|out)[0-9]{1,4}"
-        r"|(?:main|ramp|out)[0-9]{1,4}\.0)_0",
+        r"|(?::(?:M|gore|end|(?:main|ramp|out)[0-9]{1,4}-end)\.0_(?:main|ramp|out)[0-9]{1,4}"
+        r"|(?:main|ramp|out)[0-9]{1,4}\.0)_0"
+        r"|lane\.0_[01]",
         "a lane of a replay",
     ),
 }

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from lxml import etree
 
@@ -106,6 +106,21 @@ Rows = dict[tuple[float, str], tuple[float, ...]]
 """The values of `COMPARED` by time and vehicle."""
 
 
+class _OnPath(NamedTuple):
+    path: LanePath
+    x_m: float
+    """Lane coordinate on it."""
+
+    def is_at(self, x: float, y: float) -> bool:
+        """Return whether a point in the plane is this one."""
+        lane = self.path.point(self.x_m)
+        return math.hypot(x - lane.x_m, y - lane.y_m) <= LANE_END_M
+
+
+Places = dict[tuple[float, str], _OnPath | None]
+"""Path and lane coordinate by time and vehicle; None for a lane where the vehicle has no path."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Episode:
     """What is allowed of a received folder."""
@@ -115,21 +130,12 @@ class _Episode:
     record: etree._Element
     labels: etree._Element | None
     rows: Rows
-    x_m: dict[tuple[float, str], float | None]
-    """Lane coordinates of the rows; None for a lane on which a vehicle does not drive."""
+    places: Places
 
     @property
     def vehicles(self) -> tuple[str, ...]:
         """Names of the vehicles."""
         return _vehicles(self.types)
-
-    def path(self, who: str) -> LanePath:
-        """Return the lanes of a vehicle."""
-        return _path(self.road.corridor, who)
-
-
-def _path(road: Corridor, who: str) -> LanePath:
-    return road.ramp if who == VEHICLES[VUT] else road.mainline
 
 
 def _received(folder: Path) -> _Episode:
@@ -151,7 +157,7 @@ def _received(folder: Path) -> _Episode:
     # Folders of older versions have no labels.
     has_labels = os.path.lexists(folder / LABELS)
     labels = _read(folder / LABELS, allowed.LABELS) if has_labels else None
-    return _Episode(road, types, root, labels, rows, _lane_coordinates(root, road.corridor))
+    return _Episode(road, types, root, labels, rows, _places(root, road.corridor))
 
 
 def _bytes(path: Path) -> bytes:
@@ -209,8 +215,8 @@ def _difference(episode: _Episode, replayed: Rows) -> tuple[float, str] | None:
         seen = replayed.get((time, who))
         if seen is None:
             return (time, f"{who} is not there")
-        x_m = episode.x_m[time, who]
-        told = x_m is None or _is_told(x_m, episode.path(who))
+        place = episode.places[time, who]
+        told = place is None or _is_told(place.x_m, place.path)
         for name, was, now in zip(COMPARED, values, seen, strict=True):
             if not (abs(now - was) <= TOLERANCE or (name == "pos" and not told)):
                 return (time, f"{name} of {who} is {now}, recorded {was}")
@@ -231,15 +237,15 @@ def _is_told(x_m: float, path: LanePath) -> bool:
 
 def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
     """Return when and why a checked record is no episode, or None when it is one."""
-    rows = episode.rows
+    rows, road = episode.rows, episode.road.corridor
+    _, end_m = road.lane_m or (0.0, 0.0)
     times = sorted({time for time, _ in rows})
     moving = set(times[: -HOLD_STEPS - 1])
     for time, after in zip(times, [*times[1:], None], strict=True):
         for who in episode.vehicles:
             x, y, _, speed = rows[time, who]
-            x_m = episode.x_m[time, who]
-            lane = None if x_m is None else episode.path(who).point(x_m)
-            if lane is None or not math.hypot(x - lane.x_m, y - lane.y_m) <= LANE_END_M:
+            place = episode.places[time, who]
+            if place is None or not place.is_at(x, y):
                 return (time, f"{who} is recorded beside its lane")
             if after is None:
                 continue
@@ -247,27 +253,34 @@ def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
                 if rows[after, who] != rows[time, who]:
                     return (after, f"{who} is not held where the episode ended")
                 continue
-            to_m = episode.x_m[after, who]
-            if x_m is None or to_m is None or not abs(to_m - x_m - speed * DT_S) <= TOLERANCE:
+            to = episode.places[after, who]
+            if to is None or not abs(to.x_m - place.x_m - speed * DT_S) <= TOLERANCE:
                 return (time, f"{who} is recorded as not moving at its speed of {speed}")
+            if place.path is road.mainline and to.path is road.ramp and to.x_m < end_m:
+                return (after, f"{who} is recorded back on the acceleration lane")
     return None
 
 
-def _lane_coordinates(
-    record: etree._Element, road: Corridor
-) -> dict[tuple[float, str], float | None]:
-    """Return the lane coordinates of the rows of a record that was checked."""
-    starts_m = {
-        who: {piece.lane: piece.start_m for piece in _path(road, who).pieces} for who in VEHICLES
-    }
-    found: dict[tuple[float, str], float | None] = {}
+def _places(record: etree._Element, road: Corridor) -> Places:
+    """Return where the vehicles are in the rows of a record that was checked.
+
+    The VUT has the lanes of the ramp, and that of the mainline beside an acceleration lane.
+    """
+    main, ramp = (
+        {piece.lane: _OnPath(path, piece.start_m) for piece in path.pieces}
+        for path in (road.mainline, road.ramp)
+    )
+    begin_m, end_m = road.lane_m or (0.0, 0.0)
+    beside = {lane: at for lane, at in main.items() if begin_m <= at.x_m < end_m}
+    begins = {who: main if who != VEHICLES[VUT] else beside | ramp for who in VEHICLES}
+    found: Places = {}
     for timestep in record:
         time = round(float(timestep.get("time", "")), 3)
         for vehicle in timestep:
             who = str(vehicle.get("id"))
-            start_m = starts_m[who].get(str(vehicle.get("lane")))
+            begin = begins[who].get(str(vehicle.get("lane")))
             position_m = float(vehicle.get("pos", ""))
-            found[time, who] = None if start_m is None else start_m + position_m
+            found[time, who] = begin and _OnPath(begin.path, begin.x_m + position_m)
     return found
 
 

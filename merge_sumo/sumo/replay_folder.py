@@ -2,9 +2,10 @@
 
 On the shipped road it is played in the shipped net. Of any other road the folder has the net that
 hosts it (`hosting`), with a speed limit above all speeds: there lanes have ids and ends that every
-reader can check, and where the road goes on behind the end of the file, so does that net. The lanes
-beside it are polygons. Labels stand at fixed places above the road, as points of interest with a
-text: names at the cars would lie on each other at M, where a reader looks.
+reader can check, and where the road goes on behind the end of the file, so does that net. A VUT on
+an acceleration lane is on the lane of the mainline from the row in which it has merged. The lanes
+beside the road are polygons. Labels stand at fixed places above the road, as points of interest
+with a text: names at the cars would lie on each other at M, where a reader looks.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.road.netfile import NetFile, Point
-from merge_sumo.sumo.hosting import hosted_net
+from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 from merge_sumo.system.folders import new_folder
 from merge_sumo.values.case import Case
+from merge_sumo.values.merge import merged_rows
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
@@ -35,6 +37,8 @@ NET: Final = "us23.net.xml"
 """The net of the shipped road."""
 HOSTED_NET: Final = "road.net.xml"
 """The net of any other road."""
+LANE_EDGE: Final = LANE.replace(COPY, ".0")
+"""Edge of that net with an acceleration lane and the mainline beside it."""
 SURROUNDINGS: Final = "surroundings.add.xml"
 TYPES: Final = "vehicles.add.xml"
 LABELS: Final = "labels.add.xml"
@@ -143,7 +147,8 @@ def _road(road: Corridor, folder: Path) -> Road:
     fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
     content = hosted_net(fast, 1)
     drawn = _polygons(road.surroundings)
-    return Road(content, corridor_of_hosted(content, folder / HOSTED_NET), drawn)
+    _, lane_end_m = fast.lane_m or (0.0, 0.0)
+    return Road(content, corridor_of_hosted(content, folder / HOSTED_NET, lane_end_m), drawn)
 
 
 def corridor_of_shipped(content: bytes, path: Path) -> Corridor:
@@ -155,8 +160,11 @@ def _fast(path: LanePath) -> LanePath:
     return LanePath(tuple(replace(p, speed_limit_mps=SPEED_LIMIT_MPS) for p in path.pieces))
 
 
-def corridor_of_hosted(content: bytes, path: Path) -> Corridor:
-    """Find the corridor in the net of a folder; `UserError` when it has none."""
+def corridor_of_hosted(content: bytes, path: Path, lane_end_m: float = 0.0) -> Corridor:
+    """Find the corridor in the net of a folder; `UserError` when it has none.
+
+    An acceleration lane ends at the coordinate `lane_end_m`.
+    """
     edges = re.findall(rb'<edge [^>]*\bid="((main|ramp|out)([0-9]{1,4})\.0)"', content)
     main, ramp, out = (
         [name.decode() for name, of, _ in sorted(edges, key=lambda e: int(e[2])) if of == kind]
@@ -164,9 +172,16 @@ def corridor_of_hosted(content: bytes, path: Path) -> Corridor:
     )
     # Without a ramp both vehicles drive on one path, beside which the net has nothing.
     is_one_path = len(main + out) == len(re.findall(rb'<edge [^>]*\bid="[^:"]', content))
-    paths = main + out, (main if is_one_path else ramp) + out
-    edge_at_m = out[0] if out else None
-    return find_corridor(NetFile(path, content), *paths, room_after_m=0.0, edge_at_m=edge_at_m)
+    has_lane = re.search(rb'<edge [^>]*\bid="%b"' % re.escape(LANE_EDGE).encode(), content)
+    lane = [LANE_EDGE] if has_lane else []
+    paths = main + lane + out, (main if is_one_path else ramp) + lane + out
+    return find_corridor(
+        NetFile(path, content),
+        *paths,
+        room_after_m=0.0,
+        edge_at_m=out[0] if out else None,
+        lane_m=(lane_end_m, lane_end_m) if lane else None,
+    )
 
 
 def write_files(
@@ -216,12 +231,13 @@ def _types(trajectory: Trajectory) -> etree._Element:
 
 def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
     root = etree.Element("fcd-export")
-    motion = trajectory.motion.tolist()
-    motion += [motion[-1]] * HOLD_STEPS
-    for step, vehicles in enumerate(motion):
+    rows = [*zip(trajectory.motion.tolist(), merged_rows(trajectory).tolist(), strict=True)]
+    rows += [rows[-1]] * HOLD_STEPS
+    for step, (vehicles, merged) in enumerate(rows):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
         for who, (x_m, v_mps, _) in zip(VEHICLES, vehicles, strict=False):
-            lane, position, x, y, angle = road.lane_point(x_m, on_ramp=who == VEHICLES[VUT])
+            on_ramp = who == VEHICLES[VUT] and not merged
+            lane, position, x, y, angle = road.lane_point(x_m, on_ramp=on_ramp)
             etree.SubElement(
                 timestep,
                 "vehicle",

@@ -12,6 +12,7 @@ import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VUT, Scenario, lane_of
@@ -54,6 +55,16 @@ def place_of_merge_m(trajectory: Trajectory) -> float:
     """Return where the VUT merges: at M, or where it left the acceleration lane."""
     on_road = lane_of(trajectory.case.scenario) is not None
     return float(trajectory.x_vut_m[-1]) if on_road else 0.0
+
+
+def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
+    """Return the rows, (T + 1,), in which the VUT has left an acceleration lane for the mainline's.
+
+    There are none without a lane: ramp and mainline have the same lanes behind M.
+    """
+    merged = np.zeros(len(trajectory.motion), dtype=np.bool_)
+    merged[-1] = lane_of(trajectory.case.scenario) is not None and trajectory.end is End.MERGED
+    return merged
 
 
 def on_lane(trajectory: Trajectory) -> dict[str, float | None]:
