@@ -65,8 +65,8 @@ from merge_sumo.campaigns.one_case import DEBUG_DEADLINE_S, ONE, Ended, case_of,
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.scenario_suggestion import (
     about,
-    beside_the_lane,
     kind_of_merge,
+    lane_warnings,
     suggested,
     suggested_lane_m,
     unseen,
@@ -1013,7 +1013,7 @@ def check_scenario(scenario: Scenario | AnyPath, policies: AnyPath | None = None
     name = checked.name if isinstance(scenario, Scenario) else str(scenario)
     found = road_for(checked)
     road, differing = about(found), unseen(checked, folder)
-    warnings = beside_the_lane(checked, found)
+    warnings = lane_warnings(checked, found)
     lines = ["the learned drivers (levels 1 and 2) were trained on such starts, or on like ones"]
     if not isinstance(checked, MergeScenario):
         lines = []

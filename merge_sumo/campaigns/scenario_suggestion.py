@@ -38,10 +38,12 @@ def suggested_lane_m(road: Corridor) -> Bounds | None:
 
 def kind_of_merge(road: Corridor) -> list[str]:
     """Return which kind of merge a road is taken for, and why, in sentences."""
+    if road.is_one_path:
+        return []
     lane = road.acceleration_lane
     if lane is None:
         why = (
-            "the lane that ends is that of the mainline"
+            "the lane that ends is that of the mainline (exchange --mainline and --ramp?)"
             if road.lane_drop
             else "ramp and mainline have no lanes side by side before it"
         )
@@ -154,20 +156,22 @@ def about(road: Corridor) -> list[str]:
     return lines
 
 
-def beside_the_lane(scenario: Scenario, road: Corridor) -> list[str]:
-    """Return what a scenario leaves out of a road with an acceleration lane, in sentences."""
+def lane_warnings(scenario: Scenario, road: Corridor) -> list[str]:
+    """Return what a scenario leaves out of a road's acceleration lane, in sentences."""
     lane = road.acceleration_lane
-    if road.lane_m is not None or lane is None or not lane.gives_a_choice:
+    if lane is None or not lane.gives_a_choice:
         return []
-    sentences = [
-        f"the ramp has an acceleration lane, {' '.join(lane.lanes)}, of {lane.length_m:.0f} m; M "
-        "is a point at its end: `merge-sumo scenario new` writes a scenario in which the VUT "
-        "chooses where to merge on it"
-    ]
+    sentences = []
+    if road.lane_m is None:
+        sentences.append(
+            f"the ramp has an acceleration lane, {' '.join(lane.lanes)}, of {lane.length_m:.0f} m; "
+            "M is a point at its end: `merge-sumo scenario new` writes a scenario in which the VUT "
+            "chooses where to merge on it"
+        )
     on_lane_m = scenario.x_vut0_m - lane.begin_m
     if on_lane_m > 0.0:
         sentences.append(
-            f"the VUT starts on that lane, {on_lane_m:.0f} m behind its gore, which is at "
+            f"the VUT starts on the acceleration lane, {on_lane_m:.0f} m behind its gore at "
             f"{lane.begin_m:.1f} m"
         )
     return sentences

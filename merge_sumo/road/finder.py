@@ -268,10 +268,15 @@ def _meeting(
         links = _lane_drop(net, mainline[place], ramp[place], tail[place : place + 2])
         if links is not None:
             return _Meeting(*links, place=place + 1)
+    last = tail[-1]
+    following = sorted({name for lane in net.lanes(last) for name in net.edges_from(lane)})
     raise net.broken(
-        f"mainline and ramp have no lane in common up to the end of edge {tail[-1]}; name the edge "
-        "that follows on both, or there is no merge where the ramp's lane goes on beside the "
-        "mainline"
+        f"mainline and ramp have no lane in common up to the end of edge {last}; "
+        + (
+            f"name the edge that follows on both: {' or '.join(following)}"
+            if following
+            else "the ramp's lane goes on beside the mainline, and no merge is needed"
+        )
     )
 
 

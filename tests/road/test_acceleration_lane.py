@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import re
 import shutil
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -280,6 +281,7 @@ class TestAScenario:
     def new(
         folder: Path, build, mainline: str, ramp: str, **more
     ) -> tuple[MergeScenario, list[str]]:
+        folder.mkdir(exist_ok=True)
         file = folder / "mine.toml"
         lines = api.new_scenario(
             file, net=build(folder), mainline=mainline, ramp=ramp, **more
@@ -344,7 +346,12 @@ class TestAScenario:
         lane, start = api.check_scenario(scenario).record["warnings"]
         assert re.match(r"the ramp has an acceleration lane, acc_0, of 215 m; M is a point", lane)
         # The gore is 215.36 + 8 m before M.
-        assert start == "the VUT starts on that lane, 41 m behind its gore, which is at -223.4 m"
+        assert start == "the VUT starts on the acceleration lane, 41 m behind its gore at -223.4 m"
+
+        late, _ = self.new(tmp_path / "again", *LANES["lane drop"])
+        late = replace(late, lane_m=(-20.0, 139.9), x_vut0_m=-60.0)
+        (start,) = api.check_scenario(late).record["warnings"]
+        assert start == "the VUT starts on the acceleration lane, 15 m behind its gore at -75.5 m"
 
     def test_on_a_lane_that_goes_on_to_an_exit_says_so(self, tmp_path):
         scenario, lines = self.new(tmp_path, weaving, "in acc out", "ramp acc out")
@@ -353,9 +360,7 @@ class TestAScenario:
         assert weaves.startswith("weaving: the lane goes on to exit; ")
 
     def test_where_the_lane_never_ends_there_is_none(self, tmp_path):
-        with pytest.raises(
-            UserError, match="no merge where the ramp's lane goes on beside the main"
-        ):
+        with pytest.raises(UserError, match="goes on beside the mainline, and no merge is"):
             self.new(tmp_path, added_lane, "in acc out", "ramp acc out")
 
 
