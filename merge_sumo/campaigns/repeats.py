@@ -29,7 +29,7 @@ from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.registry import built_in_vuts, waits_for_client
+from merge_sumo.vuts.registry import is_built_in, waits_for_client
 
 REPEATS: Final = "repeats.jsonl"
 MOST: Final = 20
@@ -94,17 +94,15 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
     have gone. Half are the first cases, which a new controller ran; the others are spread over the
     campaign, and run before those. Errors may be a slow machine's doing, and are left out.
     """
-    built_in = built_in_vuts()
     if waits_for_client(settings.vut, settings.vut_command):
         return []
+    own_vut = not is_built_in(settings.vut)
+    own_pov = settings.pov is not None and not is_built_in(settings.pov)
     tested = [
         outcome
         for outcome in outcomes
         if not outcome.measures.end.is_error
-        and (
-            settings.vut not in built_in
-            or (outcome.case.level == OWN and settings.pov not in (None, *built_in))
-        )
+        and (own_vut or (own_pov and outcome.case.level == OWN))
     ]
     places = spread_places(len(tested), min(MOST, -(-len(tested) // ONE_IN)))
     return [tested[place] for place in places]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from merge_sumo.sumo.world import World
 from merge_sumo.system.hashing import Files
 from merge_sumo.system.suggestions import either
 from merge_sumo.values.case import Case, FloatArray, ToldCase
-from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, level_name
+from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, lane_of, level_name
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import VutFactory, kind_of
 from merge_sumo.vuts.sumo_model import SumoVut
@@ -254,10 +254,16 @@ class PovAdapter(Driver):
 
 
 def seen_from(case: Case, car: int) -> Case:
-    """Return a case as a VUT in the place of a car of the mainline would be told it."""
+    """Return a case as a VUT in the place of a car of the mainline would be told it.
+
+    It is on the mainline from the beginning, and has no acceleration lane.
+    """
     starts = case.starts()
     x_other_m, v_other_mps = starts.pop(VUT)
     x_m, v_mps = starts[car]
-    scenario = replace(case.scenario, x_vut0_m=min(x_m, BEFORE_M), v_vut0_mps=v_mps)
+    place: dict[str, Any] = {"x_vut0_m": min(x_m, BEFORE_M), "v_vut0_mps": v_mps}
+    if lane_of(case.scenario) is not None:
+        place["lane_m"] = None
+    scenario = replace(case.scenario, **place)
     told = (x_other_m, v_other_mps), (x_m, v_mps)
     return ToldCase(level=0, v_vut0_mps=v_mps, scenario=scenario, told=told)

@@ -36,7 +36,7 @@ from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.registry import built_in_vuts
+from merge_sumo.vuts.registry import is_built_in
 
 FIRST_LOOKS: Final = 10
 """Cases that are printed as those to look at first."""
@@ -608,7 +608,7 @@ def _same_vut(run: Run, settings: CampaignSettings) -> bool:
     """Return whether a VUT that is not of the package is the one that was recorded."""
     recorded, files = run.settings, run.settings.get("vut_files")
     return (
-        settings.vut not in built_in_vuts()
+        not is_built_in(settings.vut)
         and (settings.vut, settings.vut_command)
         == (recorded.get("vut"), recorded.get("vut_command"))
         and recorded.get("versions") == versions()

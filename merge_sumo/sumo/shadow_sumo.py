@@ -65,6 +65,9 @@ class ShadowSumo:
     Attributes:
         road: both paths.
         at_m: positions of the vehicles on the road along their lanes, M = 0.
+        merged: whether the VUT has left the acceleration lane of a road with one.
+        wants_to_merge: whether SUMO has put the VUT beside that lane in its last step.
+        was_forced: whether the VUT came to the end of that lane in it, and was moved beside it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -78,6 +81,15 @@ class ShadowSumo:
         self._options = [*files, *SUMO_OPTIONS]
         self._started = False
         self.at_m: dict[str, float] = {}
+        self.merged = self.wants_to_merge = self.was_forced = False
+        on_ramp = {piece.lane for piece in self.road.ramp.pieces}
+        self._beside = {piece.lane for piece in self.road.mainline.pieces} - on_ramp
+        """Lanes of the mainline alone; on those beside an acceleration lane a VUT has merged."""
+
+    @property
+    def has_lane(self) -> bool:
+        """Whether the scenario has an acceleration lane."""
+        return self.road.lane_m is not None
 
     @property
     def time_s(self) -> float:
@@ -86,11 +98,12 @@ class ShadowSumo:
 
     def path(self, name: str) -> LanePath:
         """Return the lanes that a vehicle drives on."""
-        return self.road.ramp if name == NAME_OF_VUT else self.road.mainline
+        on_ramp = name == NAME_OF_VUT and not self.merged
+        return self.road.ramp if on_ramp else self.road.mainline
 
     def load(self) -> None:
         """Start with an empty road at time 0; `UserError` where SUMO cannot use the net."""
-        libsumo = self._libsumo
+        libsumo, self.merged = self._libsumo, False
         try:
             if self._started:
                 libsumo.load(self._options)
@@ -122,7 +135,7 @@ class ShadowSumo:
 
     def enter(self, states: Mapping[str, State]) -> None:
         """Make a step in which the vehicles depart, and put them into their states."""
-        vehicle = self._libsumo.vehicle
+        vehicle, self.merged = self._libsumo.vehicle, False
         for name, state in states.items():
             start = self._start(name, state)
             vehicle.add(name, f"route.{name}", typeID=name, **start)
@@ -143,20 +156,24 @@ class ShadowSumo:
 
         A vehicle that comes to the end of the net arrives.
         """
-        self._change_lanes()
+        forced = self._change_lanes()
         self._libsumo.simulation.step()
         left = self._libsumo.vehicle.getIDList()
         self.at_m = {name: x_m for name, x_m in self.at_m.items() if name in left}
         if NAME_OF_VUT not in self.at_m:
             return None
+        self.was_forced = self.has_lane and NAME_OF_VUT in forced
+        lane = self._libsumo.vehicle.getLaneID(NAME_OF_VUT)
+        self.wants_to_merge = self.has_lane and not self.was_forced and lane in self._beside
         return float(self._libsumo.vehicle.getSpeed(NAME_OF_VUT))
 
-    def put(self, states: Mapping[str, State]) -> None:
+    def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
         """Put the vehicles that are on the road into their states.
 
-        Those beyond the end of the net, where paths go on without a road, arrive.
+        Those beyond the end of the net, where paths go on without a road, arrive. `merged` is
+        whether the VUT has left the acceleration lane.
         """
-        vehicle = self._libsumo.vehicle
+        vehicle, self.merged = self._libsumo.vehicle, merged
         for name in list(self.at_m):
             x_m, v_mps, a_mps2 = states[name]
             if x_m >= self.road.drawn_after_m:
@@ -180,21 +197,25 @@ class ShadowSumo:
         """Return where a vehicle is; SUMO's own answer is that before it was put there."""
         return self.path(name).point(self.at_m[name])
 
-    def _change_lanes(self) -> None:
-        """Move vehicles at the end of a lane that ends at M to the lane beside it.
+    def _change_lanes(self) -> list[str]:
+        """Move vehicles at the end of a lane that ends to the lane beside it, and return them.
 
         SUMO would stop them there.
         """
         if not self.road.lane_drop:
-            return
+            return []
         ends, goes_on = self.road.mainline, self.road.ramp
         if self.road.ramp_approach.yields:
             ends, goes_on = goes_on, ends
-        beside = next(piece for piece in reversed(goes_on.pieces) if piece.start_m < 0.0)
+        _, end_m = self.road.lane_m or (0.0, 0.0)
+        beside = next(piece for piece in reversed(goes_on.pieces) if piece.start_m < end_m)
+        moved = []
         for name, x_m in self.at_m.items():
             next_m = (self._libsumo.vehicle.getSpeed(name) + SPEED_MARGIN_MPS) * DT_S
-            if self.path(name) is ends and x_m < 0.0 <= x_m + next_m:
-                self._libsumo.vehicle.moveTo(name, beside.lane, beside.length_m + x_m)
+            if self.path(name) is ends and x_m < end_m <= x_m + next_m:
+                self._libsumo.vehicle.moveTo(name, beside.lane, beside.length_m + x_m - end_m)
+                moved.append(name)
+        return moved
 
     def _start(self, name: str, state: State) -> dict[str, str]:
         """Return where a vehicle departs; it can do so on the first edge of its route only."""

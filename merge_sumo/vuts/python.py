@@ -280,6 +280,9 @@ def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
     x_m, v_mps = np.delete(scene.x_m, VUT, axis=0), np.delete(scene.v_mps, VUT, axis=0)
     order = np.argsort(-x_m, axis=0, kind="stable")
     begin_m, end_m = lanes_m.copy()
+    merged = scene.x_vut_m >= 0.0
+    if scene.merged is not None:
+        merged = np.where(begin_m < end_m, scene.merged, merged)
     return SeenBatch(
         active=scene.active.copy(),
         t_s=np.round(scene.step * DT_S, 1),
@@ -291,7 +294,7 @@ def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
         v_others_mps=np.take_along_axis(v_mps, order, axis=0),
         lane_begin_m=begin_m,
         lane_end_m=end_m,
-        merged=scene.x_vut_m >= 0.0 if scene.merged is None else scene.merged.copy(),
+        merged=merged,
     )
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.gap_acceptance import GapAcceptanceVut
+from merge_sumo.drivers.gap_choice import GapChoice, GapChoiceVut
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.drivers.reference import REFERENCES
@@ -20,7 +21,7 @@ from merge_sumo.system.hashing import Files, hashed
 from merge_sumo.system.registry import Registry
 from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import workers_or_cores
-from merge_sumo.vuts.base import Vut, VutOptions
+from merge_sumo.vuts.base import Vut, VutOptions, split_options
 from merge_sumo.vuts.fmu import fmu_vut
 from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
 from merge_sumo.vuts.in_memory import HERE, here_vut, keep, object_of
@@ -60,9 +61,30 @@ def _file_before_options(argument: str) -> str:
     return argument.partition("?")[0]
 
 
-def _built_in_vut(name: str, options: VutOptions) -> Vut:
+def _built_in_vut(spec: str, options: VutOptions) -> Vut:
+    name, given = split_options(spec, spec)
     make = built_in_vuts(options.policies)[name]
+    if given:
+        make = partial(GapChoiceVut, choice=_gap_choice(name, given, spec))
     return Vut(make=lambda corridors, _world: make(corridors), by_arrays=True)
+
+
+def _gap_choice(name: str, given: dict[str, str], spec: str) -> GapChoice:
+    """Return the parameters of `gap?NAME=VALUE&...`; `UserError` for what are none."""
+    known = [field.name for field in fields(GapChoice)] if name == GAP else []
+    values: dict[str, float] = {}
+    for option, text in given.items():
+        if option not in known:
+            has = f"choose from {', '.join(known)}" if known else "it has none"
+            raise UserError(f"--vut {spec}: {name} has no option {option!r}: {has}")
+        try:
+            values[option] = float(text)
+        except ValueError:
+            raise UserError(f"--vut {spec}: {option} is {text!r}: give a number") from None
+    try:
+        return GapChoice(**values)
+    except UserError as error:
+        raise UserError(f"--vut {spec}: {error}") from error
 
 
 PYTHON: Final = VutKind(
@@ -125,6 +147,8 @@ KINDS: Final[Registry[VutKind]] = Registry(
 """The kinds that have a name of their own before the colon."""
 
 
+GAP: Final = "gap"
+"""The built-in VUT that chooses a gap on an acceleration lane, and has options."""
 LEARNED: Final = {"level1": "vut1", "level2": "vut2"}
 """The network of each learned VUT."""
 
@@ -133,8 +157,13 @@ def built_in_vuts(policies: Path | None = None) -> dict[str, Callable[[int], Dri
     """Return the VUTs that the package brings, by name; the learned ones act by `policies`."""
     designs = {name: partial(RuleBasedVut, design=design) for name, design in DESIGNS.items()}
     learned = {vut: partial(load_driver, name, folder=policies) for vut, name in LEARNED.items()}
-    rules: dict[str, Callable[[int], Driver]] = {"roundabout": GapAcceptanceVut, **REFERENCES}
-    return {"level0": Level0Vut, **learned, **designs, **rules}
+    rules: dict[str, Callable[[int], Driver]] = {GAP: GapChoiceVut, "roundabout": GapAcceptanceVut}
+    return {"level0": Level0Vut, **learned, **designs, **rules, **REFERENCES}
+
+
+def is_built_in(spec: str) -> bool:
+    """Return whether a spec names a VUT that the package brings, with options or without."""
+    return spec.partition("?")[0] in built_in_vuts()
 
 
 @dataclass(frozen=True)
@@ -204,9 +233,9 @@ def kind_of(spec: str) -> VutKind:
     prefix, colon, _ = spec.partition(":")
     if prefix in KINDS:
         return KINDS[prefix]
-    if spec in ("level0", *LEARNED):
+    if spec.partition("?")[0] in ("level0", GAP, *LEARNED):
         return RAMP_ONLY
-    if spec in built_in_vuts():
+    if is_built_in(spec):
         return BUILT_IN
     return PYTHON if colon else INSTALLED
 

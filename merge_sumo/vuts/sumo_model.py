@@ -3,7 +3,8 @@
 At every step the model decides on a speed from the state, as it does in any SUMO simulation; the
 POV is a vehicle on the road for it, before M by the right of way of the zipper junction and behind
 M as a leader. That speed is the VUT's answer: the acceleration to it is clipped and counted like
-any other, and eq. (4) moves the car.
+any other, and eq. (4) moves the car. On an acceleration lane SUMO's lane-change model decides when
+to merge: the lane on which the VUT is after SUMO's step is its wish.
 """
 
 from __future__ import annotations
@@ -12,7 +13,10 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from merge_sumo.drivers.base import Driver, Scene
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import FloatArray
@@ -109,3 +113,9 @@ class SumoVut(Driver):
         v_mps = self.world.v_mps[self._rows].ravel()
         acceleration: FloatArray = (self.world.wanted_v_mps(self._rows) - v_mps) / DT_S
         return acceleration
+
+    def wishes(self) -> NDArray[np.int8] | None:
+        """Return whether SUMO's lane-change model merged, (K,); None without a lane."""
+        if self.world.road.lane_m is None or self._rows != [VUT]:
+            return None
+        return np.where(self.world.wants_to_merge(), MERGE, STAY).astype(np.int8)

@@ -12,7 +12,7 @@ from plans import plan_for
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case, MergeCase, from_unit
-from merge_sumo.values.scenario import US23
+from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import VutFactory
@@ -66,3 +66,14 @@ def run_cases(vut: VutFactory, cases: list[Case], corridors: int = 8) -> list[Tr
             found[index] = trajectory
     assert sorted(found) == list(range(len(cases)))
     return [found[index] for index in range(len(cases))]
+
+
+def run_on(
+    vut: VutFactory, scenario: Scenario, level: int, count: int, corridors: int = 8
+) -> list[Trajectory]:
+    """Return what became of some cases of a scenario, in order."""
+    points = np.random.default_rng(0).random((count, len(scenario.dimensions(level))))
+    cases = from_unit(points, level, scenario=scenario)
+    with Simulator(plan_for(vut, scenario=scenario, corridors=corridors)) as ground:
+        found = dict(ground.run(cases))
+    return [found[index] for index in range(count)]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from campaigning import run_campaign
-from vut_contract import cases_of, factory, run_cases
+from vut_contract import cases_of, factory, run_cases, run_on
 
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import failures
 from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import MergeCase
@@ -95,3 +96,28 @@ def test_what_sumo_does_not_have_is_refused_in_a_sentence(spec, said):
     with pytest.raises(UserError, match="sumo:") as refused:
         factory(spec)
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["IDM", "Krauss", "ACC", "EIDM"])
+def test_sumos_lane_change_model_merges_from_an_acceleration_lane(name):
+    scenario, vut = named_scenario("us23-lane"), factory(f"sumo:{name}")
+    places = []
+    for level in (0, 1, 2):
+        ran = run_on(vut, scenario, level, 40)
+        assert {t.end for t in ran} == {End.MERGED}
+        places += [t.x_vut_m[-1] for t in ran]
+        if level == 0:
+            alone = run_on(vut, scenario, level, 40, corridors=1)
+            assert all(np.array_equal(a.motion, b.motion) for a, b in zip(ran, alone, strict=True))
+            assert all(np.array_equal(a.after, b.after) for a, b in zip(ran, alone, strict=True))
+    assert min(places) >= -70.0
+    assert max(places) < 130.0, "no merge is forced"
+    assert np.ptp(places) > 100.0, "it is the model that chooses the place"
+
+
+def test_sumo_merges_in_traffic():
+    for trajectory in run_on(factory("sumo:IDM"), named_scenario("us23-lane-traffic"), 0, 30):
+        assert trajectory.error is None
+        x, v, a = trajectory.motion[:, VUT].T
+        assert x[1:] == pytest.approx(x[:-1] + v[:-1] * DT_S, abs=1e-9)
+        assert v[1:] == pytest.approx(v[:-1] + a[:-1] * DT_S, abs=1e-9)

@@ -18,6 +18,7 @@ class Effect(Enum):
     """What becomes of a command."""
 
     CARRIED_OUT = "Carried out by SUMO, on the VUT and its type"
+    ON_A_LANE = "Carried out by SUMO on a road with an acceleration lane; elsewhere changes nothing"
     NOTHING = "Accepted, changes nothing"
     REFUSED = "Refused"
 
@@ -42,10 +43,14 @@ CARRIED_OUT: Final = frozenset(
     [f"vehicle.{function}" for function in (*SPEEDS, *GAPS_AND_STOPS, *MODEL, *LOOKS)]
     + [f"vehicletype.{function}" for function in (*MODEL, *LOOKS)]
 )
+ON_A_LANE: Final = frozenset(
+    {"vehicle.setLaneChangeMode", "vehicle.changeLane", "vehicle.changeLaneRelative"}
+)
+"""Commands that say on which lane the VUT is to drive, where there are two for it."""
 NOTHING: Final = frozenset(
     f"vehicle.{function}"
     for function in (
-        *("setLaneChangeMode", "changeLane", "changeLaneRelative", "changeSublane", "highlight"),
+        *("changeSublane", "highlight"),
         *("setVia", "rerouteTraveltime", "rerouteEffort", "updateBestLanes"),
     )
 )
@@ -94,6 +99,8 @@ def effect_of(functions: tuple[str, ...]) -> Effect:
     """Return what becomes of the commands that share a number."""
     if not CARRIED_OUT.isdisjoint(functions):
         return Effect.CARRIED_OUT
+    if not ON_A_LANE.isdisjoint(functions):
+        return Effect.ON_A_LANE
     if any(
         function in NOTHING
         or function.endswith(".setParameter")
@@ -142,6 +149,9 @@ def call_of_command(functions: Sequence[str], object_id: str, reader: Reader) ->
         KEYS_OF_DEVICES
     ):
         raise RefusedError(f"merge-sumo gives vehicles no devices: {arguments[0]!r:.60}")
+    if functions[0] == "vehicle.changeLane":
+        # An offset has a third value behind it, which only marks it as one.
+        return functions[len(arguments) > len(("lane", "duration"))], [object_id, *arguments[:2]]
     if name == "openGap" and arguments[:2] == [-1.0, -1.0]:
         return "vehicle.deactivateGapControl", [object_id]
     if name in ("setAdaptedTraveltime", "setEffort") and len(arguments) == 4:

@@ -99,7 +99,9 @@ def _serve(channel: Channel, sumo: ShadowSumo) -> None:
             if message["do"] == "farewell":
                 client.farewell()
             else:
-                answer = {"v_mps": client.show(message["states"], first=message["do"] == "enter")}
+                first, merged = message["do"] == "enter", message["merged"]
+                answer = {"v_mps": client.show(message["states"], first=first, merged=merged)}
+                answer["merge"] = sumo.wants_to_merge
         except FaultError as fault:
             answer = {"fault": str(fault), "gone": fault.gone, "late": fault.late}
         except ClosedError:
@@ -119,13 +121,13 @@ class Client:
         self._until_step_s: float | None = None
         """Time up to which the client asked to step, if it waits for a step; 0 for one step."""
 
-    def show(self, states: Mapping[str, State], *, first: bool) -> float | None:
+    def show(self, states: Mapping[str, State], *, first: bool, merged: bool) -> float | None:
         """Show the next state, and serve the client until it makes its next step.
 
-        With the `first` state of an episode the vehicles of the one before arrive. Returns the
-        speed that SUMO gives the VUT in that step; None where it is beyond the net. Raises
-        `FaultError` for what the client does wrong, and `ClosedError` when it says goodbye before
-        the vehicles depart.
+        With the `first` state of an episode the vehicles of the one before arrive; `merged` is
+        whether the VUT has left the acceleration lane. Returns the speed that SUMO gives the VUT in
+        that step; None where it is beyond the net. Raises `FaultError` for what the client does
+        wrong, and `ClosedError` when it says goodbye before the vehicles depart.
         """
         session = self.session
         if first:
@@ -136,7 +138,7 @@ class Client:
             self._serve_until_step()
             session.enter(states)
         else:
-            session.put(states)
+            session.put(states, merged=merged)
         self._answer_step()
         self._serve_until_step()
         return session.step()

@@ -34,6 +34,11 @@ REASONS: Final = {
 """Why a command on no variable is refused."""
 OWN_TYPE: Final = f"{NAME_OF_VUT}@{NAME_OF_VUT}"
 """What SUMO calls the type of a vehicle that has numbers of its own."""
+STAYED: Final = (
+    "vut came to the end of the acceleration lane without a lane change: it departs in lane change "
+    "mode 0, in which changeLane merges it at once; in 1621, SUMO's own, SUMO merges it"
+)
+"""Noted of a controller that may not know of the lane."""
 EXPECTED: Final = 2
 """Vehicles that are expected between two episodes."""
 
@@ -45,7 +50,7 @@ class Session:
         notes: sentences on what a command does less than in SUMO, once each.
         expected: whether more vehicles may come.
         departed: vehicles that departed since the client was last answered; and `arrived`.
-        lane_change_mode: mode of the VUT, which nothing here obeys.
+        lane_change_mode: mode of the VUT; without an acceleration lane nothing obeys it.
     """
 
     def __init__(self, sumo: ShadowSumo) -> None:
@@ -56,6 +61,8 @@ class Session:
         self.departed: list[str] = []
         self.arrived: list[str] = []
         self.lane_change_mode = 0
+        self._knows_of_the_lane = False
+        """Whether the client has ever commanded anything of lanes."""
 
     @property
     def driving(self) -> bool:
@@ -75,11 +82,14 @@ class Session:
 
     def step(self) -> float | None:
         """Make a step; return the speed that SUMO gives the VUT by what was commanded."""
-        return self._noting_arrivals(self.sumo.step)
+        v_mps = self._noting_arrivals(self.sumo.step)
+        if self.sumo.was_forced and not self._knows_of_the_lane:
+            self._note(STAYED)
+        return v_mps
 
-    def put(self, states: Mapping[str, State]) -> None:
-        """Put the vehicles into their states after the step."""
-        self._noting_arrivals(lambda: self.sumo.put(states))
+    def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
+        """Put the vehicles into their states after the step; `merged` is of the VUT."""
+        self._noting_arrivals(lambda: self.sumo.put(states, merged=merged))
 
     def clear(self) -> None:
         """End the episode: all vehicles arrive, and what was subscribed of them ends."""
@@ -150,6 +160,8 @@ class Session:
         if command == tp.SET_VEHICLE and object_id not in self.sumo.at_m:
             raise RefusedError(f"Vehicle '{object_id}' is not known.")
         mine = object_id in (NAME_OF_VUT, OWN_TYPE)
+        if effect is Effect.ON_A_LANE and self.sumo.has_lane:
+            effect, self._knows_of_the_lane = Effect.CARRIED_OUT, True
         if effect is Effect.CARRIED_OUT and mine:
             function, arguments = commands.call_of_command(functions, object_id, reader)
             self.sumo.call(function, *arguments)
@@ -162,13 +174,22 @@ class Session:
             if not isinstance(mode, int):
                 raise RefusedError("a mode is an integer")
             self.lane_change_mode = mode & LANE_CHANGE_BITS
-        note = f"{name} is accepted and changes nothing here"
-        if note not in self.notes:
-            self.notes.append(note)
+        self._note(f"{name} is accepted and changes nothing here")
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self.notes:
+            self.notes.append(sentence)
 
 
 def _expected(session: Session, _: str) -> bytes:
     return pack("i", max(len(session.sumo.at_m), EXPECTED * session.expected))
+
+
+def _lane_change_mode(session: Session, name: str) -> int:
+    """Return the mode of a vehicle; without a lane, where nothing obeys it, as it was commanded."""
+    if session.sumo.has_lane:
+        return int(session.sumo.call("vehicle.getLaneChangeMode", name))
+    return session.lane_change_mode if name == NAME_OF_VUT else 0
 
 
 OWN_ANSWERS: Final[dict[tuple[int, int], Callable[[Session, str], bytes]]] = {
@@ -176,9 +197,7 @@ OWN_ANSWERS: Final[dict[tuple[int, int], Callable[[Session, str], bytes]]] = {
     (GET_VEHICLE, 0x42): lambda s, name: pack("o", s.sumo.point(name)[2:4]),  # getPosition
     (GET_VEHICLE, 0x39): lambda s, name: pack("O", (*s.sumo.point(name)[2:4], 0.0)),  # in space
     (GET_VEHICLE, 0x43): lambda s, name: pack("d", s.sumo.point(name).angle_deg),
-    (GET_VEHICLE, LANE_CHANGE_MODE): lambda s, name: pack(
-        "i", s.lane_change_mode if name == NAME_OF_VUT else 0
-    ),
+    (GET_VEHICLE, LANE_CHANGE_MODE): lambda s, name: pack("i", _lane_change_mode(s, name)),
     # Several of SUMO's steps may pass in one of the client's, and an episode may end in it.
     (GET_SIMULATION, 0x73): lambda s, _: pack("i", len(s.departed)),
     (GET_SIMULATION, 0x74): lambda s, _: pack("l", s.departed),

@@ -3,9 +3,9 @@
 This process listens, and looks whose a connection is (`door.py`). A connection that is served is
 handed to a process of its own with a shadow SUMO (`server.py`), in which the client's commands mean
 what they mean in SUMO. A client makes a step by `simulationStep`, so client and rollout go in
-lockstep: the speed that SUMO gives the VUT in that step becomes the acceleration of eq. (4), and
-the step is answered when the rollout has made it. Between two episodes the road is empty for one
-step.
+lockstep: the speed that SUMO gives the VUT in that step becomes the acceleration of eq. (4), the
+lane on which SUMO has it says whether it wishes to merge, and the step is answered when the rollout
+has made it. Between two episodes the road is empty for one step.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from time import monotonic
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.binding import scratch_folder
@@ -85,6 +86,7 @@ class TraciVut(Driver):
         self._program: Program | None = None
         self._client: socket.socket | None = None
         self._reason: str | None = None
+        self._wishes: NDArray[np.int8] | None = None
         self._noted: set[str] = set()
         self._before_mps: dict[str, float] = {}
         """Speeds of the vehicles a step ago."""
@@ -115,6 +117,10 @@ class TraciVut(Driver):
                 self._disconnect()
         return np.array([math.nan])
 
+    def wishes(self) -> NDArray[np.int8] | None:
+        """Return whether SUMO put the VUT beside the acceleration lane; None without a lane."""
+        return self._wishes
+
     def reason(self, corridor: int) -> str | None:
         """Return what the client did wrong."""
         return self._reason
@@ -137,9 +143,13 @@ class TraciVut(Driver):
         }
         self._before_mps = {name: v for name, (_, v, _) in states.items()}
         starting, self._starting = self._starting, False
-        answer = self._enter(states) if starting else self._ask({"do": "step", "states": states})
+        merged = scene.merged is not None and bool(scene.merged[0])
+        message = {"states": states, "merged": merged}
+        answer = self._enter(message) if starting else self._ask({"do": "step", **message})
         if self._program is not None and (ended := self._program.ended(0.0)):
             raise FaultError(f"{ended}, and its connection goes on")
+        if scene.merged is not None:
+            self._wishes = np.array([MERGE if answer["merge"] else STAY], dtype=np.int8)
         wanted_mps = answer["v_mps"]
         if wanted_mps is None:  # it is beyond the end of the net: it keeps its speed
             return 0.0
@@ -148,7 +158,7 @@ class TraciVut(Driver):
             raise FaultError(f"the controller asked for an acceleration of {acceleration_mps2}")
         return float(acceleration_mps2)
 
-    def _enter(self, states: Mapping[str, Any]) -> dict[str, Any]:
+    def _enter(self, message: Mapping[str, Any]) -> dict[str, Any]:
         """Let the vehicles depart, for the client that is connected or for a new one.
 
         A controller may run once per episode: a goodbye on an empty road is no fault.
@@ -156,7 +166,7 @@ class TraciVut(Driver):
         for _ in range(2):
             if self._client is None:
                 self._connect()
-            answer = self._ask({"do": "enter", "states": states})
+            answer = self._ask({"do": "enter", **message})
             if "closed" not in answer:
                 return answer
             # The door stays open: the next client may be waiting already.

@@ -1,0 +1,129 @@
+"""The VUT that chooses a gap on an acceleration lane: which one, and where it waits for none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from vut_contract import LANE, ON_LANE, begin, factory, run_on
+
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
+from merge_sumo.drivers.gap_choice import GapChoice, GapChoiceVut
+from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.case import FloatArray, MergeCase
+from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.values.trajectory import End
+
+
+def scene(x_m: FloatArray, v_mps: FloatArray, *, merged: bool = False) -> Scene:
+    """Return a scene of one corridor with vehicles in the order of their rows."""
+    state = (np.array(values, dtype=np.float64)[:, None] for values in (x_m, v_mps))
+    return Scene(np.array([True]), np.array([9]), *state, merged=np.array([merged]))
+
+
+def asked(x_m, v_mps, *, merged=False, choice=None, case=ON_LANE) -> tuple[float, int]:
+    """Return its answer and its wish."""
+    vut = GapChoiceVut(1, choice)
+    begin(vut, case)
+    answer = vut.act(scene(x_m, v_mps, merged=merged))
+    return float(answer[0]), int(vut.wishes()[0])
+
+
+@pytest.mark.parametrize(
+    ("x_pov", "v_pov", "wish"),
+    [
+        (-70.0, 30.0, MERGE),  # behind, in the next step: -38 - 5 - (-67) = 24 m, 0.8 s at 30 m/s
+        (-69.99, 30.0, STAY),
+        (-18.5, 15.0, MERGE),  # ahead: -17 - 5 - (-38) = 16 m, 0.8 s at its own 20 m/s
+        (-18.51, 15.0, STAY),
+        (-41.0, 20.0, STAY),  # beside it
+        (500.0, 30.0, MERGE),
+    ],
+)
+def test_a_gap_is_accepted_by_its_time_gaps_in_the_next_step(x_pov, v_pov, wish):
+    assert asked([x_pov, -40.0], [v_pov, 20.0])[1] == wish
+
+
+def test_both_gaps_count_and_so_does_the_headway():
+    between = [-75.0, -40.0, -10.0, -140.0], [30.0, 20.0, 20.0, 30.0]  # 29 m behind, 25 m ahead
+    assert asked(*between)[1] == MERGE
+    assert asked(*between, choice=GapChoice(headway_s=0.96))[1] == MERGE
+    assert asked(*between, choice=GapChoice(headway_s=0.97))[1] == STAY
+    assert asked([-75.0, -40.0, -21.0, -140.0], between[1])[1] == STAY
+
+
+def test_it_wishes_nothing_before_the_gore_and_on_the_mainline():
+    assert asked([500.0, -72.1], [30.0, 20.0]) == (1.0, STAY)
+    assert asked([500.0, -72.0], [30.0, 20.0]) == (1.0, MERGE)
+    assert asked([500.0, -40.0], [30.0, 20.0], merged=True) == (1.0, NO_WISH)
+
+
+def test_without_a_lane_it_is_the_level_0_vut():
+    case = replace(ON_LANE, scenario=US23)
+    vut, level0 = GapChoiceVut(1), factory("level0")(1)
+    begin(vut, case)
+    begin(level0, case)
+    at_m = scene([-45.0, -40.0], [30.0, 27.95])._replace(merged=None)
+    assert vut.act(at_m).tolist() == level0.act(at_m).tolist() == [pytest.approx(0.5)]
+    assert vut.wishes().tolist() == [NO_WISH]
+
+
+def test_without_a_gap_it_stands_before_the_end_of_the_lane_and_waits():
+    vut = GapChoiceVut(1)
+    begin(vut)
+    x, v, hardest = -40.0, 24.0, 0.0
+    for _ in range(200):
+        a = float(vut.act(scene([x, x], [v, v]))[0])
+        assert vut.wishes().tolist() == [STAY]
+        hardest = min(hardest, a)
+        x, v = x + v * DT_S, max(v + a * DT_S, 0.0)
+    assert v == pytest.approx(0.0, abs=1e-9)
+    assert x == pytest.approx(129.0, abs=0.2)
+    assert -3.0 - 1e-9 <= hardest <= -2.9
+
+
+def test_on_the_mainline_it_keeps_a_distance():
+    near, _ = asked([-30.0, -40.0], [15.0, 20.0], merged=True)
+    far, _ = asked([400.0, -40.0], [20.0, 20.0], merged=True)
+    assert near < -2.0
+    assert 0.5 < far <= 1.0
+
+
+@pytest.mark.parametrize("name", ["us23-lane", "us23-lane-traffic"])
+def test_it_merges_in_sumo_and_a_longer_headway_merges_later(name):
+    scenario = named_scenario(name)
+    mean_m = []
+    for headway_s in (0.5, 1.2):
+        ran = run_on(factory(f"gap?headway_s={headway_s}"), scenario, 0, 40)
+        assert {t.end for t in ran} <= {End.MERGED, End.TIMEOUT}
+        assert all(t.x_vut_m[-1] < 130.0 for t in ran), "no merge is forced"
+        mean_m.append(np.mean([t.x_vut_m[-1] for t in ran]))
+    assert mean_m[0] < mean_m[1]
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("gap?headway=1", "gap has no option 'headway': choose from headway_s, brake_mps2"),
+        ("gap?headway_s=long", "headway_s is 'long': give a number"),
+        ("gap?headway_s=-1", "headway_s is -1.0: it must be a number from 0 up"),
+        ("gap?headway_s=nan", "headway_s is nan"),
+        ("gap?brake_mps2=0", "brake_mps2 is 0"),
+        ("gap?headway_s", "'headway_s' is not an option: write NAME=VALUE"),
+        ("design1?headway_s=1", "design1 has no option 'headway_s': it has none"),
+        ("level1?x=1", "level1 has no option 'x': it has none"),
+    ],
+)
+def test_what_it_has_no_option_for_is_refused_in_a_sentence(spec, said):
+    with pytest.raises(UserError, match="--vut") as refused:
+        factory(spec)
+    assert said in str(refused.value)
+
+
+def test_a_point_of_its_own_is_the_scenarios():
+    shorter = replace(LANE, lane_m=(-20.0, 40.0))
+    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=shorter)
+    assert asked([500.0, -40.0], [30.0, 20.0], case=case)[1] == STAY
+    assert asked([500.0, -22.0], [30.0, 20.0], case=case)[1] == MERGE

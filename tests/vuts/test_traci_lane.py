@@ -1,0 +1,204 @@
+"""A TraCI controller on an acceleration lane: what it sees of it, and how it changes lanes."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from controllers import STOCK_CLIENT, program
+from traci_pair import ToSession, close_shadow, shadow
+from vut_contract import factory, run_on
+
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.trajectory import End
+from merge_sumo.vuts.traci.session import STAYED, Session
+
+LANE = named_scenario("us23-lane")
+DRIVES = """
+while traci.simulation.getMinExpectedNumber() > 0:
+    traci.simulationStep()
+    if "vut" not in traci.vehicle.getIDList():
+        continue
+    traci.vehicle.setSpeed("vut", min(traci.vehicle.getSpeed("vut") + 0.1, 28.0))
+"""
+ON_LANE = (
+    DRIVES
+    + """
+    if traci.vehicle.getRoadID("vut") != "lane" or traci.vehicle.getLaneIndex("vut") != 0:
+        continue
+"""
+)
+
+
+def drive(tmp_path, source, *, cases=2, **options):
+    """Return what became of some cases with a stock client on the lane."""
+    command = program(tmp_path, STOCK_CLIENT + source + "\ntraci.close()\n")
+    vut = factory("traci", command=command, deadline_s=20.0, **options)
+    return run_on(vut, LANE, 0, cases, corridors=1)
+
+
+@pytest.mark.parametrize(
+    "change",
+    ['changeLane("vut", 1, 0.0)', 'changeLane("vut", 1, 5)', 'changeLaneRelative("vut", 1, 3)'],
+)
+def test_a_lane_change_merges_in_the_next_step_wherever_it_is_commanded(tmp_path, change):
+    source = (
+        ON_LANE
+        + f"""
+    if traci.vehicle.getLanePosition("vut") >= 100.0:
+        traci.vehicle.{change}
+"""
+    )
+    for trajectory in drive(tmp_path, source):
+        assert trajectory.error is None
+        assert trajectory.end is End.MERGED
+        before, at = trajectory.x_vut_m[-3:-1]
+        assert before < 30.0 <= at
+        assert len(trajectory.after) > 40, "it drives on itself behind the merge"
+
+
+def test_the_gap_that_a_controller_chooses_by_neighbours_is_the_one_it_gets(tmp_path):
+    source = (
+        ON_LANE
+        + """
+    gaps = [gap for side in (0b10, 0b00) for _, gap in traci.vehicle.getNeighbors("vut", side)]
+    assert gaps == [gap for _, gap in (*traci.vehicle.getLeftLeaders("vut"),
+                                       *traci.vehicle.getLeftFollowers("vut"))], gaps
+    assert traci.vehicle.couldChangeLane("vut", 1) in (True, False)
+    if all(gap > 12.0 for gap in gaps):
+        traci.vehicle.changeLane("vut", 1, 0.0)
+"""
+    )
+    *_, in_front, behind, _ = drive(tmp_path, source, cases=6)
+    for trajectory in (in_front, behind):
+        apart_m = trajectory.x_pov_m[-2] - trajectory.x_vut_m[-2]
+        last_m = trajectory.x_pov_m[-3] - trajectory.x_vut_m[-3]
+        assert apart_m > 17.0 >= last_m > 5.0
+        assert trajectory.x_vut_m[-1] < 0.0
+
+
+def test_without_a_lane_change_it_comes_to_the_end_and_a_note_says_why(tmp_path):
+    log = tmp_path / "controller.log"
+    (trajectory,) = drive(tmp_path, DRIVES, cases=1, log=log)
+    assert trajectory.end is End.MERGED
+    assert trajectory.x_vut_m[-1] >= 130.0
+    assert trajectory.clipped_steps == 0
+    assert log.read_text().splitlines() == [f"note: {STAYED}"]
+
+
+def test_in_sumos_own_modes_sumo_drives_and_merges_it(tmp_path):
+    source = """
+while traci.simulation.getMinExpectedNumber() > 0:
+    traci.simulationStep()
+    if "vut" in traci.vehicle.getIDList() and traci.vehicle.getLaneChangeMode("vut") == 0:
+        traci.vehicle.setLaneChangeMode("vut", 1621)
+        traci.vehicle.setSpeedMode("vut", 31)
+        traci.vehicle.setSpeed("vut", -1)
+"""
+    log = tmp_path / "controller.log"
+    ran = drive(tmp_path, source, cases=6, log=log)
+    assert {t.error for t in ran} == {None}
+    assert all(t.x_vut_m[-1] < 130.0 for t in ran)
+    assert not log.exists()
+
+
+def test_sumo_checks_the_gap_in_mode_512_and_not_in_mode_0(tmp_path):
+    source = (
+        DRIVES
+        + """
+    traci.vehicle.setLaneChangeMode("vut", {mode})
+    if traci.vehicle.getRoadID("vut") == "lane" and traci.vehicle.getLaneIndex("vut") == 0:
+        traci.vehicle.changeLane("vut", 1, 0.0)
+"""
+    )
+    by_mode = [drive(tmp_path, source.format(mode=mode)) for mode in (0, 512)]
+    (near, far), (near_checked, far_checked) = ([t.x_vut_m[-1] for t in ran] for ran in by_mode)
+    assert near < -65.0
+    assert near_checked > -60.0, "the POV is 17 m behind and faster"
+    assert far_checked == far
+
+
+def test_what_it_is_told_is_of_the_edge_with_both_lanes(tmp_path):
+    source = (
+        ON_LANE
+        + """
+    here = dict(
+        lane=traci.vehicle.getLaneID("vut"), index=traci.vehicle.getLaneIndex("vut"),
+        lanes=traci.edge.getLaneNumber("lane"), at=traci.vehicle.getLanePosition("vut"),
+        x=traci.vehicle.getPosition("vut")[0], y=traci.vehicle.getPosition("vut")[1],
+        pov=traci.vehicle.getLaneID("pov"), mode=traci.vehicle.getLaneChangeMode("vut"),
+    )
+    import json, pathlib
+    pathlib.Path(__file__).with_name("seen.json").write_text(json.dumps(here))
+    if here["at"] > 50.0:
+        traci.vehicle.changeLane("vut", 1, 0.0)
+"""
+    )
+    (trajectory,) = drive(tmp_path, source, cases=1)
+    seen = json.loads((tmp_path / "seen.json").read_text())
+    assert (seen["lane"], seen["index"], seen["lanes"], seen["mode"]) == ("lane_0", 0, 3, 0)
+    assert seen["pov"] in ("main_in_0", "lane_1", "main_out_0")
+    at_m = trajectory.x_vut_m[-2]
+    assert seen["at"] == pytest.approx(at_m + 70.0, abs=1e-9)
+    assert (seen["x"], seen["y"]) == pytest.approx((at_m, -3.2), abs=1e-9)
+
+
+class TestTheShadow:
+    """The SUMO that decides, step by step."""
+
+    @pytest.fixture
+    def session(self, tmp_path):
+        yield Session(shadow(tmp_path, LANE, road_for(LANE)))
+        close_shadow()
+
+    @staticmethod
+    def states(x_m, v_mps=20.0):
+        return {"pov": (x_m - 100.0, 30.0, 0.0), "vut": (x_m, v_mps, 0.0)}
+
+    def test_a_wish_that_is_not_granted_leaves_it_on_its_lane(self, session):
+        client = ToSession(session)
+        session.enter(self.states(-40.0))
+        client.vehicle.changeLane("vut", 1, 10.0)
+        session.step()
+        assert session.sumo.wants_to_merge
+        session.put(self.states(-38.0))
+        assert client.vehicle.getLaneID("vut") == "lane_0"
+        session.step()
+        assert session.sumo.wants_to_merge, "the command lasts"
+        session.put(self.states(-36.0), merged=True)
+        assert client.vehicle.getLaneID("vut") == "lane_1"
+        assert client.vehicle.getPosition("vut") == pytest.approx((-36.0, 0.0), abs=1e-9)
+
+    def test_a_merge_is_final(self, session):
+        client = ToSession(session)
+        session.enter(self.states(-40.0))
+        session.step()
+        session.put(self.states(-38.0), merged=True)
+        client.vehicle.changeLane("vut", 0, 10.0)
+        session.step()
+        session.put(self.states(-36.0), merged=True)
+        assert client.vehicle.getLaneIndex("vut") == 1
+        client.vehicle.changeLane("vut", 2, 10.0)
+        session.step()
+        session.put(self.states(-34.0), merged=True)
+        assert client.vehicle.getLaneIndex("vut") == 1
+
+    def test_the_end_of_the_lane_changes_no_speed_and_is_no_wish(self, session):
+        session.enter(self.states(120.0))
+        for x_m in (122.0, 124.0, 126.0, 128.0, 130.0, 132.0):
+            assert session.step() == 20.0
+            assert not session.sumo.wants_to_merge
+            session.put(self.states(x_m), merged=x_m >= 130.0)
+        assert session.notes == [STAYED]
+
+    def test_the_next_episode_begins_on_the_ramp(self, session):
+        session.enter(self.states(-40.0))
+        session.step()
+        session.put(self.states(-38.0), merged=True)
+        session.step()
+        session.clear()
+        session.enter(self.states(-60.0))
+        assert ToSession(session).vehicle.getLaneID("vut") == "lane_0"
