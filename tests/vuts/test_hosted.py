@@ -26,7 +26,7 @@ from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS
 from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import US23, lane_of
+from merge_sumo.values.scenario import US23, as_merge, lane_of
 from merge_sumo.values.trajectory import as_reason
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.host import wire
@@ -319,7 +319,7 @@ class TestTheWire:
         assert told.merged.tolist() == [False, True]
         assert told.facing is None
         assert [lane_of(case.scenario) for _, case in begun] == [None, (-70.0, 130.0)]
-        assert begun[1][1].scenario.lane_end == "merge"
+        assert as_merge(begun[1][1].scenario).lane_end == "merge"
         assert wire.unpack_scene(wire.pack_scene([], scene(2)))[1].merged is None
 
 

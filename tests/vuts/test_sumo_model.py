@@ -1,5 +1,7 @@
 """SUMO's own drivers as VUT: their motion, their options, and that they react to the POV."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import numpy as np
