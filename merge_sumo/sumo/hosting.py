@@ -10,8 +10,9 @@ Copies lie on top of each other in the plane; SUMO's drivers see along lanes and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise
 from typing import Final, NamedTuple
 
@@ -64,11 +65,15 @@ def hosted_paths(road: Corridor) -> tuple[HostedPath, HostedPath]:
     return main, ramp
 
 
-def hosted_net(road: Corridor, copies: int) -> bytes:
-    """Return the net with `copies` copies of a road."""
+def hosted_net(road: Corridor, copies: int, *, lane_goes_on: bool = False) -> bytes:
+    """Return the net with `copies` copies of a road.
+
+    With `lane_goes_on` the acceleration lane leads on, too: for replays, where the record changes
+    lanes, also in the step that crosses its end, in which SUMO stops a vehicle at a dead end.
+    """
     text = ['<net version="1.20">\n']
     # SUMO reads edges before the junctions that name their lanes, and connections last.
-    elements = _elements(road)
+    elements = _elements(road, lane_goes_on=lane_goes_on)
     for tag in ("edge", "junction", "connection"):
         template = "".join(
             f"{etree.tostring(element, encoding='unicode')}\n"
@@ -152,16 +157,33 @@ def _beside(path: LanePath, lane_m: Bounds, *, on_ramp: bool) -> _HostedLane:
     return _HostedLane(LANE, AT_M, piece, number=0 if on_ramp else 1, leads_on=not on_ramp)
 
 
-def _hops(lanes: Sequence[_HostedLane]) -> Iterator[_Hop]:
+def _hops(lanes: Sequence[_HostedLane], *, lane_goes_on: bool) -> Iterator[_Hop]:
     roads = [number for number, lane in enumerate(lanes) if not lane.piece.is_internal]
     for here, following in pairwise([*roads, len(lanes)]):
         if following < len(lanes) and lanes[here].leads_on:
             yield _Hop(lanes[here], lanes[here + 1 : following], lanes[following])
+        elif following < len(lanes) and lane_goes_on:
+            via = _crossing(lanes[here], lanes[here + 1 : following], lanes[following])
+            yield _Hop(lanes[here], via, lanes[following])
         else:
             yield _Hop(lanes[here], [], None)
 
 
-def _elements(road: Corridor) -> list[etree._Element]:
+def _crossing(
+    lane: _HostedLane, beside: Sequence[_HostedLane], target: _HostedLane
+) -> list[_HostedLane]:
+    """Return the way from the end of an acceleration lane, beside that of the mainline's lanes."""
+    if not beside:
+        return []
+    piece = replace(
+        beside[0].piece,
+        length_m=math.fsum(other.piece.length_m for other in beside),
+        shape=(lane.piece.shape[-1], target.piece.shape[0]),
+    )
+    return [_HostedLane(f":{AT_M}_lane0", AT_M, piece)]
+
+
+def _elements(road: Corridor, *, lane_goes_on: bool) -> list[etree._Element]:
     """Return the edges, junctions and connections of one copy, in any order."""
     elements: list[etree._Element] = []
     edges: dict[str, etree._Element] = {}
@@ -170,7 +192,7 @@ def _elements(road: Corridor) -> list[etree._Element]:
     for name, lanes in [("main", main)] if road.is_one_path else [("ramp", ramp), ("main", main)]:
         behind = f"{name}-begin{COPY}"
         elements.append(_junction(behind, "dead_end", lanes[0].piece.shape[0], []))
-        for hop in _hops(lanes):
+        for hop in _hops(lanes, lane_goes_on=lane_goes_on):
             source = hop.source
             hops = arriving.setdefault(source.junction, [])
             if any(other.source.lane == source.lane for other in hops):

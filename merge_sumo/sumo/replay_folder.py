@@ -145,7 +145,7 @@ def _road(road: Corridor, folder: Path) -> Road:
     if (road.sha256, *edges) == (shipped.sha256, MAINLINE_EDGES, RAMP_EDGES):
         return Road(shipped.path.read_bytes(), shipped, None)
     fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
-    content = hosted_net(fast, 1)
+    content = hosted_net(fast, 1, lane_goes_on=True)
     drawn = _polygons(road.surroundings)
     _, lane_end_m = fast.lane_m or (0.0, 0.0)
     return Road(content, corridor_of_hosted(content, folder / HOSTED_NET, lane_end_m), drawn)

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from foreign_nets import (
     FOREIGN,
+    LANE_M,
+    LANES,
     edge,
     lane,
     lane_drop,
@@ -33,31 +35,6 @@ from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MergeScenar
 
 EXACT = 1e-9
 MAX_SPEED = "200"
-
-
-def two_edges(folder: Path) -> Path:
-    """A curved acceleration lane of two edges, with a sidewalk beside it and internal lanes."""
-    bend = "-200,0 -120,6 -60,16 0,30"
-    return plain(
-        folder,
-        node("a", -900, 0) + node("g", -200, 0) + node("h", 0, 30) + node("e", 120, 70)
-        + node("b", 700, 200) + node("r", -500, -90),
-        edge("in", "a", "g", 2, 33, priority=9) + edge("out", "e", "b", 2, 33, priority=9)
-        + edge("acc1", "g", "h", 3, 33, priority=9, shape=bend, sidewalkWidth=2)
-        + edge("acc2", "h", "e", 3, 33, priority=9) + edge("ramp", "r", "g", 1, 17, priority=3),
-        lane("ramp", 0, "acc1", 1) + lane("in", 0, "acc1", 2) + lane("in", 1, "acc1", 3)
-        + lane("acc1", 1, "acc2", 0) + lane("acc1", 2, "acc2", 1) + lane("acc1", 3, "acc2", 2)
-        + lane("acc2", 1, "out", 0) + lane("acc2", 2, "out", 1),
-    )  # fmt: skip
-
-
-LANES = {
-    "two edges": (two_edges, "in acc1 acc2 out", "ramp acc1 acc2 out"),
-    "lane drop": FOREIGN["lane drop"],
-    "OSM": FOREIGN["OSM"],
-    "zipper": FOREIGN["zipper with an auxiliary lane"],
-}
-LANE_M = (-30.0, 60.0)
 
 
 @pytest.fixture(scope="module")

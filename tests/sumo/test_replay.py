@@ -9,17 +9,24 @@ import json
 import shutil
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_nets import LANE_M, LANES
 from lxml import etree
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.store import failures
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import road_of
+from merge_sumo.road.netfile import NetFile
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
 from merge_sumo.sumo.replay import MAX_TIMESTEPS, replay
@@ -37,7 +44,7 @@ from merge_sumo.sumo.replay_folder import (
     write_scenario,
 )
 from merge_sumo.values.case import Case, MergeCase
-from merge_sumo.values.scenario import DT_S, US23, V_VUT0_MAX_MPS, X_VUT0_M
+from merge_sumo.values.scenario import DT_S, US23, V_VUT0_MAX_MPS, X_VUT0_M, MergeScenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -224,6 +231,80 @@ class TestAnHonestRecordReplaysIdentically:
         trajectory = drive(at_level_0(-240.0 + beyond_m, 30.0), constant, constant, 110, End.MERGED)
         assert abs(trajectory.x_pov_m[80]) < 0.001
         assert_identical(write(tmp_path / "case", trajectory), 110)
+
+
+@pytest.fixture
+def lane_road(tmp_path):
+    """Return a function that finds the road of a net with an acceleration lane."""
+
+    def find(name: str) -> tuple[Corridor, MergeScenario]:
+        if name == "us23-lane":
+            scenario = named_scenario(name)
+            return road_for(scenario), scenario
+        build, mainline, ramp = LANES[name]
+        net = NetFile(build(tmp_path))
+        road = find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
+        return road, replace(US23, lane_m=LANE_M)
+
+    return find
+
+
+class TestAMergeFromALane:
+    """The VUT drives at 20 m/s from 201 m before M, and merges in the first row past a place."""
+
+    def motion(self, scenario: MergeScenario, place_m: float, end: End) -> Trajectory:
+        steps = int(np.ceil((place_m + 201.0) / 2.0))
+        x_m = -201.0 + 2.0 * np.arange(steps + 1)
+        vut = np.stack((x_m, np.full_like(x_m, 20.0), np.zeros_like(x_m)), axis=1)
+        pov = vut + np.array([-30.0, 0.0, 0.0])
+        case = MergeCase(level=0, x_pov0_m=-231.0, v_pov0_mps=20.0, scenario=scenario)
+        return Trajectory(case, np.stack((pov, vut), axis=1), end)
+
+    def written(self, folder: Path, road: Corridor, trajectory: Trajectory) -> Path:
+        write_scenario(
+            folder, road, Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory
+        )
+        return folder
+
+    def lanes(self, path: Path) -> list[str]:
+        return [
+            car.get("lane") for car in etree.parse(path).iter("vehicle") if car.get("id") == "vut"
+        ]
+
+    @pytest.mark.parametrize("name", ["us23-lane", "two edges", "lane drop", "OSM"])
+    @pytest.mark.parametrize("place", ["gore", "lane", "end"])
+    def test_is_seen_in_the_row_in_which_it_happens(self, lane_road, tmp_path, name, place):
+        road, scenario = lane_road(name)
+        begin_m, end_m = road.lane_m
+        place_m = {"gore": max(begin_m, -198.0), "lane": 21.0, "end": end_m}[place]
+        trajectory = self.motion(scenario, place_m, End.MERGED)
+        folder = self.written(tmp_path / "case", road, trajectory)
+        assert_identical(folder, len(trajectory.motion) - 1)
+        lanes = self.lanes(folder / RECORD)
+        *before, first = lanes[: len(trajectory.motion)]
+        assert {*lanes[len(before) :]} == {first}
+        assert first in (("out1.0_0", ":M.0_out0_0") if place == "end" else ("lane.0_1",))
+        assert "lane.0_1" not in before
+        assert ("lane.0_0" in before) is (place != "gore" or begin_m < -198.0)
+
+    def test_that_never_happens_is_none(self, lane_road, tmp_path):
+        road, scenario = lane_road("us23-lane")
+        trajectory = self.motion(scenario, 120.0, End.TIMEOUT)
+        folder = self.written(tmp_path / "case", road, trajectory)
+        assert_identical(folder)
+        assert self.lanes(folder / RECORD)[-1] == "lane.0_0"
+
+    def test_is_final(self, lane_road, tmp_path):
+        road, scenario = lane_road("us23-lane")
+        folder = self.written(tmp_path / "case", road, self.motion(scenario, 100.0, End.MERGED))
+        record = etree.parse(folder / RECORD)
+        rows = [car for car in record.iter("vehicle") if car.get("id") == "vut"]
+        rows[110].set("lane", "lane.0_1")
+        rows[110].set("y", "0.0")
+        record.write(folder / RECORD)
+        result = replay(folder)
+        assert result.diverged_at_s == pytest.approx(11.1)
+        assert result.detail == "vut is recorded back on the acceleration lane"
 
 
 def test_at_least_one_scenario_is_shipped():

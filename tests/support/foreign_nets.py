@@ -165,6 +165,22 @@ def roundabout(folder: Path, radius_m: float = 20.0) -> Path:
     return plain(folder, nodes, edges + round_it)
 
 
+def two_edges(folder: Path) -> Path:
+    """A curved acceleration lane of two edges, with a sidewalk beside it and internal lanes."""
+    bend = "-200,0 -120,6 -60,16 0,30"
+    return plain(
+        folder,
+        node("a", -900, 0) + node("g", -200, 0) + node("h", 0, 30) + node("e", 120, 70)
+        + node("b", 700, 200) + node("r", -500, -90),
+        edge("in", "a", "g", 2, 33, priority=9) + edge("out", "e", "b", 2, 33, priority=9)
+        + edge("acc1", "g", "h", 3, 33, priority=9, shape=bend, sidewalkWidth=2)
+        + edge("acc2", "h", "e", 3, 33, priority=9) + edge("ramp", "r", "g", 1, 17, priority=3),
+        lane("ramp", 0, "acc1", 1) + lane("in", 0, "acc1", 2) + lane("in", 1, "acc1", 3)
+        + lane("acc1", 1, "acc2", 0) + lane("acc1", 2, "acc2", 1) + lane("acc1", 3, "acc2", 2)
+        + lane("acc2", 1, "out", 0) + lane("acc2", 2, "out", 1),
+    )  # fmt: skip
+
+
 AUXILIARY = "4711#1-AddedOnRampEdge"
 FOREIGN = {
     "curved": (curved, "in out", "slip out"),
@@ -195,6 +211,15 @@ FOREIGN = {
 }
 """Name, builder, edges of the mainline and of the ramp; the first six are the kinds that count."""
 
+LANES = {
+    "two edges": (two_edges, "in acc1 acc2 out", "ramp acc1 acc2 out"),
+    "lane drop": FOREIGN["lane drop"],
+    "OSM": FOREIGN["OSM"],
+    "zipper": FOREIGN["zipper with an auxiliary lane"],
+}
+"""Those with an acceleration lane."""
+LANE_M = (-30.0, 60.0)
+"""Of a scenario; the lanes of these nets are longer."""
 SIX = list(FOREIGN)[:6]
 OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(FOREIGN)[6:]]
 ALL = [*SIX, *OTHERS]
