@@ -27,6 +27,7 @@ from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.report_sections import ReportSection, shared_words
 from merge_sumo.road.merge import road_of
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.values.case import Case, Pool, from_unit, to_unit
 from merge_sumo.values.criteria import NamedCriterion
@@ -394,24 +395,31 @@ class ScenarioKindContract:
 
 
 class VutContract:
-    """What a campaign relies on in a VUT.
+    """What a campaign relies on in a VUT, at a point and on an acceleration lane.
 
     Attributes:
         vut: what a person writes after `--vut`.
+        scenarios: names of the shipped scenarios in which it drives.
     """
 
     vut: str
+    scenarios: tuple[str, ...] = ("us23", "us23-lane")
+
+    def runs(self) -> list[Run]:
+        """Return a campaign in each scenario."""
+        return [campaign_of(self.vut, named_scenario(name)) for name in self.scenarios]
 
     def test_answers_in_every_step(self) -> None:
-        ends = {outcome.measures.end for outcome in campaign_of(self.vut).outcomes}
-        assert not {end for end in ends if end.is_error}
+        for run in self.runs():
+            errors = {outcome.measures.error for outcome in run.outcomes}
+            assert errors == {None}, run.settings["scenario"]
 
     def test_does_not_depend_on_other_corridors(self) -> None:
         """A case alone has the outcome that it had among others."""
-        run = campaign_of(self.vut)
-        for index in (0, 7):
-            alone = api.run_case(self.vut, recorded=(run.folder, index))
-            assert alone.measures == run.outcome(index).measures
+        for run in self.runs():
+            for index in (0, 7):
+                alone = api.run_case(self.vut, recorded=(run.folder, index))
+                assert alone.measures == run.outcome(index).measures
 
     def test_is_found_again_by_its_name(self) -> None:
         """A worker is told the name and makes it anew."""

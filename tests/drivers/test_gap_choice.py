@@ -12,15 +12,15 @@ from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
 from merge_sumo.drivers.gap_choice import GapChoice, GapChoiceVut
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.case import FloatArray, MergeCase
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.values.trajectory import End
 
 
-def scene(x_m: FloatArray, v_mps: FloatArray, *, merged: bool = False) -> Scene:
+def scene(x_m: list[float], v_mps: list[float], *, merged: bool = False) -> Scene:
     """Return a scene of one corridor with vehicles in the order of their rows."""
-    state = (np.array(values, dtype=np.float64)[:, None] for values in (x_m, v_mps))
-    return Scene(np.array([True]), np.array([9]), *state, merged=np.array([merged]))
+    x, v = (np.array(values, dtype=np.float64)[:, None] for values in (x_m, v_mps))
+    return Scene(np.array([True]), np.array([9]), x, v, merged=np.array([merged]))
 
 
 def asked(x_m, v_mps, *, merged=False, choice=None, case=ON_LANE) -> tuple[float, int]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from merges import HALF, SMALLER
+from networks import constant_network as network
 from plans import plan_for
 from typer.testing import CliRunner
 from vut_contract import begin, cases_of, in_process, on_lane, run_cases
@@ -70,27 +71,6 @@ def test_an_export_says_for_which_scenario_it_is_and_what_its_actions_are(export
         said = ort.InferenceSession(tmp_path / path).get_modelmeta().custom_metadata_map
         assert said["actions_mps2"] == expected
         assert said["scenario"] == ("us23" if path == "a" else "multiple")
-
-
-def network(path, *, answer, dtype=None, width=4):
-    """Write a network that answers numbers whatever it sees, times its first input's 0."""
-    helper, proto = onnx.helper, onnx.TensorProto
-    kind = proto.FLOAT if dtype == np.float32 else proto.DOUBLE
-    weight = np.zeros((width, len(answer)), dtype=dtype or np.float64)
-    bias = np.array(answer, dtype=weight.dtype)
-    graph = helper.make_graph(
-        [
-            helper.make_node("MatMul", ["in", "w"], ["m"]),
-            helper.make_node("Add", ["m", "b"], ["out"]),
-        ],
-        "g",
-        [helper.make_tensor_value_info("in", kind, [1, width])],
-        [helper.make_tensor_value_info("out", kind, [1, len(answer)])],
-        [onnx.numpy_helper.from_array(v, n) for v, n in ((weight, "w"), (bias, "b"))],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    path.write_bytes(model.SerializeToString())
-    return path
 
 
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.long)])

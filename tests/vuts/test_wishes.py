@@ -7,9 +7,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import some
-from vut_contract import ON_LANE, begin, factory, in_process, on_lane
+from vut_contract import ON_LANE, begin, cases_of, factory, in_process, on_lane, run_cases, run_on
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, VutLostError
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.base import Seen, VutOptions, seen_at_start, seen_in
 from merge_sumo.vuts.host.hosted import HostedVut
 from merge_sumo.vuts.in_memory import vut_of_object
@@ -228,3 +230,27 @@ def Vut(seen):
             driver.act(on_lane([-71.0, -71.0], [False, False]))
     finally:
         driver.close()
+
+
+def test_without_a_lane_a_wish_changes_nothing(spec):
+    alone, wishing = (
+        run_cases(in_process(spec(f"def Vut(seen):\n    return {answer}\n")), cases_of(6))
+        for answer in ("0.5", "(0.5, seen.t_s > 1.0)")
+    )
+    for one, other in zip(alone, wishing, strict=True):
+        assert one.end is other.end
+        assert np.array_equal(one.motion, other.motion)
+
+
+@pytest.mark.parametrize("process", some(["this", "own"], "own"))
+def test_a_wish_that_is_none_ends_its_case_alone_as_an_error(spec, process):
+    wish = "'yes' if seen.v_pov_mps > 30.0 and seen.x_vut_m > -80.0 else False"
+    vut = factory(spec(f"def Vut(seen):\n    return 1.0, {wish}\n"), in_process=process == "this")
+    ran = run_on(vut, named_scenario("us23-lane"), 0, 8)
+    for trajectory in ran:
+        if trajectory.v_pov_mps[0] > 30.0:
+            assert trajectory.end is End.VUT_ERROR
+            assert trajectory.error.startswith("WrongAnswerError: wishes 'yes' (str) instead of")
+        else:
+            assert trajectory.x_vut_m[-2] < 130.0 <= trajectory.x_vut_m[-1], "it is forced"
+    assert len({trajectory.end for trajectory in ran}) == 2

@@ -1,0 +1,28 @@
+"""ONNX networks for tests."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+
+def constant_network(path, *, answer, dtype=None, width=4):
+    """Write a network that answers numbers whatever it sees, times its first input's 0."""
+    onnx = pytest.importorskip("onnx")
+    helper, proto = onnx.helper, onnx.TensorProto
+    kind = proto.FLOAT if dtype == np.float32 else proto.DOUBLE
+    weight = np.zeros((width, len(answer)), dtype=dtype or np.float64)
+    bias = np.array(answer, dtype=weight.dtype)
+    graph = helper.make_graph(
+        [
+            helper.make_node("MatMul", ["in", "w"], ["m"]),
+            helper.make_node("Add", ["m", "b"], ["out"]),
+        ],
+        "g",
+        [helper.make_tensor_value_info("in", kind, [1, width])],
+        [helper.make_tensor_value_info("out", kind, [1, len(answer)])],
+        [onnx.numpy_helper.from_array(v, n) for v, n in ((weight, "w"), (bias, "b"))],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    path.write_bytes(model.SerializeToString())
+    return path
