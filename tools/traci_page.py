@@ -31,7 +31,10 @@ scenario's limits. `vut` departs in speed mode 38 with its speed set, so a contr
 commands keeps its speed: limits of acceleration act, SUMO's checks of safe speed, right of way \
 and red lights do not. Speed mode 31, `setSpeed(-1)`, `setTau`, `openGap` and `setStop` have their \
 meaning in SUMO, whose car-following model then drives the VUT (deterministically: `sigma` is 0, \
-unless `setImperfection` changes it). Other commands are accepted without effect (with one note in \
+unless `setImperfection` changes it). On a road with an acceleration lane the lane that the step \
+gives the VUT is its wish to merge; `vut` departs in lane change mode 0, so nothing but the \
+controller changes its lane ([Lane changes](../tutorials/traci-controller.md#lane-changes)). Other \
+commands are accepted without effect (with one note in \
 `controller.log`), or refused with a reason, as an error of that command; the connection stays \
 open. [Why SUMO decides](../decisions/traci-server.md).
 """
@@ -61,7 +64,7 @@ def sections() -> Iterator[str]:
             ("Not answered", unanswered),
             *(
                 (effect.value, [f for f in sets if effect_of(f.functions) is effect])
-                for effect in (Effect.CARRIED_OUT, Effect.NOTHING)
+                for effect in (Effect.CARRIED_OUT, Effect.ON_A_LANE, Effect.NOTHING)
             ),
             *((f"Refused ({reason})", those) for reason, those in refused.items()),
         ):

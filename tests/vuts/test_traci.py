@@ -43,7 +43,7 @@ CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
     encoding="utf-8"
 )
-(CONTROLLER,) = re.findall(r"```python\n(import sys, traci.*?)```", PAGE, flags=re.DOTALL)
+CONTROLLER, _ = re.findall(r"```python\n(import sys, traci.*?)```", PAGE, flags=re.DOTALL)
 """The tutorial's controller; its law is that of level 0."""
 
 

@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 from controllers import STOCK_CLIENT, program
@@ -78,6 +80,16 @@ def test_the_gap_that_a_controller_chooses_by_neighbours_is_the_one_it_gets(tmp_
         last_m = trajectory.x_pov_m[-3] - trajectory.x_vut_m[-3]
         assert apart_m > 17.0 >= last_m > 5.0
         assert trajectory.x_vut_m[-1] < 0.0
+
+
+def test_the_controller_of_the_tutorial_merges_into_a_gap(tmp_path):
+    page = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text("utf-8")
+    _, source = re.findall(r"```python\n(import sys, traci.*?)```", page, flags=re.DOTALL)
+    vut = factory("traci", command=program(tmp_path, source), deadline_s=20.0)
+    *_, behind_the_pov = run_on(vut, LANE, 0, 4, corridors=1)
+    assert behind_the_pov.error is None
+    assert -60.0 < behind_the_pov.x_vut_m[-1] < 20.0
+    assert behind_the_pov.x_pov_m[-2] - behind_the_pov.x_vut_m[-2] > 25.0
 
 
 def test_without_a_lane_change_it_comes_to_the_end_and_a_note_says_why(tmp_path):
