@@ -27,7 +27,8 @@ from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder
 from merge_sumo.values.bodies import WIDTH_M
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
+from merge_sumo.values.merge import merged_rows
+from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.values.trajectory import Trajectory
 
 TABLE: Final = "trajectories"
@@ -35,6 +36,8 @@ SEVERITY: Final = "severity"
 """Column with one of our words."""
 SIGNAL: Final = "signal_"
 """Begins the names of the columns of signals, whose names and words are a stranger's."""
+MERGED: Final = "merged"
+"""Column of scenarios with an acceleration lane: 1 where the VUT has left it, else 0."""
 FORMULA: Final = ("=", "+", "-", "@")
 """What begins a formula for a spreadsheet."""
 ROAD: Final = "road.xodr"
@@ -45,6 +48,8 @@ CONTROLLER: Final = "EgoController"
 """Parameter that names the controller of a free VUT."""
 HEIGHT_M: Final = 1.5
 WHEEL_M: Final = 0.7
+MERGED_S: Final = 1.0
+"""For which a recorded scenario goes on where the VUT has merged from an acceleration lane."""
 
 Row = tuple[float | str | None, ...]
 WriteCase = Callable[[Run, int, Path, Corridor], Path]
@@ -79,7 +84,9 @@ def columns_of(scenario: Scenario) -> tuple[str, ...]:
         for who in VEHICLES[: scenario.vehicles]
         for what, unit in (("x", "m"), ("v", "mps"), ("a", "mps2"))
     ]
-    return ("case", "level", "time_s", *motion, *(c.field for c in coordinates(scenario)), SEVERITY)
+    merged = () if lane_of(scenario) is None else (MERGED,)
+    place = (c.field for c in coordinates(scenario))
+    return ("case", "level", "time_s", *motion, *merged, *place, SEVERITY)
 
 
 def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str) -> Path:
@@ -101,7 +108,8 @@ def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str
             # Not into the file: where that cannot be written, polars raises an error of its own.
             content = io.BytesIO()
             numbers = dict.fromkeys(columns, polars.Float64)
-            schema = numbers | dict.fromkeys(("case", "level"), polars.Int64)
+            integers = {"case", "level", MERGED}.intersection(columns)
+            schema = numbers | dict.fromkeys(integers, polars.Int64)
             schema[SEVERITY] = polars.String
             for place in range(len(columns) - len(names), len(columns)):
                 if any(isinstance(row[place], str) for row in rows):
@@ -141,6 +149,7 @@ def _with_text(row: Row, place: int) -> Row:
 
 def _rows(run: Run, indices: Sequence[int], names: Sequence[str]) -> list[Row]:
     rows: list[Row] = []
+    has_lane = lane_of(run.scenario) is not None
     for index in indices:
         trajectory = run.trajectory(index)
         case = trajectory.case
@@ -149,6 +158,7 @@ def _rows(run: Run, indices: Sequence[int], names: Sequence[str]) -> list[Row]:
         left = trajectory.signals or {}
         signals = [left.get(name, (None,) * len(trajectory.motion)) for name in names]
         motion = trajectory.motion.reshape(len(trajectory.motion), -1)
+        merged = merged_rows(trajectory).tolist() if has_lane else None
         for step, state in enumerate(motion.tolist()):
             rows.append(
                 (
@@ -156,6 +166,7 @@ def _rows(run: Run, indices: Sequence[int], names: Sequence[str]) -> list[Row]:
                     case.level,
                     round(step * DT_S, 1),
                     *state,
+                    *(() if merged is None else (int(merged[step]),)),
                     *place,
                     severity,
                     *(values[step] for values in signals),
@@ -171,6 +182,10 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     VUT is only placed at its position and speed and has a controller whose name is the parameter
     `EgoController`; the other cars do what they did, whatever it does, and keep their last speed
     where the record ends. That one ends by the scenario's timeout.
+
+    A merge from an acceleration lane is the last step of the VUT's trajectory, with a lane change
+    to the lane of the POV at its end; the first scenario goes on for `MERGED_S`, with all cars at
+    their last speeds. In the road that lane has OpenDRIVE's type "entry".
 
     The reference point of each car is its front bumper, as in the record: x, y and heading are
     those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
@@ -193,27 +208,26 @@ def _scenario(
 ) -> Any:
     """Return a case as a scenario; where the VUT is free, somebody else's controller drives it."""
     scenario = trajectory.case.scenario
+    changes_lane = bool(merged_rows(trajectory).any())
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
     for row, who in enumerate(VEHICLES[: trajectory.motion.shape[1]]):
         entities.add_scenario_object(who, _car(xosc, who, scenario))
-        places = [
-            _place(xosc, road, x_m, on_ramp=row == VUT)
-            for x_m in trajectory.motion[:, row, 0].tolist()
-        ]
+        places = _places(xosc, road, trajectory, row)
+        afterwards = _afterwards(xosc, trajectory, row) if free or changes_lane else []
         init.add_init_action(who, xosc.TeleportAction(places[0]))
         init.add_init_action(who, _speed(xosc, float(trajectory.motion[0, row, 1])))
         if not free:
-            act.add_maneuver_group(_follow(xosc, who, places))
+            act.add_maneuver_group(_follow(xosc, who, places, afterwards))
         elif row == VUT:
             controller = xosc.Controller(f"${CONTROLLER}", xosc.Properties())
             init.add_init_action(who, xosc.AssignControllerAction(controller))
         else:
-            last_mps = float(trajectory.motion[-1, row, 1])
-            act.add_maneuver_group(_follow(xosc, who, places, last_mps))
+            act.add_maneuver_group(_follow(xosc, who, places, afterwards))
     story = xosc.Story(name)
     story.add_act(act)
-    end_s = scenario.timeout_s if free else trajectory.t_end_s
+    shown_s = trajectory.t_end_s + (MERGED_S if changes_lane else 0.0)
+    end_s = scenario.timeout_s if free else round(shown_s, 1)
     board = xosc.StoryBoard(init, _at_time(xosc, "end", end_s))
     board.add_story(story)
     parameters = xosc.ParameterDeclarations()
@@ -249,6 +263,26 @@ def _need(package: str) -> Any:
     return module
 
 
+def _places(xosc: Any, road: Corridor, trajectory: Trajectory, row: int) -> list[Any]:
+    """Return the places of a car at all steps."""
+    return [
+        _place(xosc, road, x_m, on_ramp=row == VUT and not merged)
+        for x_m, merged in zip(
+            trajectory.motion[:, row, 0].tolist(), merged_rows(trajectory).tolist(), strict=True
+        )
+    ]
+
+
+def _afterwards(xosc: Any, trajectory: Trajectory, row: int) -> list[tuple[str, Any]]:
+    """Return what a car does behind its trajectory, as names and actions."""
+    who = VEHICLES[row]
+    actions = [(f"{who} keeps its speed", _speed(xosc, float(trajectory.motion[-1, row, 1])))]
+    if row == VUT:
+        change = xosc.RelativeLaneChangeAction(0, VEHICLES[POV], _at_once(xosc))
+        actions.insert(0, (f"{who} changes to the lane of {VEHICLES[POV]}", change))
+    return actions
+
+
 def _place(xosc: Any, road: Corridor, x_m: float, *, on_ramp: bool) -> Any:
     _, _, x, y, angle_deg = road.lane_point(x_m, on_ramp=on_ramp)
     # SUMO's angles run clockwise from north, OpenSCENARIO's the other way round from east.
@@ -256,8 +290,10 @@ def _place(xosc: Any, road: Corridor, x_m: float, *, on_ramp: bool) -> Any:
     return xosc.WorldPosition(round(x, 9), round(y, 9), 0.0, round(heading, 9))
 
 
-def _follow(xosc: Any, who: str, places: Sequence[Any], afterwards_mps: float | None = None) -> Any:
-    """Return what lets a car follow its places, and then keep a speed, if one is given."""
+def _follow(
+    xosc: Any, who: str, places: Sequence[Any], afterwards: Sequence[tuple[str, Any]]
+) -> Any:
+    """Return what lets a car follow its places, and then do what is given, if anything."""
     times = np.round(np.arange(len(places)) * DT_S, 1).tolist()
     track = xosc.Trajectory(f"{who} recorded", closed=False)
     track.add_shape(xosc.Polyline(times, list(places)))
@@ -273,10 +309,11 @@ def _follow(xosc: Any, who: str, places: Sequence[Any], afterwards_mps: float | 
     event.add_trigger(_at_time(xosc, f"{who} start", 0.0))
     event.add_action(f"{who} follows", follow)
     maneuver.add_event(event)
-    if afterwards_mps is not None:
+    if afterwards:
         event = xosc.Event(f"{who} afterwards", xosc.Priority.override)
         event.add_trigger(_at_time(xosc, f"{who} has followed", times[-1]))
-        event.add_action(f"{who} keeps its speed", _speed(xosc, afterwards_mps))
+        for name, action in afterwards:
+            event.add_action(name, action)
         maneuver.add_event(event)
     group = xosc.ManeuverGroup(f"{who} group")
     group.add_actor(who)
@@ -291,8 +328,11 @@ def _at_time(xosc: Any, name: str, time_s: float) -> Any:
 
 
 def _speed(xosc: Any, v_mps: float) -> Any:
-    at_once = xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0.0)
-    return xosc.AbsoluteSpeedAction(v_mps, at_once)
+    return xosc.AbsoluteSpeedAction(v_mps, _at_once(xosc))
+
+
+def _at_once(xosc: Any) -> Any:
+    return xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0.0)
 
 
 def _car(xosc: Any, who: str, scenario: Scenario) -> Any:

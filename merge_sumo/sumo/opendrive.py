@@ -18,6 +18,8 @@ from merge_sumo.sumo.binding import run_program, scratch_folder
 
 NET: Final = "road.net.xml"
 ROAD: Final = "road.xodr"
+ENTRY: Final = "entry"
+"""OpenDRIVE's type of an acceleration lane."""
 SAME_M: Final = 0.5
 """Where a lane ends in SUMO and in OpenDRIVE may be this far apart."""
 MAX_ELEMENTS: Final = 10**6
@@ -40,7 +42,7 @@ def opendrive(road: Corridor) -> bytes:
         ]
         ended = run_program("netconvert", arguments, stage)
         if ended.code == 0 and (stage / ROAD).is_file():
-            return _with_crossings((stage / ROAD).read_bytes(), road)
+            return _with_paths((stage / ROAD).read_bytes(), road)
     raise UserError(f"netconvert cannot write {road.path} as OpenDRIVE: {ended.reason}")
 
 
@@ -58,14 +60,15 @@ def _net_of(road: Corridor) -> bytes:
 _Place = tuple[float, float]
 
 
-def _with_crossings(made: bytes, road: Corridor) -> bytes:
+def _with_paths(made: bytes, road: Corridor) -> bytes:
     """Return OpenDRIVE in which the ways over junctions are those of both paths.
 
     netconvert draws a way of its own, up to a metre beside the lanes inside of a junction. Here its
-    reference line becomes the centre of the lane that is driven on.
+    reference line becomes the centre of the lane that is driven on. The acceleration lane, which it
+    writes as any other, gets the type "entry".
     """
     crossings = {line for path in (road.mainline, road.ramp) for line in _crossings(path)}
-    if not crossings:
+    if not crossings and road.lane_m is None:
         return made
     parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
     root = etree.fromstring(made, parser)
@@ -76,7 +79,19 @@ def _with_crossings(made: bytes, road: Corridor) -> bytes:
                 for line in crossings:
                     if max(math.dist(line[0], begin), math.dist(line[-1], end)) <= SAME_M:
                         _draw(element, lane, line)
+        else:
+            _mark_entry(element, road)
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
+
+
+def _mark_entry(element: etree._Element, road: Corridor) -> None:
+    """Write of which type the lane of a road is, if it is the acceleration lane."""
+    begin_m, end_m = road.lane_m or (0.0, 0.0)
+    ends = [p.shape[-1][:2] for p in road.ramp.pieces if begin_m <= p.start_m < end_m]
+    for lane in element.iterfind("lanes/laneSection/right/lane"):
+        place = _end_of_lane(element, int(lane.get("id", "")), last=True)
+        if any(math.dist(place, end) <= SAME_M for end in ends):
+            lane.set("type", ENTRY)
 
 
 def _crossings(path: LanePath) -> Iterator[tuple[_Place, ...]]:

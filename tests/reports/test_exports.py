@@ -21,6 +21,7 @@ from scenariogeneration import xosc
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.store import failures
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import columns_of, write_folders, write_openscenario, write_table
 from merge_sumo.road.merge import road_of
@@ -151,6 +152,76 @@ class TestAFreeVut:
         tree = etree.parse(path.with_name(f"{path.stem}-free.xosc"))
         followers = {e.get("entityRef") for e in tree.iterfind(".//Story//EntityRef")}
         assert followers == {"pov", "ahead", "behind"}
+
+
+class TestAMergeFromALane:
+    @pytest.fixture(scope="class")
+    def made(self, tmp_path_factory):
+        """Return a campaign in which the VUT merges at M, on the lane, or never."""
+        folder, scenario = tmp_path_factory.mktemp("lane") / "run", named_scenario("us23-lane")
+        return write_run(folder, 2, levels=(1,), timeouts=[1], scenario=scenario)
+
+    @pytest.fixture(scope="class")
+    def scenario(self, made, tmp_path_factory):
+        road, folder = road_for(made.scenario), tmp_path_factory.mktemp("osc") / "case"
+        return write_openscenario(made, 0, folder, road)
+
+    def test_is_the_last_step_of_the_trajectory_and_then_a_lane_change(self, made, scenario):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            xosc.ParseOpenScenario(str(scenario))
+        tree, trajectory = etree.parse(scenario), made.trajectory(0)
+        *before, merge = vertices(tree, "vut")
+        x_vut = trajectory.x_vut_m
+        assert {y for _, x, y, _ in before if x > -70.0} == {-3.2}
+        assert len([x for _, x, _, _ in before if x > -70.0]) > 30
+        assert merge == pytest.approx((trajectory.t_end_s, x_vut[-1], 0.0, 0.0), abs=1e-8)
+        (change,) = tree.iterfind(".//LaneChangeAction")
+        assert change.find("LaneChangeActionDynamics").get("dynamicsShape") == "step"
+        target = change.find("LaneChangeTarget/RelativeTargetLane")
+        assert (target.get("entityRef"), target.get("value")) == ("pov", "0")
+        for who in ("pov", "vut"):
+            afterwards = tree.find(f".//Event[@name='{who} afterwards']")
+            begins = afterwards.find(".//SimulationTimeCondition").get("value")
+            assert float(begins) == trajectory.t_end_s
+        stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
+        assert float(stop.get("value")) == pytest.approx(trajectory.t_end_s + 1.0)
+
+    def test_is_left_to_a_free_vut(self, scenario):
+        tree = etree.parse(scenario.with_name(f"{scenario.stem}-free.xosc"))
+        assert tree.find(".//LaneChangeAction") is None
+        assert {e.get("entityRef") for e in tree.iterfind(".//Story//EntityRef")} == {"pov"}
+
+    def test_that_never_happens_is_none(self, made, tmp_path):
+        road = road_for(made.scenario)
+        tree = etree.parse(write_openscenario(made, 1, tmp_path / "case", road))
+        assert tree.find(".//LaneChangeAction") is None
+        assert vertices(tree, "vut")[-1][2] < 0.0
+
+    def test_has_a_road_whose_entry_lane_ends(self, scenario):
+        tree = etree.parse(scenario.with_name("road.xodr"))
+        (entry,) = tree.iterfind(".//lane[@type='entry']")
+        road = next(entry.iterancestors("road"))
+        assert (entry.get("id"), float(road.get("length"))) == ("-3", 200.0)
+        into, out = (
+            {
+                (link.get("from"), link.get("to"))
+                for connection in tree.iterfind(".//connection")
+                if connection.get(end) == road.get("id")
+                for link in connection
+            }
+            for end in ("outgoingRoad", "incomingRoad")
+        )
+        assert (into, out) == (set(), {("-1", "-1"), ("-2", "-2")})
+
+    @pytest.mark.parametrize("file_format", ["csv", "parquet"])
+    def test_is_a_column_of_a_table(self, made, tmp_path, file_format):
+        path = write_table(made, [0, 1], tmp_path / "table", file_format)
+        frame = (polars.read_csv if file_format == "csv" else polars.read_parquet)(path)
+        assert frame.columns == list(columns_of(made.scenario))
+        first, second = (frame.filter(case=case)["merged"].to_list() for case in (0, 1))
+        assert first == [*(0 for _ in first[1:]), 1]
+        assert set(second) == {0}
 
 
 class TestATable:

@@ -17,6 +17,7 @@ from foreign_nets import (
     LANES,
     edge,
     lane,
+    lane_corridor_of,
     lane_drop,
     node,
     plain,
@@ -44,9 +45,7 @@ def road(tmp_path_factory):
 
     def get(name: str) -> Corridor:
         if name not in found:
-            build, mainline, ramp = LANES[name]
-            net = NetFile(build(tmp_path_factory.mktemp("net")))
-            found[name] = find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
+            found[name] = lane_corridor_of(name, tmp_path_factory.mktemp("net"))
         return found[name]
 
     return get

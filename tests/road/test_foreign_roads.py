@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_nets import ALL, FOREIGN, OTHERS, SIX, corridor_of
+from foreign_nets import ALL, FOREIGN, LANES, OTHERS, SIX, corridor_of, lane_corridor_of
 from handmade import write_run
 from lxml import etree
 from plans import POVS
@@ -317,6 +317,20 @@ class TestAnExport:
                 assert off_m < (LANE_WIDTH_M if beside else 0.03), x_m
                 compared += not beside
         assert compared > 150
+
+    @pytest.mark.parametrize("name", LANES)
+    def test_to_opendrive_has_both_lanes_of_a_merge(self, tmp_path, name):
+        road = lane_corridor_of(name, tmp_path)
+        begin_m, end_m = road.lane_m
+        (tmp_path / "road.xodr").write_bytes(opendrive(road))
+        segments = lane_centres(tmp_path / "road.xodr")
+        for on_ramp in (False, True):
+            for x_m in np.arange(max(begin_m, -200.0), end_m + 100.0, 1.7):
+                at = road.lane_point(float(x_m), on_ramp=on_ramp)
+                assert distance(segments, at.x_m, at.y_m) < 0.03, x_m
+        entries = etree.parse(tmp_path / "road.xodr").findall(".//lane[@type='entry']")
+        beside = [p for p in road.ramp.pieces if begin_m <= p.start_m < end_m and not p.is_internal]
+        assert len(entries) == len(beside)
 
     def test_to_opendrive_is_refused_when_the_net_was_changed_since(self, tmp_path):
         road = corridor_of("zipper", tmp_path)

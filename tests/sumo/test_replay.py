@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_nets import LANE_M, LANES
+from foreign_nets import LANE_M, lane_corridor_of
 from lxml import etree
 
 from merge_sumo.campaigns.campaign import export_case
@@ -23,9 +23,7 @@ from merge_sumo.campaigns.store import failures
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import road_of
-from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
@@ -241,10 +239,7 @@ def lane_road(tmp_path):
         if name == "us23-lane":
             scenario = named_scenario(name)
             return road_for(scenario), scenario
-        build, mainline, ramp = LANES[name]
-        net = NetFile(build(tmp_path))
-        road = find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
-        return road, replace(US23, lane_m=LANE_M)
+        return lane_corridor_of(name, tmp_path), replace(US23, lane_m=LANE_M)
 
     return find
 

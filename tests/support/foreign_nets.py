@@ -230,3 +230,10 @@ def corridor_of(name: str, folder: Path):
     """Build a net and find its merge."""
     build, mainline, ramp = FOREIGN[name]
     return find_corridor(NetFile(build(folder)), mainline.split(), ramp.split())
+
+
+def lane_corridor_of(name: str, folder: Path):
+    """Return the merge in one of `LANES`, with its acceleration lane."""
+    build, mainline, ramp = LANES[name]
+    net = NetFile(build(folder))
+    return find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
