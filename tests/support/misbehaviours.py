@@ -476,6 +476,11 @@ ANSWERS: Final = {
         "type('Odd', (), {'__repr__': lambda s: 'x' * 10 ** 7})()": "answered xxx",
         "np.array(float('nan'))": "answered nan",
         "np.float32('inf')": "answered inf",
+        "(1.0, float('nan'))": "wishes nan (float)",
+        "(1.0, 'yes')": "wishes 'yes' (str)",
+        "(1.0, True, 1)": "answered (1.0, True, 1) (tuple)",
+        "(True, True)": "answered True (bool)",
+        "type('Odd', (tuple,), {'__len__': lambda s: 1 / 0})()": "ZeroDivisionError",
     }.items()
 }
 HARMLESS: Final = {
@@ -676,6 +681,9 @@ OTHERS: Final = {
     "batched: objects": batched("return answer.astype(object)", "shape"),
     "batched: complex": batched("return answer + 1j", "shape"),
     "batched: nan for one": batched("answer[bad] = np.nan", "answered nan"),
+    "batched: half a wish for one": batched(
+        "answer = np.stack([answer, 0.5 * bad])", "wishes 0.5 instead of 1 or 0"
+    ),
     "batched: what was given": batched("seen.x_vut_m[:] = 9.0"),
     "batched: an array that hangs": batched(
         f"""

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
+from conftest import some
 from controllers import STOCK_CLIENT, program
 from traci_pair import ToSession, close_shadow, shadow
 from vut_contract import factory, run_on
@@ -42,10 +43,14 @@ def drive(tmp_path, source, *, cases=2, **options):
     return run_on(vut, LANE, 0, cases, corridors=1)
 
 
-@pytest.mark.parametrize(
-    "change",
-    ['changeLane("vut", 1, 0.0)', 'changeLane("vut", 1, 5)', 'changeLaneRelative("vut", 1, 3)'],
+CHANGES = (
+    'changeLane("vut", 1, 0.0)',
+    'changeLane("vut", 1, 5)',
+    'changeLaneRelative("vut", 1, 3)',
 )
+
+
+@pytest.mark.parametrize("change", some(CHANGES, CHANGES[2]))
 def test_a_lane_change_merges_in_the_next_step_wherever_it_is_commanded(tmp_path, change):
     source = (
         ON_LANE
@@ -62,6 +67,7 @@ def test_a_lane_change_merges_in_the_next_step_wherever_it_is_commanded(tmp_path
         assert len(trajectory.after) > 40, "it drives on itself behind the merge"
 
 
+@pytest.mark.slow
 def test_the_gap_that_a_controller_chooses_by_neighbours_is_the_one_it_gets(tmp_path):
     source = (
         ON_LANE
@@ -92,6 +98,7 @@ def test_the_controller_of_the_tutorial_merges_into_a_gap(tmp_path):
     assert behind_the_pov.x_pov_m[-2] - behind_the_pov.x_vut_m[-2] > 25.0
 
 
+@pytest.mark.slow
 def test_without_a_lane_change_it_comes_to_the_end_and_a_note_says_why(tmp_path):
     log = tmp_path / "controller.log"
     (trajectory,) = drive(tmp_path, DRIVES, cases=1, log=log)
@@ -101,6 +108,7 @@ def test_without_a_lane_change_it_comes_to_the_end_and_a_note_says_why(tmp_path)
     assert log.read_text().splitlines() == [f"note: {STAYED}"]
 
 
+@pytest.mark.slow
 def test_in_sumos_own_modes_sumo_drives_and_merges_it(tmp_path):
     source = """
 while traci.simulation.getMinExpectedNumber() > 0:
@@ -117,6 +125,7 @@ while traci.simulation.getMinExpectedNumber() > 0:
     assert not log.exists()
 
 
+@pytest.mark.slow
 def test_sumo_checks_the_gap_in_mode_512_and_not_in_mode_0(tmp_path):
     source = (
         DRIVES
@@ -133,6 +142,7 @@ def test_sumo_checks_the_gap_in_mode_512_and_not_in_mode_0(tmp_path):
     assert far_checked == far
 
 
+@pytest.mark.slow
 def test_what_it_is_told_is_of_the_edge_with_both_lanes(tmp_path):
     source = (
         ON_LANE
