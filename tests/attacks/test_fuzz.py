@@ -26,6 +26,12 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.scenario_suggestion import (
+    about,
+    kind_of_merge,
+    lane_warnings,
+    suggested,
+)
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.campaigns.store import (
     OUTCOMES,
@@ -39,11 +45,13 @@ from merge_sumo.campaigns.store import (
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
+from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo import replay, replay_folder
 from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.system.resources import resource
-from merge_sumo.values.scenario import US23
+from merge_sumo.values.scenario import US23, as_merge
 
 here = settings(
     max_examples=60,
@@ -266,6 +274,21 @@ class TestAScenario:
         if road is not None:
             answer(lambda: hosted_net(road, 2))
             answer(lambda: road.speed_limit_mps)
+
+    @here
+    @given(data=st.data())
+    def test_with_a_spoilt_net_that_has_an_acceleration_lane(self, tmp_path, data):
+        scenario = as_merge(named_scenario("us23-lane"))
+        net = resource("sumo_net") / str(scenario.net)
+        path = tmp_path / "spoilt.net.xml"
+        path.write_bytes(data.draw(some(net.read_bytes())))
+        lane_m = data.draw(st.sampled_from([None, scenario.lane_m, (-0.0, 1e-9), (-1e3, 1e3)]))
+        edges = scenario.mainline, scenario.ramp
+        road = answer(lambda: road_of(path, *edges, lane_m=lane_m))
+        if road is not None:
+            answer(lambda: hosted_net(road, 2))
+            answer(lambda: road_svg(road, suggested(road, "spoilt")))
+            answer(lambda: [*about(road), *kind_of_merge(road), *lane_warnings(scenario, road)])
 
     def test_that_is_an_entity_bomb_is_refused_quickly(self, tmp_path):
         bomb = '<!DOCTYPE l [<!ENTITY a0 "ha">'
