@@ -948,11 +948,14 @@ def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> VutCheck:
 def scenarios() -> Shown:
     """Return the scenarios that the package brings, by name; as `merge-sumo scenario list`."""
     shipped = {name: named_scenario(name) for name in shipped_scenarios()}
-    ranges = {name: scenario.dimensions(0)[:2] for name, scenario in shipped.items()}
-    lines = [
-        f"{name}: POV from {x.low:g} to {x.high:g} m at {v.low:g} to {v.high:g} m/s"
-        for name, (x, v) in ranges.items()
-    ]
+    lines = []
+    for name, scenario in shipped.items():
+        x, v = scenario.dimensions(0)[:2]
+        line = f"{name}: POV from {x.low:g} to {x.high:g} m at {v.low:g} to {v.high:g} m/s"
+        if isinstance(scenario, MergeScenario) and scenario.lane_m is not None:
+            begin_m, end_m = scenario.lane_m
+            line += f"; acceleration lane from {begin_m:g} to {end_m:g} m"
+        lines.append(line)
     return Shown({name: scenario.to_record() for name, scenario in shipped.items()}, lines)
 
 
