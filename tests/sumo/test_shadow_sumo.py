@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
-from foreign_nets import corridor_of
+from foreign_nets import LANE_M, LANES, corridor_of, lane_corridor_of
 from traci_pair import ToSession, close_shadow, shadow
 
 from merge_sumo.engine.simulator import road_for
@@ -81,3 +83,29 @@ def test_who_leaves_a_lane_that_ends_at_m_goes_on_as_commanded(tmp_path):
         sumo.put({"pov": (-100.0, 10.0, 0.0), "vut": (x_m, 10.0, 0.0)})
         point = road.lane_point(x_m, on_ramp=True)
         assert sumo.call("vehicle.getLaneID", "vut") == point.lane
+
+
+@pytest.mark.parametrize("name", LANES)
+def test_a_lane_change_anywhere_on_an_acceleration_lane_is_a_wish_in_that_step(name, tmp_path):
+    road = lane_corridor_of(name, tmp_path)
+    session = Session(shadow(tmp_path, replace(US23, lane_m=LANE_M), road))
+    vehicle, v_mps = ToSession(session).vehicle, 15.0
+    begin_m, end_m = road.lane_m or (0.0, 0.0)
+    for merges_m in (begin_m + 1.0, (begin_m + end_m) / 2.0, end_m - 8.0, None):
+        x_m, merged = begin_m - 20.0, False
+        session.enter({"pov": (x_m - 90.0, v_mps, 0.0), "vut": (x_m, v_mps, 0.0)})
+        while x_m < end_m + 40.0:
+            wishes = merges_m is not None and x_m >= merges_m and not merged
+            if wishes:
+                vehicle.changeLane("vut", vehicle.getLaneIndex("vut") + 1, 0.0)
+            assert session.step() == v_mps
+            assert merged or session.sumo.wants_to_merge == wishes
+            x_m += v_mps * DT_S
+            merged = merged or wishes or x_m >= end_m
+            states = {"pov": (x_m - 90.0, v_mps, 0.0), "vut": (x_m, v_mps, 0.0)}
+            session.put(states, merged=merged)
+            point = road.lane_point(x_m, on_ramp=not merged)
+            assert vehicle.getLaneID("vut") == point.lane
+            assert vehicle.getLanePosition("vut") == pytest.approx(point.position_m, abs=1e-9)
+        session.step()
+        session.clear()
