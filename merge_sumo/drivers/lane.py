@@ -81,6 +81,20 @@ Following = Callable[[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
 """Gives accelerations by gaps, speeds, speeds and accelerations of leaders, and desired speeds."""
 
 
+def follow_mps2(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> FloatArray:
+    """Return the acceleration of a VUT that is driven for after its merge, (K,): IDM.
+
+    The states are (A, K); it follows the nearest car ahead, and wants the level-0 speed.
+    """
+    gaps_m = x_m - x_m[VUT]
+    gaps_m[VUT] = -1.0
+    gaps_m = np.where(gaps_m > 0.0, gaps_m, np.inf)
+    leader, places = gaps_m.argmin(axis=0), np.arange(x_m.shape[1])
+    gap_m = gaps_m[leader, places] - scenario.pov_length_m
+    v_desired = np.full(x_m.shape[1], scenario.level0_v_mps)
+    return idm_mps2(gap_m, v_mps[VUT], v_mps[leader, places], v_desired)
+
+
 class LanePov(Driver):
     """Drives cars of the mainline beside an acceleration lane by a driver that knows a merge at M.
 
@@ -166,6 +180,12 @@ class Merging:
         """Whether the VUT has ever said whether it wishes to merge."""
         self._wishes = np.zeros(corridors, dtype=np.bool_)
 
+    @property
+    def driven_for(self) -> NDArray[np.bool_]:
+        """Which VUTs only accelerate and have merged: they are driven for, (K,)."""
+        only_accelerate: NDArray[np.bool_] = self.merged & ~self._states_wishes
+        return only_accelerate
+
     def begin(self, corridor: int) -> None:
         """Forget a corridor: a VUT begins on the ramp."""
         self.merged[corridor] = self._states_wishes[corridor] = self._wishes[corridor] = False
@@ -183,9 +203,9 @@ class Merging:
             wishes = np.full(len(self.merged), NO_WISH, dtype=np.int8)
         self._states_wishes |= wishes != NO_WISH
         self._wishes = np.where(self._states_wishes, wishes == MERGE, next_m >= 0.0)
-        following = self.merged & ~self._states_wishes
-        if following.any():
-            answer[VUT] = np.where(following, self._follow(x_m, v_mps), answer[VUT])
+        if self.driven_for.any():
+            followed = follow_mps2(x_m, v_mps, self._scenario)
+            answer[VUT] = np.where(self.driven_for, followed, answer[VUT])
         if self._stops:
             grants = self._wishes & (next_m >= self.begin_m)
             most = (self._stopping_mps(next_m, v_mps[VUT]) - v_mps[VUT]) / DT_S
@@ -197,16 +217,6 @@ class Merging:
         granted = self._wishes & (next_m >= self.begin_m)
         self.merged = self.merged | granted | (next_m >= self.end_m)
         return self.merged
-
-    def _follow(self, x_m: FloatArray, v_mps: FloatArray) -> FloatArray:
-        """Return the acceleration of a VUT that is driven for after its merge, (K,): IDM."""
-        gaps_m = x_m - x_m[VUT]
-        gaps_m[VUT] = -1.0
-        gaps_m = np.where(gaps_m > 0.0, gaps_m, np.inf)
-        leader, places = gaps_m.argmin(axis=0), np.arange(x_m.shape[1])
-        gap_m = gaps_m[leader, places] - self._scenario.pov_length_m
-        v_desired = np.full(x_m.shape[1], self._scenario.level0_v_mps)
-        return idm_mps2(gap_m, v_mps[VUT], v_mps[leader, places], v_desired)
 
     def _stopping_mps(self, next_m: FloatArray, v_mps: FloatArray) -> FloatArray:
         """Return the highest next speed from which a VUT can still stop before the lane's end.

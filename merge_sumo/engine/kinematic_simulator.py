@@ -24,7 +24,7 @@ from merge_sumo.engine.rollout import rollout
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.values.case import Case
+from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import VUT, lane_of
 from merge_sumo.values.trajectory import Trajectory
 
@@ -110,11 +110,13 @@ class KinematicSimulator(Simulator):
         """Raise `UserError` where a case ended otherwise in SUMO."""
         lines = centre_lines(self._plan.road)
         verdicts = [self._plan.criterion.verdict(one, lines) for one in (kinematic, sumo)]
+        ours, theirs = _whole(kinematic), _whole(sumo)
         if (
             kinematic.end is sumo.end
             and kinematic.error == sumo.error
             and kinematic.motion.shape == sumo.motion.shape
-            and np.abs(kinematic.motion - sumo.motion)[..., :2].max() <= ROUNDING
+            and ours.shape == theirs.shape
+            and np.abs(ours - theirs)[..., :2].max() <= ROUNDING
             and verdicts[0].failed == verdicts[1].failed
         ):
             return
@@ -141,6 +143,13 @@ def drawn(cases: Sequence[Case]) -> set[int]:
     seed = zlib.crc32(repr((cases[0].level, cases[0].starts())).encode())
     count = math.ceil(CHECKED_SHARE * len(cases))
     return set(np.random.default_rng(seed).choice(len(cases), count, replace=False).tolist())
+
+
+def _whole(trajectory: Trajectory) -> FloatArray:
+    """Return the motion of an episode and of its follow-up, (T, A, 3)."""
+    if trajectory.after is None:
+        return trajectory.motion
+    return np.concatenate((trajectory.motion, trajectory.after))
 
 
 def _said(trajectory: Trajectory) -> str:

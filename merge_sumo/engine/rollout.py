@@ -365,9 +365,15 @@ class _Rollout:
                 episode.left.append((self.row - 1 - episode.first_row, left))
 
     def only_numbers(self, answer: FloatArray) -> FloatArray:
-        """Return answers, (A, K), with 0 where one is no number; note whose doing that was."""
+        """Return answers, (A, K), with 0 where one is no number; note whose doing that was.
+
+        A VUT that is driven for answers what it likes.
+        """
         finite = np.isfinite(answer)
-        for row, corridor in np.argwhere(~finite & self.active).tolist():
+        wrong = ~finite & self.active
+        if self.merging is not None:
+            wrong[VUT] &= ~self.merging.driven_for
+        for row, corridor in np.argwhere(wrong).tolist():
             said = f"answered {answer[row, corridor]}"
             if row == VUT:
                 error = End.VUT_ERROR, self.raised or self.vut.reason(corridor) or said
@@ -380,7 +386,8 @@ class _Rollout:
     def finish(self, corridor: int, end: End, error: str | None = None) -> tuple[int, Trajectory]:
         """Return the record of a corridor's episode; after an error without the last step.
 
-        An error behind M ends the follow-up alone: the VUT has merged.
+        An error behind M ends the follow-up alone: the VUT has merged. After a merge from an
+        acceleration lane it is one of the episode, because the time after the merge is judged.
         """
         episode = self.episodes[corridor]
         assert episode is not None, "only running episodes end"  # noqa: S101
@@ -397,7 +404,7 @@ class _Rollout:
         # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
         motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
         clipped = int(self.clipped[corridor])
-        if episode.merge_row is None:
+        if episode.merge_row is None or (error is not None and self.merging is not None):
             signals = series(episode.left, len(motion))
             alone = Trajectory(episode.case, motion, end, error, clipped, signals=signals)
             return episode.index, alone

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
+from merge_sumo.drivers.lane import follow_mps2
 from merge_sumo.drivers.levelk import DECISION_STEPS
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.engine.evaluate import opened_simulator, workers_or_here
@@ -50,7 +51,7 @@ from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray, MergeCase
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import brake_after_mps2
-from merge_sumo.values.scenario import DT_S, EpisodeTime
+from merge_sumo.values.scenario import DT_S, EpisodeTime, Scenario
 from merge_sumo.values.score import Outcome, is_close
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.output import LOG
@@ -342,7 +343,7 @@ class Stage:
     def __init__(self, plan: SimulationPlan, world: World | EquationWorld, povs: Driver) -> None:
         """Take the plan, the world, and the POVs."""
         self._world, self._povs = world, _Mainline(povs)
-        self._substitutes = _Substitutes(world.corridors, plan.scenario.max_steps)
+        self._substitutes = _Substitutes(world.corridors, plan.scenario)
         self._criterion, self._lines = plan.criterion, centre_lines(plan.road)
 
     def takeover(self, failure: Trajectory, until: int) -> _Counterfactual:
@@ -377,15 +378,19 @@ def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) ->
 
 
 class _Substitutes(Driver):
-    """Drives in the VUT's place: first what the VUT did, then a reference driver."""
+    """Drives in the VUT's place: first what the VUT did, then a reference driver.
 
-    def __init__(self, corridors: int, steps: int) -> None:
-        """Prepare for a number of corridors, and for failures of at most so many steps."""
+    After a merge from an acceleration lane it follows as a VUT that is driven for.
+    """
+
+    def __init__(self, corridors: int, scenario: Scenario) -> None:
+        """Prepare for a number of corridors, and for failures in a scenario."""
         super().__init__(corridors)
+        self._scenario = scenario
         self._drivers = {name: make(corridors) for name, make in REFERENCES.items()}
         self._by = np.zeros(corridors, dtype=np.int64)
         self._until = np.zeros(corridors, dtype=np.int64)
-        self._recorded = np.zeros((steps + 1, corridors))
+        self._recorded = np.zeros((scenario.max_steps + 1, corridors))
         self._merges_at = np.zeros(corridors, dtype=np.int64)
         """Step after which the VUT of the failure was on the mainline."""
         self._wishes = np.zeros(corridors, dtype=np.int8)
@@ -408,6 +413,9 @@ class _Substitutes(Driver):
             if drives.any():
                 answer[drives] = driver.act(scene)[drives]
                 driver.forget(recorded)
+        if scene.merged is not None and scene.merged.any():
+            followed = follow_mps2(scene.x_m, scene.v_mps, self._scenario)
+            answer = np.where(scene.merged, followed, answer)
         # On an acceleration lane: where the VUT did, then as who only accelerates.
         at_m = scene.x_vut_m + scene.v_vut_mps * DT_S >= 0.0
         merges = np.where(recorded, scene.step >= self._merges_at, at_m)

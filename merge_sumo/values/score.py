@@ -460,9 +460,11 @@ def _crossing_time_s(x: FloatArray, v: FloatArray) -> float | None:
 
 
 def _post_encroachment_time(trajectory: Trajectory) -> float | None:
+    """Return PET at M, or at the place of a merge from a lane, where the VUT may have stood."""
     place_m = place_of_merge_m(trajectory)
-    x_pov_m, x_vut_m = trajectory.x_pov_m - place_m, trajectory.x_vut_m - place_m
-    t_vut = _crossing_time_s(x_vut_m, trajectory.v_vut_mps)
+    x_pov_m, x_vut_m = trajectory.x_pov_m - place_m, trajectory.x_vut_m
+    on_road = lane_of(trajectory.case.scenario) is not None
+    t_vut = trajectory.t_end_s if on_road else _crossing_time_s(x_vut_m, trajectory.v_vut_mps)
     t_pov = _crossing_time_s(x_pov_m, trajectory.v_pov_mps)
     if t_pov is None:
         v_end = float(trajectory.v_pov_mps[-1])

@@ -15,7 +15,7 @@ from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import FloatArray, MergeCase
-from merge_sumo.values.scenario import DT_S, US23, VUT, MergeScenario
+from merge_sumo.values.scenario import DT_S, POV, US23, VUT, MergeScenario
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -190,6 +190,39 @@ class TestSumo:
         assert all(at_end)
 
 
+RAISING = """
+class Raises:
+    "Knows nothing behind M."
+
+    def act(self, seen):
+        if seen.merged:
+            raise ValueError("behind M")
+        return {answer}
+"""
+
+
+class TestAControllerThatRaisesAfterItsMerge:
+    def episodes(self, tmp_path, answer):
+        (tmp_path / "raises.py").write_text(RAISING.format(answer=answer))
+        road = named_scenario("us23-lane")
+        cases = uniform(20, 0, road)
+        raising = plan_for(f"{tmp_path / 'raises.py'}:Raises", scenario=road)
+        calm = plan_for("level0", scenario=road).with_engine("kinematic")
+        return (run_cases(plan, cases).trajectories for plan in (raising, calm))
+
+    def test_is_driven_for_where_it_only_accelerates(self, tmp_path):
+        answer = "min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)"
+        for raising, calm in zip(*self.episodes(tmp_path, answer), strict=True):
+            assert raising.end is End.MERGED
+            np.testing.assert_allclose(raising.after, calm.after, rtol=0.0, atol=1e-9)
+
+    def test_is_an_error_where_it_chooses_to_merge(self, tmp_path):
+        for raising, _ in zip(*self.episodes(tmp_path, "1.0, True"), strict=True):
+            assert raising.end is End.VUT_ERROR
+            assert raising.error.startswith("ValueError: behind M")
+            assert raising.after is None
+
+
 class TestAnEpisode:
     def merged(self, x_pov: float, v_pov: float, x_vut: float, v_vut: float) -> Trajectory:
         case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
@@ -204,6 +237,16 @@ class TestAnEpisode:
         assert (measures.gap_ahead_m, measures.time_gap_ahead_s) == (5.0, 0.25)
         assert (measures.gap_behind_m, measures.time_gap_behind_s) == (None, None)
         assert measures.dx_m == 10.0
+
+    def test_of_a_vut_that_stood_has_the_time_since_the_pov_passed(self):
+        case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
+        motion = np.zeros((31, 2, 3))
+        motion[:, VUT, 0] = 30.0
+        motion[:, POV, 0] = -27.0 + 3.0 * np.arange(31)  # passes the VUT after 1.9 s
+        motion[:, POV, 1] = 30.0
+        measures = measure(Trajectory(case, motion, End.MERGED, after=motion[-1:]))
+        assert measures.stood_s == 3.1
+        assert measures.pet_s == pytest.approx(1.1)
 
     def test_is_measured_with_a_car_behind(self):
         measures = measure(self.merged(10.0, 30.0, 30.0, 20.0))

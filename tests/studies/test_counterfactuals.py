@@ -20,7 +20,7 @@ from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
-from merge_sumo.engine.evaluate import opened_simulator
+from merge_sumo.engine.evaluate import opened_simulator, run_cases
 from merge_sumo.engine.povs import Povs, own_pov
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import report_page
@@ -37,6 +37,7 @@ from merge_sumo.studies.counterfactuals import (
     write_avoidance,
 )
 from merge_sumo.system.workers import InProcess, Workers, open_workers
+from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import OWN, US23
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.registry import VutFactory
@@ -129,6 +130,7 @@ class TestEveryFailure:
 
 
 FOLLOWED_UP = {"levels": (0,), "cases": 200, "follow_up_s": 3.0, "fail_when": "unsafe"}
+UNSAFE = {"levels": (0, 2), "cases": 300, "fail_when": "unsafe"}
 DRIVEN = [
     pytest.param("design1", "us23", {"levels": (0,), "cases": 60}, 10),
     pytest.param("design1", "us23", {"levels": (0, 1, 2), "cases": 400}, 100, marks=LONG),
@@ -136,6 +138,8 @@ DRIVEN = [
     pytest.param("level0", "us23-traffic", {"levels": (0, 2), "cases": 200}, 60, marks=LONG),
     pytest.param("level0", "roundabout", {"levels": (0, 1), "cases": 200}, 60, marks=LONG),
     pytest.param("sumo:IDM", "us23", FOLLOWED_UP, 30, marks=LONG),
+    pytest.param("level0", "us23-lane", UNSAFE, 15, marks=LONG),
+    pytest.param("design1", "us23-lane-traffic", UNSAFE, 30, marks=LONG),
 ]
 
 
@@ -153,6 +157,27 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_le
         in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
     assert run_counterfactuals(plan, failing) == in_sumo
     assert len({one.latest_takeover_s for one in in_sumo}) > 3
+
+
+def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
+    road = named_scenario("us23-lane")
+    settings = CampaignSettings(
+        vut="level0", scenario=road, levels=(0,), cases=120, seed=4, fail_when="unsafe"
+    )
+    run = run_campaign(settings, tmp_path / "run")
+    plan = resolve(settings)
+    failing = [o for o in run.outcomes if o.failed]
+    found = run_counterfactuals(plan, [(o.index, run.trajectory(o.index)) for o in failing])
+    passing: list[list[str]] = [[] for _ in failing]
+    for name in REFERENCES:
+        by_name = plan_for(name, scenario=road, criterion=plan.criterion)
+        results = run_cases(by_name.with_engine("kinematic"), [o.case for o in failing])
+        for names, result, verdict in zip(passing, results, results.verdicts(), strict=True):
+            can_brake = brake_after_mps2(result.trajectory) <= 4.0
+            if can_brake and verdict.is_tested and not verdict.failed:
+                names.append(name)
+    assert [list(one.avoided_by) for one in found] == passing
+    assert len(set(map(tuple, passing))) > 1
 
 
 def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
