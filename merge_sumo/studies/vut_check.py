@@ -112,6 +112,7 @@ class _Timed(Driver):
         super().__init__(driver.corridors)
         self._driver = driver
         self.reason, self.close = driver.reason, driver.close  # type: ignore[method-assign]
+        self.wishes = driver.wishes  # type: ignore[method-assign]
         self.us_per_step: list[float] = []
         self.us_per_begin: list[float] = []
         self._begun, self._begin_s = 0, 0.0
