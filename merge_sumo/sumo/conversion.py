@@ -28,6 +28,7 @@ MAX_ELEMENTS: Final = 2 * 10**6
 _ID: Final = matching(r"-?\d{1,20}", "a whole number")
 _TEXT: Final = matching(r"[^\x00-\x08]*", "a text")
 _WORD: Final = matching(r"[\w.:+-]{0,200}", "letters, digits and . : + -")
+_UNIT: Final = matching(r"(?:m/s|km/h|mph)?", "m/s, km/h or mph")
 _LENGTH: Final = number(-1e7, 1e7)
 _TAG: Final = {"tag": Allowed({"k": _TEXT, "v": _TEXT}, required=("k", "v"))}
 _MEMBER: Final = Allowed({"type": _WORD, "ref": _ID, "role": _TEXT})
@@ -53,7 +54,7 @@ def _numbers(*names: str) -> dict[str, received.Values]:
 _CUBIC: Final = ("a", "b", "c", "d")
 _END: Final = {"elementType": _WORD, "elementId": _TEXT, "contactPoint": _WORD, "id": _TEXT}
 _LINK: Final = Allowed({}, {"predecessor": Allowed(_END), "successor": Allowed(_END)})
-_SPEED: Final = {"s": _LENGTH, "sOffset": _LENGTH, "max": _TEXT, "unit": _WORD}
+_SPEED: Final = {"s": _LENGTH, "sOffset": _LENGTH, "max": _TEXT, "unit": _UNIT}
 _LANE: Final = Allowed(
     {"id": _ID, "type": _WORD, "level": _WORD},
     {

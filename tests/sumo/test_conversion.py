@@ -13,6 +13,7 @@ from calling import assert_refused
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
+from merge_sumo.road.netfile import NetFile
 from merge_sumo.sumo import conversion
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
@@ -83,6 +84,16 @@ class TestTheCommand:
         code, out, err = command_line("run", "--vut", "level0", *case)
         assert (code, err) == (0, "")
         assert json.loads(out)["end"] == "MERGED"
+
+    @pytest.mark.parametrize(
+        ("unit", "mps"), [("m/s", 45.0), ("km/h", 12.5), ("mph", 20.12), ("", 45.0)]
+    )
+    def test_takes_the_units_of_speed_of_opendrive(self, here, unit, mps):
+        map_file = here / "us23.xodr"
+        text = opendrive(road_of()).decode()
+        map_file.write_text(text.replace('max="45.000000"', f'max="45" unit="{unit}"'))
+        (lane,) = NetFile(map_file, net_of_map(map_file)).lanes("-42")
+        assert lane.speed_limit_mps == pytest.approx(mps, abs=0.01)
 
     def test_says_which_edges_there_are_and_writes_nothing(self, here, command_line):
         asked = ("scenario", "new", "a.toml", "--net", "ramp.osm")
