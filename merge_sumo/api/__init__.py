@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from merge_sumo.analysis.coordinates import outside_of_the_pool
 from merge_sumo.analysis.result import Shown
+from merge_sumo.analysis.traffic import Traffic, named_traffic
 from merge_sumo.analysis.verdict import parse_gates
 from merge_sumo.api.keywords import (
     CampaignKeywords,
@@ -50,6 +51,7 @@ from merge_sumo.api.results import (
     CampaignRun,
     CaseRun,
     CertificateResult,
+    PerMergeResult,
     PolicyChecks,
     ProbabilityResult,
     TruthResult,
@@ -99,6 +101,7 @@ from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies import benchmark, certificate, reproduction, versions, vut_check
+from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies.benchmark import Benchmark
 from merge_sumo.studies.certificate import runs_points_on
@@ -138,7 +141,14 @@ if TYPE_CHECKING:
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
 __all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign", "certify"]
 __all__ += ["check_scenario", "check_vut", "compare", "compare_runs", "dated", "export"]
-__all__ += ["export_policy", "history", "new_scenario", "open_in_gui", "open_run"]
+__all__ += [
+    "export_policy",
+    "failures_per_merge",
+    "history",
+    "new_scenario",
+    "open_in_gui",
+    "open_run",
+]
 __all__ += ["probability", "replay", "report", "reproduce", "rerun", "resume", "run_case"]
 __all__ += ["scenarios", "train", "truth", "truths", "vuts"]
 
@@ -868,6 +878,60 @@ def probability(
             on_case=lambda _: counter.ended(1),
         )
     return ProbabilityResult(estimate, target, before.criterion, distribution is None)
+
+
+def failures_per_merge(
+    run: AnyRun,
+    traffic: Traffic | AnyPath,
+    *,
+    density_veh_per_km: float | None = None,
+    cases: int = per_merge.DEFAULT_CASES,
+    confidence: float = 0.95,
+    seed: int = 0,
+    net: AnyPath | None = None,
+    out: AnyPath | None = None,
+    trust_vut: bool = False,
+    engine: str = Engine.SUMO,
+    **given: Unpack[RerunKeywords],
+) -> PerMergeResult:
+    """Estimate with how many mainline cars a merge fails; as `merge-sumo failures-per-merge`.
+
+    Args:
+        run: the campaign, or its folder.
+        traffic: the traffic on the mainline: a shipped one by name, or its TOML file.
+        density_veh_per_km: density of the traffic, by default its own.
+        cases: fresh cases to run.
+        confidence: chance that an interval holds.
+        seed: same seed, same cases.
+        net: net for that; must be the one of the campaign.
+        out: new file to write; `failures-per-merge.json` in the folder of the campaign by default.
+        trust_vut: run the controller that a folder names although it was not made here.
+        engine: "sumo", or "kinematic": see `truths`.
+        given: how the drivers run, where it is to change, and where the cases run: see
+            `RerunKeywords`.
+    """
+    check_keywords("failures_per_merge", given, RerunKeywords)
+    before = _opened(run).run
+    on_road = traffic if isinstance(traffic, Traffic) else named_traffic(str(traffic))
+    on_road = on_road.with_density(density_veh_per_km)
+    target = before.folder / per_merge.RESULT if out is None else Path(out)
+    fields, runner = given_again(None, given, {"vut": before.vut})
+    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
+    plan = resolve(settings, _path(net)).with_engine(engine)
+    with runner.open(plan) as opened, runner.counter("fresh cases", cases) as counter:
+        found = per_merge.failures_per_merge(
+            before,
+            settings,
+            plan,
+            on_road,
+            target,
+            cases=cases,
+            confidence=confidence,
+            seed=seed,
+            workers=opened,
+            on_case=lambda _: counter.ended(1),
+        )
+    return PerMergeResult(found, target, before.criterion)
 
 
 def reproduce(

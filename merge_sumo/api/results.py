@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -30,9 +30,11 @@ from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
+from merge_sumo.studies.failures_per_merge import FailuresPerMerge, OverMixtures, Part
 from merge_sumo.studies.stratified import Estimate
 from merge_sumo.studies.truth import REAL_REGION, Truth
 from merge_sumo.system.printable import counted, quoted
+from merge_sumo.system.suggestions import either
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23, level_name
@@ -488,6 +490,78 @@ class ProbabilityResult(Result):
             f"[{plain.low:.3g}, {plain.high:.3g}]",
             f"written: {self.file}",
         ]
+
+
+@dataclass(frozen=True, repr=False)
+class PerMergeResult(Result):
+    """With how many mainline cars a merge fails.
+
+    Attributes:
+        found: `all_levels` and `levels`, each with `least`, `most`, `low` and `high`; `parts`.
+        file: file that was written.
+        criterion: what counts as a failure.
+    """
+
+    found: FailuresPerMerge
+    file: Path
+    criterion: Criterion
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {**self.found.to_record(), "file": str(self.file)}
+
+    def lines(self) -> list[str]:
+        """Return the range over all mixtures, levels and parts, and what is counted."""
+        found, traffic = self.found, self.found.traffic
+        lines = [
+            f"failures per merge: {_per_merge(found.all_levels)}, "
+            f"{100.0 * found.confidence:g} % interval, {_mixed(found.parts)}",
+            f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km, "
+            f"{traffic.speeds.words} ({traffic.source})",
+        ]
+        if not self.criterion.is_papers:
+            lines.append(f"  a case fails when {self.criterion.words}")
+        for level, one in found.levels.items():
+            lines.append(f"  level {level_name(level)}: {_per_merge(one)}")
+            parts = [part for part in found.parts if part.level == level]
+            lines += [f"    {_part_line(part)}" for part in parts]
+        lines.append(f"  {found.counted}")
+        if found.without_verdict:
+            lines.append(
+                f"  {found.without_verdict} cases without a verdict: safe for the lower ends, "
+                "failures for the upper ends"
+            )
+        return [*lines, f"written: {self.file}"]
+
+
+def _mixed(parts: Sequence[Part]) -> str:
+    """Return of which POVs a range is."""
+    levels = sorted({part.level for part in parts})
+    named = either(map(level_name, levels)).replace(" or ", " and ")
+    mixed = [f"levels {named}"] if len(levels) > 1 else []
+    mixed += ["psi"] if any(part.svo_rad is not None for part in parts) else []
+    return f"whatever the shares of {' and of '.join(mixed)}" if mixed else f"at level {named}"
+
+
+def _per_merge(one: OverMixtures) -> str:
+    """Return a range over mixtures with its interval."""
+    ends = f"{one.least:.3g}" if one.least == one.most else f"{one.least:.3g} to {one.most:.3g}"
+    return f"{ends} [{one.low:.3g}, {one.high:.3g}]"
+
+
+def _part_line(part: Part) -> str:
+    """Return what a part rests on."""
+    names = []
+    if part.svo_rad is not None:
+        low, high = np.degrees(part.svo_rad)
+        names.append(f"psi {low:.0f} to {high:.0f} degrees")
+    if part.speed_sd_mps is not None:
+        names.append(f"sd {part.speed_sd_mps:g} m/s")
+    one = part.estimate
+    return (
+        f"{', '.join(names) or 'all'}: {part.failures_per_merge:.3g} [{part.low:.3g}, "
+        f"{part.high:.3g}], {counted(one.failures, 'failure')} in {counted(one.cases, 'case')}"
+    )
 
 
 class PolicyChecks(Result, dict[str, "PolicyCheck"]):

@@ -104,6 +104,14 @@ def scenarios(incomplete: str) -> Completions:
     return _matching(incomplete, [*shipped, *_files(incomplete, (".toml",))])
 
 
+def traffics(incomplete: str) -> Completions:
+    """Return the shipped traffics, and TOML files."""
+    from merge_sumo.analysis.traffic import shipped_traffics
+
+    shipped = [(name, "shipped") for name in shipped_traffics()]
+    return _matching(incomplete, [*shipped, *_files(incomplete, (".toml",))])
+
+
 def formats(incomplete: str) -> Completions:
     """Return the formats of an export."""
     from merge_sumo.reports.formats import FORMATS

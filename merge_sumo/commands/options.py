@@ -24,8 +24,8 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "How many cases, and which": (
         *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
-        *("truth_cases", "dense", "quick", "distribution", "learn_from", "stop_after_converged"),
-        "audit",
+        *("truth_cases", "dense", "quick", "distribution", "traffic", "density", "learn_from"),
+        *("stop_after_converged", "audit"),
     ),
     "Verdict": ("fail_when", "require", "gate", "tolerance", "rerun", "confidence"),
     "Where it runs, and what it writes": (
@@ -39,6 +39,7 @@ GROUP_OF: Final = {name: group for group, names in GROUPS.items() for name in na
 
 KEYWORDS: Final = {
     "v_vut0": "v_vut0_mps",
+    "density": "density_veh_per_km",
     "deadline": "deadline_s",
     "vut_memory": "vut_memory_gib",
     "follow_up": "follow_up_s",

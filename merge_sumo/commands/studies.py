@@ -1,4 +1,4 @@
-"""Commands that measure: truth, compare, certify, probability, reproduce."""
+"""Commands that measure: truth, compare, certify, probability, failures-per-merge, reproduce."""
 
 from __future__ import annotations
 
@@ -186,6 +186,54 @@ def probability(given: Given, run: RunArgument) -> None:
     from merge_sumo import api
 
     given.print(api.probability(run, **given.written))
+
+
+@app.verb(
+    options=("net", "policies", "pov", *HOSTING, "engine", *RUNNING, "trust_vut"),
+    own={
+        "density": option(
+            float | None,
+            None,
+            "Cars per km of the mainline's lane.",
+            metavar="VEH_PER_KM",
+            show_default="that of the traffic",
+        ),
+        "cases": option(int, 8000, "Fresh cases to run."),
+        "confidence": option(float, 0.95, "Chance that an interval holds."),
+        "seed": SEED,
+        "out": option(
+            Path | None,
+            None,
+            "New file to write.",
+            metavar="FILE",
+            show_default="RUN/failures-per-merge.json",
+        ),
+    },
+)
+def failures_per_merge(
+    given: Given,
+    run: RunArgument,
+    traffic: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Traffic on the mainline: exid-2, exid-3, exid-5 or michigan-65mph, or a TOML "
+            "file with density and speeds.",
+            autocompletion=complete.traffics,
+        ),
+    ],
+) -> None:
+    """Estimate with how many cars of the mainline a merge fails, in traffic of a published site.
+
+    Fresh cases run as for `probability`, with the speeds of the traffic, for each level by itself
+    and, at level 2, for each third of psi. Their shares in real traffic are unknown: the range over
+    all mixtures is the result, with an interval that is valid for each of them.
+
+    Example:  merge-sumo failures-per-merge runs/design2 --traffic exid-5
+    """
+    from merge_sumo import api
+
+    given.print(api.failures_per_merge(run, traffic, **given.written))
 
 
 @app.verb(

@@ -10,20 +10,19 @@ x_pov0_m = [-220, -90]
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.records import read_toml
 from merge_sumo.system.resources import resource
 from merge_sumo.system.suggestions import meant
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.scenario_kinds import scenario_of_record
 
 SUFFIX: Final = ".toml"
-MAX_BYTES: Final = 1 << 20
 
 
 def shipped_scenarios() -> list[str]:
@@ -60,18 +59,7 @@ def read_scenario(path: Path) -> Scenario:
 
 def _read(path: Path) -> Scenario:
     """Return the scenario of a file, with its net as the file names it."""
-    try:
-        if not path.is_file() or path.stat().st_size > MAX_BYTES:
-            raise UserError(f"cannot read the scenario {path}: it is no file, or a giant one")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot read the scenario {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"the scenario {path} is no text in UTF-8") from error
-    try:
-        record: dict[str, Any] = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"the scenario {path} is no TOML: {error}") from error
+    text, record = read_toml(path, "scenario")
     try:
         return scenario_of_record({"name": path.stem, **record})
     except UserError as error:

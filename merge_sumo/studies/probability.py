@@ -40,7 +40,7 @@ from merge_sumo.system.folders import add_to, check_new_file, write_new
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DX_CRASH_M
+from merge_sumo.values.scenario import DX_CRASH_M, Scenario
 from merge_sumo.values.score import Outcome
 
 RESULT: Final = "probability.json"
@@ -94,23 +94,15 @@ def failure_probability(
         UserError: for a distribution or numbers that make no sense, a run whose net or policies are
             not those of today, or files that exist or cannot be written.
     """
-    for name, number, fits, bounds in (
-        ("cases", cases, cases >= 1, "it must be 1 or more"),
-        ("confidence", confidence, 0.5 <= confidence < 1.0, "choose 0.5 or more, and below 1"),
-        ("seed", seed, seed >= 0, "it must be 0 or more"),
-    ):
-        if not fits:
-            raise UserError(f"--{name} is {number}: {bounds}")
-    _same_system(run, record_of(settings, plan))
+    check_numbers(cases, confidence, seed)
+    same_system(run, record_of(settings, plan))
     stated = read_distribution(distribution, settings.levels, settings.scenario)
-    check_new_file(out)
-    lines = out.with_suffix(LINES)
-    if lines == out:
-        raise UserError(f"--out is {out}: end it in .json, as cases go to {LINES} beside it")
-    check_new_file(lines)
-    strata = strata_of(run, settings, plan, stated, cases, confidence)
+    lines = lines_beside(out)
+    expected = Expected(run, settings, plan)
+    strata = strata_of(expected, settings.scenario, stated, cases, confidence)
     draws = strata.draw(np.random.default_rng([seed, STREAM]))
-    outcomes = _run(settings, plan, stated, draws, lines, on_case, workers)
+    drawn = cases_of(settings, stated, draws)
+    outcomes = run_fresh(plan, drawn, notes_of(draws), lines, on_case, workers)
     failed = np.array([outcome.failed for outcome in outcomes])
     judged = np.array([outcome.score is not None for outcome in outcomes])
     result = estimate(strata, draws, failed, judged, confidence)
@@ -125,25 +117,40 @@ def failure_probability(
     return result
 
 
+def check_numbers(cases: int, confidence: float, seed: int) -> None:
+    """Raise `UserError` where a number makes no sense."""
+    for name, number, fits, bounds in (
+        ("cases", cases, cases >= 1, "it must be 1 or more"),
+        ("confidence", confidence, 0.5 <= confidence < 1.0, "choose 0.5 or more, and below 1"),
+        ("seed", seed, seed >= 0, "it must be 0 or more"),
+    ):
+        if not fits:
+            raise UserError(f"--{name} is {number}: {bounds}")
+
+
+def lines_beside(out: Path) -> Path:
+    """Return the file of fresh cases beside a result; `UserError` unless both can be new files."""
+    check_new_file(out)
+    lines = out.with_suffix(LINES)
+    if lines == out:
+        raise UserError(f"--out is {out}: end it in .json, as cases go to {LINES} beside it")
+    check_new_file(lines)
+    return lines
+
+
 def strata_of(
-    run: Run,
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    stated: Distribution,
-    cases: int,
-    confidence: float,
+    expected: Expected, scenario: Scenario, stated: Distribution, cases: int, confidence: float
 ) -> Strata:
     """Return the strata that the outcomes of a campaign suggest."""
     from threadpoolctl import threadpool_limits
 
-    expected = _Expected(run, settings, plan)
     chance = {}
     # One thread: rounding must not depend on the number of cores.
     with threadpool_limits(1):
         for level in stated.levels:
-            dims = len(settings.scenario.dimensions(level))
+            dims = len(scenario.dimensions(level))
             chance[level] = of_cells(dims, _of_chances(stated, level, expected.at(level)))
-    return Strata(stated.levels, chance, settings.scenario, cases, confidence)
+    return Strata(stated.levels, chance, scenario, cases, confidence)
 
 
 def _of_chances(
@@ -153,7 +160,7 @@ def _of_chances(
     return lambda chances: of_points(stated.points(level, chances))
 
 
-class _Expected:
+class Expected:
     """P(fail) of cases as expected after a campaign: by twin and surrogate, or surrogate alone.
 
     What is expected decides the width of the interval, and not its validity.
@@ -162,6 +169,7 @@ class _Expected:
     def __init__(self, run: Run, settings: CampaignSettings, plan: SimulationPlan) -> None:
         self._sampler = make_sampler("uniform", settings.pool, 0)
         self._sampler.tell(run.outcomes)
+        self._by_level: dict[int, Callable[[FloatArray], FloatArray]] = {}
         self._limit_m = settings.scenario.dx_crash_m if plan.criterion.is_papers else DX_CRASH_M
         lines = centre_lines(plan.road)
         self._twin = Twin(settings.pool, plan.povs, 0, criterion=plan.criterion, lines=lines)
@@ -172,6 +180,11 @@ class _Expected:
 
     def at(self, level: int) -> Callable[[FloatArray], FloatArray]:
         """Return P(fail), (n,), as a function of points, (n, d), of a level's unit cube."""
+        if level not in self._by_level:
+            self._by_level[level] = self._learned(level)
+        return self._by_level[level]
+
+    def _learned(self, level: int) -> Callable[[FloatArray], FloatArray]:
         history = self._sampler.history(level)
         surrogate = learn_chance(history)
 
@@ -210,7 +223,8 @@ def _parts(points: FloatArray) -> list[FloatArray]:
     return np.array_split(points, len(points) // CHUNK + 1)
 
 
-def _same_system(run: Run, today: Mapping[str, Any]) -> None:
+def same_system(run: Run, today: Mapping[str, Any]) -> None:
+    """Raise `UserError` where a run had another net or other policies than today's settings."""
     for name in ("net_sha256", "policies_sha256"):
         if run.settings.get(name) != today[name]:
             what, others = ("net", "another") if name == "net_sha256" else ("policies", "other")
@@ -219,16 +233,8 @@ def _same_system(run: Run, today: Mapping[str, Any]) -> None:
             )
 
 
-def _run(
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    stated: Distribution,
-    draws: Draws,
-    lines: Path,
-    on_case: OnCase | None,
-    workers: Workers | None,
-) -> list[Outcome]:
-    """Run the draws in order, some at a time; write each outcome with its weight."""
+def cases_of(settings: CampaignSettings, stated: Distribution, draws: Draws) -> list[Case]:
+    """Return the cases of draws from a distribution, in their order."""
     by_place: dict[int, Case] = {}
     for level in stated.levels:
         places = np.flatnonzero(draws.level == level)
@@ -236,7 +242,24 @@ def _run(
         points = stated.points(level, draws.chances[places, :dims])
         drawn = settings.pool.cases(points, level)
         by_place.update(zip(places.tolist(), drawn, strict=True))
-    cases = [by_place[place] for place in range(len(by_place))]
+    return [by_place[place] for place in range(len(by_place))]
+
+
+def notes_of(draws: Draws) -> list[dict[str, float]]:
+    """Return what the line of each drawn case says beside its outcome."""
+    weights, strata = draws.weight.tolist(), draws.stratum.tolist()
+    return [{"weight": w, "stratum": h} for w, h in zip(weights, strata, strict=True)]
+
+
+def run_fresh(
+    plan: SimulationPlan,
+    cases: Sequence[Case],
+    notes: Sequence[Mapping[str, float]],
+    lines: Path,
+    on_case: OnCase | None,
+    workers: Workers | None,
+) -> list[Outcome]:
+    """Run cases in order, some at a time; write each outcome with what is noted of its case."""
     outcomes: list[Outcome] = []
     with workers_or_here(workers) as processes:
         plan = plan.for_cases(len(cases))
@@ -249,16 +272,16 @@ def _run(
                 if on_case is not None:
                     on_case(outcome)
             ran.sort(key=lambda outcome: outcome.index)
-            _append(lines, ran, draws)
+            append_lines(lines, ran, notes)
             outcomes += ran
     return outcomes
 
 
-def _append(lines: Path, outcomes: Sequence[Outcome], draws: Draws) -> None:
+def append_lines(
+    lines: Path, outcomes: Sequence[Outcome], notes: Sequence[Mapping[str, float]]
+) -> None:
+    """Add outcomes to the file of fresh cases, and sync it."""
     content = ""
     for o in outcomes:
-        record = o.to_record()
-        record["weight"] = float(draws.weight[o.index])
-        record["stratum"] = int(draws.stratum[o.index])
-        content += json.dumps(record, allow_nan=False) + "\n"
+        content += json.dumps({**o.to_record(), **notes[o.index]}, allow_nan=False) + "\n"
     add_to(lines, content.encode(), new=outcomes[0].index == 0)

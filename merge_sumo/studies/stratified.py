@@ -246,8 +246,12 @@ def estimate(
     failed: NDArray[np.bool_],
     judged: NDArray[np.bool_],
     confidence: float,
+    risk: tuple[float, float] | None = None,
 ) -> Estimate:
-    """Return the estimate from the draws of all strata, (n,): which failed, and had a verdict."""
+    """Return the estimate from the draws of all strata, (n,): which failed, and had a verdict.
+
+    `risk` is how likely the lower and the upper end may be wrong, by default that of `risks`.
+    """
     found = [
         Stratum(
             float(share),
@@ -262,7 +266,7 @@ def estimate(
     ]
     certain = np.array([one.failures for one in found])
     possible = certain + [one.without_verdict for one in found]
-    n, low_risk, high_risk = len(failed), *risks(len(found), confidence)
+    n, (low_risk, high_risk) = len(failed), risk or risks(len(found), confidence)
     probability = float(strata.share @ (certain / strata.cases))
     likely = round(probability * n)
     plain = clopper_pearson(likely, n, (1.0 - confidence) / 2.0)

@@ -9,6 +9,7 @@ file may be somebody else's.
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable, Container, Sequence
 from dataclasses import is_dataclass
 from enum import Enum
@@ -48,6 +49,7 @@ WORDS: Final[dict[Any, str]] = {
     tuple[str, ...]: "a list of texts",
 }
 """Types of fields in words; another type is a table of names and values."""
+MAX_TOML_BYTES: Final = 1 << 20
 _NAMED: Final = re.compile(r"Object (missing required|contains unknown) field `(.*?)`", re.DOTALL)
 
 
@@ -142,6 +144,25 @@ def read_indexed(
             raise RecordError(f"line {number} of {path} is of no such case: {error}") from error
         values[value.index] = value
     return values
+
+
+def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
+    """Return the text of a TOML file, and its record; `what` it holds stands in the sentences.
+
+    Raises `UserError` where it cannot be read or is no TOML.
+    """
+    try:
+        if not path.is_file() or path.stat().st_size > MAX_TOML_BYTES:
+            raise UserError(f"cannot read the {what} {path}: it is no file, or a giant one")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot read the {what} {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"the {what} {path} is no text in UTF-8") from error
+    try:
+        return text, tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"the {what} {path} is no TOML: {error}") from error
 
 
 def to_plain(value: object) -> Any:

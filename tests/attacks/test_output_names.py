@@ -34,6 +34,7 @@ from merge_sumo.campaigns.store import (
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.reports.report import REPORT, write_report
+from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability, reproduction
 from merge_sumo.system import folders
 from merge_sumo.system.printable import printable, quoted
@@ -258,16 +259,26 @@ class TestAHundredNames:
         appeared = assert_nothing_was_touched(world, write, named)
         assert {"a b.svg", "-rf.html", "日本.svg"} <= set(appeared)
 
-    def test_of_a_probability_touch_nothing(self, world, call, run, monkeypatch, names):
-        def ran(_settings, _net, _stated, draws, lines, _on_case, _workers):
-            chosen = run.outcomes[: len(draws.level)]
-            probability._append(lines, chosen, draws)
+    @pytest.mark.parametrize(
+        ("study", "command"),
+        [
+            (probability, ("probability",)),
+            (per_merge, ("failures-per-merge", "--traffic", "exid-5")),
+        ],
+        ids=["probability", "failures-per-merge"],
+    )
+    def test_of_fresh_cases_touch_nothing(
+        self, world, call, run, monkeypatch, names, study, command
+    ):
+        def ran(_plan, cases, notes, lines, _on_case, _workers):
+            chosen = run.outcomes[: len(cases)]
+            probability.append_lines(lines, chosen, notes)
             return chosen
 
-        monkeypatch.setattr(probability, "_run", ran)
+        monkeypatch.setattr(study, "run_fresh", ran)
         nothing = type("Nothing", (), {"at": lambda _, level: lambda points: np.zeros(len(points))})
-        monkeypatch.setattr(probability, "_Expected", lambda *_: nothing())
-        arguments = ("probability", run.folder, "--cases", 4)
+        monkeypatch.setattr(study, "Expected", lambda *_: nothing())
+        arguments = (*command, run.folder, "--cases", 10)
         appeared = assert_nothing_was_touched(
             world, lambda name: call(*arguments, f"--out={name}"), names
         )
@@ -464,7 +475,7 @@ class TestAReceivedFolder:
 
     @pytest.mark.parametrize("name", ["probability.json", "probability.jsonl"])
     def test_with_a_link_for_a_probability_gets_none(self, received, tmp_path, name, monkeypatch):
-        monkeypatch.setattr(probability, "_run", lambda *_: 1 / 0)
+        monkeypatch.setattr(probability, "run_fresh", lambda *_: 1 / 0)
         (received / name).symlink_to("../ours/new")
         before = tree(tmp_path)
         run, out = Run(received), received / probability.RESULT

@@ -138,6 +138,7 @@ def commands(run: Path, out: Path) -> list[tuple[object, ...]]:
         ("run", "--case", run, 0),
         ("compare-runs", run, run),
         ("probability", run, "--cases", 10, "--out", out / "p.json"),
+        ("failures-per-merge", run, "--traffic", "exid-5", "--out", out / "f.json"),
     ]
 
 

@@ -67,10 +67,11 @@ class TestOptions:
             for option in ("as_json", "quiet", "workers", "level")
         }
         assert set(COMMANDS) == has["as_json"]
-        runs_cases = {"campaign", "certify", "compare", "probability", "rerun", "truth"}
+        fresh = {"failures-per-merge", "probability"}
+        runs_cases = {"campaign", "certify", "compare", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
         assert has["quiet"] == {*runs_cases, "reproduce", "train"}
-        assert has["level"] == {*runs_cases, "run"} - {"probability"}
+        assert has["level"] == {*runs_cases, "run"} - fresh
 
 
 class TestHelp:

@@ -504,6 +504,7 @@ class TestTrust:
             ("campaign", "--resume", theirs),
             ("campaign", "--resume", theirs, "--vut", "design2"),
             ("probability", theirs, "--cases", 4, "--out", tmp_path / "p.json"),
+            ("failures-per-merge", theirs, "--traffic", "exid-5", "--out", tmp_path / "f.json"),
         ):
             assert_refused(call(*command), "my_pov.py:Pov: say --trust-vut")
         assert call("report", theirs)[0] == 0
