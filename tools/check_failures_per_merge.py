@@ -38,7 +38,6 @@ from merge_sumo.studies.failures_per_merge import OverMixtures, failures_per_mer
 from merge_sumo.values.case import Case, FloatArray, MergeCase
 from merge_sumo.values.scenario import US23, VUT, MergeScenario, as_merge
 from merge_sumo.values.trajectory import Trajectory
-from merge_sumo.vuts.registry import built_in_vuts
 
 DENSITIES: Final = (4.9, 8.7, 20.0)
 """In veh/km: two of the shipped sites, and a denser traffic."""
@@ -205,13 +204,13 @@ def main() -> None:
     parser.add_argument("part", choices=("brute", "road"))
     parser.add_argument("--merges", type=int, default=20_000)
     parser.add_argument("--cases", type=int, default=4000, help="fresh cases of the formula")
-    parser.add_argument("--vut", nargs="+", default=None, choices=sorted(built_in_vuts()))
+    parser.add_argument("--vut", nargs="+", default=None, metavar="SPEC")
     parser.add_argument("--level", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--start", type=float, default=START_MPS, help="of the ramp, in m/s")
     parser.add_argument("--engine", default=str(Engine.KINEMATIC), help="of the random traffic")
     args = parser.parse_args()
     if args.part == "road":
-        road(args.merges, args.vut or ["level0", "careful"], args.level, args.start)
+        road(args.merges, args.vut or ["level0", "gap"], args.level, args.start)
     elif not brute(
         args.merges, args.cases, args.vut or ["design1", "design2"], args.level, args.engine
     ):
