@@ -11,6 +11,7 @@ with a text: names at the cars would lie on each other at M, where a reader look
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -57,8 +58,12 @@ SEEN: Final = 1.6
 """Width of the picture, as a multiple of where the cars drove."""
 SMALLEST_M: Final = 100.0
 """Of such a width."""
+SEEN_BESIDE: Final = 1.15
+"""The same with an acceleration lane, where cars are drawn smaller."""
 EXAGGERATED: Final = 1.0 / 175.0
 """How much larger cars are drawn than they are, for a metre of the picture's width."""
+MOST_BESIDE: Final = 1.7
+"""At most, with an acceleration lane: cars side by side do not look as if they touched."""
 MOVING_INK: Final = "0.85,0.30,0.05"
 """Of labels at cars: it is read on a black road and beside it."""
 LETTERS: Final = "60"
@@ -107,6 +112,8 @@ class Picture:
     y_m: float
     width_m: float
     height_m: float
+    borders: bool = False
+    """Whether lines are drawn between lanes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,21 +286,28 @@ def _picture(road: Road, record: etree._Element) -> Picture:
 
 def _view(picture: Picture) -> etree._Element:
     viewport = picture.zoom, f"{picture.x_m:g}", f"{picture.y_m:g}"
-    return view_settings(picture.exaggeration, viewport)
+    return view_settings(picture.exaggeration, viewport, borders=picture.borders)
 
 
 def view_settings(
-    exaggeration: str, viewport: tuple[str, str, str], label: str | None = None
+    exaggeration: str,
+    viewport: tuple[str, str, str],
+    label: str | None = None,
+    *,
+    borders: bool = False,
 ) -> etree._Element:
     """Return the settings of a view with large cars, labelled by one of their parameters.
 
-    `viewport` is zoom, x and y. Without a `label` cars have none.
+    `viewport` is zoom, x and y. Without a `label` cars have none. `borders` draws lines between
+    lanes.
     """
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
     vehicles = {"vehicleQuality": "3", "vehicle_exaggeration": exaggeration}
     if label is not None:
         vehicles |= {"vehicleTextParam": label, **_text("vehicleText", "70", MOVING_INK)}
+    if borders:
+        etree.SubElement(scheme, "edges", laneShowBorders="1")
     etree.SubElement(scheme, "vehicles", vehicles)
     etree.SubElement(
         scheme,
@@ -333,10 +347,12 @@ def _picture_of(road: Corridor, record: etree._Element) -> Picture:
         return width_m, (min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0
 
     whole_m, (driven_m, x, y) = box(net)[0], box(cars or net)
-    seen_m = SEEN * max(driven_m, SMALLEST_M)
-    exaggeration = f"{max(EXAGGERATED * seen_m, 1.0):.1f}"
+    seen, most = (SEEN, math.inf) if road.lane_m is None else (SEEN_BESIDE, MOST_BESIDE)
+    seen_m = seen * max(driven_m, SMALLEST_M)
+    exaggeration = f"{min(max(EXAGGERATED * seen_m, 1.0), most):.1f}"
     zoom = f"{100.0 * whole_m / seen_m:.0f}"
-    return Picture(exaggeration, zoom, round(x), round(y), seen_m, seen_m * SHAPE)
+    at = round(x), round(y), seen_m, seen_m * SHAPE
+    return Picture(exaggeration, zoom, *at, borders=road.lane_m is not None)
 
 
 def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Element:
@@ -416,7 +432,8 @@ def verdict_line(outcome: Outcome) -> str:
     severity = "" if found.severity is None else f"{found.severity}, "
     failed = "fails" if outcome.failed else "does not fail"
     end = found.end.value.replace("_", " ").lower()
-    return f"{severity}{failed}: {end} at {found.t_end_s:.1f} s"
+    place = "" if found.lane_share is None else f", at {found.lane_share:.2f} of the lane"
+    return f"{severity}{failed}: {end} at {found.t_end_s:.1f} s{place}"
 
 
 def _label(

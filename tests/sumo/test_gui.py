@@ -20,7 +20,12 @@ from processes import marked, none_left
 import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.store import failures
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import COLOURS, LABELS, SURROUNDINGS_COLOUR, VIEW, write_scenario
+from merge_sumo.values.case import MergeCase
+from merge_sumo.values.score import Outcome, measure
+from merge_sumo.values.trajectory import End, Trajectory
 
 PICTURE_TIMES_S = (2.0, 7.0)
 LABELS_SHARE = 0.2
@@ -213,6 +218,27 @@ def test_on_a_foreign_road_the_picture_has_lanes_those_beside_them_and_both_cars
         for image in foreign_pictures
     )
     assert late < early
+
+
+def test_a_merge_from_an_acceleration_lane_is_seen(display, tmp_path):
+    """The VUT is on the lane beside that of the POV, and then on the same."""
+    scenario = named_scenario("us23-lane")
+    x_m = -100.0 + 2.0 * np.arange(66)  # merges at 6.5 s
+    vut = np.stack((x_m, np.full(66, 20.0), np.zeros(66)), axis=1)
+    case = MergeCase(level=0, x_pov0_m=-160.0, v_pov0_mps=20.0, scenario=scenario)
+    motion = np.stack((vut - np.array([60.0, 0.0, 0.0]), vut), axis=1)
+    trajectory = Trajectory(case, motion, End.MERGED)
+    outcome = Outcome(0, 0, case, measure(trajectory))
+    write_scenario(tmp_path / "case", road_for(scenario), outcome, trajectory)
+    early, late = taken_of(tmp_path / "case", display, tmp_path)
+    driven = car(late, "pov").mean(axis=0) - car(early, "pov").mean(axis=0)
+    metres = 20.0 * 4.5 / driven[1]
+    beside_m, behind_m = (
+        metres * (car(image, "vut").mean(axis=0)[0] - car(image, "pov").mean(axis=0)[0])
+        for image in (early, late)
+    )
+    assert beside_m == pytest.approx(3.2, abs=0.8)
+    assert behind_m == pytest.approx(0.0, abs=0.5)
 
 
 def test_the_window_has_the_case_the_verdict_and_the_colours_of_the_report(run, pictures, tmp_path):

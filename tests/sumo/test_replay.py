@@ -275,6 +275,8 @@ class TestAMergeFromALane:
         trajectory = self.motion(scenario, place_m, End.MERGED)
         folder = self.written(tmp_path / "case", road, trajectory)
         assert_identical(folder, len(trajectory.motion) - 1)
+        share = (trajectory.x_vut_m[-1] - scenario.lane_m[0]) / np.ptp(scenario.lane_m)
+        assert f"at {share:.2f} of the lane" in (folder / LABELS).read_text()
         lanes = self.lanes(folder / RECORD)
         *before, first = lanes[: len(trajectory.motion)]
         assert {*lanes[len(before) :]} == {first}
