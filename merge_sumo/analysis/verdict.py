@@ -155,7 +155,7 @@ class Verdict:
 def judge(outcomes: Iterable[Outcome]) -> Verdict:
     """Return the verdict on outcomes."""
     cases = failures = contacts = errors = timeouts = 0
-    goal = Scenario.goal
+    goal = Scenario.default_goal
     groups: dict[tuple[End, str], tuple[str, list[int]]] = {}
     for outcome in outcomes:
         cases += 1

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from merge_sumo.analysis.coordinates import coordinates
+from merge_sumo.analysis.merging import Merging, merging_of, merging_record
 from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
@@ -137,6 +138,11 @@ class CampaignRun(Result):
         return summarise(self._run.outcomes, self._run.levels)
 
     @cached_property
+    def merging(self) -> Merging | None:
+        """Where on an acceleration lane the VUT merges, and by which gaps; None without a lane."""
+        return merging_of(self._run.outcomes)
+
+    @cached_property
     def careful(self) -> str | None:
         """Share of the failures that a careful driver would have avoided, in a sentence.
 
@@ -183,6 +189,7 @@ class CampaignRun(Result):
         return {
             **asdict(self.summary),
             **self.verdict.to_record(),
+            **merging_record(outcomes),
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
@@ -206,6 +213,7 @@ class CampaignRun(Result):
         if self.summary.severities:
             counts = (f"{number} {name}" for name, number in self.summary.severities.items())
             optional.append(f"  severity of all cases: {', '.join(counts)}")
+        optional += [] if self.merging is None else [f"  {self.merging.sentence}"]
         optional += self.verdict.trouble_lines()
         optional += [f"  {run.ran_again_in_words}"] if run.ran_again else []
         optional += [f"  note: {note}" for note in doubts(run.outcomes, run.criterion)]

@@ -11,15 +11,15 @@ from merge_sumo.analysis.verdict import Verdict, in_words
 from merge_sumo.system.printable import counted
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import HARSH_MPS2
-from merge_sumo.values.scenario import level_name
+from merge_sumo.values.scenario import Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
 
 
-def rule_in_words(criterion: Criterion, crash_m: float) -> str:
-    """Return when a case fails, in a clause; `crash_m` is the distance of the paper's criterion."""
+def rule_in_words(criterion: Criterion, scenario: Scenario) -> str:
+    """Return when a case of a scenario fails, in a clause."""
     if criterion.is_papers:
-        return f"front bumpers within {crash_m:g} m at M"
+        return f"front bumpers within {scenario.dx_crash_m:g} m at {scenario.place}"
     return criterion.in_short
 
 
@@ -29,7 +29,7 @@ def headline(
     worst: Sequence[Outcome],
     kinds: Mapping[int, Kind],
     criterion: Criterion,
-    crash_m: float,
+    scenario: Scenario,
 ) -> str:
     """Return the result of a campaign in a few sentences: what was not tested comes first."""
     if not verdict.cases:
@@ -39,7 +39,7 @@ def headline(
         for level, found in summary.levels.items():
             if found.cases and not found.tested:
                 said.append(f"At POV level {level_name(level)} nothing was tested.")
-        said.append(_failures(verdict, summary, worst, kinds, criterion, crash_m))
+        said.append(_failures(verdict, summary, worst, kinds, criterion, scenario))
     return " ".join(said)
 
 
@@ -49,9 +49,9 @@ def _failures(
     worst: Sequence[Outcome],
     kinds: Mapping[int, Kind],
     criterion: Criterion,
-    crash_m: float,
+    scenario: Scenario,
 ) -> str:
-    rule = rule_in_words(criterion, crash_m)
+    rule, crash_m = rule_in_words(criterion, scenario), scenario.dx_crash_m
     if not summary.failures:
         others = "the other " if verdict.tested < verdict.cases else ""
         return (
@@ -89,33 +89,39 @@ def failures_in_words(failures: Sequence[Outcome], rule: str) -> str:
     return f"{counted(len(failures), 'failure')} ({told})"
 
 
-def avoidable_text(failures: Sequence[Outcome], crash_m: float) -> str | None:
+def avoidable_text(failures: Sequence[Outcome], scenario: Scenario) -> str | None:
     """Return the number of avoidable failures in words; None if it is unknown for all."""
     told = [o.measures.avoidable for o in failures if o.measures.avoidable is not None]
     if not told:
         return None
-    of = "" if len(told) == len(failures) else f" with front bumpers within {crash_m:g} m at M"
+    crash_m, place = scenario.dx_crash_m, scenario.place
+    near = f" with front bumpers within {crash_m:g} m at {place}"
+    of = "" if len(told) == len(failures) else near
     return (
         f"In {sum(told)} of {counted(len(told), 'failure')}{of}, full braking or full acceleration "
-        f"of the VUT would have kept {crash_m:g} m at M."
+        f"of the VUT would have kept {crash_m:g} m at {place}."
     )
 
 
-def harmful_merges_text(outcomes: Iterable[Outcome], crash_m: float) -> str | None:
+def harmful_merges_text(outcomes: Iterable[Outcome], scenario: Scenario) -> str | None:
     """Return the number of cases that are not failures and not harmless either, in words."""
     found = Counter(o.measures.severity for o in outcomes if not o.failed)
     said = {
         Severity.CONTACT: "bodies touch",
-        Severity.CONFLICT: f"the front bumpers are within {crash_m:g} m at M",
+        Severity.CONFLICT: f"the front bumpers are within {scenario.dx_crash_m:g} m at M",
         Severity.HARSH: f"the car behind has to brake harder than {HARSH_MPS2:g} m/s² after M",
     }
-    parts = [f"in {counted(found[key], 'case')} {what}" for key, what in said.items() if found[key]]
+    parts = [
+        f"in {counted(found[key], 'case')} {scenario.said(what)}"
+        for key, what in said.items()
+        if found[key]
+    ]
     if not parts:
         return None
     return f"No failures, but no harmless merges: {in_words(parts)} (--fail-when unsafe)."
 
 
-def overlaps_before_m_text(outcomes: Iterable[Outcome]) -> str | None:
+def overlaps_before_m_text(outcomes: Iterable[Outcome], scenario: Scenario) -> str | None:
     """Return the number of cases in which bodies overlap before M alone, in words."""
     before = sum(
         (o.measures.before_clearance_m or 0.0) < 0.0 and o.measures.severity != Severity.CONTACT
@@ -123,7 +129,7 @@ def overlaps_before_m_text(outcomes: Iterable[Outcome]) -> str | None:
     )
     if not before:
         return None
-    return (
+    return scenario.said(
         f"In {counted(before, 'case')} bodies overlap before M, where the lanes run together, "
         "and not from M on: that is no contact (measure before_clearance_m)."
     )

@@ -15,6 +15,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.analysis.coordinates import described
+from merge_sumo.analysis.merging import place_in_words
 from merge_sumo.analysis.verdict import GateResult, Verdict, message_of
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
@@ -102,6 +103,8 @@ def _why(outcome: Outcome) -> str:
         parts.append(f"relative speed {measures.impact_speed_mps:.1f} m/s")
     if measures.dx_m is not None:
         parts.append(f"dx {measures.dx_m:.1f} m")
+    if measures.lane_share is not None:
+        parts.append(f"merges {place_in_words(measures.lane_share)}")
     if outcome.margin is not None:
         parts.append(f"margin {outcome.margin:.3g}")
     return ", ".join(parts)

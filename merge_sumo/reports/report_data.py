@@ -20,8 +20,17 @@ from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
-from merge_sumo.values.measures import MEASURES, Measure
-from merge_sumo.values.scenario import ALL_LEVELS, DT_S, VEHICLES, MergeScenario, level_name
+from merge_sumo.values.measures import Measure
+from merge_sumo.values.scenario import (
+    ALL_LEVELS,
+    DT_S,
+    VEHICLES,
+    MergeScenario,
+    Scenario,
+    lane_of,
+    level_name,
+)
+from merge_sumo.values.score import measures_in
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.signals import to_record
 from merge_sumo.values.trajectory import End, Trajectory
@@ -69,20 +78,21 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
         "search": _search(facts),
         "replay": f"merge-sumo replay {_quoted(facts.run.folder)}",
         **_road(facts.road),
+        **_lane(scenario),
     }
 
 
-def listed_measures() -> list[Measure]:
-    """Return the measures that the table of all cases has a column for."""
-    return [measure for measure in MEASURES.values() if measure.column]
+def listed_measures(scenario: Scenario) -> list[Measure]:
+    """Return the measures that the table of all cases of a scenario has a column for."""
+    return [measure for measure in measures_in(scenario) if measure.column]
 
 
 def _headings(facts: ReportModel) -> list[dict[str, Any]]:
     """Return the columns of the table: the score, and measures of which a case has a value."""
-    labels = facts.run.scenario.measure_labels
+    scenario = facts.run.scenario
     return [
-        {"name": m.name, "title": m.title_as(labels.get(m.name)), "digits": m.digits}
-        for m in listed_measures()
+        {"name": m.name, "title": m.title_in(scenario), "digits": m.digits}
+        for m in listed_measures(scenario)
         if m.name == "score" or any(o.measures.value(m.name) is not None for o in facts.shown)
     ]
 
@@ -98,7 +108,7 @@ def _boxes(facts: ReportModel) -> list[dict[str, Any]]:
 
 def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
     ends, kinds, severities = list(End), list(Kind), list(Severity)
-    listed = listed_measures()
+    listed = listed_measures(facts.run.scenario)
     columns: dict[str, list[Any]] = {}
     for o in facts.shown:
         found = facts.diagnoses.get(o.index, UNKNOWN)
@@ -258,6 +268,12 @@ def _road(road: Corridor) -> dict[str, Any]:
         "ramp": points(road.ramp),
         "lanes": [[place(x, y) for x, y, _ in shape] for shape in lanes],
     }
+
+
+def _lane(scenario: Scenario) -> dict[str, Any]:
+    """Return the acceleration lane, and what sentences call the place of a merge; or nothing."""
+    lane_m = lane_of(scenario)
+    return {} if lane_m is None else {"lane": lane_m, "place": scenario.place}
 
 
 def _quoted(path: Path) -> str:

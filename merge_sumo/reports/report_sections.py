@@ -14,6 +14,7 @@ from typing import Any, Final
 from markupsafe import Markup
 
 from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
+from merge_sumo.analysis.merging import REAR_HEADWAY_S, SITES, SOURCE, merging_of
 from merge_sumo.analysis.plausibility import notes_on
 from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
@@ -28,6 +29,7 @@ from merge_sumo.reports.headline import (
     headline,
     overlaps_before_m_text,
 )
+from merge_sumo.reports.lane_picture import picture_of
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
@@ -36,7 +38,7 @@ from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.printable import counted, printable
 from merge_sumo.system.registry import Registry
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.scenario import MergeScenario, level_name
+from merge_sumo.values.scenario import MergeScenario, lane_of, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import meanings
 from merge_sumo.vuts.output import LOG, end_of
@@ -75,6 +77,7 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "settings": {name: _shown(value) for name, value in run.settings.items() if value},
         "scenario": run.scenario,
         "is_merge": isinstance(run.scenario, MergeScenario),
+        "lane_m": lane_of(run.scenario),
         "traffic": run.scenario.vehicles > 2,
         "coordinates": model.coordinates,
         "levels": levels,
@@ -89,7 +92,7 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
 def head_words(model: ReportModel) -> dict[str, Any]:
     """Return the result in sentences, and what a reader is to know of the page as a whole."""
     run, wanted = model.run, model.run.settings.get("cases")
-    rule = run.criterion, run.scenario.dx_crash_m
+    rule = run.criterion, run.scenario
     result = headline(model.verdict, model.summary, model.worst, model.kinds, *rule)
     lost = [str(o.index) for o in model.shown if o.index not in model.motion]
     if len(lost) > LISTED:
@@ -109,7 +112,7 @@ def _untested(model: ReportModel) -> dict[str, Any] | None:
 
 
 def _numbers(model: ReportModel) -> dict[str, Any]:
-    outcomes, crash_m = model.run.outcomes, model.run.scenario.dx_crash_m
+    outcomes, scenario = model.run.outcomes, model.run.scenario
     return {
         "found": model.verdict,
         "truth_cases": " or ".join(
@@ -118,9 +121,9 @@ def _numbers(model: ReportModel) -> dict[str, Any]:
         "plausible_chance": f"{PLAUSIBLE:.0%}",
         "fewest_failures": FEWEST_FAILURES,
         "radii": _radii({len(model.run.scenario.dimensions(level)) for level in model.levels}),
-        "avoidable": avoidable_text(model.worst, crash_m),
-        "after": harmful_merges_text(outcomes, crash_m),
-        "before": overlaps_before_m_text(outcomes),
+        "avoidable": avoidable_text(model.worst, scenario),
+        "after": harmful_merges_text(outcomes, scenario),
+        "before": overlaps_before_m_text(outcomes, scenario),
         "batches": len({o.batch for o in outcomes}),
         "recorded": _recorded(model.run),
         "driven": _duration(sum(o.measures.t_end_s for o in outcomes)),
@@ -132,6 +135,24 @@ def _maps(model: ReportModel) -> dict[str, Any]:
     return {
         "severities": meanings(scenario),
         "covered": any(len(scenario.dimensions(level)) <= 3 for level in model.levels),
+    }
+
+
+def _merging(model: ReportModel) -> dict[str, Any] | None:
+    outcomes, lane_m = model.run.outcomes, lane_of(model.run.scenario)
+    found = merging_of(outcomes)
+    if found is None or lane_m is None:
+        return None
+    levels = {
+        f"level {level_name(level)}": merging_of(o for o in outcomes if o.case.level == level)
+        for level in model.levels
+    }
+    return {
+        "picture": picture_of(found, lane_m),
+        "rows": [("all", found), *((name, one) for name, one in levels.items() if one)],
+        "sites": SITES,
+        "headway_s": REAR_HEADWAY_S,
+        "source": SOURCE,
     }
 
 
@@ -259,6 +280,7 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "untested": ReportSection(template=_own("untested"), words=_untested),
         "numbers": ReportSection(template=_own("numbers"), words=_numbers),
         "where": ReportSection(template=_own("where"), words=_maps),
+        "merging": ReportSection(template=_own("merging"), words=_merging),
         "words": ReportSection(template=_own("words"), words=_in_words),
         "cases": ReportSection(template=_own("cases"), words=_cases),
         "all": ReportSection(template=_own("all")),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -16,8 +16,10 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.diagnosis import Kind
+from merge_sumo.analysis.merging import SOURCE, Merging
 from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns.store import Run
+from merge_sumo.reports.lane_picture import picture_of
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.static_map import map_of
 from merge_sumo.studies.history import History, LevelOfVersion, RegionChange
@@ -25,10 +27,10 @@ from merge_sumo.studies.versions import Change, ComparedCase, RunComparison
 from merge_sumo.system.folders import write_new
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Bounds, lane_of, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.values.trajectory import End, Trajectory
 
 SHOWN: Final = 200
 """Cases that are drawn, in the order of `RunComparison.cases`; more are counted."""
@@ -102,12 +104,18 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Lines over time or versions, with (y, words) and (x, words) of the ticks."""
+    """Lines over time or versions, with (y, words) and (x, words) of the ticks.
+
+    `window` is where an acceleration lane lies, as (y, height), and `dot` the place of a merge from
+    it; None without one.
+    """
 
     title: str
     lines: list[Line]
     ticks: list[tuple[float, str]]
     names: list[tuple[float, str]]
+    window: tuple[float, float] | None = None
+    dot: tuple[float, float] | None = None
 
 
 STYLES: Final = ("report.css", "history.css")
@@ -133,7 +141,7 @@ def comparison_page(
     `motions` are those of the cases that were run again with the other VUT; B may be worse by
     `tolerance`.
     """
-    runs = {"A": a, "B": b}
+    runs, lane_m = {"A": a, "B": b}, lane_of(a.scenario)
     shown = [_shown(case, runs, motions) for case in compared.cases[:SHOWN]]
     sections = {
         change: [one for one in shown if one["case"].change is change] for change in MEANING
@@ -160,6 +168,13 @@ def comparison_page(
         sections={change: cases for change, cases in sections.items() if cases},
         meaning=MEANING,
         more=len(compared.cases) - len(shown),
+        lane_m=lane_m,
+        places={
+            name: (found, picture_of(found, lane_m))
+            for name, found in compared.merging.items()
+            if lane_m is not None
+        },
+        source=SOURCE,
     )
 
 
@@ -201,10 +216,27 @@ def _how(outcome: Outcome | None) -> str:
 def _motion_charts(motion: Trajectory, both: Sequence[Trajectory]) -> list[Chart]:
     """Return speeds and distances to M of all cars, over the axes of both motions of the case."""
     end_s = max(m.t_end_s for m in both) or DT_S
-    return [
+    speeds, places = (
         _motion_chart(title, motion.motion[:, :, k], [m.motion[:, :, k] for m in both], end_s)
         for title, k in (("speed, m/s", 1), ("distance to M, m", 0))
-    ]
+    )
+    lane_m = lane_of(motion.case.scenario)
+    return [speeds, places if lane_m is None else _with_lane(places, motion, both, lane_m)]
+
+
+def _with_lane(
+    chart: Chart, motion: Trajectory, both: Sequence[Trajectory], lane_m: Bounds
+) -> Chart:
+    """Return the chart of the places of cars with an acceleration lane and the merge from it."""
+    shown = np.concatenate([m.motion[:, :, 0].ravel() for m in both])
+    low, span = float(shown.min()), max(float(np.ptp(shown)), 1.0)
+    bottom, top = (OVER_TIME.y(min(max((x_m - low) / span, 0.0), 1.0)) for x_m in lane_m)
+    dot = None
+    if motion.end is End.MERGED:
+        end_s = max(m.t_end_s for m in both) or DT_S
+        share = (float(motion.x_vut_m[-1]) - low) / span
+        dot = OVER_TIME.x(motion.t_end_s / end_s), OVER_TIME.y(share)
+    return replace(chart, window=(top, round(bottom - top, 1)), dot=dot)
 
 
 def _motion_chart(title: str, rows: FloatArray, both: Sequence[FloatArray], end_s: float) -> Chart:
@@ -277,7 +309,25 @@ def _history_charts(history: History) -> list[Chart]:
         _version_chart(
             "Kinds of failure, all levels", {key: row for key, row in kinds.items() if any(row)}
         ),
+        *([_places_chart(history)] if any(version.merging for version in history.versions) else []),
     ]
+
+
+def _places_chart(history: History) -> Chart:
+    """Return where on an acceleration lane the versions merge, by level."""
+    rows = {
+        (f"level {level_name(level)}", f"level{level}"): [
+            _place(version.merging.get(level)) for version in history.versions
+        ]
+        for level in history.levels
+    }
+    return _version_chart("Place of the merge, median share of the lane", rows)
+
+
+def _place(found: Merging | None) -> float | None:
+    """Return the median place; a merge where the lane ends is beyond it by the way of a step."""
+    share = None if found is None else found.lane_share
+    return None if share is None else min(share, 1.0)
 
 
 def _version_chart(title: str, rows: dict[tuple[str, str], list[float | None]]) -> Chart:
@@ -341,10 +391,30 @@ def _table(history: History, level: int) -> list[tuple[str, list[str]]]:
     ]
     if any(one.avoidance_known for one in known):
         rows.append(("avoided by a careful driver", _avoided))
-    return [
+    table = [
         (name, ["" if one is None else str(value(one)) for one in of_versions])
         for name, value in rows
     ]
+    return [*table, *_merging_rows(history, level)]
+
+
+def _merging_rows(history: History, level: int) -> list[tuple[str, list[str]]]:
+    """Return the rows of a level's table on merges from an acceleration lane; none without one."""
+    found = [version.merging.get(level) for version in history.versions]
+    if not any(found):
+        return []
+    rows: list[tuple[str, Callable[[Merging], str]]] = [
+        ("place of the merge, median", lambda one: _or_dash(one.lane_share, ".0%")),
+        ("merges at the end of the lane", lambda one: str(one.forced)),
+        ("stood on the lane", lambda one: str(one.stood)),
+        ("time gap ahead, median s", lambda one: _or_dash(one.time_gap_ahead_s, ".2f")),
+        ("time gap behind, median s", lambda one: _or_dash(one.time_gap_behind_s, ".2f")),
+    ]
+    return [(name, ["" if one is None else value(one) for one in found]) for name, value in rows]
+
+
+def _or_dash(value: float | None, digits: str) -> str:
+    return "–" if value is None else format(value, digits)
 
 
 def _of_severity(severity: Severity, one: LevelOfVersion) -> int:

@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 
 from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.diagnosis import Kind, diagnose
+from merge_sumo.analysis.merging import Merging, merging_of
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import severities_of
 from merge_sumo.analysis.verdict import Verdict, in_words, judge
@@ -34,6 +35,7 @@ from merge_sumo.studies.versions import check_comparable
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import fmc, radius_for, regions
 from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
 
 ROUNDING: Final = 1e-9
 """Share of the radius by which two points may be further apart and still count as near."""
@@ -78,6 +80,8 @@ class Version:
         sampler: that chose the cases.
         verdict: on all of its cases.
         levels: by POV level.
+        merging: merges from an acceleration lane by POV level, and in all at None; empty without a
+            lane.
     """
 
     folder: str
@@ -85,6 +89,7 @@ class Version:
     sampler: str
     verdict: Verdict
     levels: dict[int, LevelOfVersion]
+    merging: dict[int | None, Merging]
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
@@ -94,7 +99,12 @@ class Version:
         levels = {
             level_name(level): of_level.to_record() for level, of_level in self.levels.items()
         }
-        return {**record, **counts, "levels": levels}
+        merging = {
+            "all" if level is None else level_name(level): asdict(found)
+            for level, found in self.merging.items()
+        }
+        more = {"merging": merging} if merging else {}
+        return {**record, **counts, "levels": levels, **more}
 
 
 class RegionChange(StrEnum):
@@ -214,6 +224,7 @@ class History(Result):
         for number, version in enumerate(self.versions, start=1):
             text.append(f"{number}: {version.folder} ({version.vut}): {version.verdict.counts}")
             text += version.verdict.trouble_lines()
+            text += [f"  {version.merging[None].sentence}"] if version.merging else []
         for step in self.steps:
             counts = [f"{n} {became}" for became in RegionChange if (n := step.count(became))]
             text.append(
@@ -287,12 +298,18 @@ def _notes(runs: Sequence[Run], levels_by_run: Sequence[list[int]]) -> list[str]
 
 def _version(run: Run, levels: Sequence[int]) -> Version:
     known = read_avoidance(run)
+    by_level: dict[int | None, list[Outcome]] = {
+        level: [outcome for outcome in run.outcomes if outcome.case.level == level]
+        for level in levels
+    }
+    cases = by_level | {None: run.outcomes}
     return Version(
         folder=str(run.folder),
         vut=run.vut,
         sampler=str(run.settings.get("sampler")),
         verdict=judge(run.outcomes),
         levels={level: _level(run, level, known) for level in levels},
+        merging={level: found for level, ran in cases.items() if (found := merging_of(ran))},
     )
 
 

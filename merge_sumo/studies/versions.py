@@ -17,6 +17,7 @@ from functools import partial
 from operator import itemgetter
 from typing import Any, Final
 
+from merge_sumo.analysis.merging import Merging, merging_of
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.plan import resolve
@@ -33,7 +34,7 @@ from merge_sumo.system.printable import counted
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import level_name
+from merge_sumo.values.scenario import US23, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.registry import is_built_in
@@ -180,12 +181,12 @@ class LevelChange:
     fmc_broke: float
     changes: dict[str, int]
 
-    def worse(self, level: int, tolerance: float) -> list[str]:
-        """Return in sentences why B is worse than A at this level."""
+    def worse(self, level: int, tolerance: float, goal: str) -> list[str]:
+        """Return in sentences why B is worse than A at this level; a VUT is to reach `goal`."""
         at, a, b = f"at POV level {level_name(level)}", self.untested_a, self.untested_b
         reasons = []
         if b.nothing_tested:
-            reasons.append(f"{at} B reached the merge point in no case of its campaign")
+            reasons.append(f"{at} B reached {goal} in no case of its campaign")
         for what, number_a, number_b in (
             ("error", a.errors, b.errors),
             ("error or timeout", a.errors + a.timeouts, b.errors + b.timeouts),
@@ -208,18 +209,23 @@ class RunComparison(Result):
         levels: by POV level.
         cases: every case in which one failed or gave no verdict, as `ComparedCase.rank` orders.
         evidence: how the verdicts of the other VUT came about, as a sentence.
+        goal: what a VUT is to reach.
+        merging: merges of A and of B from an acceleration lane in their own cases, by "A" and "B";
+            empty without a lane.
     """
 
     levels: dict[int, LevelChange]
     cases: list[ComparedCase]
     evidence: str
+    goal: str = US23.goal
+    merging: Mapping[str, Merging] = field(default_factory=dict)
 
     def worse(self, tolerance: float) -> list[str]:
         """Return in sentences why B is worse than A by more than the tolerance, if it is."""
         return [
             reason
             for level, change in self.levels.items()
-            for reason in change.worse(level, tolerance)
+            for reason in change.worse(level, tolerance, self.goal)
         ]
 
     def to_record(self) -> dict[str, Any]:
@@ -228,7 +234,9 @@ class RunComparison(Result):
             {"run": one.run, "case": asdict(one.case), **one.to_record()} for one in self.cases
         ]
         levels = {level: asdict(change) for level, change in self.levels.items()}
-        return {"levels": levels, "cases": cases, "evidence": self.evidence}
+        merging = {name: asdict(found) for name, found in self.merging.items()}
+        more = {"merging": merging} if merging else {}
+        return {"levels": levels, "cases": cases, "evidence": self.evidence, **more}
 
     def lines(self) -> list[str]:
         """Return a table of what changed, level by level, and how that is known."""
@@ -242,7 +250,8 @@ class RunComparison(Result):
                 f"{level_name(level):<6} {of_level.fmc_a:8.4f} {of_level.fmc_b:8.4f} "
                 f"{of_level.fmc_fixed:8.4f} {of_level.fmc_broke:8.4f}   {changes}"
             )
-        return [*table, f"evidence: {self.evidence}"]
+        merging = (f"{name} {found.sentence}" for name, found in self.merging.items())
+        return [*table, *merging, f"evidence: {self.evidence}"]
 
     def __repr__(self) -> str:
         levels = (
@@ -330,7 +339,10 @@ def _comparison(
         )
         for level in levels
     }
-    return RunComparison(by_level, ranked, evidence)
+    own = {"A": own_a, "B": own_b}
+    merging = {name: found for name, ran in own.items() if (found := merging_of(ran))}
+    goal = next((outcome.case.scenario.goal for outcome in own_a), US23.goal)
+    return RunComparison(by_level, ranked, evidence, goal, merging)
 
 
 # Two campaigns: the telling cases of each, run again with the VUT of the other.

@@ -17,6 +17,7 @@ from typing import Final, Literal
 from merge_sumo.errors import UserError
 from merge_sumo.system.registry import Registry
 from merge_sumo.values.bodies import CentreLines
+from merge_sumo.values.scenario import Scenario
 from merge_sumo.values.trajectory import Trajectory
 
 Further = tuple[tuple[str, float | None], ...]
@@ -42,9 +43,14 @@ class Measure:
     """Measures an episode on a road, and returns None where that has no value; None for the
     fields of `Measures`."""
 
-    def title_as(self, name: str | None = None) -> str:
-        """Return name and unit, as the head of a column shows them; `column` is the usual name."""
-        return f"{name or self.column} {self.unit}".replace("s2", "s²").rstrip()
+    def label_in(self, scenario: Scenario) -> str:
+        """Return its name in the listing of an episode of a scenario."""
+        return scenario.said(scenario.measure_labels.get(self.name, self.label))
+
+    def title_in(self, scenario: Scenario) -> str:
+        """Return name and unit, as the head of a column of a scenario shows them."""
+        name = scenario.said(scenario.measure_labels.get(self.name, self.column))
+        return f"{name} {self.unit}".replace("s2", "s²").rstrip()
 
 
 OURS: Final = (
@@ -230,6 +236,7 @@ OURS: Final = (
         "lane_share",
         "place of the merge as a share of the acceleration lane, from its begin",
         label="share of the lane",
+        column="share of the lane",
         digits=2,
         missing=math.inf,
     ),
@@ -254,6 +261,7 @@ OURS: Final = (
         "gap ahead over the speed of the VUT",
         unit="s",
         label="time gap ahead at the merge",
+        column="time gap ahead",
         digits=2,
         missing=math.inf,
         worse="low",
@@ -263,6 +271,7 @@ OURS: Final = (
         "gap behind over the speed of the car behind",
         unit="s",
         label="time gap behind at the merge",
+        column="time gap behind",
         digits=2,
         missing=math.inf,
         worse="low",
@@ -272,6 +281,7 @@ OURS: Final = (
         "time for which the VUT stood on the acceleration lane",
         unit="s",
         label="stood on the lane",
+        column="stood",
         missing=0.0,
         worse="high",
     ),

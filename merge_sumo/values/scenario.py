@@ -10,6 +10,7 @@ case. `US23` is the paper's: Wang et al., sections VI and VII and Table I.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
@@ -177,8 +178,8 @@ class Scenario:
     """The `End` of an episode that `has_ended`."""
     level_about: ClassVar[Mapping[int, str]] = {}
     """What the POV of a level does, in the words of a caption."""
-    goal: ClassVar[str] = "the end of the scenario"
-    """What the VUT reaches in an episode that is no TIMEOUT."""
+    default_goal: ClassVar[str] = "the end of the scenario"
+    """What the VUT reaches in an episode that is no TIMEOUT, where its cases do not say."""
     measure_labels: ClassVar[Mapping[str, str]] = {}
     """What listings call measures of which `MEASURES` has the words for merges, by name."""
     default_criterion: ClassVar[str] = "contact"
@@ -252,6 +253,22 @@ class Scenario:
     def criterion(self) -> str:
         """The criterion of a campaign that names none."""
         return self.default_criterion
+
+    @property
+    def goal(self) -> str:
+        """What the VUT reaches in an episode that is no TIMEOUT."""
+        return self.default_goal
+
+    @property
+    def place(self) -> str:
+        """What sentences call the place of a merge; texts that are written with M are said so."""
+        return "M"
+
+    def said(self, text: str) -> str:
+        """Return a text of this package, written with M, as it is true of this scenario."""
+        if self.place == "M":
+            return text
+        return re.sub(r"\bM\b", self.place, text.replace("behind M", "after M"))
 
     @property
     def _before_m(self) -> str:
@@ -363,7 +380,7 @@ class MergeScenario(Scenario):
         1: "makes room for a VUT that accelerates",
         2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
     }
-    goal: ClassVar[str] = "the merge point"
+    default_goal: ClassVar[str] = "the merge point"
     default_criterion: ClassVar[str] = "paper"
 
     name: str = "us23"
@@ -410,6 +427,16 @@ class MergeScenario(Scenario):
     def criterion(self) -> str:
         """The criterion of a campaign that names none; the paper's is not for a lane."""
         return "unsafe" if self.lane_m is not None else self.default_criterion
+
+    @property
+    def goal(self) -> str:
+        """The merge point; on an acceleration lane that is no point."""
+        return "the mainline" if self.lane_m is not None else self.default_goal
+
+    @property
+    def place(self) -> str:
+        """M; on an acceleration lane, where M is only expected, the merge."""
+        return "the merge" if self.lane_m is not None else "M"
 
     @property
     def vehicles(self) -> int:

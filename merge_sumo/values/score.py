@@ -22,7 +22,14 @@ from merge_sumo.values.audit_mark import AuditMark
 from merge_sumo.values.avoidability import last_avoidable_s
 from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.measures import OURS, Further, further_measures, further_of
+from merge_sumo.values.measures import (
+    MEASURES,
+    OURS,
+    Further,
+    Measure,
+    further_measures,
+    further_of,
+)
 from merge_sumo.values.merge import (
     brake_after_mps2,
     closest_after_m,
@@ -259,6 +266,12 @@ ON_LANE: Final = (
     *("time_gap_ahead_s", "time_gap_behind_s", "stood_s"),
 )
 """Measures of a merge from an acceleration lane."""
+
+
+def measures_in(scenario: Scenario) -> list[Measure]:
+    """Return the measures that episodes of a scenario may have, those of a lane only with one."""
+    left_out = () if lane_of(scenario) else ON_LANE
+    return [measure for measure in MEASURES.values() if measure.name not in left_out]
 
 
 def record_fields(scenario: Scenario) -> tuple[tuple[str, ...], tuple[str, ...], Any]:

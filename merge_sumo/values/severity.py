@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 from merge_sumo.values.merge import HARSH_MPS2
-from merge_sumo.values.scenario import MergeScenario, Scenario
+from merge_sumo.values.scenario import MergeScenario, Scenario, lane_of
 from merge_sumo.values.trajectory import End
 
 
@@ -27,12 +27,15 @@ def meanings(scenario: Scenario) -> dict[Severity, str]:
     """Return what the words mean in a scenario."""
     if not isinstance(scenario, MergeScenario):
         return {Severity.CONTACT: "bodies touch", Severity.SAFE: "no contact"}
-    return {
-        Severity.CONTACT: "bodies touch at M or right after it",
+    follow_up_s = 0.0 if lane_of(scenario) is None else scenario.follow_up_s
+    soon = f"within {follow_up_s:g} s after" if follow_up_s else "right after"
+    found = {
+        Severity.CONTACT: f"bodies touch at M or {soon} it",
         Severity.CONFLICT: f"front bumpers within {scenario.dx_crash_m:g} m at M, no contact",
         Severity.HARSH: f"the rear car must brake harder than {HARSH_MPS2:g} m/s² after M",
         Severity.SAFE: "none of these",
     }
+    return {severity: scenario.said(meaning) for severity, meaning in found.items()}
 
 
 def severity_of(

@@ -385,7 +385,7 @@ class TestTheSurrogate:
 
 def headline_of(outcomes) -> str:
     levels = (0, 1, 2) if outcomes else (0,)
-    rule = PAPER_CRITERION, US23.dx_crash_m
+    rule = PAPER_CRITERION, US23
     return headline(judge(outcomes), summarise(outcomes, levels), failures(outcomes), {}, *rule)
 
 

@@ -4,6 +4,7 @@ const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 const namespace = document.querySelector("svg").namespaceURI;
 const DT = data.dt, CRASH = data.crash_m;
+const LANE = data.lane ?? null, PLACE = data.place ?? "M"; // an acceleration lane: [begin, end]; what its merges are called
 const coordinates = data.coordinates; // of all levels; the last ones are those of some levels only
 const vehicles = data.vehicles, POV = vehicles.indexOf("pov"), VUT = vehicles.indexOf("vut");
 const NAMES = { pov: "POV", vut: "VUT", ahead: "car ahead", behind: "car behind" };
@@ -37,7 +38,9 @@ function motion(i) {
     for (let t = 1; t < rows; t++) places.push(places[t - 1] + speed[t - 1] * DT);
     return places;
   });
-  return { rows, v, x, met: cases.nearest[i] };
+  // On an acceleration lane the last row is that of the merge.
+  const merge = LANE && data.ends[cases.end[i]] === "MERGED" ? x[VUT][rows - 1] : null;
+  return { rows, v, x, met: cases.nearest[i], merge };
 }
 const failed = (i) => cases.failed[i] === 1;
 let matching = null; // the cases that the filters let through; null without a filter
@@ -69,17 +72,21 @@ function conduct(i) { // what both did, by their speeds
   const of = (brakes, accelerates) => brakes !== null ? `begins to brake at ${fixed(brakes, 1)} s` : accelerates ? "accelerates" : "keeps its speed within 1 m/s";
   return `The VUT ${of(cases.vut_brakes[i], cases.vut_accelerates[i])}, the ${met} ${of(cases.pov_brakes[i], cases.pov_accelerates[i])}.`;
 }
+function placeOfMerge(i) { // on an acceleration lane
+  const share = cases.lane_share[i];
+  return share >= 1 ? "where the lane ends" : `after ${fixed(100 * share, 0)} % of the lane`;
+}
 function words(i) {
   const end = data.ends[cases.end[i]], parts = [], found = severity(i), at = `${fixed(cases.t_end_s[i], 1)} s`;
   const met = NAMES[vehicles[cases.nearest[i]]];
   if (end === "MERGED") {
     const first = cases.dx_m[i] < 0 ? "VUT" : met, kind = cases.kind[i] === null ? "" : ` (${data.kinds[cases.kind[i]]})`;
     if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}${kind}.`);
-    parts.push(`The VUT reaches M at ${at}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx_m[i]), 1)} m ahead.`);
+    parts.push(`The VUT ${LANE ? `merges at ${at}, ${placeOfMerge(i)}` : `reaches M at ${at}`}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx_m[i]), 1)} m ahead.`);
     if (found === "contact") parts.push(`Bodies touch at a relative speed of ${fixed(cases.impact_speed_mps[i], 1)} m/s.`);
     else if (cases.brake_after_mps2[i] === null) parts.push("No braking of the car behind is in time.");
-    else if (cases.brake_after_mps2[i] < 0.1) parts.push("The car behind has to brake at less than 0.1 m/s² after M.");
-    else parts.push(`The car behind has to brake at ${fixed(cases.brake_after_mps2[i], 1)} m/s² after M.`);
+    else if (cases.brake_after_mps2[i] < 0.1) parts.push(`The car behind has to brake at less than 0.1 m/s² after ${PLACE}.`);
+    else parts.push(`The car behind has to brake at ${fixed(cases.brake_after_mps2[i], 1)} m/s² after ${PLACE}.`);
   } else if (end === "COMPLETED") {
     if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}.`);
     parts.push(`The episode ends at ${at}.`);
@@ -89,14 +96,16 @@ function words(i) {
   } else {
     parts.push(`${end}: ${(data.errors[cases.index[i]] || "no reason given").replace(/\.?$/, ".")}`);
   }
-  if (cases.before_clearance_m[i] !== null && cases.before_clearance_m[i] < 0) parts.push("Bodies overlap before M, where the lanes run together.");
+  if (cases.before_clearance_m[i] !== null && cases.before_clearance_m[i] < 0) parts.push(`Bodies overlap before ${PLACE}, where the lanes run together.`);
+  if (LANE && cases.stood_s[i] > 0) parts.push(`The VUT stood on the lane for ${fixed(cases.stood_s[i], 1)} s.`);
   if (cases.margin && cases.margin[i] !== null) {
     parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
   if (cases.rows[i] && (tested(i) || end === "TIMEOUT")) parts.push(conduct(i));
   if (cases.kind[i] !== null) {
     const until = cases.way_out[i];
-    parts.push(until === null ? "There never was a way out for the VUT." : `Full braking or full acceleration of the VUT would have kept ${fixed(data.crash_m, 0)} m at M until ${fixed(until, 1)} s.`);
+    const none = LANE ? `Neither full braking nor full acceleration of the VUT would ever have kept ${fixed(CRASH, 0)} m at this place.` : "There never was a way out for the VUT.";
+    parts.push(until === null ? none : `Full braking or full acceleration of the VUT would have kept ${fixed(data.crash_m, 0)} m at ${LANE ? "this place" : "M"} until ${fixed(until, 1)} s.`);
   }
   if (cases.avoided_by && cases.avoided_by[i] !== null) {
     const by = cases.avoided_by[i], until = cases.latest_takeover[i];
@@ -334,15 +343,15 @@ function tip(event, text) {
   tipBox.style.top = `${below ? event.clientY + 14 : event.clientY - 10 - tipBox.offsetHeight}px`;
 }
 /* ---------- plots over time ---------- */
-function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags = [], xTicks = 4, yTicks = true, decimals = null }) {
+function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], windows = [], dots = [], flags = [], xTicks = 4, yTicks = true, decimals = null }) {
   const [, , w, h] = svg.getAttribute("viewBox").split(" ").map(Number);
   const left = 40, right = w - 12, top = 8, bottom = h - 28;
   const X = (x) => left + (x - xRange[0]) / (xRange[1] - xRange[0] || 1) * (right - left);
   const Y = (y) => bottom - (y - yRange[0]) / (yRange[1] - yRange[0] || 1) * (bottom - top);
   svg.replaceChildren();
-  for (const [low, high] of bands) {
+  for (const [name, [low, high]] of [...windows.map((ends) => ["window", ends]), ...bands.map((ends) => ["danger", ends])]) {
     const [a, b] = [Y(clamp(high, ...yRange)), Y(clamp(low, ...yRange))];
-    draw(svg, "rect", { class: "danger", x: left, y: a, width: right - left, height: b - a });
+    draw(svg, "rect", { class: name, x: left, y: a, width: right - left, height: b - a });
   }
   const step = nice((yRange[1] - yRange[0]) / 5);
   for (let y = Math.ceil(yRange[0] / step) * step; yTicks && y <= yRange[1] + 1e-12; y += step) {
@@ -359,6 +368,7 @@ function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], flags
     draw(svg, "path", { class: `line ${name}`, d: path(points.map(([x, y]) => [X(x), Y(clamp(y, ...yRange))])) });
     if (points.length === 1) draw(svg, "circle", { class: name, cx: X(points[0][0]), cy: Y(points[0][1]), r: 2 });
   }
+  for (const { name, x, y } of dots) draw(svg, "circle", { class: name, cx: X(x), cy: Y(y), r: 4 });
   for (const { name, x, y } of flags) draw(svg, "path", { class: name, d: `M${X(x)} ${Y(y) - 2}l-4.5 -7h9Z` });
   return { X, now: draw(svg, "line", { class: "now", x1: -9, x2: -9, y1: top, y2: bottom }), from: left, to: right, end: xRange[1] };
 }
@@ -484,10 +494,12 @@ function showMotion(i) {
   const inView = range([...gap[met], ...otherGap, -12, 12]); // of the car that the VUT meets
   const flags = [[met, cases.pov_brakes[i]], [VUT, cases.vut_brakes[i]]]
     .filter(([, t]) => t !== null).map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] }));
+  const merges = [other, moving].filter((one) => one && one.merge !== null)
+    .map((one) => ({ name: one === other ? "merged beside" : "merged", x: (one.rows - 1) * DT, y: one.merge }));
   const common = { xRange: [0, end], xLabel: "time, s" };
   charts = [
     plot(byId("chart-speed"), { ...common, yRange: range(all("v"), 0.14), lines: both("v"), flags }),
-    plot(byId("chart-position"), { ...common, yRange: range(all("x")), lines: both("x") }),
+    plot(byId("chart-position"), { ...common, yRange: range(all("x")), lines: both("x"), windows: LANE ? [LANE] : [], dots: merges }),
     plot(byId("chart-gap"), {
       ...common, yRange: inView, bands: [[-CRASH, CRASH]],
       lines: [...(other ? [{ name: "gap beside", points: over(otherGap) }] : []), ...others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }))],
@@ -550,7 +562,7 @@ function TopView(figure) {
     svg.replaceChildren();
     // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
     for (const lane of data.lanes) draw(svg, "path", { class: "lane", d: path(lane.map(([x, y]) => [x, -y])), "stroke-width": 3.05 });
-    draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -5.4, y2: 2.4, "stroke-width": 0.25 });
+    LANE ? drawLane() : draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -5.4, y2: 2.4, "stroke-width": 0.25 });
     for (const who of vehicles) {
       const group = draw(svg, "g");
       draw(group, "rect", { class: who, x: -5, y: -1, width: 5, height: 2, rx: 0.6 });
@@ -559,12 +571,24 @@ function TopView(figure) {
       cars[who] = { group, brake, label };
     }
   };
+  const across = (name, from, to, x) => { // a line over the road between two paths, at a lane coordinate
+    const a = pose(from, x), b = pose(to, x), length = Math.hypot(b.x - a.x, b.y - a.y) || 1, u = 2.4 * (b.x - a.x) / length, v = 2.4 * (b.y - a.y) / length;
+    draw(svg, "line", { class: name, x1: a.x - u, y1: -(a.y - v), x2: b.x + u, y2: -(b.y + v), "stroke-width": 0.25 });
+  };
+  const drawLane = () => { // the acceleration lane, and where the VUT left it
+    const begin = LANE[0] + 0.01, end = LANE[1] - 0.01; // at its very ends are those of other lanes, too
+    const inside = data.ramp.filter(([at]) => at > begin && at < end).map(([at]) => at);
+    const points = [begin, ...inside, end].map((at) => pose(data.ramp, at));
+    draw(svg, "path", { class: "window", d: path(points.map(({ x, y }) => [x, -y])), "stroke-width": 3.05 });
+    if (this.moving && this.moving.merge !== null) across("merge", data.main, data.ramp, Math.min(this.moving.merge, end));
+  };
   const row = (t) => { // the rows of the motion that a step is between; its last one stays
     const { rows } = this.moving, s = Math.min(t, rows - 1), k = Math.min(Math.floor(s), Math.max(rows - 2, 0));
     return { k, next: Math.min(k + 1, rows - 1), share: s - k };
   };
   const mix = (values, { k, next, share }) => (1 - share) * values[k] + share * values[next];
-  this.places = (t) => this.moving.x.map((x, who) => pose(who === VUT ? data.ramp : data.main, mix(x, row(t))));
+  const hasMerged = (t) => this.moving.merge !== null && t >= this.moving.rows - 1;
+  this.places = (t) => this.moving.x.map((x, who) => pose(who === VUT && !hasMerged(t) ? data.ramp : data.main, mix(x, row(t))));
   this.at = (t, { x: middle, y: centre, width, height }) => {
     const now = row(t), places = this.places(t), vutAbove = places[VUT].y > places[POV].y;
     const size = Math.max(1, Math.min(width / 90, height / 22.5)); // labels fit

@@ -1,0 +1,140 @@
+"""Where on an acceleration lane a VUT merges and which gaps it accepts, beside published figures.
+
+The published figures are those of people in traffic; the cases of a campaign are chosen by a
+sampler and more contested than traffic. So they are put side by side, and no test is made of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any, Final
+
+from merge_sumo.system.printable import counted
+from merge_sumo.values.scenario import lane_of, level_name
+from merge_sumo.values.score import Outcome
+
+BINS: Final = 20
+"""Bins of a histogram over the lane."""
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What was published of a ramp: number of its merges, mean place of cars on the lane."""
+
+    name: str
+    merges: int
+    lane_share: float
+
+
+SOURCE: Final = "exiD, Li et al. 2023, arXiv 2303.11531"
+SITES: Final = (Site("site 2", 1292, 0.32), Site("site 3", 565, 0.46), Site("site 5", 1573, 0.33))
+"""Three German motorway ramps of exiD."""
+REAR_HEADWAY_S: Final = (2.0, 2.7)
+"""Medians of the headway to the car behind at the merge, over types of merges, on these ramps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Merging:
+    """Merges of some cases from an acceleration lane.
+
+    Attributes:
+        cases: cases that ran.
+        merges: cases in which the VUT merged.
+        lane_share: median place, as a share of the lane; None without a merge.
+        forced: merges where the lane ends, which leave the VUT no choice.
+        stood: cases in which the VUT stood on the lane.
+        time_gap_ahead_s: median time gap to the car ahead; None without one.
+        time_gap_behind_s: the same of the car behind.
+        failing: failures by place, in bins of equal width over the lane, (BINS,).
+        others: the other merges by place.
+    """
+
+    cases: int
+    merges: int
+    lane_share: float | None
+    forced: int
+    stood: int
+    time_gap_ahead_s: float | None
+    time_gap_behind_s: float | None
+    failing: tuple[int, ...]
+    others: tuple[int, ...]
+
+    @property
+    def sentence(self) -> str:
+        """Return it as a line, with the published figures."""
+        if self.lane_share is None:
+            return f"no merge in {counted(self.cases, 'case')}{self._stops}"
+        shares = [site.lane_share for site in SITES]
+        text = (
+            f"merges {place_in_words(self.lane_share)} in the median (people in the mean: "
+            f"{min(shares):.0%} to {max(shares):.0%}), {self.forced} of {self.merges} where it "
+            f"ends{self._stops}"
+        )
+        low_s, high_s = REAR_HEADWAY_S
+        if self.time_gap_ahead_s is not None:
+            text += f"; median time gap ahead {self.time_gap_ahead_s:.2f} s"
+        if self.time_gap_behind_s is not None:
+            text += (
+                f"; behind {self.time_gap_behind_s:.2f} s (people: headways of {low_s:g} to "
+                f"{high_s:g} s)"
+            )
+        return text
+
+    @property
+    def _stops(self) -> str:
+        return f"; it stood on the lane in {counted(self.stood, 'case')}" if self.stood else ""
+
+
+def merging_of(outcomes: Iterable[Outcome]) -> Merging | None:
+    """Return what is found of merges; None without cases, and where there is no lane."""
+    ran = list(outcomes)
+    if not ran or lane_of(ran[0].case.scenario) is None:
+        return None
+    placed = [(share, o.failed) for o in ran if (share := o.measures.lane_share) is not None]
+    shares = [share for share, _ in placed]
+    return Merging(
+        cases=len(ran),
+        merges=len(placed),
+        lane_share=_median(shares),
+        forced=sum(share >= 1.0 for share in shares),
+        stood=sum(o.measures.stood_s > 0.0 for o in ran),
+        time_gap_ahead_s=_median(o.measures.time_gap_ahead_s for o in ran),
+        time_gap_behind_s=_median(o.measures.time_gap_behind_s for o in ran),
+        failing=_binned(share for share, failed in placed if failed),
+        others=_binned(share for share, failed in placed if not failed),
+    )
+
+
+def merging_record(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Return what JSON shows of merges from a lane, in all and by level; nothing without a lane."""
+    found = merging_of(outcomes)
+    if found is None:
+        return {}
+    levels = {
+        level_name(level): merging_of(o for o in outcomes if o.case.level == level)
+        for level in sorted({o.case.level for o in outcomes})
+    }
+    by_level = {name: asdict(one) for name, one in levels.items() if one is not None}
+    people: dict[str, Any] = {"source": SOURCE, "rear_headway_s": REAR_HEADWAY_S}
+    people["sites"] = [asdict(site) for site in SITES]
+    return {"merging": {**asdict(found), "levels": by_level, "people": people}}
+
+
+def place_in_words(lane_share: float) -> str:
+    """Return where on the lane a merge is, in a phrase."""
+    return "where the lane ends" if lane_share >= 1.0 else f"after {lane_share:.0%} of the lane"
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return median(known) if known else None
+
+
+def _binned(shares: Iterable[float]) -> tuple[int, ...]:
+    """Return how many shares lie in each bin; the merges where the lane ends are in the last."""
+    counts = [0] * BINS
+    for share in shares:
+        counts[min(int(share * BINS), BINS - 1)] += 1
+    return tuple(counts)

@@ -1,0 +1,239 @@
+"""What is said and drawn of merges from an acceleration lane, and that nothing of it is without."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+from handmade import write_run
+from lxml import etree
+from test_browser import browser, shown  # noqa: F401 (a fixture)
+from test_report import data_of, root_of, text_of
+
+from merge_sumo.analysis.merging import BINS, merging_of
+from merge_sumo.api import CampaignRun
+from merge_sumo.campaigns.store import Run
+from merge_sumo.reports.lane_picture import picture_of
+from merge_sumo.reports.motion import lines_of, verdict_of
+from merge_sumo.reports.report import report_page, write_report
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.scenario import US23, lane_of
+from merge_sumo.values.severity import Severity, meanings
+from merge_sumo.values.trajectory import End
+
+LANE = named_scenario("us23-lane")
+OF_M = (
+    *("due at M (at constant speed)", "distance to M, m", "M, where a merge is expected"),
+    "M = 0, where a merge is expected",
+)
+"""What M, the place at which a merge is expected, is still named in."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    """Merges at M, one error, and timeouts on the lane; cases fail by the paper's rule."""
+    folder = tmp_path_factory.mktemp("lane") / "run"
+    return write_run(folder, scenario=LANE, errors={179: "answered nan"}, timeouts=[5, 6])
+
+
+@pytest.fixture(scope="module")
+def page(made) -> str:
+    return report_page(made)
+
+
+def without(text: str, phrases: tuple[str, ...]) -> str:
+    for phrase in phrases:
+        text = text.replace(phrase, "")
+    return text
+
+
+class TestSentences:
+    def test_call_no_merge_by_m_on_a_lane(self, made, page):
+        text = text_of(page)
+        assert re.findall(r".{20}\bM\b.{20}", without(text, OF_M)) == []
+        assert "(front bumpers within 6 m at the merge;" in text
+        assert "would have kept 6 m at the merge" in text
+        assert "the VUT did not reach the mainline in 12 s" in text
+        titles = [measure["title"] for measure in data_of(page)["measures"]]
+        assert {"Δx at the merge m", "braking asked after the merge m/s²"} <= {*titles}
+        found = meanings(LANE)
+        assert found[Severity.CONTACT] == "bodies touch at the merge or within 5 s after it"
+        assert found[Severity.HARSH].endswith("brake harder than 3 m/s² after the merge")
+
+    def test_speak_of_m_and_of_no_lane_without_one(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=20)
+        page = report_page(run)
+        assert "(front bumpers within 6 m at M;" in text_of(page)
+        assert "lane" not in without(text_of(page), ("along the lane", "where the lanes run"))
+        assert not {"lane", "place"} & set(data_of(page))
+        assert not {"x_merge_m", "lane_share", "stood_s"} & set(data_of(page)["cases"])
+        assert not root_of(page).xpath("//section[@aria-labelledby='merging']")
+        assert "merging" not in CampaignRun(run).to_record()
+        assert not any("merges" in line for line in CampaignRun(run).lines())
+        outcome = run.outcomes[0]
+        listed = "\n".join(lines_of(outcome, run.trajectory(0)))
+        assert "stood" not in listed
+        assert "=" not in listed
+
+    def test_of_the_terminal_agree_with_the_motion(self, made):
+        outcome = next(o for o in made.outcomes if o.measures.dx_m and o.measures.dx_m > 0.0)
+        trajectory = made.trajectory(outcome.index)
+        share = (trajectory.x_vut_m[-1] + 70.0) / 200.0
+        said = verdict_of(outcome, trajectory)
+        assert f"the VUT merges after {share:.0%} of the lane, the front bumper of the POV" in said
+        assert " m ahead at the merge" in said
+        *lines, legend = lines_of(outcome, trajectory)
+        assert legend == "  = acceleration lane, from -70 to 130 m"
+        assert sum(line.startswith("  stood on the lane") for line in lines) == 1
+        strip = next(line.split()[-1] for line in lines if line.startswith("  0.0 "))
+        low_m = trajectory.motion[0, :, 0].min()
+        high_m = 130.0 + 0.08 / 0.92 * (130.0 - low_m)
+        places = [round((x - low_m) / (high_m - low_m) * 47) for x in (-70.0, 0.0, 130.0)]
+        begin, at_m, end = places
+        assert strip[begin : end + 1] == "=" * (at_m - begin) + "|" + "=" * (end - at_m)
+        assert strip[begin - 1] + strip[end + 1] == ".."
+
+    @pytest.mark.slow
+    def test_of_the_page_agree_with_the_motion(self, browser, made):  # noqa: F811
+        with shown(browser, write_report(made)) as page:
+            said = page.evaluate("() => cases.index.map((index, i) => [index, words(i)])")
+        merged = 0
+        for index, words in said:
+            found, motion = made.outcome(index).measures, made.trajectory(index)
+            assert not re.search(r"\bM\b", words), words
+            if found.end is End.MERGED:
+                merged += 1
+                share = (motion.x_vut_m[-1] + 70.0) / 200.0
+                when = f"merges at {motion.t_end_s:.1f} s, after {100 * share:.0f} % of the lane;"
+                assert when in words
+            elif found.end is End.TIMEOUT:
+                assert "did not reach the mainline in 12 s." in words
+                assert ("The VUT stood on the lane" in words) is (found.stood_s > 0.0)
+        assert merged == 177
+
+
+class TestMerging:
+    def test_is_counted_and_binned_by_place(self, made):
+        ran = [o for o in made.outcomes if o.measures.end is End.MERGED][:6]
+        shares = (0.0, 0.0499, 0.35, 0.999, 1.0, 1.02)
+        gaps = (None, 0.5, None, 2.0, 1.0, None)
+        outcomes = [
+            replace(
+                o,
+                measures=replace(
+                    o.measures, lane_share=share, time_gap_behind_s=gap, time_gap_ahead_s=None
+                ),
+                margin=margin,
+            )
+            for o, share, gap, margin in zip(
+                ran, shares, gaps, (-1.0, 1.0, 1.0, -1.0, 1.0, -1.0), strict=True
+            )
+        ]
+        stopped = next(o for o in made.outcomes if o.measures.end is End.TIMEOUT)
+        outcomes.append(replace(stopped, measures=replace(stopped.measures, stood_s=3.2)))
+        found = merging_of(outcomes)
+        assert (found.cases, found.merges, found.forced, found.stood) == (7, 6, 2, 1)
+        assert found.lane_share == pytest.approx((0.35 + 0.999) / 2)
+        assert (found.time_gap_ahead_s, found.time_gap_behind_s) == (None, 1.0)
+        assert found.failing == (1, *[0] * (BINS - 2), 2)
+        assert found.others == (1, *[0] * 6, 1, *[0] * (BINS - 9), 1)
+        picture = picture_of(found, lane_of(LANE))
+        assert picture.most == 3
+        # The last bin: two failures of three merges, and the third on top of them.
+        (_, x, y, _, height), (_, x2, y2, _, height2) = picture.bars[-2:]
+        assert (x, x2) == (363.0, 363.0)
+        assert height == pytest.approx(2 * height2, abs=0.2)
+        assert y2 + height2 == pytest.approx(y, abs=0.11)
+        assert picture.expected == pytest.approx(40.0 + 0.35 * 340.0)
+        assert [mark.x for mark in picture.people] == [
+            pytest.approx(40.0 + share * 340.0, abs=0.1) for share in (0.32, 0.33, 0.46)
+        ]
+
+    def test_is_nothing_without_a_lane(self, made):
+        case = replace(made.outcomes[0].case, scenario=US23)
+        assert merging_of([replace(made.outcomes[0], case=case)]) is None
+        assert merging_of([]) is None
+
+    def test_is_in_the_report_and_in_json_with_the_published_figures(self, made, page):
+        (section,) = root_of(page).xpath("//section[@aria-labelledby='merging']")
+        text = " ".join(section.text_content().split())
+        assert "exiD, Li et al. 2023, arXiv 2303.11531" in text
+        rows = [[cell.text for cell in row] for row in section.xpath(".//tbody/tr")]
+        assert [row[:3] for row in rows[-3:]] == [
+            ["people, site 2", "1,292", "32 %"],
+            ["people, site 3", "565", "46 %"],
+            ["people, site 5", "1,573", "33 %"],
+        ]
+        assert rows[0][:5] == ["all", "177", "35 %", "0", "2"]
+        record = CampaignRun(made).to_record()["merging"]
+        assert json.loads(json.dumps(record))["people"]["rear_headway_s"] == [2.0, 2.7]
+        assert sum(record["failing"]) + sum(record["others"]) == record["merges"] == 177
+        assert sum(level["merges"] for level in record["levels"].values()) == 177
+        assert sum("of the lane in the median" in one for one in CampaignRun(made).lines()) == 1
+
+
+@pytest.mark.slow
+class TestThePictures:
+    def test_have_the_vut_on_the_lane_until_it_merges(self, browser, made):  # noqa: F811
+        index = next(o.index for o in made.outcomes if o.measures.end is End.MERGED)
+        rows = len(made.trajectory(index).motion)
+        with shown(browser, write_report(made)) as page:
+            page.evaluate(f"() => show(place.get({index}))")
+            before, after = page.evaluate(
+                f"() => [{rows - 2}, {rows - 1}].map((t) => views[0].places(t)[VUT])"
+            )
+            band, dot = (
+                page.locator(f"#chart-position {mark}").bounding_box()
+                for mark in ("rect.window", "circle.merged")
+            )
+            assert page.locator("#road path.window").count() == 1
+            assert page.locator("#road line.merge").count() == 1
+        assert abs(before["y"]) == pytest.approx(3.2, abs=0.01)
+        assert after["y"] == pytest.approx(0.0, abs=0.01)
+        middle = dot["y"] + dot["height"] / 2
+        assert band["y"] < middle < band["y"] + band["height"]
+
+    def test_have_no_lane_without_one(self, browser, tmp_path):  # noqa: F811
+        run = write_run(tmp_path / "run", per_level=10)
+        with shown(browser, write_report(run)) as page:
+            assert page.locator(".window, .merged").count() == 0
+            line = page.locator("#road line.merge")
+            ends = [line.get_attribute(name) for name in ("x1", "x2", "y1", "y2")]
+        assert ends == ["0", "0", "-5.4", "2.4"]
+
+
+@pytest.mark.slow
+def test_new_measures_decide_gates_junit_and_versions(call, tmp_path):
+    rule = "time_gap_behind_s < 0.5"
+    asked = ("--scenario", "us23-lane", "--seed", 0, "--cases", 20, "--level", 0, "-q")
+    for name in ("level0", "design2"):
+        out = ("--out", tmp_path / name, "--junit", tmp_path / f"{name}.xml")
+        code, said, _ = call(
+            "campaign", "--vut", name, *asked, *out, "--fail-when", rule, "--gate", "failures"
+        )
+        run = Run(tmp_path / name)
+        gaps = [o.measures.time_gap_behind_s for o in run.outcomes]
+        failing = [o.index for o in run.outcomes if o.failed]
+        assert failing == [i for i, gap in enumerate(gaps) if gap is not None and gap < 0.5]
+        assert code == bool(failing)
+        assert "0 of 20 where it ends" in said
+        suites = etree.parse(tmp_path / f"{name}.xml").getroot()
+        (level,) = suites.findall("testsuite[@name='POV level 0']")
+        wrong = [failure.get("message") for failure in level.iter("failure")]
+        assert len(wrong) == len(failing)
+        assert all(re.search(r"merges after 3[56]% of the lane", message) for message in wrong)
+    both = (tmp_path / "level0", tmp_path / "design2")
+    assert len([o for o in Run(both[0]).outcomes if o.failed]) > 0
+    code, out, _ = call("compare-runs", *both, "--json", "--out", tmp_path / "changes.html")
+    merging = json.loads(out)["merging"]
+    assert {name: one["merges"] for name, one in merging.items()} == {"A": 20, "B": 20}
+    html = (tmp_path / "changes.html").read_text()
+    assert html.count('class="places"') == 2
+    code, out, _ = call("history", *both, "--json", "--out", tmp_path / "history.html")
+    assert code == 0
+    assert json.loads(out)["versions"][1]["merging"]["all"] == merging["B"]
+    assert "place of the merge, median" in (tmp_path / "history.html").read_text()
