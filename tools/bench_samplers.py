@@ -5,6 +5,7 @@
     python tools/bench_samplers.py --time
     python tools/bench_samplers.py --per-case
     python tools/bench_samplers.py --trials --seeds 10 --first 1000
+    python tools/bench_samplers.py --held-out --seeds 6 --first 2000
     python tools/bench_samplers.py --dense --vut design1 --level 0 --seeds 10 --first 1000
     python tools/bench_samplers.py --dense --cases 100 --batch 2 --learned-from old.py:Vut
 
@@ -13,7 +14,9 @@ own and the others in batches of 20; the second does so for `gpr` with one of it
 at a time; the third prints the seconds that a sampler takes for a batch after N cases; the fourth
 prints the CPU time of `coverage` with its twin for a case at three levels after N uniform cases,
 and the memory of the twin; `--trials` lets `coverage`, the same without its twin, and `gpr` search
-the VUTs of `trial_vuts.py`, on which nothing was tuned, at every level at which they fail.
+the VUTs of `trial_vuts.py`, on which nothing was tuned, at every level at which they fail;
+`--held-out` lets samplers search the VUTs of `held_out_vuts.py`, whose failures nothing foretells,
+and prints medians with the least and the most after 100 and 400 cases.
 
 `--dense` measures against a dense truth of 1,000,000 cases by the kinematic engine: the share of
 its FMC after few cases, and the cases to .9 of it as a ratio to those of an oracle, which knows all
@@ -56,6 +59,9 @@ from merge_sumo.values.trajectory import End
 CASES, BATCH = 400, 20
 WITHOUT = "coverage without its twin"
 TRIALS = ("Idm", "Hysteresis", "Delayed", "Rss", "Courteous", "Table", "Noisy", "Hidden")
+HELD_OUT = ("Cells", "Islands", "Shell", "NoisySensors")
+DEVELOPMENT = ("Lots", "Stripes", "Ring")
+"""VUTs whose failures nothing foretells: those to report on, and those to choose on."""
 FEWEST_FAILURES = 5
 """Failures of a truth from which a share of it means something."""
 SHOWN = (100, 200, 400)
@@ -309,6 +315,28 @@ def print_trials(trials: Sequence[str], seeds: int, first: int) -> dict[str, dic
     return figures
 
 
+def print_held_out(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """Print and return how samplers search VUTs whose failures nothing foretells."""
+    figures: dict[str, Any] = {}
+    shown = [SHOWN.index(n) for n in (100, 400)]
+    print(f"{'median FMC / truth [least, most]':40s} {'N=100':>18s} {'N=400':>18s}  sampler s")
+    for trial in options.held_out or HELD_OUT:
+        vut = f"{Path(__file__).with_name('held_out_vuts.py')}:{trial}"
+        settings = CampaignSettings(vut=vut, levels=(options.level,), scenario=US23)
+        plan = resolve(settings).for_cases(BATCH)
+        truth = ground_truth(plan, options.level)
+        for name in names:
+            seeds = range(options.first, options.first + options.seeds)
+            runs = [search(name, options.level, seed, plan, truth) for seed in seeds]
+            shares = np.array([[run[0][place] for place in shown] for run in runs])
+            seconds = float(np.median([run[2] for run in runs]))
+            row = f"{trial}, level {options.level}: {name}"
+            figures[row] = {"shares": shares.tolist(), "sampler s": seconds}
+            columns = (f"{np.median(of):6.3f} [{of.min():.2f}, {of.max():.2f}]" for of in shares.T)
+            print(f"{row:40s} {' '.join(columns)}  {seconds:9.1f}", flush=True)
+    return figures
+
+
 def main() -> None:
     """Parse the command line and print the table that it asks for."""
     parser = argparse.ArgumentParser(description="What samplers find, and what they cost.")
@@ -324,6 +352,14 @@ def main() -> None:
         choices=TRIALS,
         metavar="NAME",
         help=f"search VUTs unlike ours: all, or some of {', '.join(TRIALS)}",
+    )
+    parser.add_argument(
+        "--held-out",
+        nargs="*",
+        choices=(*HELD_OUT, *DEVELOPMENT),
+        metavar="NAME",
+        help=f"search VUTs that nothing foretells: {', '.join(HELD_OUT)}, or some of these and "
+        f"{', '.join(DEVELOPMENT)}",
     )
     parser.add_argument("--dense", action="store_true", help="beside a dense truth and an oracle")
     parser.add_argument("--learned-from", metavar="VUT", help="of --dense: an earlier version")
@@ -342,6 +378,9 @@ def main() -> None:
         figures = print_dense(options, names)
         what = f"samplers, {options.vut}, level {options.level}, dense"
         append_record(options.record, what, figures)
+    elif options.held_out is not None:
+        figures = print_held_out(options, names)
+        append_record(options.record, f"samplers, held out, level {options.level}", figures)
     elif options.trials is not None:
         figures = print_trials(options.trials or TRIALS, options.seeds, options.first)
         append_record(options.record, "samplers, trials", figures)

@@ -143,14 +143,14 @@ class Calibration:
         if first < PREDICTED // 2:
             return
         before, since = history.take(slice(first)), history.take(slice(first, None))
-        far = _far(since.points, before.points[before.failed])
+        far = is_far(since.points, before.points[before.failed])
         predicted = np.bincount(far, Belief(before).of(since.points), minlength=2)
         failed = np.bincount(far, since.failed, minlength=2)
         self.factors = np.minimum((failed + 1.0) / (predicted + 1.0), 1.0)
 
     def of(self, belief: Belief, cases: FloatArray) -> FloatArray:
         """Return the corrected P(fail) of cases, (m, d), as (m,)."""
-        corrected: FloatArray = belief.of(cases) * self.factors[_far(cases, self._failing)]
+        corrected: FloatArray = belief.of(cases) * self.factors[is_far(cases, self._failing)]
         return corrected
 
 
@@ -205,7 +205,7 @@ def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
     return [history.failed, safe & ~pov_first, safe & pov_first]
 
 
-def _far(points: FloatArray, failing: FloatArray) -> NDArray[np.int64]:
+def is_far(points: FloatArray, failing: FloatArray) -> NDArray[np.int64]:
     """Return for each point, (n,), 1 where no failure is near, else 0."""
     return (nearest(points, failing) > FAR * radius_for(points.shape[1])).astype(np.int64)
 

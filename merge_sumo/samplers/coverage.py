@@ -15,6 +15,7 @@ import numpy as np
 
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.base_rate import BaseRate
 from merge_sumo.samplers.belief import Belief, Calibration, gap_m, has_gaps
 from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
 from merge_sumo.samplers.coverage_grid import CoverageGrid
@@ -22,7 +23,7 @@ from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, covered_grid, 
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
 from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
-from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import DX_CRASH_M
@@ -199,11 +200,28 @@ class CoverageSampler(Sampler):
                 return Proposal(spread, chance, chance, (None,) * n)
             return _Search(history, pending, rng, n).batch(n)
         skill = yield from self._skill(level, history)
+        base_rate = None
+        if skill.breaks_promises and not few:
+            base_rate = self._base_rate(level, history, pending, n)
         if skill.is_worthless and not few:
-            batch = _Search(history, pending, rng, n).batch(n)
+            batch = _Search(history, pending, rng, n).batch(n, base_rate)
             gaps_m = yield Query(level, batch.points)
             return skill.annotated(batch, gaps_m)
-        return (yield from twin_guided_batch(history, pending, n, rng, level, skill))
+        return (yield from twin_guided_batch(history, pending, n, rng, level, skill, base_rate))
+
+    def _base_rate(
+        self, level: int, history: LevelHistory, pending: FloatArray, n: int
+    ) -> BaseRate:
+        """Return the base rate of a level, with the sequence of its first batch."""
+        predictions = [outcome.prediction for outcome in self.observed(level)]
+        errors = [
+            outcome.case
+            for outcome in self._outcomes.values()
+            if outcome.score is None and outcome.case.level == level
+        ]
+        unknown = np.concatenate([pending, to_unit(errors, level, self.pool.scenario)])
+        begins = np.random.default_rng([self.seed, 0, level])
+        return BaseRate(history, predictions, unknown, n, self.proposed(level), begins)
 
     def _skill(self, level: int, history: LevelHistory) -> Asking[PredictionSkill]:
         """Return the skill of the predictions so far, of all levels."""
@@ -254,14 +272,23 @@ class _Search:
         worth = probability * (self._grid.new(balls) + EVEN_IF_COVERED)
         kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
         self._candidates, self._aim = candidates[kept], probability[kept]
-        self._probability = (
-            self._aim if limit is None else calibration.of(Belief(history), self._candidates)
-        )
+        self._calibration = calibration
+        self._belief = belief if limit is None else Belief(history)
+        self._probability = self._aim if limit is None else self._chance(self._candidates)
 
-    def batch(self, n: int) -> Proposal:
-        """Return the greedy batch of `n` cases."""
+    def batch(self, n: int, base_rate: BaseRate | None = None) -> Proposal:
+        """Return the greedy batch of `n` cases, with a base rate where its picks promise more."""
         picks, gain = greedy(self._grid, self._candidates, self._aim, self._probability, n)
-        return Proposal(self._candidates[picks], gain, self._probability[picks], (None,) * n)
+        points, unknown = self._candidates[picks], (None,) * n
+        batch = Proposal(points, gain, self._probability[picks], unknown)
+        if base_rate is None:
+            return batch
+        following = base_rate.following
+        return base_rate.mixed(batch, Proposal(following, gain, self._chance(following), unknown))
+
+    def _chance(self, points: FloatArray) -> FloatArray:
+        """Return the calibrated P(fail) of points, (m, d), as (m,)."""
+        return self._calibration.of(self._belief, points)
 
 
 def _limit(history: LevelHistory) -> float | None:

@@ -47,6 +47,10 @@ TRUSTED_FROM: Final = 100
 WORTHLESS: Final = 0.05
 JUDGED_FROM: Final = 40
 """A predictor with less weight than that, after so many cases, is not asked for candidates."""
+BROKEN: Final = 0.5
+PROMISED_BEFORE: Final = 0.25
+"""Slope of the verdicts over P(fail) below which picks are compared with cases from anywhere, and
+sum of the squares of P(fail) that speaks for a slope of 1 before there is a record."""
 EDGE: Final = float(np.arcsinh(1.0))
 """The limit of a failure on the scale of `compressed`."""
 
@@ -104,6 +108,7 @@ class PredictionSkill:
             agree on the verdict, (2,).
         trust: factor of the gains. Picks have a large P(fail), so P(fail) is biased upwards among
             them; the outcomes of the last picks give the bias.
+        kept: how much of what was promised came, at most 1: the slope of the verdicts over P(fail).
     """
 
     def __init__(
@@ -122,9 +127,10 @@ class PredictionSkill:
         self._limit_m = limit_m
         self._mixture = (PRIOR / PRIOR.sum())[None]
         self.experts, self.twin, self.trust = np.ones(1), np.array([0.5, 0.5]), 1.0
-        self._cases = len(known)
+        self._cases, self.kept = len(known), 1.0
         if known:
             self._learn_weights(known, self._weights([o for o, _ in known], level))
+            self.kept = self._kept(known, level)
             last = [one for one in known if one[0].case.level == level][-TRUSTED_FROM:]
             failed, predicted = (sum(o.failed for o, _ in last), sum(f.p_fail for _, f in last))
             self.trust = min((failed + 1.0) / (predicted + 1.0), 1.0)
@@ -134,6 +140,11 @@ class PredictionSkill:
     def is_worthless(self) -> bool:
         """Whether the predictions so far show no skill for this VUT."""
         return self._cases >= JUDGED_FROM and bool((self.twin < WORTHLESS).all())
+
+    @property
+    def breaks_promises(self) -> bool:
+        """Whether less than half of the failures came that the predictions so far promised."""
+        return self.kept < BROKEN
 
     @property
     def is_doubted(self) -> bool:
@@ -190,6 +201,14 @@ class PredictionSkill:
         gaps = np.abs(np.nan_to_num(gaps_m, nan=NO_GAP_M)).reshape(-1, gaps_m.shape[-1])
         failing = gaps < self._limit_m
         return np.asarray(failing.all(axis=0) | ~failing.any(axis=0))
+
+    def _kept(self, known: Known, level: int) -> float:
+        """Return the slope of the verdicts over P(fail), at most 1; of all levels, as weighted."""
+        weight = self._weights([o for o, _ in known], level)
+        failed = np.array([o.failed for o, _ in known])
+        promised = np.array([said.p_fail for _, said in known])
+        came = float(weight @ (promised * failed)) + PROMISED_BEFORE
+        return min(came / (float(weight @ np.square(promised)) + PROMISED_BEFORE), 1.0)
 
     def _learn_errors(
         self, outcomes: Sequence[Outcome], level: int, replayed: Mapping[int, FloatArray]

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.samplers.base_rate import BaseRate
 from merge_sumo.samplers.belief import Belief, Calibration
 from merge_sumo.samplers.candidates import (
     LOCAL_REACH,
@@ -56,6 +57,7 @@ def twin_guided_batch(
     rng: np.random.Generator,
     level: int,
     skill: PredictionSkill,
+    base_rate: BaseRate | None = None,
 ) -> Asking[Proposal]:
     """Return a batch of `n` cases of a level that the predictor can predict.
 
@@ -63,13 +65,14 @@ def twin_guided_batch(
 
     P(fail) of a candidate is that of the twin and that of the surrogate, weighted by the skill of
     the predictions so far. Without outcomes at the level there is no surrogate, and half of the
-    batch is spread over the cube.
+    batch is spread over the cube. With a base rate, picks that promise less than that give way.
     """
     candidates = _Candidates(history, pending, level, skill)
     first_points = yield from _first_candidates(candidates, history, n, rng)
     yield from candidates.add(first_points)
     reach = REFINED_REACH * radius_for(history.dims)
-    for _ in range(ROUNDS):
+    # What does not come true is not refined.
+    for _ in range(ROUNDS if base_rate is None else 0):
         batch, _ = greedy(
             candidates.grid.copy(), candidates.points, candidates.p_fail, candidates.p_fail, n
         )
@@ -88,8 +91,14 @@ def twin_guided_batch(
     picks, gain = greedy(
         candidates.grid, candidates.points, p_fail, p_fail, n - len(first), information
     )
-    gain = np.concatenate([np.ones(len(first)), gain]) * skill.trust
-    return candidates.proposal(first + picks, gain)
+    gain = np.concatenate([np.ones(len(first)), gain])
+    if base_rate is None:
+        return candidates.proposal(first + picks, gain * skill.trust)
+    picked = candidates.proposal(first + picks, gain)
+    spread_from = len(candidates.points)
+    yield from candidates.add(base_rate.following)
+    following = [*range(spread_from, len(candidates.points))]
+    return base_rate.mixed(picked, candidates.proposal(following, gain))
 
 
 class _Candidates:
