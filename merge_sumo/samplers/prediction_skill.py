@@ -48,9 +48,12 @@ WORTHLESS: Final = 0.05
 JUDGED_FROM: Final = 40
 """A predictor with less weight than that, after so many cases, is not asked for candidates."""
 BROKEN: Final = 0.5
+BROKEN_BATCHES: Final = 4
 PROMISED_BEFORE: Final = 0.25
-"""Slope of the verdicts over P(fail) below which picks are compared with cases from anywhere, and
-sum of the squares of P(fail) that speaks for a slope of 1 before there is a record."""
+"""Slope of the verdicts over P(fail) below which picks are compared with cases from anywhere, the
+fewest batches that it is judged by, as cases of a batch are alike (the first one of design2
+promises .7 and keeps nothing, the fifth keeps all), and sum of the squares of P(fail) that speaks
+for a slope of 1 before there is a record."""
 EDGE: Final = float(np.arcsinh(1.0))
 """The limit of a failure on the scale of `compressed`."""
 
@@ -128,6 +131,7 @@ class PredictionSkill:
         self._mixture = (PRIOR / PRIOR.sum())[None]
         self.experts, self.twin, self.trust = np.ones(1), np.array([0.5, 0.5]), 1.0
         self._cases, self.kept = len(known), 1.0
+        self._batches = len({outcome.batch for outcome, _ in known})
         if known:
             self._learn_weights(known, self._weights([o for o, _ in known], level))
             self.kept = self._kept(known, level)
@@ -144,7 +148,7 @@ class PredictionSkill:
     @property
     def breaks_promises(self) -> bool:
         """Whether less than half of the failures came that the predictions so far promised."""
-        return self.kept < BROKEN
+        return self._batches >= BROKEN_BATCHES and self.kept < BROKEN
 
     @property
     def is_doubted(self) -> bool:

