@@ -11,8 +11,16 @@ import numpy as np
 
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
-from merge_sumo.road.corridor import MIN_LANE_M, Corridor, LanePath, lane_around_m
-from merge_sumo.values.scenario import US23, V_VUT0_MPS, Bounds, MergeScenario, Scenario, as_merge
+from merge_sumo.road.corridor import MAX_LANE_M, MIN_LANE_M, Corridor, LanePath, lane_around_m
+from merge_sumo.values.scenario import (
+    MAX_EPISODE_S,
+    US23,
+    V_VUT0_MPS,
+    Bounds,
+    MergeScenario,
+    Scenario,
+    as_merge,
+)
 from merge_sumo.values.scenario_scale import Units
 
 MARGIN: Final = 0.15
@@ -23,6 +31,8 @@ ROOM: Final = 0.98
 """Of the length of a path that is used."""
 BEFORE_GORE_M: Final = 50.0
 """A VUT starts at least so far before an acceleration lane, where the ramp allows: 2 to 3 s."""
+PATIENCE: Final = 2.0
+"""The timeout is at least so many times what the level-0 profile takes to the end of the lane."""
 FOLLOW_UP_S: Final = 5.0
 """How long the traffic behind a merge on a lane is followed."""
 
@@ -58,10 +68,12 @@ def kind_of_merge(road: Corridor) -> list[str]:
     elif lane.gives_a_choice:
         lines = [f"kind: merge at the point M, as asked for, although {beside}"]
     else:
-        lines = [
-            f"kind: merge at the point M, because {beside} only, which the net does not mark and "
-            f"which is less than {MIN_LANE_M:g} m"
-        ]
+        why = (
+            f"more than {MAX_LANE_M:g} m"
+            if lane.length_m > MAX_LANE_M
+            else f"less than {MIN_LANE_M:g} m, and the net does not mark it"
+        )
+        lines = [f"kind: merge at the point M, because {beside}: {why}"]
     if lane.exits:
         lines.append(
             f"weaving: the lane goes on to {' and '.join(lane.exits)}; the VUT has to leave it "
@@ -83,9 +95,11 @@ def suggested(road: Corridor, name: str) -> MergeScenario:
     x_vut0_m = _down(max(far_m, gore_m - ROOM * (road.ramp.before_m + gore_m)))
     v_vut0_mps = round(min(V_VUT0_MPS, limit_at(road.ramp, x_vut0_m)), 1)
     level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
-    due_s = float(
-        level0_time_to(np.array(-x_vut0_m), np.array(v_vut0_mps), US23.level0_a_mps2, level0_v_mps)
-    )
+    lane_m = road.lane_m and suggested_lane_m(road)
+    way_m = np.array([0.0, lane_m[1] if lane_m else 0.0]) - x_vut0_m
+    due_s, end_s = level0_time_to(
+        way_m, np.array(v_vut0_mps), US23.level0_a_mps2, level0_v_mps
+    ).tolist()
     slow, fast = round(SLOWEST * limit_mps, 1), round(limit_mps, 1)
     low = max(-fast * due_s * (1.0 + MARGIN), -ROOM * road.mainline.before_m)
     high = max(-slow * due_s * (1.0 - MARGIN), low / 2.0)
@@ -104,7 +118,8 @@ def suggested(road: Corridor, name: str) -> MergeScenario:
         v_min_mps=round(min(US23.v_min_mps, 0.5 * v_vut0_mps), 1),
         level0_v_mps=level0_v_mps,
         reach_m=max(US23.reach_m, float(math.ceil(-low)), float(math.ceil(-x_vut0_m))),
-        lane_m=road.lane_m and suggested_lane_m(road),
+        lane_m=lane_m,
+        timeout_s=min(max(US23.timeout_s, float(math.ceil(PATIENCE * end_s))), MAX_EPISODE_S),
         follow_up_s=FOLLOW_UP_S if road.lane_m else US23.follow_up_s,
     )
 

@@ -130,6 +130,8 @@ EXPECTED_SHARE: Final = 0.35
 after a mean share of .32, .46 and .33 (Li et al. 2023, arXiv 2303.11531, 3,430 merges)."""
 MIN_LANE_M: Final = 50.0
 """A shorter lane that the net does not mark leaves no choice: 2 s at 25 m/s."""
+MAX_LANE_M: Final = 2000.0
+"""A longer lane is one of the mainline that ends somewhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +157,8 @@ class AccelerationLane:
     @property
     def gives_a_choice(self) -> bool:
         """Whether a driver chooses on it where to merge."""
-        return self.is_marked or self.length_m >= MIN_LANE_M
+        long_enough = self.is_marked or self.length_m >= MIN_LANE_M
+        return long_enough and self.length_m <= MAX_LANE_M
 
 
 def lane_around_m(length_m: float) -> Bounds:

@@ -294,15 +294,14 @@ class TestAScenario:
         scenario, _ = self.new(tmp_path, build, *LANES["lane drop"][1:])
         assert scenario.lane_m == (-245.0, 455.0)
         assert scenario.x_vut0_m == -295.0
+        # From 18 m/s at 1 m/s2 to 28 m/s in 230 m and 10 s, and 520 m at 28 m/s: twice 28.6 s.
+        assert scenario.timeout_s == 58.0
 
     @pytest.mark.parametrize(
         ("length_m", "kind", "lane_m"),
         [
-            (
-                49.9,
-                "merge at the point M, because .* only, .* not mark and .* less than 50 m",
-                None,
-            ),
+            (49.9, "merge at the point M, because .*: less than 50 m, and .* not mark", None),
+            (2000.1, "merge at the point M, because .*: more than 2000 m", None),
             (50.0, "acceleration lane, because .* for 50.0 m; ", (-17.5, 32.5)),
         ],
     )
