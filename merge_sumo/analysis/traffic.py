@@ -27,9 +27,10 @@ from merge_sumo.values.scenario import Dimension
 
 FOLDER: Final = Path(__file__).resolve().parent / "traffics"
 SUFFIX: Final = ".toml"
+LEAST_SD_MPS: Final = 0.01
+MOST_SD_MPS: Final = 100.0
 LEAST_INSIDE: Final = 0.01
 """Share of the speeds of a traffic that a pool has at least, or nothing is estimated."""
-
 Density = Annotated[float, Meta(gt=0.0, le=1000.0)]
 """Vehicles per kilometre of a lane; 1,000 would be cars of a metre, one behind the other."""
 
@@ -52,17 +53,17 @@ class SpeedsInPool:
 class NormalSpeeds(Record, frozen=True, tag_field="kind", tag="normal"):
     """A normal distribution of speeds, in m/s; `sd` is [low, high] where only a range is known."""
 
-    mean: Annotated[float, Meta(gt=0.0)]
+    mean: Annotated[float, Meta(gt=0.0, le=100.0)]
     # Bounds of a number beside a list are more than msgspec 0.22 can read: `check` has them.
     sd: float | tuple[float, float]
 
     def check(self) -> None:
-        """Raise `UserError` where `sd` is no number above 0, and no range of them."""
-        # A comparison with NaN is false.
-        rising = self._ends[0] > 0.0 and (len(self._ends) == 1 or self._ends[0] < self._ends[1])
-        if not (rising and math.isfinite(self._ends[-1])):
+        """Raise `UserError` where `sd` is no number within its bounds, and no range of them."""
+        low, high = LEAST_SD_MPS, MOST_SD_MPS
+        rises = len(self._ends) == 1 or self._ends[0] < self._ends[1]
+        if not (rises and all(low <= sd <= high for sd in self._ends)):
             stated = list(self.sd) if isinstance(self.sd, tuple) else self.sd
-            raise UserError(f"sd is {stated}: choose a number above 0, or [low, high]")
+            raise UserError(f"sd is {stated}: choose {low:g} to {high:g}, or [low, high]")
 
     @property
     def _ends(self) -> tuple[float, ...]:
@@ -99,8 +100,9 @@ class HistogramSpeeds(Record, frozen=True, tag_field="kind", tag="histogram"):
         if len(self.edges) != len(self.weights) + 1:
             count = len(self.weights)
             raise UserError(f"{count} weights of speeds need {count + 1} edges")
-        if self.edges[0] < 0.0 or (np.diff(self.edges) <= 0.0).any():
-            raise UserError("edges of speeds must rise, from 0 up")
+        rise = (np.diff(self.edges) > 0.0).all() and np.isfinite(self.edges).all()
+        if self.edges[0] < 0.0 or not rise:
+            raise UserError("edges of speeds must rise, from 0 up, and be finite")
         if not 0.0 < sum(self.weights) < math.inf:
             raise UserError("weights of speeds must be not all 0, and finite")
 
@@ -148,6 +150,12 @@ class Traffic(Record, frozen=True):
         if self.density_veh_per_km is None:
             raise UserError(f"{self.name} states no density: give one with --density, in veh/km")
         return self.density_veh_per_km / 1000.0
+
+    def checked(self) -> Traffic:
+        """Return the traffic; `UserError` where it was made of values that no file may have."""
+        traffic = convert(to_plain(self), Traffic)
+        traffic.speeds.check()
+        return traffic
 
     def with_density(self, density_veh_per_km: float | None) -> Traffic:
         """Return the traffic with another density; None is its own. `UserError` for no density."""
@@ -200,8 +208,6 @@ def named_traffic(name: str) -> Traffic:
 def _read(path: Path) -> Traffic:
     _, record = read_toml(path, "traffic")
     try:
-        traffic = convert({"name": path.stem, **record}, Traffic)
-        traffic.speeds.check()
+        return convert({"name": path.stem, **record}, Traffic).checked()
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    return traffic

@@ -912,7 +912,7 @@ def failures_per_merge(
     """
     check_keywords("failures_per_merge", given, RerunKeywords)
     before = _opened(run).run
-    on_road = traffic if isinstance(traffic, Traffic) else named_traffic(str(traffic))
+    on_road = traffic.checked() if isinstance(traffic, Traffic) else named_traffic(str(traffic))
     on_road = on_road.with_density(density_veh_per_km)
     target = before.folder / per_merge.RESULT if out is None else Path(out)
     fields, runner = given_again(None, given, {"vut": before.vut})

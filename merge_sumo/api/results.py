@@ -530,9 +530,10 @@ class PerMergeResult(Result):
         if not self.criterion.is_papers:
             lines.append(f"  a case fails when {self.criterion.words}")
         for level, one in found.levels.items():
-            lines.append(f"  level {level_name(level)}: {_per_merge(one)}")
             parts = [part for part in found.parts if part.level == level]
-            lines += [f"    {_part_line(part)}" for part in parts]
+            rests_on = f", {_counts(parts[0])}" if len(parts) == 1 else ""
+            lines.append(f"  level {level_name(level)}: {_per_merge(one)}{rests_on}")
+            lines += [f"    {_part_line(part)}" for part in parts if len(parts) > 1]
         lines.append(f"  {found.counted}")
         if found.without_verdict:
             lines.append(
@@ -558,18 +559,21 @@ def _per_merge(one: OverMixtures) -> str:
 
 
 def _part_line(part: Part) -> str:
-    """Return what a part rests on."""
+    """Return the failures per merge of a part, and what they rest on."""
     names = []
     if part.svo_rad is not None:
         low, high = np.degrees(part.svo_rad)
         names.append(f"psi {low:.0f} to {high:.0f} degrees")
     if part.speed_sd_mps is not None:
         names.append(f"sd {part.speed_sd_mps:g} m/s")
+    interval = f"{part.failures_per_merge:.3g} [{part.low:.3g}, {part.high:.3g}]"
+    return f"{', '.join(names)}: {interval}, {_counts(part)}"
+
+
+def _counts(part: Part) -> str:
+    """Return what a part rests on."""
     one = part.estimate
-    return (
-        f"{', '.join(names) or 'all'}: {part.failures_per_merge:.3g} [{part.low:.3g}, "
-        f"{part.high:.3g}], {counted(one.failures, 'failure')} in {counted(one.cases, 'case')}"
-    )
+    return f"{counted(one.failures, 'failure')} in {counted(one.cases, 'case')}"
 
 
 class PolicyChecks(Result, dict[str, "PolicyCheck"]):

@@ -147,8 +147,8 @@ class FailuresPerMerge:
         (x_low, x_high), (v_low, v_high) = self.x_m, self.v_mps
         cars = _range((min(p.cars for p in self.parts), max(p.cars for p in self.parts)), ".2g")
         return (
-            f"counted: the {cars} mainline cars per merge that start in the pool, from {x_low:g} "
-            f"to {x_high:g} m at {v_low:g} to {v_high:g} m/s; not counted: cars that start "
+            f"counted per merge: {cars} mainline cars, those that start in the pool, from "
+            f"{x_low:g} to {x_high:g} m at {v_low:g} to {v_high:g} m/s; not counted: cars that start "
             f"elsewhere or at other speeds, as {_range(self.outside, '.0%')} of this traffic"
         )
 

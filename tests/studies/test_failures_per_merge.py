@@ -170,6 +170,15 @@ class TestTheParts:
         assert "\n" not in str(error.value)
 
 
+def bins(edges: str, weights: str) -> dict[str, str]:
+    """Return what makes a file one with a histogram."""
+    return {
+        '"normal"': '"histogram"',
+        "mean = 25.1": f"edges = {edges}",
+        "sd = [2.6, 3.1]": f"weights = {weights}",
+    }
+
+
 PUBLISHED = {"exid-2": (5.7, 23.3), "exid-3": (4.9, 21.5), "exid-5": (8.7, 25.1)}
 
 
@@ -225,9 +234,17 @@ class TestATraffic:
             ({"mean = 25.1": "mean = nan"}, "mean is nan"),
             ({"sd = [2.6, 3.1]": "sd = [3.1, 2.6]"}, r"sd is \[3.1, 2.6\]"),
             ({"sd = [2.6, 3.1]": "sd = 0"}, "sd is 0"),
+            ({"sd = [2.6, 3.1]": "sd = 1e-320"}, "sd is 1e-320"),
+            ({"mean = 25.1": "mean = 1e308"}, r"mean is 1e\+308"),
             ({"sd = [2.6, 3.1]": "sd = nan"}, "sd is nan"),
             ({"sd = [2.6, 3.1]": "sd = [2.6, 2.8, 3.1]"}, "sd is"),
             ({'"normal"': '"beta"'}, "'beta'"),
+            (bins("[20, 25, 30]", "[1]"), "1 weights of speeds need 2 edges"),
+            (bins("[20, nan]", "[1]"), "must rise"),
+            (bins("[20, inf]", "[1]"), "must rise"),
+            (bins("[30, 20]", "[1]"), "must rise"),
+            (bins("[20, 30]", "[0]"), "not all 0"),
+            (bins("[20, 30]", "[-1]"), "weights"),
             ({"source": "# source"}, "no source"),
             ({"[speeds]": "[speeds"}, "is no TOML"),
         ],
@@ -241,6 +258,11 @@ class TestATraffic:
         with pytest.raises(UserError, match=says) as error:
             named_traffic(str(tmp_path / "mine.toml"))
         assert "\n" not in str(error.value)
+
+    @pytest.mark.parametrize("speeds", [NormalSpeeds(mean=26.0, sd=-1.0), ALONE])
+    def test_of_python_is_checked_as_a_file(self, campaign, speeds):
+        with pytest.raises(UserError, match=r"sd is -1\.0|source is ''"):
+            ms.failures_per_merge(campaign.folder, Traffic(source="", speeds=speeds))
 
     @pytest.mark.parametrize("density", [0.0, -1.0, float("nan"), 1e9])
     def test_has_no_such_density(self, density):
@@ -296,9 +318,9 @@ class TestOfACampaign:
         assert "arXiv 2303.11531" in said
         assert "per kilometre" not in said
         assert (
-            "counted: the 0.71 to 0.72 mainline cars per merge that start in the pool, from -340 "
-            "to -180 m at 25 to 35 m/s; not counted: cars that start elsewhere or at other speeds, "
-            "as 48% to 49% of this traffic" in said
+            "counted per merge: 0.71 to 0.72 mainline cars, those that start in the pool, from "
+            "-340 to -180 m at 25 to 35 m/s; not counted: cars that start elsewhere or at other "
+            "speeds, as 48% to 49% of this traffic" in said
         )
 
     def test_grow_with_the_density(self):
