@@ -148,8 +148,9 @@ class FailuresPerMerge:
         cars = _range((min(p.cars for p in self.parts), max(p.cars for p in self.parts)), ".2g")
         return (
             f"counted per merge: {cars} mainline cars, those that start in the pool, from "
-            f"{x_low:g} to {x_high:g} m at {v_low:g} to {v_high:g} m/s; not counted: cars that start "
-            f"elsewhere or at other speeds, as {_range(self.outside, '.0%')} of this traffic"
+            f"{x_low:g} to {x_high:g} m at {v_low:g} to {v_high:g} m/s; not counted: cars "
+            "that start elsewhere or at other speeds, as "
+            f"{_range(self.outside, '.0%')} of this traffic"
         )
 
     def to_record(self) -> dict[str, Any]:
