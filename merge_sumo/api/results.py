@@ -119,7 +119,7 @@ class CampaignRun(Result):
 
     @property
     def timeouts(self) -> Table:
-        """The cases in which the VUT never reached the merge point."""
+        """The cases in which the VUT never merged."""
         return Table(o for o in self._run.outcomes if o.measures.end is End.TIMEOUT)
 
     @cached_property
@@ -157,7 +157,7 @@ class CampaignRun(Result):
 
     @property
     def passed(self) -> bool:
-        """Whether the VUT reached the merge point in some case, and no gate is met."""
+        """Whether the VUT merged in some case, and no gate is met."""
         return self.verdict.tested > 0 and not any(gate.met for gate in self.gates)
 
     @property

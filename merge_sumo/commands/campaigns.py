@@ -73,8 +73,8 @@ def campaign(
 
     Ctrl-C lets the running batch end and says how to go on; twice stops at once.
 
-    Exit code 1 when a --gate is met, and always when the VUT reached the merge point in no case:
-    then nothing was tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
+    Exit code 1 when a --gate is met, and always when the VUT merged in no case: then
+    nothing was tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
     """
@@ -202,7 +202,7 @@ def rerun(
 
     Exit code 1 when it is worse than what was recorded, as in compare-runs: at some level the share
     of cases with an error, with an error or a timeout, or the failure mode coverage (FMC) grew by
-    more than the tolerance, or it reached the merge point in no case.
+    more than the tolerance, or it merged in no case.
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2
     """
@@ -348,7 +348,7 @@ def compare_runs(
     The failures, errors and timeouts of each campaign are run again with the other's VUT. Exit
     code 1 when B is worse at some level: when one of these grew by more than the tolerance, the
     share of cases with an error, the share of cases with an error or a timeout, or the failure
-    mode coverage (FMC); and whenever B reached the merge point in no case of its campaign.
+    mode coverage (FMC); and whenever B merged in no case of its campaign.
 
     Example:  merge-sumo compare-runs runs/design1 runs/design2 --out changes.html
     """

@@ -22,9 +22,10 @@ from merge_sumo.campaigns.store import Run
 from merge_sumo.reports.motion import verdict_of
 from merge_sumo.reports.report import REPORT, write_report
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.values.scenario import US23
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.scenario import US23, as_merge, lane_of
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.values.trajectory import End, Trajectory
 
 TRIALS = Path(__file__).parents[2] / "tools" / "trial_vuts.py"
 OWN = {
@@ -34,18 +35,35 @@ OWN = {
     "Startled": "return -4.0 if abs(seen.x_pov_m - seen.x_vut_m) < 12.0 else 1.0",
     "Stops": "return -3.0",
     "Sways": "return 1.5 if int(seen.t_s) % 2 else -1.0",
+    "Seeks": "return 0.5, abs(seen.x_pov_m - seen.x_vut_m) > 6.5",
+    "Waits": "return 0.7 if seen.x_vut_m < -20.0 else -0.4, seen.x_pov_m > seen.x_vut_m + 5.0",
 }
 """Controllers of the tests, by what `act` returns."""
 VUTS = (
     *("level0", "level1", "level2", "design1", "design2", "careful", "reg157"),
     *("sumo:Krauss", "sumo:IDM", "sumo:EIDM"),
     *(f"trial:{name}" for name in ("Idm", "Hysteresis", "Delayed", "Rss", "Courteous", "Table")),
-    *(f"own:{name}" for name in OWN),
+    *(f"own:{name}" for name in OWN if name not in ("Seeks", "Waits")),
+    *("lane:design2", "lane:level0", "lane:Seeks", "stop:Waits"),
 )
 CONTESTED = replace(US23, name="contested", x_pov0_m=(-290.0, -230.0), v_pov0_mps=(27.0, 33.0))
 """US-23 with starts that make for encounters."""
+CONTESTED_LANE = replace(
+    as_merge(named_scenario("us23-lane")),
+    name="contested-lane",
+    x_pov0_m=CONTESTED.x_pov0_m,
+    v_pov0_mps=CONTESTED.v_pov0_mps,
+    follow_up_s=0.0,
+)
+"""The same with an acceleration lane, judged by the motion that is recorded."""
+ON_LANE = {
+    "lane": CONTESTED_LANE,
+    "stop": replace(CONTESTED_LANE, name="contested-stop", lane_end="stop"),
+}
+"""Scenarios with a lane, by the kind of a controller."""
 LENGTH_M, NEAR_M, DT_S, REACTION_S, BRAKED_MPS = 5.0, 6.0, 0.1, 0.75, 1.0
 NUMBER = r"(-?\d+(?:\.\d+)?)"
+PLACE = "(?:M|the merge)"
 
 
 def spec_of(vut: str, folder: Path) -> str:
@@ -53,8 +71,8 @@ def spec_of(vut: str, folder: Path) -> str:
     kind, _, name = vut.partition(":")
     if kind == "trial":
         return f"{TRIALS}:{name}"
-    if kind != "own":
-        return vut
+    if name not in OWN:
+        return name if kind in ON_LANE else vut
     file = folder / f"{name.lower()}.py"
     file.write_text(f"class {name}:\n    def act(self, seen):\n        {OWN[name]}\n")
     return f"{file}:{name}"
@@ -69,7 +87,9 @@ class Told:
         self.dx, self.end_s = x_pov - x_vut, (len(self.vut) - 1) * DT_S
         self.gap = abs(self.dx) - LENGTH_M
         self.closing = v_vut - v_pov if self.dx >= 0.0 else v_pov - v_vut
-        self.arrived = x_vut >= 0.0
+        self.lane_m = lane_of(trajectory.case.scenario)
+        self.place_m = x_vut if self.lane_m else 0.0
+        self.arrived = trajectory.end is End.MERGED if self.lane_m else x_vut >= 0.0
 
     @staticmethod
     def braking_s(rows: Sequence[Sequence[float]]) -> float | None:
@@ -99,7 +119,7 @@ class Told:
         return "accelerates" if self.gains(rows) else "keeps its speed within 1 m/s"
 
     def way_out_s(self) -> float | None:
-        """Return the last time from which full braking or acceleration keeps 6 m at M."""
+        """Return the last time from which full braking or acceleration keeps 6 m at the merge."""
         return max((s for s in range(len(self.vut) - 1) if self._keeps(s)), default=None)
 
     def _keeps(self, start: int) -> bool:
@@ -107,7 +127,7 @@ class Told:
             x, v = self.vut[start][:2]
             for step in range(start + 1, start + 301):
                 x, v = x + v * DT_S, max(v + a * DT_S, 0.0)
-                if x >= 0.0:
+                if x >= self.place_m:
                     over = max(step - len(self.pov) + 1, 0)
                     x_pov, v_pov, _ = self.pov[min(step, len(self.pov) - 1)]
                     if abs(x_pov + over * v_pov * DT_S - x) >= NEAR_M:
@@ -177,6 +197,27 @@ def check_arrival(told: Told, at: str, first: str, ahead: str) -> None:
     assert first == ("VUT" if told.dx < 0.0 else "POV")
 
 
+def check_merge(told: Told, at: str, where: str, first: str, ahead: str) -> None:
+    assert told.lane_m is not None
+    check_arrival(told, at, first, ahead)
+    check_place(told, where)
+
+
+def check_place(told: Told, where: str) -> None:
+    """Check where on the lane a merge is said to be."""
+    begin_m, end_m = told.lane_m or (0.0, 0.0)
+    share = (told.place_m - begin_m) / (end_m - begin_m)
+    assert share >= 0.0
+    assert (where == "where the lane ends") == (share >= 1.0)
+    if found := re.search(NUMBER, where):
+        near(found.group(), 100.0 * share, 0)
+
+
+def check_stood(told: Told, seconds: str) -> None:
+    assert told.lane_m is not None
+    near(seconds, DT_S * sum(x >= told.lane_m[0] and v < 0.1 for x, v, _ in told.vut))
+
+
 def check_braking_after(told: Told, mps2: str) -> None:
     room = told.gap - told.closing * REACTION_S
     assert told.closing > 0.0
@@ -219,13 +260,18 @@ CHECKS: dict[str, Callable[..., None]] = {
     r"(Contact|Conflict|Harsh|Safe)(?: \(([^)]+)\))?\.": check_severity,
     rf"The VUT reaches M at {NUMBER} s; the front bumper of the (VUT|POV) is {NUMBER} m ahead\.":
         check_arrival,
-    rf"The car behind has to brake at {NUMBER} m/s² after M\.": check_braking_after,
-    r"The car behind has to brake at less than 0\.1 m/s² after M\.": check_hardly_braking,
+    rf"The car behind has to brake at {NUMBER} m/s² after {PLACE}\.": check_braking_after,
+    rf"The car behind has to brake at less than 0\.1 m/s² after {PLACE}\.": check_hardly_braking,
     r"The VUT (.+), the POV (.+)\.": check_conduct,
-    rf"Full braking or full acceleration of the VUT would have kept 6 m at M until {NUMBER} s\.":
-        check_way_out,
+    rf"Full braking or full acceleration of the VUT would have kept 6 m at (?:M|this place) until "
+    rf"{NUMBER} s\.": check_way_out,
+    r"Neither full braking nor full acceleration of the VUT would ever have kept 6 m at this "
+    r"place\.": check_no_way_out,
+    rf"The VUT merges at {NUMBER} s, (after \d+ % of the lane|where the lane ends); the front "
+    rf"bumper of the (VUT|POV) is {NUMBER} m ahead\.": check_merge,
+    rf"The VUT stood on the lane for {NUMBER} s\.": check_stood,
     r"There never was a way out for the VUT\.": check_no_way_out,
-    rf"Timeout: the VUT did not reach the merge point in {NUMBER} s\.": check_timeout,
+    rf"Timeout: the VUT did not reach the (?:merge point|mainline) in {NUMBER} s\.": check_timeout,
     rf"Bodies touch at a relative speed of {NUMBER} m/s\.": check_impact,
     r"Bodies overlap before M, where the lanes run together\.": of_another_test,
     r"In the VUT's place .+ would have avoided it\.": of_another_test,
@@ -236,7 +282,9 @@ CHECKS: dict[str, Callable[..., None]] = {
 """The sentences of the case view, and what checks their numbers and words."""
 
 
-@pytest.fixture(scope="module", params=some(VUTS, "design2", "trial:Delayed", "own:Startled"))
+@pytest.fixture(
+    scope="module", params=some(VUTS, "design2", "trial:Delayed", "own:Startled", "stop:Waits")
+)
 def campaign(request, tmp_path_factory) -> Run:
     folder = tmp_path_factory.mktemp("sentences")
     settings = CampaignSettings(
@@ -246,7 +294,8 @@ def campaign(request, tmp_path_factory) -> Run:
         cases=90,
         batch=90,
         seed=11,
-        scenario=CONTESTED,
+        scenario=ON_LANE.get(request.param.partition(":")[0], CONTESTED),
+        fail_when="paper",
     )
     run = run_campaign(settings, folder / "run")
     write_report(run)
@@ -272,13 +321,17 @@ class TestWhatIsSaid:
             told = Told(trajectory := campaign.trajectory(outcome.index))
             found = re.fullmatch(
                 rf"MERGED at {NUMBER} s, (contact|conflict|harsh|safe)"
-                rf"(?: at a relative speed of {NUMBER} m/s)?: the front bumper of the (VUT|POV) is "
-                rf"{NUMBER} m ahead at M(?: \(([^:]+): .+\))?",
+                rf"(?: at a relative speed of {NUMBER} m/s)?: (?:the VUT merges (.+), )?"
+                rf"the front bumper of the (VUT|POV) is {NUMBER} m ahead at {PLACE}"
+                r"(?: \(([^:]+): .+\))?",
                 verdict_of(outcome, trajectory),
             )
             assert found is not None
-            at, word, impact, first, ahead, kind = found.groups()
+            at, word, impact, where, first, ahead, kind = found.groups()
             check_arrival(told, at, first, ahead)
+            assert (where is None) == (told.lane_m is None)
+            if where is not None:
+                check_place(told, where)
             check_severity(told, word.capitalize(), kind)
             assert (impact is None) == (word != "contact")
 
