@@ -238,6 +238,7 @@ def lane_road(tmp_path):
     def find(name: str) -> tuple[Corridor, MergeScenario]:
         if name == "us23-lane":
             scenario = named_scenario(name)
+            assert isinstance(scenario, MergeScenario)
             return road_for(scenario), scenario
         return lane_corridor_of(name, tmp_path), replace(US23, lane_m=LANE_M)
 
