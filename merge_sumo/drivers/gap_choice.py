@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
-from merge_sumo.drivers.lane import acc_mps2
+from merge_sumo.drivers.lane import acc_mps2, stopping_mps
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case, FloatArray
@@ -87,7 +87,7 @@ class GapChoiceVut(Level0Vut):
         self._wishes = np.where(merges, MERGE, np.where(on_lane, STAY, NO_WISH)).astype(np.int8)
         answer = super().act(scene)
         stays = on_lane & ~merges
-        stopping = self._stopping_mps(end_m - END_MARGIN_M - next_m[VUT])
+        stopping = stopping_mps(end_m - END_MARGIN_M - next_m[VUT], self.choice.brake_mps2)
         slower = np.minimum(answer, (stopping - scene.v_vut_mps) / DT_S)
         answer = np.where(stays, slower, answer)
         if scene.merged is not None:
@@ -113,16 +113,6 @@ class GapChoiceVut(Level0Vut):
         )
         gap: NDArray[np.bool_] = enough.all(axis=0)
         return gap
-
-    def _stopping_mps(self, room_m: FloatArray) -> FloatArray:
-        """Return the highest speeds from which the VUT stops within distances, (K,).
-
-        By eq. (4) braking at b from a speed v takes v^2 / (2 b) + v dt / 2.
-        """
-        brake = self.choice.brake_mps2
-        half = 0.5 * brake * DT_S
-        speed: FloatArray = np.sqrt(half**2 + 2.0 * brake * np.maximum(room_m, 0.0)) - half
-        return speed
 
     def _following_mps2(self, scene: Scene) -> FloatArray:
         """Return the acceleration of ACC behind the car ahead, (K,)."""

@@ -95,6 +95,16 @@ def follow_mps2(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> Float
     return idm_mps2(gap_m, v_mps[VUT], v_mps[leader, places], v_desired)
 
 
+def stopping_mps(room_m: FloatArray, brake_mps2: float) -> FloatArray:
+    """Return the highest speeds from which a vehicle still stops within distances, (K,).
+
+    By eq. (4) braking at b from a speed v takes v^2 / (2 b) + v dt / 2.
+    """
+    half = 0.5 * brake_mps2 * DT_S
+    speed: FloatArray = np.sqrt(half**2 + 2.0 * brake_mps2 * np.maximum(room_m, 0.0)) - half
+    return speed
+
+
 class LanePov(Driver):
     """Drives cars of the mainline beside an acceleration lane by a driver that knows a merge at M.
 
@@ -208,7 +218,8 @@ class Merging:
             answer[VUT] = np.where(self.driven_for, followed, answer[VUT])
         if self._stops:
             grants = self._wishes & (next_m >= self.begin_m)
-            most = (self._stopping_mps(next_m, v_mps[VUT]) - v_mps[VUT]) / DT_S
+            stopping = stopping_mps(self.end_m - END_MARGIN_M - next_m, -self._scenario.a_min_mps2)
+            most = (stopping - v_mps[VUT]) / DT_S
             answer[VUT] = np.where(self.merged | grants, answer[VUT], np.minimum(answer[VUT], most))
 
     def step(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.bool_]:
@@ -217,14 +228,3 @@ class Merging:
         granted = self._wishes & (next_m >= self.begin_m)
         self.merged = self.merged | granted | (next_m >= self.end_m)
         return self.merged
-
-    def _stopping_mps(self, next_m: FloatArray, v_mps: FloatArray) -> FloatArray:
-        """Return the highest next speed from which a VUT can still stop before the lane's end.
-
-        By eq. (4) braking at b from a speed v takes v^2 / (2 b) + v dt / 2.
-        """
-        b_mps2 = -self._scenario.a_min_mps2
-        room_m = np.maximum(self.end_m - END_MARGIN_M - next_m, 0.0)
-        half = 0.5 * b_mps2 * DT_S
-        speed: FloatArray = np.sqrt(half**2 + 2.0 * b_mps2 * room_m) - half
-        return speed

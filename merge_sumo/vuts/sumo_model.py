@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
+from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import FloatArray
@@ -107,15 +108,30 @@ class SumoVut(Driver):
         """
         super().__init__(corridors)
         self.world, self._rows = world, list(rows)
+        self._chooses = world.road.lane_m is not None and self._rows == [VUT]
+        self._merges = np.zeros(world.corridors, dtype=np.bool_)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the accelerations to the speeds that SUMO decided on."""
         v_mps = self.world.v_mps[self._rows].ravel()
-        acceleration: FloatArray = (self.world.wanted_v_mps(self._rows) - v_mps) / DT_S
+        wanted_mps = self.world.wanted_v_mps(self._rows)
+        if self._chooses:
+            self._merges = self.world.wants_to_merge()
+            stays = ~self._merges if scene.merged is None else ~(self._merges | scene.merged)
+            wanted_mps = np.where(stays, np.minimum(wanted_mps, self._stopping_mps()), wanted_mps)
+        acceleration: FloatArray = (wanted_mps - v_mps) / DT_S
         return acceleration
 
     def wishes(self) -> NDArray[np.int8] | None:
         """Return whether SUMO's lane-change model merged, (K,); None without a lane."""
-        if self.world.road.lane_m is None or self._rows != [VUT]:
-            return None
-        return np.where(self.world.wants_to_merge(), MERGE, STAY).astype(np.int8)
+        return np.where(self._merges, MERGE, STAY).astype(np.int8) if self._chooses else None
+
+    def _stopping_mps(self) -> FloatArray:
+        """Return the highest speeds from which VUTs stop before the end of their lane, (K,).
+
+        In a step SUMO moves by the new speed and eq. (4) by the old one, so a driver that brakes at
+        the last moment would come a little beyond the end.
+        """
+        _, end_m = self.world.road.lane_m or (0.0, 0.0)
+        next_m = self.world.x_m[VUT] + self.world.v_mps[VUT] * DT_S
+        return stopping_mps(end_m - END_MARGIN_M - next_m, -self.world.scenario.a_min_mps2)
