@@ -68,6 +68,7 @@ class ShadowSumo:
         merged: whether the VUT has left the acceleration lane of a road with one.
         wants_to_merge: whether SUMO has put the VUT beside that lane in its last step.
         was_forced: whether the VUT came to the end of that lane in it, and was moved beside it.
+        by_sumo: whether SUMO's own driver chose the speed of the VUT in it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -81,7 +82,7 @@ class ShadowSumo:
         self._options = [*files, *SUMO_OPTIONS]
         self._started = False
         self.at_m: dict[str, float] = {}
-        self.merged = self.wants_to_merge = self.was_forced = False
+        self.merged = self.wants_to_merge = self.was_forced = self.by_sumo = False
         on_ramp = {piece.lane for piece in self.road.ramp.pieces}
         self._beside = {piece.lane for piece in self.road.mainline.pieces} - on_ramp
         """Lanes of the mainline alone; on those beside an acceleration lane a VUT has merged."""
@@ -162,10 +163,14 @@ class ShadowSumo:
         self.at_m = {name: x_m for name, x_m in self.at_m.items() if name in left}
         if NAME_OF_VUT not in self.at_m:
             return None
+        vehicle = self._libsumo.vehicle
+        v_mps = float(vehicle.getSpeed(NAME_OF_VUT))
         self.was_forced = self.has_lane and NAME_OF_VUT in forced
-        lane = self._libsumo.vehicle.getLaneID(NAME_OF_VUT)
+        lane = vehicle.getLaneID(NAME_OF_VUT)
         self.wants_to_merge = self.has_lane and not self.was_forced and lane in self._beside
-        return float(self._libsumo.vehicle.getSpeed(NAME_OF_VUT))
+        own_mps = vehicle.getSpeedWithoutTraCI(NAME_OF_VUT)
+        self.by_sumo = bool(own_mps == v_mps) and not self.was_forced
+        return v_mps
 
     def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
         """Put the vehicles that are on the road into their states.

@@ -126,6 +126,20 @@ while traci.simulation.getMinExpectedNumber() > 0:
 
 
 @pytest.mark.slow
+def test_sumos_car_following_stands_before_the_end_of_a_lane_that_it_may_not_leave(tmp_path):
+    source = """
+while traci.simulation.getMinExpectedNumber() > 0:
+    traci.simulationStep()
+    if "vut" in traci.vehicle.getIDList():
+        traci.vehicle.setSpeed("vut", -1)
+"""
+    (trajectory,) = drive(tmp_path, source, cases=1)
+    assert trajectory.end is End.TIMEOUT
+    assert trajectory.x_vut_m[-1] == pytest.approx(129.5, abs=0.3)
+    assert trajectory.v_vut_mps[-1] == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.slow
 def test_sumo_checks_the_gap_in_mode_512_and_not_in_mode_0(tmp_path):
     source = (
         DRIVES

@@ -101,7 +101,7 @@ def _serve(channel: Channel, sumo: ShadowSumo) -> None:
             else:
                 first, merged = message["do"] == "enter", message["merged"]
                 answer = {"v_mps": client.show(message["states"], first=first, merged=merged)}
-                answer["merge"] = sumo.wants_to_merge
+                answer |= {"merge": sumo.wants_to_merge, "by_sumo": sumo.by_sumo}
         except FaultError as fault:
             answer = {"fault": str(fault), "gone": fault.gone, "late": fault.late}
         except ClosedError:

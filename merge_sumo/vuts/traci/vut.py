@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
+from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.binding import scratch_folder
@@ -31,7 +32,7 @@ from merge_sumo.sumo.child import ChildDiedError, SumoChild
 from merge_sumo.sumo.shadow_sumo import write_files
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
+from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.vuts.base import Vut, VutOptions
 from merge_sumo.vuts.process import TOKEN_VARIABLE, Program, split_command
 from merge_sumo.vuts.traci import server
@@ -82,6 +83,7 @@ class TraciVut(Driver):
         super().__init__(corridors)
         self._port, self._command, self._options = port, command, options
         self._shadow = Shadow(road, scenario)
+        self._lane_m, self._brake_mps2 = lane_of(scenario), -scenario.a_min_mps2
         self._door: Door | None = None
         self._program: Program | None = None
         self._client: socket.socket | None = None
@@ -153,6 +155,10 @@ class TraciVut(Driver):
         wanted_mps = answer["v_mps"]
         if wanted_mps is None:  # it is beyond the end of the net: it keeps its speed
             return 0.0
+        if self._lane_m is not None and not (merged or answer["merge"]) and answer["by_sumo"]:
+            # As `SumoVut` does: by eq. (4) SUMO's driver would come a little beyond the lane's end.
+            room_m = self._lane_m[1] - END_MARGIN_M - (x_m[VUT] + v_mps[VUT] * DT_S)
+            wanted_mps = min(wanted_mps, float(stopping_mps(np.array(room_m), self._brake_mps2)))
         acceleration_mps2 = (wanted_mps - v_mps[VUT]) / DT_S
         if not math.isfinite(acceleration_mps2):
             raise FaultError(f"the controller asked for an acceleration of {acceleration_mps2}")
