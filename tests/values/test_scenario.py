@@ -216,7 +216,7 @@ def test_a_campaign_of_the_paper_is_recorded_with_all_numbers(run):
     assert run.scenario == US23
 
 
-@pytest.mark.parametrize("name", some(SIX, "curved", "OpenDRIVE"))
+@pytest.mark.parametrize("name", some(SIX, "curved", "lane drop", "OpenDRIVE"))
 def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
     build, mainline, ramp = FOREIGN[name]
     net, file = build(tmp_path), tmp_path / "mine.toml"
@@ -224,7 +224,7 @@ def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
     made = invoke("scenario", "new", file, "--net", net, *edges)
     assert made.exit_code == 0, made.output
     assert made.stdout.splitlines()[0] == f"net: {net.name}"
-    assert "\nright of way: " in made.stdout
+    assert "\nkind: " in made.stdout
     assert b"<svg" in (tmp_path / "mine.svg").read_bytes()
     again = invoke("scenario", "new", file, "--net", net, *edges)
     assert isinstance(again.exception, UserError)
