@@ -135,7 +135,7 @@ class Traffic(Record, frozen=True):
         source: where the figures are from.
         speeds: of the cars of the lane beside the ramp, in m/s.
         density_veh_per_km: cars per kilometre of that lane, before the ramp meets it; None where
-            nobody has measured it.
+            the source has none.
         name: name of its file.
     """
 

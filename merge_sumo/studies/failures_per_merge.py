@@ -10,7 +10,7 @@ each car is judged by itself. The pool's uniform x is natural as it is, and v is
 the number of cars that start in the pool, times their P(fail), whose interval is that of
 `stratified.py`.
 
-Nobody has measured how common levels and orientations are. N is linear in their shares, so over
+How common levels and orientations are on a road is not known. N is linear in their shares, so over
 all mixtures it lies between the least and the most of the levels and of `PSI_PARTS` equal ranges
 of psi; where the traffic states a range of its standard deviation, of both ends of it, too.
 """
