@@ -51,6 +51,10 @@ def without(text: str, phrases: tuple[str, ...]) -> str:
     return text
 
 
+def test_the_page_is_the_same_when_written_again(made, page):
+    assert report_page(Run(made.folder)) == page
+
+
 class TestSentences:
     def test_call_no_merge_by_m_on_a_lane(self, made, page):
         text = text_of(page)
