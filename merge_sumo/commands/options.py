@@ -116,7 +116,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "follow_up": option(
         float | None,
         None,
-        "Time for which both drive on after M, with measures of its own.",
+        "Time for which both drive on after the merge, with measures of its own.",
         metavar="SECONDS",
         show_default="the scenario's, 0",
     ),
@@ -184,7 +184,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "fail_when": option(
         str | None,
         None,
-        "What counts as a failure: {criteria} (paper: front bumpers within 6 m at M), or a "
+        "What counts as a failure: {criteria} (paper: front bumpers within 6 m at the merge), or a "
         "condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
         metavar="EXPR",
         show_default="the scenario's, paper in merges",

@@ -90,8 +90,9 @@ class Criterion:
             return
         spoken = _names(self.words)
         if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
+            where = scenario.said("behind M")
             raise UserError(
-                f"--fail-when speaks of {min(named)}, which is measured behind M: say how long "
+                f"--fail-when speaks of {min(named)}, which is measured {where}: say how long "
                 "with --follow-up SECONDS"
             )
         if lane_of(scenario) is None and (named := spoken.intersection(ON_LANE)):
