@@ -20,6 +20,7 @@ import argparse
 from collections.abc import Sequence
 
 import numpy as np
+from bench_record import add_record_option, append_record
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
@@ -75,7 +76,9 @@ def idm(
     return idm_mps2(gap_m, v, v_leader, v_desired)
 
 
-def _print_regret(cases: Sequence[Case], lane_m: Bounds) -> None:
+def regrets(cases: Sequence[Case], lane_m: Bounds) -> dict[str, float]:
+    """Return the mean regret by the place of the merge in m, and print it with its spread."""
+    means = {}
     k, reward = len(cases), Reward.of(US23)
     starts = np.array([[x for start in case.starts() for x in start] for case in cases])
     print(f"POV-1, {k} cases; VUT: level 0, merges at")
@@ -90,14 +93,19 @@ def _print_regret(cases: Sequence[Case], lane_m: Bounds) -> None:
         best = best_response(Game("pov", None, reward), shifted)
         got, kept = (parts.of("pov", np.zeros(k)) for parts in (reached, unmoved))
         regret = (best - got) / (best - kept).mean()
+        means[f"{place_m:.0f}"] = float(regret.mean())
         crash = -reward.weights.crash / 2
         print(
             f"{place_m:7.0f} {regret.mean():12.1%} {np.quantile(regret, 0.99):12.1%}"
             f"{reached.collided.mean():13.1%} {(best < crash).mean():13.1%}"
         )
 
+    return means
 
-def _print_braking(cases: Sequence[Case]) -> None:
+
+def hard_braking(cases: Sequence[Case]) -> dict[str, int]:
+    """Return after how many easy merges cars brake hard, by the way they follow, and print it."""
+    found = {}
     print("followers   merges that need at most 1 m/s2   harder than 3 m/s2 after them")
     for name, follow in (("ACC", acc_mps2), ("IDM", idm)):
         pov = LanePov(Level0Pov(len(cases)), follow)
@@ -105,6 +113,8 @@ def _print_braking(cases: Sequence[Case]) -> None:
         easy = [one for one in merges if 0.0 < brake_after_mps2(one) <= 1.0]
         hard = [one for one in easy if one.after is not None and one.after[:, 0, 2].min() < -3.0]
         print(f"{name:9} {len(easy):12} {len(hard):12}")
+        found[name] = len(hard)
+    return found
 
 
 def main() -> None:
@@ -112,13 +122,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
+    add_record_option(parser)
     arguments = parser.parse_args()
     scenario = as_merge(named_scenario("us23-lane"))
     assert scenario.lane_m is not None, "a lane"  # noqa: S101
     points = np.random.default_rng(arguments.seed).random((arguments.cases, 2))
     cases = from_unit(points, 1, scenario=scenario)
-    _print_regret(cases, scenario.lane_m)
-    _print_braking(cases)
+    regret, hard = regrets(cases, scenario.lane_m), hard_braking(cases)
+    append_record(arguments.record, "lane", {"mean_regret": regret, "braked_hard": hard})
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ REAR_HEADWAY_S: Final = (2.0, 2.7)
 
 
 @dataclass(frozen=True, slots=True)
-class Merging:
+class MergeStatistics:
     """Merges of some cases from an acceleration lane.
 
     Attributes:
@@ -87,14 +87,14 @@ class Merging:
         return f"; it stood on the lane in {counted(self.stood, 'case')}" if self.stood else ""
 
 
-def merging_of(outcomes: Iterable[Outcome]) -> Merging | None:
+def merging_of(outcomes: Iterable[Outcome]) -> MergeStatistics | None:
     """Return what is found of merges; None without cases, and where there is no lane."""
     ran = list(outcomes)
     if not ran or lane_of(ran[0].case.scenario) is None:
         return None
     placed = [(share, o.failed) for o in ran if (share := o.measures.lane_share) is not None]
     shares = [share for share, _ in placed]
-    return Merging(
+    return MergeStatistics(
         cases=len(ran),
         merges=len(placed),
         lane_share=_median(shares),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.analysis.merging import Merging, merging_of, merging_record
+from merge_sumo.analysis.merging import MergeStatistics, merging_of, merging_record
 from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
@@ -138,7 +138,7 @@ class CampaignRun(Result):
         return summarise(self._run.outcomes, self._run.levels)
 
     @cached_property
-    def merging(self) -> Merging | None:
+    def merging(self) -> MergeStatistics | None:
         """Where on an acceleration lane the VUT merges, and by which gaps; None without a lane."""
         return merging_of(self._run.outcomes)
 

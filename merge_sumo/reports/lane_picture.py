@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.analysis.merging import BINS, SITES, Merging
+from merge_sumo.analysis.merging import BINS, SITES, MergeStatistics
 from merge_sumo.values.scenario import Bounds
 
 LEFT: Final = 40.0
@@ -44,7 +44,7 @@ class LanePicture:
     people: list[Mark]
 
 
-def picture_of(found: Merging, lane_m: Bounds) -> LanePicture:
+def picture_of(found: MergeStatistics, lane_m: Bounds) -> LanePicture:
     """Return the histogram of merges from a lane that begins and ends at some coordinates."""
     pairs = list(zip(found.failing, found.others, strict=True))
     most = max(*map(sum, pairs), 1)

@@ -16,7 +16,7 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.diagnosis import Kind
-from merge_sumo.analysis.merging import SOURCE, Merging
+from merge_sumo.analysis.merging import SOURCE, MergeStatistics
 from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns.store import Run
 from merge_sumo.reports.lane_picture import picture_of
@@ -324,7 +324,7 @@ def _places_chart(history: History) -> Chart:
     return _version_chart("Place of the merge, median share of the lane", rows)
 
 
-def _place(found: Merging | None) -> float | None:
+def _place(found: MergeStatistics | None) -> float | None:
     """Return the median place; a merge where the lane ends is beyond it by the way of a step."""
     share = None if found is None else found.lane_share
     return None if share is None else min(share, 1.0)
@@ -403,7 +403,7 @@ def _merging_rows(history: History, level: int) -> list[tuple[str, list[str]]]:
     found = [version.merging.get(level) for version in history.versions]
     if not any(found):
         return []
-    rows: list[tuple[str, Callable[[Merging], str]]] = [
+    rows: list[tuple[str, Callable[[MergeStatistics], str]]] = [
         ("place of the merge, median", lambda one: _or_dash(one.lane_share, ".0%")),
         ("merges at the end of the lane", lambda one: str(one.forced)),
         ("stood on the lane", lambda one: str(one.stood)),

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.diagnosis import Kind, diagnose
-from merge_sumo.analysis.merging import Merging, merging_of
+from merge_sumo.analysis.merging import MergeStatistics, merging_of
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import severities_of
 from merge_sumo.analysis.verdict import Verdict, in_words, judge
@@ -89,7 +89,7 @@ class Version:
     sampler: str
     verdict: Verdict
     levels: dict[int, LevelOfVersion]
-    merging: dict[int | None, Merging]
+    merging: dict[int | None, MergeStatistics]
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""

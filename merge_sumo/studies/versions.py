@@ -17,7 +17,7 @@ from functools import partial
 from operator import itemgetter
 from typing import Any, Final
 
-from merge_sumo.analysis.merging import Merging, merging_of
+from merge_sumo.analysis.merging import MergeStatistics, merging_of
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.plan import resolve
@@ -218,7 +218,7 @@ class RunComparison(Result):
     cases: list[ComparedCase]
     evidence: str
     goal: str = US23.goal
-    merging: Mapping[str, Merging] = field(default_factory=dict)
+    merging: Mapping[str, MergeStatistics] = field(default_factory=dict)
 
     def worse(self, tolerance: float) -> list[str]:
         """Return in sentences why B is worse than A by more than the tolerance, if it is."""

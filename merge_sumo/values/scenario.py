@@ -410,7 +410,7 @@ class MergeScenario(Scenario):
         near = f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
         yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
         begin_m, end_m = self.lane_m or (0.0, 0.0)
-        around = "where the lane begins and ends: from x_vut0_m to 0, and more than 0"
+        around = "[begin, end] of the lane: begin from x_vut0_m to 0, end above 0"
         fits = self.lane_m is None or self.x_vut0_m <= begin_m <= 0.0 < end_m
         yield "lane_m", fits, around
         # No zero-argument super(): `slots` makes another class of this one.

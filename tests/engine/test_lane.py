@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from plans import plan_for
 from test_kinematic_simulator import uniform
 
@@ -167,6 +168,8 @@ class TestSumo:
         for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
             assert one.end is other.end is End.MERGED
             np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
+            assert one.after is not None
+            assert other.after is not None
             np.testing.assert_allclose(one.after, other.after, rtol=0.0, atol=1e-9)
 
     def test_has_the_vut_on_the_mainline_from_the_merge_on(self, late, monkeypatch):
@@ -175,7 +178,7 @@ class TestSumo:
         lanes: list[tuple[float, bool]] = []
         command = World.command
 
-        def noted(world: World, a_mps2: FloatArray, merged: FloatArray) -> None:
+        def noted(world: World, a_mps2: FloatArray, merged: NDArray[np.bool_]) -> None:
             command(world, a_mps2, merged)
             wants = world.wants_to_merge()
             active = world.x_m[VUT] > -100.0

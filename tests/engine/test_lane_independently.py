@@ -22,9 +22,10 @@ from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.case import Case, MergeCase, from_unit
 from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.scenario import as_merge
 from merge_sumo.values.trajectory import End
 
-ROAD = named_scenario("us23-lane")
+ROAD = as_merge(named_scenario("us23-lane"))
 BEGIN_M, END_M = -70.0, 130.0
 DT_S, LENGTH_M, A_MIN, A_MAX = 0.1, 5.0, -4.0, 2.0
 CRUISE_MPS = 28.0
@@ -127,7 +128,8 @@ class Pov:
             m = END_M if now.x_vut >= 0.0 else 0.0
             state = (now.x_pov - m, now.v_pov, now.x_vut - m, now.v_vut)
             svo = np.array([self.case.svo_rad]) if self.case.level == 2 else None
-            inputs = features(*(np.array([each]) for each in state), svo, scenario=ROAD)
+            x_pov, v_pov, x_vut, v_vut = (np.array([each]) for each in state)
+            inputs = features(x_pov, v_pov, x_vut, v_vut, svo, scenario=ROAD)
             values = NETWORKS[self.case.level].values(inputs)[0]
             self.held = float(actions_mps2(ROAD)[int(values.argmax())])
         return self.held
@@ -185,6 +187,7 @@ def test_an_episode_is_that_of_the_definition(name, level, count, tmp_path):
     cases: list[Case] = from_unit(points, level, scenario=ROAD)
     results = run_cases(plan_for(spec, scenario=ROAD, criterion=Criterion("unsafe")), cases)
     for case, result, verdict in zip(cases, results, results.verdicts(), strict=True):
+        assert isinstance(case, MergeCase)
         place, least_m, braking = simulate(case, VUTS[name]())
         measures = result.measures
         assert (result.trajectory.end is End.MERGED) == (place is not None)
