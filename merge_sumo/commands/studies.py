@@ -189,6 +189,7 @@ def probability(given: Given, run: RunArgument) -> None:
 
 
 @app.verb(
+    "failures-per-merge",
     options=("net", "policies", "pov", *HOSTING, "engine", *RUNNING, "trust_vut"),
     own={
         "density": option(
