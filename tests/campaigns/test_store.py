@@ -22,7 +22,7 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.measures import further_measures
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import FOLLOWED_UP, Measures, Outcome, measure
+from merge_sumo.values.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, measure
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -434,5 +434,6 @@ class TestARun:
 
 def test_every_measure_is_in_the_record():
     record = episode(0)[0].to_record()
-    elsewhere = {"nearest", "further", *FOLLOWED_UP}  # in traffic, and where there is a follow-up
+    # In traffic, where there is a follow-up, and on an acceleration lane.
+    elsewhere = {"nearest", "further", *FOLLOWED_UP, *ON_LANE}
     assert {field.name for field in fields(Measures)} - elsewhere <= set(record)

@@ -242,7 +242,7 @@ class TestOtherCommands:
     def test_vuts_lists_those_that_are_trained_there(self, call, same, one):
         assert "level1, level2, design1" in call("vuts", "--policies", same)[1]
         said = call("vuts", "--policies", one)[1]
-        assert "built in: level0, design1, design2, roundabout, careful, " in said
+        assert "built in: level0, design1, design2, gap, roundabout, careful, " in said
 
     def test_a_check_and_an_export_take_them(self, call, swapped, one):
         assert call("check-vut", "level1", "--policies", swapped)[0] == 0
