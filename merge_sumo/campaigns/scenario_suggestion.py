@@ -27,6 +27,8 @@ MARGIN: Final = 0.15
 """The pool reaches this far beyond the starts from which both vehicles meet at M."""
 SLOWEST: Final = 0.7
 """Of the speed limit: the mainline drives at least so fast."""
+SAME_M: Final = 0.05
+"""Coordinates that differ by less are written alike."""
 ROOM: Final = 0.98
 """Of the length of a path that is used."""
 BEFORE_GORE_M: Final = 50.0
@@ -154,8 +156,11 @@ def about(road: Corridor) -> list[str]:
     if road.is_one_path:
         return [*lines, f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"]
     if road.lane_m is not None and (lane := road.acceleration_lane) is not None:
+        begin_m, end_m = road.lane_m
         ends = f"from {lane.begin_m:.1f} m, the gore, to {lane.end_m:.1f} m"
-        share = -lane.begin_m / lane.length_m
+        if begin_m > lane.begin_m + SAME_M:
+            ends += f", used from {begin_m:.1f} m on"
+        share = -begin_m / (end_m - begin_m)
         return [
             *lines,
             f"acceleration lane: {' '.join(lane.lanes)}, {ends}",

@@ -148,7 +148,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         int | None,
         None,
         "Most cases that run or wait for a worker while the sampler is asked for more, instead of "
-        "batches: for controllers that take seconds for a case. About twice the workers.",
+        "batches: for controllers that take seconds for a case. About three times the workers.",
         metavar="N",
     ),
     "seed": option(int, 0, "Same seed, same outcomes."),
@@ -187,7 +187,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "What counts as a failure: {criteria} (paper: front bumpers within 6 m at the merge), or a "
         "condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
         metavar="EXPR",
-        show_default="the scenario's, paper in merges",
+        show_default="the scenario's: paper where M is a point, unsafe on a lane",
     ),
     "require": option(
         str | None,

@@ -171,7 +171,7 @@ def in_a_sentence(avoidances: Iterable[Avoidance]) -> str | None:
         f"{careful} of {len(known)} {plural} would have been avoided by a careful and competent "
         f"driver, {takeover} by the fuzzy safety model"
     )
-    if times:
+    if times and takeover:
         middle = times[math.floor((len(times) - 1) / 2)]
         sentence += f" (which may take over until {middle:.1f} s, in the median)"
     return f"{sentence}, and {pov} by a careful driver on the mainline."

@@ -143,7 +143,7 @@ def measure_ranges(scenario: Scenario, speeds: Speeds) -> dict[str, Range]:
         "gap_behind_m": Range(-length_m, inf),
         "time_gap_ahead_s": ANY,
         "time_gap_behind_s": ANY,
-        "stood_s": NOT_NEGATIVE,
+        "stood_s": Range(0.0, scenario.timeout_s + DT_S),
         **dict.fromkeys(further_measures(), ANY),
     }
 

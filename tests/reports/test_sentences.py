@@ -252,6 +252,11 @@ def check_impact(told: Told, mps: str) -> None:
     near(mps, abs(told.closing))
 
 
+def check_later(told: Told, mps: str) -> None:
+    assert told.gap > 0.0
+    check_impact(told, mps)
+
+
 def of_another_test(*_: object) -> None:
     """Accept what test_severity.py (before M) and test_avoidance.py (other drivers) check."""
 
@@ -273,6 +278,7 @@ CHECKS: dict[str, Callable[..., None]] = {
     r"There never was a way out for the VUT\.": check_no_way_out,
     rf"Timeout: the VUT did not reach the (?:merge point|mainline) in {NUMBER} s\.": check_timeout,
     rf"Bodies touch at a relative speed of {NUMBER} m/s\.": check_impact,
+    rf"Bodies touch after (?:M|the merge), at a relative speed of {NUMBER} m/s\.": check_later,
     r"Bodies overlap before M, where the lanes run together\.": of_another_test,
     r"In the VUT's place .+ would have avoided it\.": of_another_test,
     r"No reference driver in the VUT's place would have avoided it\.": of_another_test,

@@ -83,7 +83,7 @@ function words(i) {
     const first = cases.dx_m[i] < 0 ? "VUT" : met, kind = cases.kind[i] === null ? "" : ` (${data.kinds[cases.kind[i]]})`;
     if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}${kind}.`);
     parts.push(`The VUT ${LANE ? `merges at ${at}, ${placeOfMerge(i)}` : `reaches M at ${at}`}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx_m[i]), 1)} m ahead.`);
-    if (found === "contact") parts.push(`Bodies touch at a relative speed of ${fixed(cases.impact_speed_mps[i], 1)} m/s.`);
+    if (found === "contact") parts.push(`Bodies touch${cases.bumper_gap_m[i] > 0 ? ` after ${PLACE},` : ""} at a relative speed of ${fixed(cases.impact_speed_mps[i], 1)} m/s.`);
     else if (cases.brake_after_mps2[i] === null) parts.push("No braking of the car behind is in time.");
     else if (cases.brake_after_mps2[i] < 0.1) parts.push(`The car behind has to brake at less than 0.1 m/s² after ${PLACE}.`);
     else parts.push(`The car behind has to brake at ${fixed(cases.brake_after_mps2[i], 1)} m/s² after ${PLACE}.`);

@@ -164,6 +164,8 @@ class Session:
             effect, self._knows_of_the_lane = Effect.CARRIED_OUT, True
         if effect is Effect.CARRIED_OUT and mine:
             function, arguments = commands.call_of_command(functions, object_id, reader)
+            if function == "vehicle.changeLane":
+                self._check_lane(*arguments[:2])
             self.sumo.call(function, *arguments)
             return
         if effect is Effect.CARRIED_OUT and commands.OF_OTHERS.isdisjoint(functions):
@@ -175,6 +177,13 @@ class Session:
                 raise RefusedError("a mode is an integer")
             self.lane_change_mode = mode & LANE_CHANGE_BITS
         self._note(f"{name} is accepted and changes nothing here")
+
+    def _check_lane(self, name: str, index: object) -> None:
+        """Refuse a lane that the vehicle's edge does not have, as SUMO's server does."""
+        road = self.sumo.call("vehicle.getRoadID", name)
+        lanes = self.sumo.call("edge.getLaneNumber", road)
+        if not (isinstance(index, int) and 0 <= index < lanes):
+            raise RefusedError(f"No lane with index '{index}' on road '{road}'.")
 
     def _note(self, sentence: str) -> None:
         if sentence not in self.notes:
