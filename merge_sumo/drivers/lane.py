@@ -217,14 +217,17 @@ class Merging:
             followed = follow_mps2(x_m, v_mps, self._scenario)
             answer[VUT] = np.where(self.driven_for, followed, answer[VUT])
         if self._stops:
-            grants = self._wishes & (next_m >= self.begin_m)
             stopping = stopping_mps(self.end_m - END_MARGIN_M - next_m, -self._scenario.a_min_mps2)
             most = (stopping - v_mps[VUT]) / DT_S
-            answer[VUT] = np.where(self.merged | grants, answer[VUT], np.minimum(answer[VUT], most))
+            leaves = self.merged | self._granted(next_m)
+            answer[VUT] = np.where(leaves, answer[VUT], np.minimum(answer[VUT], most))
 
     def step(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.bool_]:
         """Return which VUTs are on the mainline after the next step of states, (A, K): (K,)."""
         next_m = x_m[VUT] + v_mps[VUT] * DT_S
-        granted = self._wishes & (next_m >= self.begin_m)
-        self.merged = self.merged | granted | (next_m >= self.end_m)
+        self.merged = self.merged | self._granted(next_m) | (next_m >= self.end_m)
         return self.merged
+
+    def _granted(self, next_m: FloatArray) -> NDArray[np.bool_]:
+        """Return whose wish is granted, (K,), by the next places of the VUTs, (K,)."""
+        return self._wishes & (next_m >= self.begin_m)

@@ -149,7 +149,7 @@ class FailuresPerMerge:
         return (
             f"counted per merge: {cars} mainline cars, those that start in the pool, from "
             f"{x_low:g} to {x_high:g} m at {v_low:g} to {v_high:g} m/s; not counted: cars "
-            "that start elsewhere or at other speeds, as "
+            "that start elsewhere, and those at other speeds, "
             f"{_range(self.outside, '.0%')} of this traffic"
         )
 

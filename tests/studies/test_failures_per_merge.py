@@ -319,8 +319,8 @@ class TestOfACampaign:
         assert "per kilometre" not in said
         assert (
             "counted per merge: 0.71 to 0.72 mainline cars, those that start in the pool, from "
-            "-340 to -180 m at 25 to 35 m/s; not counted: cars that start elsewhere or at other "
-            "speeds, as 48% to 49% of this traffic" in said
+            "-340 to -180 m at 25 to 35 m/s; not counted: cars that start elsewhere, and those "
+            "at other speeds, 48% to 49% of this traffic" in said
         )
 
     def test_grow_with_the_density(self):
