@@ -388,8 +388,9 @@ class TruthResult(Result):
         lines = []
         for level, truth in self.truths.items():
             lines.append(
-                f"{self.vut} at level {level_name(level)}: {len(truth.failures)} failures in "
-                f"{len(truth.score)} cases, FMC {fmc(truth.failures):.4f}"
+                f"{self.vut} at level {level_name(level)}: "
+                f"{counted(len(truth.failures), 'failure')} in "
+                f"{counted(len(truth.score), 'case')}, FMC {fmc(truth.failures):.4f}"
                 f"{_regions_of(truth)}{_engine_of(truth)}"
             )
             lines += [f"  {remark}" for remark in truth.remarks()]
@@ -402,14 +403,16 @@ def _regions_of(truth: Truth) -> str:
     """Return in words how many regions there are; "" where too few failures tell them."""
     if not truth.tells_regions:
         return ""
-    return f", {len(truth.real_regions())} regions with at least {REAL_REGION:.0%} of the failures"
+    regions = counted(len(truth.real_regions()), "region")
+    return f", {regions} with at least {REAL_REGION:.0%} of the failures"
 
 
 def _engine_of(truth: Truth) -> str:
     """Return in words which cases SUMO did not run; "" where it ran all."""
     if truth.in_sumo == len(truth.score):
         return ""
-    return f"; by the equations of motion, and {truth.in_sumo} cases in SUMO as well, all alike"
+    cases = counted(truth.in_sumo, "case")
+    return f"; by the equations of motion, and {cases} in SUMO as well, all alike"
 
 
 @dataclass(frozen=True, repr=False)

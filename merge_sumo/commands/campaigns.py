@@ -221,9 +221,9 @@ def rerun(
                 f"look at one: merge-sumo run --case {quoted(run)} {one.index} "
                 f"--vut {quoted(result.vut)} --gui"
             )
-        show(f"it is {'worse' if why else 'not worse'}, with a tolerance of {tolerance:g}")
+        show(f"it is {result.compared.judgement(tolerance)} (A is what was recorded, B is now)")
         for sentence in why:
-            show(f"  {sentence} (A is what was recorded, B is now)")
+            show(f"  {sentence}")
     raise typer.Exit(1 if why else 0)
 
 
@@ -367,8 +367,7 @@ def compare_runs(
         _print_comparison(compared, runs)
         alone = sum(level.changes["not run again"] for level in compared.levels.values())
         known = f"; {alone} failure{'s'[: alone > 1]} ran with one of them alone" if alone else ""
-        worse = "worse" if why else "not worse"
-        show(f"B is {worse} than A, with a tolerance of {tolerance:g}{known}")
+        show(f"B is {compared.judgement(tolerance)}{known}")
         for sentence in why:
             show(f"  {sentence}")
         if out is not None:

@@ -132,7 +132,7 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
             "pov_brakes": found.pov_brakes_s,
             "vut_accelerates": int(found.vut_accelerates),
             "pov_accelerates": int(found.pov_accelerates),
-            "kind": None if found.kind is None else kinds.index(found.kind),
+            "kind": kinds.index(facts.kinds[o.index]) if o.index in facts.kinds else None,
             "offset": offsets.get(o.index, 0),
             "rows": len(facts.motion[o.index].motion) if o.index in facts.motion else 0,
         }

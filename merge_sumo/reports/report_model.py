@@ -90,8 +90,11 @@ class ReportModel:
             for o in self.shown
             if o.index in self.motion
         }
+        failed = {o.index for o in self.worst}
         self.kinds: dict[int, Kind] = {
-            index: found.kind for index, found in self.diagnoses.items() if found.kind is not None
+            index: found.kind
+            for index, found in self.diagnoses.items()
+            if found.kind is not None and index in failed
         }
         self.boxes = [
             box

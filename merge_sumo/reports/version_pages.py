@@ -156,7 +156,7 @@ def comparison_page(
         runs=runs,
         compared=compared,
         why=compared.worse(tolerance),
-        tolerance=f"{tolerance:g}",
+        tolerance=tolerance,
         counts=_counts(compared),
         changes=list(Change),
         # What broke lies on top.

@@ -228,6 +228,17 @@ class RunComparison(Result):
             for reason in change.worse(level, tolerance, self.goal)
         ]
 
+    def judgement(self, tolerance: float) -> str:
+        """Return whether B is worse than A, by what, and how many cases broke all the same."""
+        if self.worse(tolerance):
+            return f"worse than A, with a tolerance of {tolerance:g}"
+        broke = sum(case.change is Change.BROKE for case in self.cases)
+        broken = f"; {counted(broke, 'case')} broke all the same" if broke else ""
+        return (
+            "not worse than A: FMC and the share of cases without a verdict grow at no level by "
+            f"more than {tolerance:g}{broken}"
+        )
+
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
         cases = [
