@@ -11,7 +11,6 @@ The file of a folder which somebody sent is data as everything in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
