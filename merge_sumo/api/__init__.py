@@ -1102,6 +1102,7 @@ def train(
     seed: int = 0,
     scenario: Scenario | AnyPath | None = None,
     out: AnyPath | None = None,
+    a_min: float | None = None,
     check: bool = False,
     cases: int = 300,
     progress: bool | None = None,
@@ -1113,6 +1114,8 @@ def train(
         seed: same seed, same weights on one machine.
         scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
         out: folder; by default that of the shipped policies, for "us23" only.
+        a_min: hardest braking of the POVs in m/s2, below 0; by default that of the scenario, which
+            is always that of the VUTs.
         check: train nothing, and measure the regret of the networks in the folder.
         cases: random cases of such a check.
         progress: show progress; by default in a notebook and on a terminal.
@@ -1144,6 +1147,7 @@ def train(
             train_library(
                 *(folder, names, seed),
                 scenario=played,
+                a_min_mps2=a_min,
                 on_progress=bars.progressed,
                 on_done=bars.done,
             )

@@ -14,7 +14,7 @@ from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.stopping import StoppingRule
 from merge_sumo.campaigns.store import SETTINGS, scenario_of
 from merge_sumo.campaigns.transfer import hashes, lessons
-from merge_sumo.drivers.policies import policies_in
+from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
@@ -234,7 +234,7 @@ def _is_text(text: str) -> bool:
 
 def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
-    folder = None if settings.policies is None else str(plan.povs.policies)
+    folder = None if settings.policies is None else policies_name(plan.povs.policies)
     return {
         **asdict(settings),
         "scenario": settings.scenario.to_record(),

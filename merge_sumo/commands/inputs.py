@@ -136,6 +136,13 @@ def check_scenario(
             "Folder to write.",
             show_default="the shipped policies, for us23 only",
         ),
+        "a_min": option(
+            float | None,
+            None,
+            "Hardest braking of the POVs in m/s2, below 0, such as -2.",
+            "--a-min",
+            show_default="that of the scenario",
+        ),
         "check": option(
             bool,
             False,

@@ -101,8 +101,9 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "policies": option(
         Path | None,
         None,
-        "Folder of learned drivers, as `train --out DIR` makes it, instead of the shipped ones.",
-        metavar="DIR",
+        "Folder of learned drivers, as `train --out DIR` makes it, or a shipped library such as "
+        "human, instead of the default ones.",
+        metavar="NAME|DIR",
     ),
     "scenario": option(
         str,

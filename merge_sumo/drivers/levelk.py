@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Final
 
@@ -46,6 +47,8 @@ MANY_ROWS: Final = 40
 SINGLE_ERROR: Final = 1e-3
 """A lead of the best action, as a share of 1 + max |Q|, that float32 cannot turn round. Of 200,000
 states for each of the eight shipped networks the largest error is 1e-5."""
+LIMIT: Final = "a_min_mps2"
+"""Name of the tensor, (1,), with the hardest braking that a network chooses, where it has one."""
 _HORIZON_S: Final = 20.0
 _GAP_SCALES_M: Final = (80.0, 25.0, 8.0)
 
@@ -151,11 +154,17 @@ def prospects(
 class QNetwork:
     """A multilayer perceptron with rectified units that gives Q of every action.
 
-    `layers` are pairs of weights (outputs, inputs) and biases (outputs,).
+    `layers` are pairs of weights (outputs, inputs) and biases (outputs,). `a_min_mps2` is the
+    hardest braking that its driver chooses; None for that of the scenario.
     """
 
-    def __init__(self, layers: Sequence[tuple[FloatArray, FloatArray]]) -> None:
-        """Take the layers, as float64."""
+    def __init__(
+        self,
+        layers: Sequence[tuple[FloatArray, FloatArray]],
+        a_min_mps2: float | None = None,
+    ) -> None:
+        """Take the layers, as float64, and the limit of braking."""
+        self.a_min_mps2 = a_min_mps2
         self.layers = [
             (np.ascontiguousarray(weight, dtype=np.float64), np.asarray(bias, dtype=np.float64))
             for weight, bias in layers
@@ -163,9 +172,22 @@ class QNetwork:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, FloatArray]) -> QNetwork:
-        """Return the network whose tensors are named 0.weight, 0.bias, 1.weight, ..."""
+        """Return the network whose tensors are named 0.weight, 0.bias, 1.weight, ...
+
+        The limit of braking, if the network has one, is a tensor of one number.
+        """
         count = len(tensors) // 2
-        return cls([(tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(count)])
+        layers = [(tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(count)]
+        return cls(layers, float(tensors[LIMIT].item()) if LIMIT in tensors else None)
+
+    def limited(self, scenario: Scenario) -> Scenario:
+        """Return the scenario with the network's limit of braking, if that is the lower one.
+
+        Its observations and its actions are those of this scenario.
+        """
+        if self.a_min_mps2 is None or self.a_min_mps2 <= scenario.a_min_mps2:
+            return scenario
+        return replace(scenario, a_min_mps2=self.a_min_mps2)
 
     @property
     def sees_svo(self) -> bool:
@@ -260,6 +282,8 @@ class LevelKDriver(Driver):
         self._held = np.zeros(corridors)
         """Accelerations, (K,); NaN where the action values of the last decision were not finite."""
         self._scenarios: list[Scenario] = [US23]
+        self._limited: list[Scenario] = [network.limited(US23)]
+        """The same scenarios with the network's limit of braking."""
         self._scenario = np.zeros(corridors, dtype=np.int64)
         """Which of them is a corridor's; a campaign has one."""
         self._last: tuple[Scenario, int] = US23, 0
@@ -271,6 +295,7 @@ class LevelKDriver(Driver):
         if case.scenario is not self._last[0]:  # to compare scenarios takes a while
             if case.scenario not in self._scenarios:
                 self._scenarios.append(case.scenario)
+                self._limited.append(self.network.limited(case.scenario))
             self._last = case.scenario, self._scenarios.index(case.scenario)
         self._scenario[corridor] = self._last[1]
 
@@ -279,7 +304,7 @@ class LevelKDriver(Driver):
         due = np.flatnonzero((scene.step % DECISION_STEPS == 0) & scene.active)
         if not due.size:
             return self._held
-        for number, scenario in enumerate(self._scenarios):
+        for number, scenario in enumerate(self._limited):
             mine = due[self._scenario[due] == number]
             if mine.size:
                 self._decide(mine, scene, scenario)

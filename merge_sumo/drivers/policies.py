@@ -34,19 +34,42 @@ MOST_BYTES: Final = 1 << 26
 """No network and no manifest is larger."""
 
 
+HUMAN: Final = "human"
+"""Shipped library for `us23` in which no POV brakes harder than people did: it is used by name."""
+
+
 def policies_of(scenario: Scenario) -> Path:
     """Return the shipped policies for a scenario: those of its name, else those of the paper's."""
-    shipped = resource("policies")
-    by_name = {manifest.parent.name: manifest.parent for manifest in shipped.glob(f"*/{MANIFEST}")}
-    return by_name.get(scenario.name, shipped)
+    by_name = {name: folder for name, folder in _shipped().items() if name != HUMAN}
+    return by_name.get(scenario.name, resource("policies"))
+
+
+def _shipped() -> dict[str, Path]:
+    """Return the shipped libraries besides the paper's, by name."""
+    manifests = resource("policies").glob(f"*/{MANIFEST}")
+    return {manifest.parent.name: manifest.parent for manifest in manifests}
+
+
+def policies_name(folder: Path) -> str:
+    """Return the name of a shipped library, which any installation knows, else the whole path."""
+    return folder.name if folder in _shipped().values() else str(folder)
 
 
 def policies_in(folder: str | Path) -> Path:
     """Return where the policies are that a person or a record names, as a whole path.
 
-    Raises `UserError` where there are none.
+    That is a folder, or the name of a shipped library. Raises `UserError` where there are none, or
+    where a folder here has the name of a shipped library.
     """
+    shipped = _shipped().get(str(folder))
     try:
+        if shipped is not None:
+            if (Path(folder) / MANIFEST).is_file() and Path(folder).resolve() != shipped.resolve():
+                raise UserError(
+                    f"--policies: {folder} is a shipped library and a folder here: name the folder "
+                    "by its whole path, or another folder to run in"
+                )
+            return shipped
         if (Path(folder) / MANIFEST).is_file():
             return Path(folder).resolve()
         what = "has no manifest" if Path(folder).is_dir() else "is no folder"
@@ -54,7 +77,7 @@ def policies_in(folder: str | Path) -> Path:
         what = f"cannot be read ({getattr(error, 'strerror', None) or error})"
     raise UserError(
         f"--policies: {folder} {what}: name a folder of policies, such as `merge-sumo train --out "
-        "DIR` makes"
+        f"DIR` makes, or a shipped library: {', '.join(sorted(_shipped()))}"
     )
 
 
@@ -153,6 +176,8 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
         inputs, outputs = network.layers[0][0].shape[1], network.layers[-1][0].shape[0]
         if not network.is_finite:
             raise ValueError("a weight is NaN, infinite or beyond float32")
+        if network.a_min_mps2 is not None and not -20.0 <= network.a_min_mps2 < 0.0:
+            raise ValueError("its limit of braking is not from -20 to below 0 m/s2")
         if not np.isfinite(network.values(np.zeros((1, inputs)))).all():
             raise ValueError("its action values are not finite")
     except (SafetensorError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:

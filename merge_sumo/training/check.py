@@ -154,7 +154,8 @@ def check_network(
 
     reached, collided = returns(network)
     unmoved, _ = returns(level0)
-    best = best_returns(Game(role, opponent, reward), network, cases, svo_rad)
+    game = Game(role, opponent, reward, network.a_min_mps2)
+    best = best_returns(game, network, cases, svo_rad)
     if opponent is not None:
         # The driver's own games are some that a search may find.
         best = np.maximum(best, reached)

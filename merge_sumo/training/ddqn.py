@@ -161,9 +161,9 @@ def train(
                 torch._foreach_lerp_(averages, weights, s.polyak)
             update += 1
             if on_progress and update % 1000 == 0:
-                fit = float(loss.detach())
-                on_progress(Progress(update, fit, *collector.recent(), export(target)))
-    return export(target)
+                fit, now = float(loss.detach()), export(target, game.a_min_mps2)
+                on_progress(Progress(update, fit, *collector.recent(), now))
+    return export(target, game.a_min_mps2)
 
 
 class _Collector:
@@ -191,7 +191,7 @@ class _Collector:
     def collect(self, online: nn.Sequential, epsilon: float, replay: Replay) -> None:
         """Take one decision in every game, a random one with probability epsilon."""
         games = self.game.corridors
-        before = features(*self.state.T, scenario=self.game.scenario)
+        before = features(*self.state.T, scenario=self.game.of_agent)
         seen = before
         if self.sees_svo:
             seen = np.column_stack([before, *_svo_columns(self.svo_rad)])
@@ -201,7 +201,7 @@ class _Collector:
         action = np.where(self.rng.random(games) < epsilon, random, action)
         state, parts, over = self.game.decide(self.game.actions_mps2[action])
         in_parts = np.stack([parts.safe, parts.pov_ego, parts.vut_ego], axis=1)
-        after = features(*state.T, scenario=self.game.scenario)
+        after = features(*state.T, scenario=self.game.of_agent)
         replay.add(before, action, in_parts, after, ~over)
         self.returns += parts.of(self.game.role, self.svo_rad)
         self.decisions += 1
@@ -267,14 +267,15 @@ def make_network(inputs: int, width: int) -> nn.Sequential:
     )
 
 
-def export(network: nn.Sequential) -> QNetwork:
-    """Return a torch network as one that acts in numpy."""
+def export(network: nn.Sequential, a_min_mps2: float | None = None) -> QNetwork:
+    """Return a torch network as one that acts in numpy, with its limit of braking."""
     linear = [layer for layer in network if isinstance(layer, nn.Linear)]
     return QNetwork(
         [
             (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
             for layer in linear
-        ]
+        ],
+        a_min_mps2,
     )
 
 

@@ -11,6 +11,7 @@ actions 0 to 6 are accelerations of -4 to +2 m/s2. `scenario=` plays another sce
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Final, Literal
 
 import gymnasium
@@ -43,15 +44,26 @@ class MergeGame:
     """K games in the corridors of one SUMO world, each advanced by decisions of 0.5 s."""
 
     def __init__(
-        self, role: Role, opponent: Driver, reward: Reward, road: Corridor | None = None
+        self,
+        role: Role,
+        opponent: Driver,
+        reward: Reward,
+        road: Corridor | None = None,
+        a_min_mps2: float | None = None,
     ) -> None:
         """Open a world with as many corridors as the opponent drives in.
 
         The reward says which scenario is played; its road is the shipped one where none is given.
+        `a_min_mps2` is the hardest braking of the agent, by default that of the scenario.
         """
         self.role, self.opponent, self.reward = role, opponent, reward
         self.scenario = as_merge(reward.scenario)
-        self.actions_mps2 = actions_mps2(self.scenario)
+        self.a_min_mps2 = a_min_mps2
+        self.of_agent = (
+            self.scenario if a_min_mps2 is None else replace(self.scenario, a_min_mps2=a_min_mps2)
+        )
+        """The scenario with the agent's limit of braking."""
+        self.actions_mps2 = actions_mps2(self.of_agent)
         self.max_decisions = self.scenario.max_steps // DECISION_STEPS
         self.corridors = opponent.corridors
         self.world = World(self.corridors, road, scenario=self.scenario)

@@ -46,6 +46,7 @@ class Game:
     role: Role  # "pov" or "vut"
     opponent: QNetwork | None  # the network of level k-1, or None for the level-0 driver
     reward: Reward  # of the scenario that is played
+    a_min_mps2: float | None = None  # hardest braking of the agent; None for the scenario's
 
     @property
     def scenario(self) -> Scenario:
@@ -54,8 +55,10 @@ class Game:
 
     @property
     def actions_mps2(self) -> FloatArray:
-        """The accelerations that a driver chooses from."""
-        return actions_mps2(self.scenario)
+        """The accelerations that the agent chooses from."""
+        if self.a_min_mps2 is None:
+            return actions_mps2(self.scenario)
+        return actions_mps2(replace(self.scenario, a_min_mps2=self.a_min_mps2))
 
     @property
     def max_decisions(self) -> int:
@@ -134,7 +137,8 @@ class Game:
         if self.opponent is None:
             return None
         answer = greedy(self.opponent, self.scenario)(state, svo_rad)
-        return np.asarray(self.actions_mps2[answer], dtype=np.float64)
+        choices = actions_mps2(self.opponent.limited(self.scenario))
+        return np.asarray(choices[answer], dtype=np.float64)
 
     def _level0_answer(self, v_vut_mps: FloatArray) -> FloatArray:
         """Return the level-0 opponent's acceleration at a step, (n,)."""
@@ -160,4 +164,4 @@ def inputs_of(
     """Return what a network sees of states, (n, 4), and of psi, (n,), if it has one."""
     psi = svo_rad if network.sees_svo else None
     x_pov, v_pov, x_vut, v_vut = state.T
-    return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=scenario)
+    return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=network.limited(scenario))

@@ -20,9 +20,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from safetensors.numpy import save
 
-from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
+from merge_sumo.drivers.levelk import LIMIT, LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import (
     MANIFEST,
     NETWORKS,
@@ -117,6 +118,7 @@ class _Task:
     road: Corridor
     seed: int
     settings: TrainingSettings
+    a_min_mps2: float | None
 
 
 def train_library(
@@ -127,6 +129,7 @@ def train_library(
     settings: TrainingSettings | None = None,
     *,
     scenario: Scenario,
+    a_min_mps2: float | None = None,
     on_progress: Callable[[TrainingProgress], None] | None = None,
     on_done: Callable[[str, PolicyCheck | None], None] | None = None,
 ) -> None:
@@ -134,18 +137,27 @@ def train_library(
 
     A network that the folder's manifest already has with the same scenario, seed, weights,
     settings and opponent is not trained again, so an interrupted training goes on with what is not
-    finished. Next to each network lies a log, `<name>.training.jsonl`. Raises `UserError` when the
-    scenario has no road, an opponent is missing or of another scenario, the folder has such a
-    network of another plan, or the folder cannot be written or holds something else.
+    finished. Next to each network lies a log, `<name>.training.jsonl`. `a_min_mps2` is the hardest
+    braking of the POVs; the VUTs keep the scenario's limit. Raises `UserError` when the limit is
+    not one of the scenario, the scenario has no road, an opponent is missing or of another
+    scenario, the folder has such a network of another plan, or the folder cannot be written or
+    holds something else.
     """
     scenario = of_two(scenario)
+    if a_min_mps2 is not None and not scenario.a_min_mps2 <= a_min_mps2 < 0.0:
+        raise UserError(
+            f"the hardest braking of a POV is {a_min_mps2:g} m/s2: choose a number from "
+            f"{scenario.a_min_mps2:g} to below 0, such as --a-min {scenario.a_min_mps2 / 2:g}"
+        )
     reward = Reward(weights or RewardWeights.of(scenario), scenario)
     road = road_for(scenario)
     _take(folder)
     for level, pair in enumerate(PAIRS, start=1):
         of_level = settings or LEVEL_SETTINGS[level]
         plans = {
-            name: _plan(folder, name, seed, reward, of_level) for name in pair if name in names
+            name: _plan(folder, name, seed, reward, of_level, a_min_mps2)
+            for name in pair
+            if name in names
         }
         tasks = []
         for name, plan in plans.items():
@@ -158,7 +170,8 @@ def train_library(
                     )
                 role, opponent = OPPONENTS[name]
                 network = None if opponent == "level0" else load_network(opponent, folder)
-                tasks.append(_Task(name, role, network, reward, road, seed, of_level))
+                limit = plan.get(LIMIT)
+                tasks.append(_Task(name, role, network, reward, road, seed, of_level, limit))
             elif on_done is not None:
                 on_done(name, None)
         for trained, network, check, seconds in _train_in_parallel(folder, tasks, on_progress):
@@ -192,15 +205,22 @@ def _take(folder: Path) -> None:
 def _is_of(known: dict[str, Any], plan: dict[str, Any]) -> bool:
     """Return whether the entry of a manifest, perhaps empty, follows a plan."""
     others = plan.keys() - {"scenario"}
-    same = all(known.get(key) == plan[key] for key in others)
+    same = all(known.get(key) == plan.get(key) for key in {*others, LIMIT})
     return same and plays_as(scenario_of(known), scenario_of(plan))
 
 
 def _plan(
-    folder: Path, name: str, seed: int, reward: Reward, settings: TrainingSettings
+    folder: Path,
+    name: str,
+    seed: int,
+    reward: Reward,
+    settings: TrainingSettings,
+    a_min_mps2: float | None,
 ) -> dict[str, Any]:
-    """Return everything that decides the weights of a network."""
+    """Return everything that decides the weights of a network; a POV may brake less."""
     role, opponent = OPPONENTS[name]
+    limit = a_min_mps2 if role == "pov" else None
+    of_limit = "" if a_min_mps2 is None else f" --a-min {a_min_mps2:g}"
     scenario = reward.scenario
     of_scenario = "" if plays_as(scenario, US23) else f" --scenario {quoted(scenario.name)}"
     opponent_sha256 = None
@@ -215,7 +235,7 @@ def _plan(
             )
         opponent_sha256 = entry["sha256"]
     return {
-        "command": f"merge-sumo train --only {name} --seed {seed}{of_scenario}",
+        "command": f"merge-sumo train --only {name} --seed {seed}{of_scenario}{of_limit}",
         "scenario": scenario_record(scenario),
         "role": role,
         "opponent": opponent,
@@ -223,6 +243,7 @@ def _plan(
         "seed": seed,
         "reward_weights": asdict(reward.weights),
         "settings": asdict(settings),
+        **({} if limit is None else {LIMIT: limit}),
     }
 
 
@@ -294,7 +315,7 @@ def _report_into(reports: Any) -> None:
 def _train_one(task: _Task) -> _Trained:
     """Train a network by DDQN in SUMO, refine it, check it in SUMO."""
     sees_svo = task.name == "pov2"
-    played_out = Game(task.role, task.opponent, task.reward)
+    played_out = Game(task.role, task.opponent, task.reward, task.a_min_mps2)
     regret = QuickRegret(played_out, sees_svo=sees_svo)
     ddqn, refinement = task.settings.ddqn, task.settings.refine
 
@@ -312,7 +333,7 @@ def _train_one(task: _Task) -> _Trained:
         opponent = make_opponent(task.role, "level0", GAMES)
     else:
         opponent = LevelKDriver(GAMES, task.opponent)
-    game = MergeGame(task.role, opponent, task.reward, task.road)
+    game = MergeGame(task.role, opponent, task.reward, task.road, task.a_min_mps2)
     try:
         report = reporter("ddqn", ddqn.updates)
         network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=report)
@@ -329,13 +350,15 @@ def _keep(
     folder: Path, name: str, network: QNetwork, entry: dict[str, Any], check: PolicyCheck
 ) -> None:
     """Write a network, then its entry in the manifest."""
-    content = save(
-        {
-            f"{i}.{part}": tensor.astype("float32")
-            for i, layer in enumerate(network.layers)
-            for part, tensor in zip(("weight", "bias"), layer, strict=True)
-        }
-    )
+    tensors = {
+        f"{i}.{part}": tensor.astype("float32")
+        for i, layer in enumerate(network.layers)
+        for part, tensor in zip(("weight", "bias"), layer, strict=True)
+    }
+    if network.a_min_mps2 is not None:
+        # In the file, so that its hash covers the limit, too.
+        tensors[LIMIT] = np.array([network.a_min_mps2])
+    content = save(tensors)
     replace_own(folder / f"{name}{WEIGHTS}", content)
     packages = ("torch", "numpy", "libsumo")
     known = {

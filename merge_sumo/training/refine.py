@@ -121,7 +121,7 @@ def refine(
             hard = tried.hard
             rounds = [*rounds, _label(game, network, tried, rng, s)][-s.kept_rounds :]
             cost = _fit(model, average, optimiser, rounds, rng, s, number)
-            network = export(average)
+            network = export(average, game.a_min_mps2)
             if on_progress is not None:
                 on_progress(Progress(number + 1, cost, tried.mean_return, None, network))
     return network

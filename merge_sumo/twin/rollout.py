@@ -189,13 +189,14 @@ class TwinRollout:
             of = np.flatnonzero(levels == level)
             if not len(of):
                 continue
+            limited = network.limited(self._scenario)
             seen = feature_columns(
                 x_m[:, of].ravel(),
                 v_mps[:, of].ravel(),
                 np.tile(x_vut_m[of], cars),
                 np.tile(v_vut_mps[of], cars),
                 np.tile(svo_rad[of], cars) if network.sees_svo else None,
-                scenario=self._scenario,
+                scenario=limited,
             )
             chosen = network.values_at_once(np.array(seen).T).argmax(axis=1)
-            held_mps2[:, of] = actions_mps2(self._scenario)[chosen].reshape(cars, -1)
+            held_mps2[:, of] = actions_mps2(limited)[chosen].reshape(cars, -1)

@@ -57,6 +57,11 @@ def export_onnx(
         raise UserError(f"there is no policy {name!r}: choose one of {', '.join(NETWORKS)}")
     check_new_file(path)
     network = load_network(name, folder)
+    if network.a_min_mps2 is not None:
+        raise UserError(
+            f"{name} chooses from accelerations of its own, down to {network.a_min_mps2:g} m/s2, "
+            "which an ONNX file does not say: export a policy without a limit of braking"
+        )
     played = scenario or scenario_of(read_manifest(folder)[name])
     graph = _Graph(helper, numpy_helper)
     # Typed as anything: what `features` takes for arrays are columns that record.

@@ -14,7 +14,13 @@ from plans import POVS
 
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
-from merge_sumo.drivers.levelk import FEATURES, QNetwork, actions_mps2, features
+from merge_sumo.drivers.levelk import (
+    FEATURES,
+    LevelKDriver,
+    QNetwork,
+    actions_mps2,
+    features,
+)
 from merge_sumo.drivers.policies import NETWORKS, load_driver, load_network, read_manifest
 from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
@@ -206,6 +212,42 @@ class TestOtherScenarios:
         unscaled = best - game.play(start, psi, greedy(network, US23))
         assert scaled.mean() < 0.02
         assert unscaled.mean() > 5.0 * scaled.mean()
+
+
+class TestALimitOfBraking:
+    """A network whose driver brakes by 2 m/s2 at most, and drives beside others."""
+
+    LAYERS = (  # weights (actions, features) and biases
+        (np.zeros((7, FEATURES)), np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])),
+    )
+    """Always the hardest braking."""
+
+    def test_is_that_of_its_actions_and_observations_unless_the_scenario_s_is_lower(self):
+        limited = QNetwork(self.LAYERS, -2.0)
+        assert actions_mps2(limited.limited(US23)).tolist() == [-2, -1.5, -1, -0.5, 0, 1, 2]
+        assert limited.limited(dataclasses.replace(US23, a_min_mps2=-1.5)).a_min_mps2 == -1.5
+        assert QNetwork(self.LAYERS).limited(US23) is US23
+        # The gap at M of a POV that brakes for the 8.125 s of a VUT at 22.4 m/s: columns 13 to 15.
+        at = [np.array([v]) for v in (-273.0, 33.0, -182.0, 22.4)]
+        whole, half = (features(*at, scenario=s)[0] for s in (US23, limited.limited(US23)))
+        assert np.flatnonzero(whole != half).tolist() == [13, 14, 15]
+
+    def test_holds_in_a_simulation_in_which_the_vut_brakes_harder(self):
+        corridors, case = 2, from_unit(np.array([[0.5, 0.5]]), 1, scenario=US23)[0]
+        with World(corridors, scenario=US23) as world:
+            pov = LevelKDriver(corridors, QNetwork(self.LAYERS, -2.0))
+            vut = LevelKDriver(corridors, QNetwork(self.LAYERS))
+            (_, found), *_ = rollout(world, pov, vut, [case])
+        assert found.a_pov_mps2[:10].tolist() == [-2.0] * 10
+        assert found.a_vut_mps2[:10].tolist() == [-4.0] * 10
+
+    def test_counts_for_the_agent_of_a_game_alone(self):
+        brakes = QNetwork(self.LAYERS)
+        game = Game("pov", brakes, REWARD, -2.0)
+        state = np.array([[-200.0, 30.0, -182.0, 20.0]])
+        after, _, _ = game.advance(state, np.zeros(1), game.actions_mps2[:1])
+        assert after[0, 1] == pytest.approx(29.0)  # half a second of -2 m/s2
+        assert after[0, 3] == pytest.approx(18.0)  # and of -4 m/s2
 
 
 class TestTheExampleRuns:

@@ -24,7 +24,7 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES
-from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_of
+from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_in, policies_of
 from merge_sumo.engine.evaluate import open_simulators
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
@@ -274,6 +274,23 @@ class TestOtherCommands:
         for named in ("nowhere", "file", "empty", ".", "/dev/null"):
             assert_refused(call(*command, "--policies", named), "name a folder of policies")
         assert sorted(tmp_path.iterdir()) == before
+
+
+class TestAShippedLibrary:
+    def test_is_known_by_its_name_and_recorded_by_it(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        folder = policies_of(US23) / "roundabout"
+        assert policies_in("roundabout") == folder
+        settings = CampaignSettings(vut="design1", policies="roundabout", scenario=US23, **SMALL)
+        run_campaign(settings, tmp_path / "run")
+        assert read_settings(tmp_path / "run")["policies"] == "roundabout"
+
+    def test_is_not_confused_with_a_folder_of_its_name(self, same, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        shutil.copytree(same, tmp_path / "roundabout")
+        with pytest.raises(UserError, match="a shipped library and a folder here"):
+            policies_in("roundabout")
+        assert policies_in(tmp_path / "roundabout") == tmp_path / "roundabout"
 
 
 class TestAFolder:

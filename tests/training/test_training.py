@@ -37,6 +37,7 @@ from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
 from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.vuts.onnx_export import export_onnx
 
 WEIGHTS = reward.RewardWeights()
 REWARD = reward.Reward(WEIGHTS, US23)
@@ -542,6 +543,24 @@ class TestHelix:
         with pytest.raises(UserError, match=r"has a pov1 of another scenario, seed.*--out"):
             train_library(library, ("pov1",), seed=1, settings=SMALL, scenario=US23)
         assert (library / "pov1.safetensors").read_bytes() == before
+
+    @pytest.mark.slow
+    def test_a_pov_with_a_limit_of_braking_keeps_it_in_its_file(self, tmp_path):
+        train_library(tmp_path, ("pov1",), settings=SMALL, scenario=US23, a_min_mps2=-2.0)
+        entry = read_manifest(tmp_path)["pov1"]
+        assert entry["command"] == "merge-sumo train --only pov1 --seed 0 --a-min -2"
+        assert entry["a_min_mps2"] == load_network("pov1", tmp_path).a_min_mps2 == -2.0
+        for other in (None, -1.0):
+            with pytest.raises(UserError, match=r"has a pov1 of another .*--out"):
+                train_library(tmp_path, ("pov1",), settings=SMALL, scenario=US23, a_min_mps2=other)
+        with pytest.raises(UserError, match="accelerations of its own, down to -2 m/s2"):
+            export_onnx("pov1", tmp_path / "pov1.onnx", tmp_path)
+
+    @pytest.mark.parametrize("a_min_mps2", [0.0, 1.0, -4.5, float("nan")])
+    def test_a_limit_that_is_none_of_the_scenario_is_refused(self, tmp_path, a_min_mps2):
+        with pytest.raises(UserError, match="choose a number from -4 to below 0"):
+            train_library(tmp_path / "new", scenario=US23, a_min_mps2=a_min_mps2)
+        assert not (tmp_path / "new").exists()
 
     def test_level_2_needs_level_1_first(self, library):
         with pytest.raises(UserError, match="pov2 is trained against vut1: train that one first"):
