@@ -994,18 +994,22 @@ def vuts(policies: AnyPath | None = None) -> Shown:
     return Shown({**names, "kinds": listed}, lines)
 
 
-def check_vut(vut: AnyVut, **hosting: Unpack[Hosting]) -> VutCheck:
+def check_vut(
+    vut: AnyVut, *, scenario: Scenario | AnyPath | None = None, **hosting: Unpack[Hosting]
+) -> VutCheck:
     """Let a VUT drive a few cases and say what is wrong with it; as `merge-sumo check-vut`.
 
     Args:
         vut: as of `campaign`.
+        scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
         hosting: `policies`, `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`; see
             `Hosting`.
     """
     check_keywords("check_vut", hosting, Hosting)
     spec, _, _ = drivers_of(vut, None, 1)
     fields = recordable({name: value for name, value in hosting.items() if name != "pov"})
-    settings = CampaignSettings(vut=spec, levels=(0,), scenario=US23, **fields)
+    driven = US23 if scenario is None else scenario_of(scenario)
+    settings = CampaignSettings(vut=spec, levels=(0,), scenario=driven, **fields)
     return vut_check.check_vut(resolve(settings))
 
 

@@ -40,7 +40,11 @@ def vuts(given: Given) -> None:
     given.print(api.vuts(**given.keywords))
 
 
-@app.verb("check-vut", options=(*HOSTING, "policies"))
+@app.verb(
+    "check-vut",
+    options=(*HOSTING, "policies"),
+    own={"scenario": _scenario_option("Scenario to drive in, or a file of one.", "us23")},
+)
 def check_vut(
     given: Given,
     vut: Annotated[

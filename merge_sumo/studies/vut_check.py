@@ -15,18 +15,16 @@ from merge_sumo.analysis.result import Result
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.values.case import Case, FloatArray, MergeCase
-from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.values.case import Case, FloatArray, MergeCase, from_unit
+from merge_sumo.values.scenario import DT_S, Scenario, lane_of
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.in_memory import is_here
 from merge_sumo.vuts.registry import waits_for_client
 
 CORRIDORS: Final = 4
-CASES: Final = tuple(
-    MergeCase(level=0, x_pov0_m=x, v_pov0_mps=v, scenario=US23)
-    for x, v in product((-340.0, -300.0, -260.0, -220.0), (25.0, 28.0, 31.0, 34.0))
-)
-FROM_STAND: Final = replace(CASES[0], v_vut0_mps=0.0)
+PLACES: Final = tuple(product((0.0, 0.25, 0.5, 0.75), (0.0, 0.3, 0.6, 0.9)))
+"""Cases in the unit square of the first two coordinates of a level-0 pool: where the POV starts and
+how fast, in a merge."""
 LONG_BEGIN_US: Final = 20e3
 """A campaign of hundreds of cases feels it when an episode takes longer than this to begin."""
 
@@ -71,25 +69,28 @@ class VutCheck(Result):
 def check_vut(plan: SimulationPlan) -> VutCheck:
     """Let the VUT of a plan drive a few cases, some of them again, and one from a stand."""
     plan = plan.for_cases(CORRIDORS)
+    cases = _ordinary_cases(plan.scenario)
+    from_stand = replace(cases[0], v_vut0_mps=0.0)
     with Simulator(plan) as ground:
         timed = ground.vut = _Timed(ground.vut)
-        first = _run(ground, CASES)
-        problems, differing = _errors(CASES, first), list[_Difference]()
+        first = _run(ground, cases)
+        problems, differing = _errors(cases, first), list[_Difference]()
         if not problems:
-            cases = [*CASES, *_meetings(first)]
-            first += _run(ground, cases[len(CASES) :])
+            meetings = _meetings(first)
+            cases += meetings
+            first += _run(ground, meetings)
             backwards = _run(ground, cases[::-1])[::-1]
             differing += _differences("the same cases in another order", first, backwards)
             alone = [_run(ground, [case])[0] for case in cases]
             differing += _differences("each case alone", first, alone)
             for corridor in range(ground.world.corridors):
-                ground.vut.begin(corridor, FROM_STAND)
+                ground.vut.begin(corridor, from_stand)
             differing += _differences("a reset too many", first, _run(ground, cases))
         notes = _limits(first) + timed.long_begin()
-        problems += _from_stand(ground)
-        notes += _not_numbers(ground)
+        problems += _from_stand(ground, from_stand)
+        notes += _not_numbers(ground, cases[0])
         if not problems and not differing:
-            after = _run(ground, CASES[:1])
+            after = _run(ground, cases[:1])
             differing += _differences("a state that is no number", first[:1], after)
     if differing:
         problems += [
@@ -103,6 +104,12 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
         us_per_step_median=statistics.median(timed.us_per_step),
         us_per_step_worst=max(timed.us_per_step),
     )
+
+
+def _ordinary_cases(scenario: Scenario) -> list[Case]:
+    points = np.full((len(PLACES), len(scenario.dimensions(0))), 0.5)
+    points[:, :2] = PLACES
+    return from_unit(points, 0, scenario=scenario)
 
 
 class _Timed(Driver):
@@ -148,20 +155,20 @@ def _run(ground: Simulator, cases: Sequence[Case]) -> list[Trajectory]:
 
 
 def _meetings(trajectories: Sequence[Trajectory]) -> list[Case]:
-    """Return, for each speed of the POV, the case in which the two would meet at M."""
-    low_m, high_m = US23.x_pov0_m
-    nearest: dict[float, Trajectory] = {}
+    """Return, for each speed of the POV, the case in which the two would meet at M.
+
+    Other kinds of scenarios than merges have none.
+    """
+    nearest: dict[float, tuple[Trajectory, MergeCase]] = {}
     for one in sorted(trajectories, key=lambda one: -abs(_gap_m(one))):
-        nearest[one.case.v_pov0_mps] = one
-    return [
-        MergeCase(
-            level=0,
-            x_pov0_m=min(max(one.case.x_pov0_m - _gap_m(one), low_m), high_m),
-            v_pov0_mps=v_pov0_mps,
-            scenario=one.case.scenario,
-        )
-        for v_pov0_mps, one in nearest.items()
-    ]
+        if isinstance(one.case, MergeCase):
+            nearest[one.case.v_pov0_mps] = one, one.case
+    meetings: list[Case] = []
+    for one, case in nearest.values():
+        low_m, high_m = case.scenario.bounds("x_pov0_m")
+        x_pov0_m = min(max(case.x_pov0_m - _gap_m(one), low_m), high_m)
+        meetings.append(replace(case, x_pov0_m=x_pov0_m))
+    return meetings
 
 
 def _gap_m(trajectory: Trajectory) -> float:
@@ -234,8 +241,8 @@ def _limits(trajectories: Sequence[Trajectory]) -> list[str]:
     ]
 
 
-def _from_stand(ground: Simulator) -> list[str]:
-    (trajectory,) = _run(ground, [FROM_STAND])
+def _from_stand(ground: Simulator, from_stand: Case) -> list[str]:
+    (trajectory,) = _run(ground, [from_stand])
     if trajectory.error is not None:
         return [
             f"From a stand (v = 0) it ends as VUT_ERROR at t = {trajectory.t_end_s} s: "
@@ -246,16 +253,20 @@ def _from_stand(ground: Simulator) -> list[str]:
     return []
 
 
-def _not_numbers(ground: Simulator) -> list[str]:
+def _not_numbers(ground: Simulator, case: Case) -> list[str]:
     """Show the VUT a state of NaN; it may answer anything, but must not hang or end us."""
-    corridors = ground.world.corridors
+    corridors, vehicles = ground.world.corridors, len(ground.world.x_m)
     if ground.world.vut_type is not None:
         return []  # SUMO's own drivers see SUMO's state, which is never NaN
     active = np.zeros(corridors, dtype=bool)
     active[0] = True
-    nothing = np.full(corridors, np.nan)
-    ground.vut.begin(0, CASES[0])
-    scene = Scene.of_pair(active, np.zeros(corridors, dtype=np.int64), *[nothing] * 4)
+    nothing = np.full((vehicles, corridors), np.nan)
+    ground.vut.begin(0, case)
+    step = np.zeros(corridors, dtype=np.int64)
+    merged = None if lane_of(case.scenario) is None else np.zeros(corridors, dtype=bool)
+    scene = Scene(
+        active, step, nothing, nothing, facing=step if vehicles > 2 else None, merged=merged
+    )
     try:
         answer = float(ground.vut.act(scene)[0])
     except VutLostError as lost:

@@ -173,6 +173,8 @@ class World:
         self._obeys = np.ones(self.x_m.shape, dtype=bool)
         """Who holds the speed that it is told, (A, corridors); SUMO drives the others."""
         self._obeys[VUT] = self.vut_type is None
+        self._lane_changes = self.vut_type is not None and self.road.lane_m is not None
+        """Whether SUMO's lane-change model decides when VUTs merge."""
         World._open = True
         self.read()
 
@@ -199,15 +201,16 @@ class World:
             name = self._ids[row * self.corridors + corridor]
             lane, start_m = self._lane_at(row, corridor, x)
             by_sumo = self.vut_type is not None if row == VUT else own and self.car_type is not None
-            renewed = by_sumo or not self._obeys[row, corridor]
+            renewed = by_sumo or not self._obeys[row, corridor] or self._lane_changes
             if renewed:
-                # A new vehicle: some of SUMO's models remember how they drove.
+                # A new vehicle: some of SUMO's models remember how they drove, and its lane-change
+                # model what it told the cars beside it.
                 self._remove(name)
                 self._enter(name, (VUT_TYPE if row == VUT else OWN_CAR) if by_sumo else CAR)
                 self._obeys[row, corridor] = not by_sumo
             self._move_to(name, lane, x - start_m)
             self._set_previous_speed(name, v, 0.0)
-            if renewed and not (by_sumo and row == VUT and self.road.lane_m is not None):
+            if renewed and not (row == VUT and self._lane_changes):
                 self._set_lane_change_mode(name, 0)
             if not by_sumo:
                 if renewed:

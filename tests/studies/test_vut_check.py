@@ -7,7 +7,8 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from merge_sumo import cli
+from merge_sumo import check_vut, cli
+from merge_sumo.road.scenario_file import shipped_scenarios
 from merge_sumo.vuts.registry import KINDS, PYTHON, built_in_vuts
 
 GOOD = "def Vut(seen):\n    return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)\n"
@@ -92,3 +93,10 @@ def test_a_policy_is_exported_and_its_path_printed(tmp_path):
     done = CliRunner().invoke(cli.app, ["policies", "export", "vut1", "--out", str(path)])
     assert done.stdout.strip() == str(path)
     assert path.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("name", shipped_scenarios())
+@pytest.mark.parametrize("vut", ["design1", "sumo:IDM"])
+def test_a_good_vut_is_good_on_every_shipped_scenario(name, vut):
+    checked = check_vut(vut, scenario=name)
+    assert checked.problems == []

@@ -117,6 +117,14 @@ def test_sumos_lane_change_model_merges_from_an_acceleration_lane(name):
     assert np.ptp(places) > 100.0, "it is the model that chooses the place"
 
 
+@pytest.mark.parametrize("name", ["IDM", "ACC"])
+def test_sumos_lane_change_model_forgets_the_cars_of_other_episodes(name):
+    scenario, vut = named_scenario("us23-lane-traffic"), factory(f"sumo:{name}")
+    together = run_on(vut, scenario, 0, 30)
+    alone = run_on(vut, scenario, 0, 30, corridors=1)
+    assert all(np.array_equal(a.motion, b.motion) for a, b in zip(together, alone, strict=True))
+
+
 def test_sumo_merges_in_traffic():
     for trajectory in run_on(factory("sumo:Krauss"), named_scenario("us23-lane-traffic"), 0, 40):
         assert trajectory.error is None
