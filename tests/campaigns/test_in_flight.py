@@ -85,6 +85,7 @@ def ends_of_groups(outcomes) -> list[int]:
     return [after.index for before, after in pairwise(outcomes) if after.batch > before.batch]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEARNING)
 def test_a_search_depends_neither_on_the_order_of_ends_nor_on_chunks_nor_on_a_stop(name):
     expected = searched(name, 0, 1)
@@ -136,12 +137,14 @@ def test_many_in_flight_are_batches_for_a_sampler_that_waits():
 
 
 class TestACampaign:
+    @pytest.mark.slow
     def test_has_the_same_bytes_on_any_number_of_workers(self, whole, tmp_path):
         for count in (2, 5):
             with Workers(partial(LocalProcesses, count), count) as workers:
                 run_campaign(settings(), tmp_path / str(count), workers=workers)
             assert outcomes(tmp_path / str(count)) == outcomes(whole)
 
+    @pytest.mark.slow
     def test_has_the_same_bytes_where_it_goes_on_in_processes(self, whole, tmp_path):
         with open_workers(2, here_s=0.2) as workers:
             run_campaign(settings(), tmp_path / "run", workers=workers)
@@ -169,6 +172,7 @@ class TestACampaign:
                 path.name for path in (whole / TRAJECTORIES).iterdir()
             }
 
+    @pytest.mark.slow
     def test_that_was_interrupted_keeps_whole_groups(self, whole, tmp_path):
         groups = 0
 
@@ -185,6 +189,7 @@ class TestACampaign:
         resume_campaign(tmp_path / "run")
         assert outcomes(tmp_path / "run") == outcomes(whole)
 
+    @pytest.mark.slow
     def test_grows_as_one_that_had_the_cases_from_the_start(self, whole, tmp_path):
         ends = ends_of_groups(Run(whole).outcomes)
         folder = run_campaign(settings(cases=ends[-3]), tmp_path / "run").folder
@@ -197,6 +202,7 @@ class TestACampaign:
         with pytest.raises(UserError, match="in_flight differs"):
             resume_campaign(folder, {"in_flight": 13, "cases": 70})
 
+    @pytest.mark.slow
     def test_that_converges_ends_where_it_would_have_ended(self, tmp_path):
         eager = settings(cases=300, in_flight=10, stop_after_converged=0.9)
         run = run_campaign(eager, tmp_path / "run")

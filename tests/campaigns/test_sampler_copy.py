@@ -59,6 +59,7 @@ def beside():
     return open_workers(2, here_s=10.0 * HERE_S)
 
 
+@pytest.mark.slow
 def test_outcomes_are_those_of_one_process(worth_it, alone, tmp_path):
     with beside() as workers:
         assert ran(tmp_path / "run", workers) == alone
@@ -66,6 +67,7 @@ def test_outcomes_are_those_of_one_process(worth_it, alone, tmp_path):
         assert workers.begin_beside(os.getpid)() != os.getpid()
 
 
+@pytest.mark.slow
 def test_when_it_dies_this_process_searches_all_levels(worth_it, alone, tmp_path, monkeypatch):
     proposals = CopyBeside.proposals
     pids = []

@@ -233,6 +233,7 @@ class TestOtherCommands:
         assert code == 0
         assert "does not do again what case" in out
 
+    @pytest.mark.slow
     def test_a_probability_is_of_the_policies_of_its_campaign(self, call, same, swapped, tmp_path):
         run_campaign(settings(swapped), tmp_path / "run")
         fresh = ("probability", tmp_path / "run", "--cases", 8)

@@ -538,6 +538,7 @@ class TestHelix:
         assert told == [("pov1", None)]
         assert (library / "pov1.safetensors").stat().st_mtime_ns == before
 
+    @pytest.mark.slow
     def test_another_seed_does_not_overwrite_a_network(self, library):
         before = (library / "pov1.safetensors").read_bytes()
         with pytest.raises(UserError, match=r"has a pov1 of another scenario, seed.*--out"):
@@ -634,6 +635,7 @@ class TestTrainingForAnotherScenario:
         assert "a_min_mps2 -4 is like -8.51 in us23 (trained on -4)" in said
         assert f"merge-sumo train --scenario {ring} --out ring-policies" in said
 
+    @pytest.mark.slow
     def test_a_check_measures_the_regret_on_the_scenario(self, trained, ring):
         words = ("train", "--check", "--scenario", ring, "--only", "pov1", "--cases", 4, "--json")
         done = invoke(*words, "--out", trained[0])
