@@ -177,6 +177,16 @@ OURS: Final = (
         missing=0.0,
         worse="high",
     ),
+    Measure(
+        "pov_slowdown_mps",
+        "speed of the POV at the start minus its lowest speed up to t1; None in records of "
+        "versions without it",
+        unit="m/s",
+        label="slow-down of the POV",
+        column="POV slows by",
+        missing=0.0,
+        worse="high",
+    ),
     Measure("merged_first", '"VUT" or "POV": whose front bumper is ahead at M'),
     Measure(
         "last_avoidable_s",

@@ -101,6 +101,7 @@ class Measures:
     brake_after_mps2: float | None = None
     vut_max_brake_mps2: float = 0.0
     pov_max_brake_mps2: float = 0.0
+    pov_slowdown_mps: float | None = None
     impact_speed_mps: float | None = None
     merged_first: Literal["VUT", "POV"] | None = None
     last_avoidable_s: float | None = None
@@ -126,12 +127,14 @@ class Measures:
 
         After an error a verdict says nothing, and `values` are left out.
         """
+        v_pov_mps = trajectory.motion[:, trajectory.nearest, 1]
         hardest_mps2 = [max(0.0, -a) for a in trajectory.motion[:, :, 2].min(axis=0).tolist()]
         common: dict[str, Any] = {
             "end": trajectory.end,
             "t_end_s": trajectory.t_end_s,
             "vut_max_brake_mps2": hardest_mps2[VUT],
             "pov_max_brake_mps2": hardest_mps2[trajectory.nearest],
+            "pov_slowdown_mps": float(v_pov_mps[0] - v_pov_mps.min()),
             "clipped_steps": trajectory.clipped_steps,
             "error": None if trajectory.error is None else as_reason(trajectory.error),
             "nearest": VEHICLES[trajectory.nearest],
@@ -259,6 +262,8 @@ class Outcome:
         return cls(known.index, known.batch, case, measures, *told)
 
 
+LATER: Final = ("pov_slowdown_mps",)
+"""Measures that records of the last release do not have: they are None there."""
 FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
 """Measures of the follow-up."""
 ON_LANE: Final = (
@@ -293,9 +298,11 @@ def _record_fields(
     not_fields = {"further", *left_out}
     measure_names = tuple(name for name in Measures.__slots__ if name not in not_fields)
     types = get_type_hints(kind.case_type) | get_type_hints(Measures) | {"index": int, "batch": int}
-    required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
+    always = [name for name in measure_names if name not in LATER]
+    required = [(name, types[name]) for name in ("index", "batch", *case_names, *always)]
     further = [(name, float | None, None) for name in further_measures()]
     optional = [
+        *((name, types[name], None) for name in LATER),
         *further,
         ("margin", float | None, None),
         ("foretold", Prediction | None, None),

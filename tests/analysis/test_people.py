@@ -1,0 +1,160 @@
+"""Failures beside published figures of people, by hand."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from merge_sumo.analysis.people import (
+    BRAKING,
+    HEE_PEOPLE,
+    SLOWDOWN,
+    Place,
+    beside_people,
+    none_of,
+)
+from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.values.case import MergeCase
+from merge_sumo.values.fmc import fmc
+from merge_sumo.values.scenario import OWN, US23
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
+
+ONE, TWO, FIVE = 1 / 23, 2 / 23, 5 / 23
+
+
+def failing(index, brake_mps2, slowdown_mps=0.0, level=1, scenario=US23, **measured):
+    """Return a failure in which the POV brakes and slows down by so much."""
+    case = MergeCase(level=level, x_pov0_m=-250.0 - index, v_pov0_mps=30.0, scenario=scenario)
+    measures = Measures(
+        end=End.MERGED,
+        t_end_s=9.0,
+        score=-700.0,
+        pov_max_brake_mps2=brake_mps2,
+        pov_slowdown_mps=slowdown_mps,
+        **measured,
+    )
+    return Outcome(index, 0, case, measures)
+
+
+SAFE = replace(failing(9, 3.0, 9.0), index=9, measures=Measures(end=End.MERGED, t_end_s=9.0))
+
+
+class TestThePlaceOfABehaviour:
+    @pytest.mark.parametrize(
+        ("published", "value", "at_least", "at_most"),
+        [
+            (BRAKING, 0.0, 1.0, 1.0),
+            (BRAKING, 0.3, 0.5, 1.0),
+            (BRAKING, 0.66, 0.5, 1.0),
+            (BRAKING, 1.0, 0.05, 0.5),
+            (BRAKING, 1.4, 0.05, 0.5),
+            (BRAKING, 2.0, ONE, 0.05),
+            (BRAKING, 2.06, ONE, 0.05),
+            (BRAKING, 2.07, 0.0, 0.0),
+            (SLOWDOWN, 0.5, FIVE, 1.0),
+            (SLOWDOWN, 0.6, TWO, FIVE),
+            (SLOWDOWN, 2.0, ONE, TWO),
+            (SLOWDOWN, 9.0, 0.0, ONE),
+        ],
+    )
+    def test_is_the_step_of_the_figures_that_it_lies_in(self, published, value, at_least, at_most):
+        assert published.place(value) == Place(at_least, at_most)
+
+    def test_never_rises_with_the_value_and_is_an_interval(self):
+        for published in (BRAKING, SLOWDOWN):
+            places = [published.place(value / 50.0) for value in range(-5, 200)]
+            assert all(place.at_least <= place.at_most for place in places)
+            for shares in zip(*((p.at_least, p.at_most) for p in places), strict=True):
+                assert list(shares) == sorted(shares, reverse=True)
+
+    def test_share_says_which_figure_is_the_limit(self):
+        shares = (1.0, 0.96, 0.95, 0.9, 0.5)
+        assert [BRAKING.limit(share) for share in shares] == [2.06, 2.06, 1.4, 1.4, 0.66]
+        assert [SLOWDOWN.limit(share) for share in shares] == [None, None, 2.0, 1.0, 0.5]
+
+
+class TestFailuresBesidePeople:
+    OUTCOMES = (
+        failing(0, 2.0, 4.0, merged_first="VUT", pet_s=0.4, ttc_s=1.0),
+        failing(1, 3.0, 6.0, merged_first="VUT", pet_s=0.2),
+        failing(2, 1.0, 1.5, merged_first="POV", pet_s=9.0, ttc_s=3.0),
+        failing(3, 0.0, level=0),
+        SAFE,
+    )
+
+    def test_are_inside_where_no_figure_shows_that_the_pov_did_more(self):
+        found = beside_people(self.OUTCOMES)
+        assert {i: p.inside for i, p in found.places.items()} == {0: 1, 1: 0, 2: 1, 3: 1}
+        assert (found.failures, found.inside) == (4, 3)
+        level = found.levels[1]
+        assert (level.failures, level.inside, level.outside) == (3, 2, 1)
+        assert (level.brakes_harder, level.slows_more, level.slows_beyond) == (1, 0, 2)
+        assert (level.hardest_mps2, level.most_mps) == (3.0, 6.0)
+        assert (level.pov_first, level.merged) == (1, 3)
+        assert level.ttc_s == 2.0
+        assert level.headway_s == pytest.approx(0.3), "of the POVs that come second alone"
+        # Two cases 2 m apart in a pool of 160 m, from 340 m before M on: their balls overlap.
+        points = [[(-250.0 - i + 340.0) / 160.0, 0.5] for i in (0, 2)]
+        assert level.fmc == pytest.approx(fmc(points))
+
+    def test_within_95_percent_of_people_brake_and_slow_down_less(self):
+        found = beside_people(self.OUTCOMES, 0.95)
+        assert [i for i, place in found.places.items() if place.inside] == [2, 3]
+        assert (found.levels[1].brakes_harder, found.levels[1].slows_more) == (2, 2)
+        assert "brakes at 1.4 m/s2 or less and slows down by 2 m/s or less" in found.line
+
+    def test_name_the_level_that_does_more_than_people(self):
+        first, second = beside_people(self.OUTCOMES).findings
+        assert first == (
+            "level 1 brakes harder than any of 23 published drivers in 1 of 3 failures: a finding "
+            "about this library of drivers"
+        )
+        assert second.startswith("level 1 slows down by more than 2 m/s in 2 of 3 failures")
+        (own,) = beside_people([failing(0, 2.5, level=OWN)]).findings
+        assert own.startswith("the POV of your own brakes harder than any of 23")
+        traffic = named_scenario("us23-traffic")
+        case = {"headway_ahead_s": 2.0, "headway_behind_s": 2.0}
+        met = failing(0, 2.5, nearest="behind")
+        met = replace(met, case=replace(met.case, scenario=traffic, **case))
+        assert beside_people([met]).findings[0].startswith("the car met at level 1 brakes harder")
+
+    def test_of_records_without_the_slow_down_are_decided_by_braking(self):
+        old = [failing(0, 1.0, None), failing(1, 3.0, None)]
+        found = beside_people(old, 0.95)
+        assert [place.inside for place in found.places.values()] == [True, False]
+        assert (found.unknown, beside_people(old).unknown) == (1, 0)
+        assert found.places[0].slowdown is None
+        assert found.levels[1].most_mps is None
+
+    def test_are_all_inside_where_the_figures_are_of_faster_roads(self):
+        roundabout = named_scenario("roundabout")
+        start = {"x_pov0_m": -50.0, "v_pov0_mps": 8.0, "v_vut0_mps": 6.0}
+        case = MergeCase(level=1, scenario=roundabout, **start)
+        found = beside_people([replace(failing(0, 4.0), case=case)])
+        assert (found.inside, found.places, found.findings) == (1, {}, [])
+        assert found.line == (
+            "beside people: left out: the published drivers drive at 23.7 m/s in the mean, on a "
+            "motorway, and the mainline starts at 12 m/s or less here"
+        )
+
+    def test_say_nothing_without_failures(self):
+        assert beside_people([SAFE]).line is None
+        assert beside_people([], levels=(0, 1)).levels.keys() == {0, 1}
+
+    @pytest.mark.parametrize("share", [0.0, -1.0, 1.01, math.nan])
+    def test_need_a_share_of_people(self, share):
+        with pytest.raises(UserError, match="it is a share of people, above 0 and up to 1"):
+            beside_people([], share)
+
+
+def test_what_none_of_23_drivers_does_may_be_that_of_one_of_eight():
+    share = none_of(HEE_PEOPLE)
+    assert (1.0 - share) ** 23 == pytest.approx(0.05)
+    assert f"{share:.1%}" == "12.2%"
+    assert "up to 12.2% of drivers" in beside_people([]).caveat
