@@ -54,6 +54,7 @@ from merge_sumo.api.results import (
     PerMergeResult,
     PolicyChecks,
     ProbabilityResult,
+    StressResult,
     TruthResult,
 )
 from merge_sumo.campaigns.campaign import (
@@ -103,6 +104,7 @@ from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies import benchmark, certificate, reproduction, versions, vut_check
 from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability as estimates
+from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.benchmark import Benchmark
 from merge_sumo.studies.certificate import runs_points_on
 from merge_sumo.studies.counterfactuals import note_avoidance
@@ -150,7 +152,7 @@ __all__ += [
     "open_run",
 ]
 __all__ += ["probability", "replay", "report", "reproduce", "rerun", "resume", "run_case"]
-__all__ += ["scenarios", "train", "truth", "truths", "vuts"]
+__all__ += ["scenarios", "stress", "train", "truth", "truths", "vuts"]
 
 AnyPath = Path | str
 AnyRun = CampaignRun | Path | str
@@ -932,6 +934,47 @@ def failures_per_merge(
             on_case=lambda _: counter.ended(1),
         )
     return PerMergeResult(found, target, before.criterion)
+
+
+def stress(
+    run: AnyRun,
+    *,
+    draws: int = ladder.DEFAULT_DRAWS,
+    seed: int = 0,
+    net: AnyPath | None = None,
+    trust_vut: bool = False,
+    **given: Unpack[RerunKeywords],
+) -> StressResult:
+    """Run the cases of a campaign again, each time a little otherwise; as `merge-sumo stress`.
+
+    Args:
+        run: the campaign, or its folder, into which `stress.json` is written.
+        draws: times that all cases run where the change is drawn at random.
+        seed: same seed, same draws.
+        net: net for that; must be the one of the campaign.
+        trust_vut: run the controller that the folder names although it was not made here.
+        given: how the drivers run, where it is to change, and where the cases run: see
+            `RerunKeywords`.
+
+    `robust` of the result has the failures that fail every time, the worst first.
+    """
+    check_keywords("stress", given, RerunKeywords)
+    before = _opened(run).run
+    check_own(before.folder / ladder.STRESS)
+    fields, runner = given_again(None, given, {"vut": before.vut})
+    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
+    plan = resolve(settings, _path(net)).with_engine(None)
+    total = sum(ladder.runs_of(change, draws) for change in ladder.RUNGS)
+    cases = total * sum(outcome.is_tested for outcome in before.outcomes)
+    with runner.open(plan) as opened, runner.counter("cases again", cases) as counter:
+        found = ladder.stress(
+            *(before, settings, plan),
+            draws=draws,
+            seed=seed,
+            workers=opened,
+            on_cases=counter.ended,
+        )
+    return StressResult(found, before.folder / ladder.STRESS)
 
 
 def reproduce(

@@ -33,8 +33,10 @@ from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.failures_per_merge import FailuresPerMerge, OverMixtures, Part
 from merge_sumo.studies.stratified import Estimate
+from merge_sumo.studies.stress import Stress
 from merge_sumo.studies.truth import REAL_REGION, Truth
 from merge_sumo.system.printable import counted, quoted
+from merge_sumo.system.records import to_plain
 from merge_sumo.system.suggestions import either
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
@@ -577,6 +579,43 @@ def _counts(part: Part) -> str:
     """Return what a part rests on."""
     one = part.estimate
     return f"{counted(one.failures, 'failure')} in {counted(one.cases, 'case')}"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class StressResult(Result):
+    """Which verdicts of a campaign flip where something is a little otherwise.
+
+    Attributes:
+        found: `rungs`, each with its `flips`; `robust` and `fragile` failures.
+        file: file that was written.
+    """
+
+    found: Stress
+    file: Path
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        found = self.found
+        lists = {"robust": found.robust, "fragile": found.fragile}
+        return {**to_plain(found), **lists, "file": str(self.file)}
+
+    def lines(self) -> list[str]:
+        """Return a table of the rungs, and which failures are robust."""
+        found = self.found
+        lines = [
+            f"{counted(found.cases, 'case')} of {found.vut}, {len(found.failures)} of them "
+            f"failures, {found.runs} times each",
+            "   flips  now pass  now fail  no verdict  what is changed",
+        ]
+        for rung in found.rungs:
+            if rung.skipped:
+                lines.append(f"{'not run':>40}  {rung.about}: {rung.skipped}")
+                continue
+            passes, fails, without = rung.counts
+            numbers = f"{passes:10d}{fails:10d}{without:12d}"
+            drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
+            lines.append(f"{found.share(rung) or 0.0:8.1%}{numbers}  {rung.about}{drawn}")
+        return [*lines, found.sentence, f"written: {self.file}"]
 
 
 class PolicyChecks(Result, dict[str, "PolicyCheck"]):

@@ -25,7 +25,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "How many cases, and which": (
         *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
         *("truth_cases", "dense", "quick", "distribution", "traffic", "density", "learn_from"),
-        *("stop_after_converged", "audit"),
+        *("draws", "stop_after_converged", "audit"),
     ),
     "Verdict": ("fail_when", "require", "gate", "tolerance", "rerun", "confidence"),
     "Where it runs, and what it writes": (

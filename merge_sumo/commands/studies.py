@@ -238,6 +238,27 @@ def failures_per_merge(
 
 
 @app.verb(
+    options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"),
+    own={
+        "draws": option(int, 5, "Times that all cases run where a change is drawn at random."),
+        "seed": SEED,
+    },
+)
+def stress(given: Given, run: RunArgument) -> None:
+    """Run the cases of a campaign again, a little otherwise: which verdicts hang by a thread?
+
+    With a shorter step, an actuator that lags, limited power, a start that is off by the error of a
+    sensor, and longer cars on the mainline. Failures that fail every time are robust: `report`
+    lists them first.
+
+    Example:  merge-sumo stress runs/design2
+    """
+    from merge_sumo import api
+
+    given.print(api.stress(run, **given.keywords))
+
+
+@app.verb(
     options=["dense", "policies", "dask", "quiet"],
     own={
         "seeds": option(

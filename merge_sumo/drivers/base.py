@@ -162,6 +162,13 @@ class Driver(ABC):
         """
         return None
 
+    def clipped(self) -> NDArray[np.bool_] | None:
+        """Return which of the last answers come of commands outside the limits, (K,).
+
+        None where answers are the commands themselves, and show it.
+        """
+        return None
+
     def signals(self) -> Mapping[int, Left]:
         """Return what the controllers left with their last answers, by corridor."""
         return NO_SIGNALS

@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar, overload
 
 import numpy as np
 
-from merge_sumo.engine.kinematic_simulator import CHUNK, KinematicSimulator
+from merge_sumo.engine.kinematic_simulator import CHUNK, KinematicSimulator, SubstepSimulator
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
@@ -275,19 +275,24 @@ _one_at_a_time = RLock()
 def opened_simulator(plan: SimulationPlan) -> Iterator[Simulator]:
     """Give the simulator of this process, which stays open for the next chunk of the same plan."""
     global _kept  # noqa: PLW0603 (one SUMO per process)
-    key = plan.key(), plan.vut, plan.povs, plan.engine, plan.corridors
+    key = plan.key(), plan.vut, plan.povs, plan.engine, plan.corridors, plan.substeps
     with _one_at_a_time:
         try:
             if _kept is None or _kept[0] != key:
                 close_simulator()
                 plan.check_software()
-                kinematic = plan.engine is Engine.KINEMATIC
-                _kept = key, KinematicSimulator(plan) if kinematic else Simulator(plan)
+                _kept = key, _simulator(plan)
                 when_worker_ends(close_simulator)
             yield _kept[1]
         except BaseException:
             close_simulator()  # it stands in the middle of episodes
             raise
+
+
+def _simulator(plan: SimulationPlan) -> Simulator:
+    if plan.substeps > 1:
+        return SubstepSimulator(plan)
+    return KinematicSimulator(plan) if plan.engine is Engine.KINEMATIC else Simulator(plan)
 
 
 def close_simulator() -> None:

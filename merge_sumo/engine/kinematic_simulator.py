@@ -133,6 +133,25 @@ class KinematicSimulator(Simulator):
             self._sumo.close()
 
 
+class SubstepSimulator(Simulator):
+    """A VUT and the POVs by eq. (4) alone, each step in parts: for a step shorter than SUMO's."""
+
+    def __init__(self, plan: SimulationPlan) -> None:
+        """Start the drivers; `UserError` for those that drive in SUMO only."""
+        with ExitStack() as opened:
+            most = CORRIDORS if plan.needs_sumo is None else plan.corridors
+            corridors = min(most, plan.vut.vut.max_corridors or most)
+            corridors = plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
+            world = EquationWorld(corridors, plan.road, plan.scenario, plan.substeps)
+            self._open_drivers(plan, world, None, opened)
+
+    def run(
+        self, cases: Sequence[Case], ran_again: set[int] | None = None
+    ) -> Iterator[tuple[int, Trajectory]]:
+        """Run cases; yield (place in `cases`, trajectory)."""
+        return rollout(self.world, self.pov, self.vut, cases, ran_again)
+
+
 def drawn(cases: Sequence[Case]) -> set[int]:
     """Return the places of the cases that are drawn at random to be checked.
 

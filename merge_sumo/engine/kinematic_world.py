@@ -26,9 +26,12 @@ class EquationWorld:
     vut_type: None = None
     """SUMO drives none of its vehicles."""
 
-    def __init__(self, corridors: int, road: Corridor, scenario: Scenario) -> None:
-        """Park the vehicles of a scenario on a road."""
+    def __init__(
+        self, corridors: int, road: Corridor, scenario: Scenario, substeps: int = 1
+    ) -> None:
+        """Park the vehicles of a scenario on a road; a step is integrated in so many parts."""
         self.corridors, self.road, self.scenario = corridors, road, scenario
+        self.substeps = substeps
         self.vehicles = scenario.vehicles
         self.x_m: FloatArray = np.full((self.vehicles, corridors), -PARKING_M)
         self.v_mps: FloatArray = np.zeros((self.vehicles, corridors))
@@ -59,5 +62,24 @@ class EquationWorld:
 
         Both lanes of a merge have one coordinate, so `merged` changes nothing here.
         """
+        if self.substeps > 1:
+            self._in_parts(a_mps2)
+            return
         self.x_m = self.x_m + self.v_mps * DT_S
         self.v_mps = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
+
+    def _in_parts(self, a_mps2: FloatArray) -> None:
+        """Move all vehicles by eq. (4) with a shorter step, and the same accelerations.
+
+        An episode that ends in a part stands still for the others: its last row is that part.
+        """
+        has_ended = self.scenario.has_ended
+        goes_on = np.ones(self.corridors, dtype=np.bool_)
+        ended_before = has_ended(self.x_m, self.v_mps)
+        part_s = DT_S / self.substeps
+        for _ in range(self.substeps):
+            x_m = self.x_m + self.v_mps * part_s
+            v_mps = np.maximum(self.v_mps + a_mps2 * part_s, 0.0)
+            self.x_m = np.where(goes_on, x_m, self.x_m)
+            self.v_mps = np.where(goes_on, v_mps, self.v_mps)
+            goes_on = ended_before | ~has_ended(self.x_m, self.v_mps)

@@ -53,6 +53,8 @@ class SimulationPlan:
         criterion: what counts as a failure.
         engine: what moves the vehicles; campaigns take SUMO.
         corridors: the most episodes at a time in SUMO; decides no outcome.
+        substeps: parts of a step in which vehicles are moved, by eq. (4) without SUMO if it is more
+            than one. Drivers are asked once a step.
         versions: those of the software that gives the outcomes; by default of this process.
         policies_sha256: hashes of the learned drivers; by default of those that this process finds.
     """
@@ -64,6 +66,7 @@ class SimulationPlan:
     criterion: Criterion
     engine: Engine = Engine.SUMO
     corridors: int = MAX_CORRIDORS
+    substeps: int = 1
     versions: Mapping[str, str] = field(default_factory=versions)
     policies_sha256: Mapping[str, str] = field(default_factory=dict)
 

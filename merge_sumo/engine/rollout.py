@@ -337,7 +337,10 @@ class _Rollout:
         self.now[..., 2] = acceleration.T
         off = answer - acceleration
         # In most steps nobody asks for more than it may.
-        if np.vdot(off, off) > (0.5 * ROUNDING_MPS2) ** 2:
+        commands = self.vut.clipped()
+        if commands is not None:
+            self.clipped += commands
+        elif np.vdot(off, off) > (0.5 * ROUNDING_MPS2) ** 2:
             self.clipped += np.abs(off[VUT]) > ROUNDING_MPS2
         return acceleration
 

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
+from merge_sumo.drivers.actuation import ActuatedDriver
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.lane import LanePov
 from merge_sumo.engine.kinematic_world import EquationWorld
@@ -66,7 +67,7 @@ class Simulator:
     ) -> None:
         """Start the drivers of a world, which are told of SUMO's; `opened` closes all."""
         self.world = world
-        self.vut = plan.vut(world.corridors, sumo)
+        self.vut = through_actuator(plan.vut(world.corridors, sumo), plan.scenario)
         opened.callback(self.vut.close)
         self.pov = povs_for(plan.scenario, plan.povs, world.corridors, sumo)
         opened.callback(self.pov.close)
@@ -93,6 +94,13 @@ class Simulator:
     def __exit__(self, *_: object) -> None:
         """Close it."""
         self.close()
+
+
+def through_actuator(vut: Driver, scenario: Scenario) -> Driver:
+    """Return the driver of a VUT behind the actuator of a scenario, itself behind a perfect one."""
+    if scenario.act.is_perfect:
+        return vut
+    return ActuatedDriver(vut, scenario.act.at_most("delay_s"))
 
 
 def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None = None) -> Driver:

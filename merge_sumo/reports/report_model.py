@@ -24,6 +24,7 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.studies.counterfactuals import read_avoidance
 from merge_sumo.studies.expectation import read_expectation
+from merge_sumo.studies.stress import stress_of
 from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import DEADLINE_S, LEVELS, OWN
@@ -70,7 +71,11 @@ class ReportModel:
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.worst = failures(run.outcomes)
         self.regions = regions_of(self.worst)
-        self.spread = spread_failures(self.worst)[:LISTED]
+        self.stress = stress_of(run.folder)
+        robust = set() if self.stress is None else set(self.stress.robust)
+        # The sort is stable: without a stress test the order is that of the regions.
+        spread = sorted(spread_failures(self.worst), key=lambda o: o.index not in robust)
+        self.spread = spread[:LISTED]
         self.avoidance = read_avoidance(run)
         self.repeats = read_repeats(run)
         self.near = sorted(

@@ -34,6 +34,7 @@ from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
 from merge_sumo.studies.counterfactuals import in_a_sentence
+from merge_sumo.studies.stress import NOTHING
 from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.printable import counted, printable
 from merge_sumo.system.registry import Registry
@@ -174,13 +175,34 @@ def _in_words(model: ReportModel) -> dict[str, Any] | None:
     }
 
 
+def _stress(model: ReportModel) -> dict[str, Any] | None:
+    found = model.stress
+    if found is None:
+        return None
+    unchanged = sum(rung.flips for rung in found.rungs if rung.name == NOTHING.name)
+    repeats = (
+        f"{counted(unchanged, 'verdict')} flipped where nothing was changed: a result depends on "
+        "more than its case, and the other rows have that in them."
+    )
+    text = found.sentence
+    return {
+        "stress": found,
+        "sentence": text[:1].upper() + text[1:],
+        "repeats": repeats if unchanged else "",
+        "is_older": found.cases != sum(outcome.is_tested for outcome in model.run.outcomes),
+    }
+
+
 def _cases(model: ReportModel) -> dict[str, Any]:
     tables = [
         (f"{trouble.count} {trouble.end}: {trouble.message}", model.examples_of(trouble))
         for trouble in model.troubles()
     ]
+    first = "one of each region first"
+    if model.stress is not None:
+        first = "robust ones first, of these one of each region"
     tables += [
-        ("Ten worst failures, one of each region first", model.spread),
+        (f"Ten worst failures, {first}", model.spread),
         ("Ten cases nearest to a failure", model.near[:LISTED]),
     ]
     if model.surprises:
@@ -282,6 +304,7 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "where": ReportSection(template=_own("where"), words=_maps),
         "merging": ReportSection(template=_own("merging"), words=_merging),
         "words": ReportSection(template=_own("words"), words=_in_words),
+        "stress": ReportSection(template=_own("stress"), words=_stress),
         "cases": ReportSection(template=_own("cases"), words=_cases),
         "all": ReportSection(template=_own("all")),
         "search": ReportSection(template=_own("search")),

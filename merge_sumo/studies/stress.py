@@ -11,16 +11,34 @@ The file of a folder which somebody sent is data as everything in it.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
+import numpy as np
 from msgspec import Meta
 
+from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.campaigns.store import Run, failures
+from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.studies.probability import same_system
 from merge_sumo.system.arrays import regular
-from merge_sumo.system.records import Record, decode
+from merge_sumo.system.folders import replace_own
+from merge_sumo.system.printable import counted
+from merge_sumo.system.records import Record, decode, to_plain
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import COORDINATES, DT_S, Scenario
+from merge_sumo.values.score import Outcome, Verdict
 
 STRESS: Final = "stress.json"
+LISTED: Final = 10
+"""Failures that are not robust that a sentence names."""
 Index = Annotated[int, Meta(ge=0)]
 """The index of a case in its campaign."""
 
@@ -37,11 +55,6 @@ class Flips(Record, frozen=True):
     passes: tuple[Index, ...] = ()
     fails: tuple[Index, ...] = ()
     without_verdict: tuple[Index, ...] = ()
-
-    @property
-    def count(self) -> int:
-        """Number of verdicts that flip."""
-        return len(self.passes) + len(self.fails) + len(self.without_verdict)
 
 
 class Rung(Record, frozen=True):
@@ -62,9 +75,18 @@ class Rung(Record, frozen=True):
     skipped: str = ""
 
     @property
+    def counts(self) -> tuple[int, int, int]:
+        """Failures that pass, passes that fail, and cases without a verdict, over all runs."""
+        return (
+            sum(len(run.passes) for run in self.runs),
+            sum(len(run.fails) for run in self.runs),
+            sum(len(run.without_verdict) for run in self.runs),
+        )
+
+    @property
     def flips(self) -> int:
         """Verdicts that flip, over all runs."""
-        return sum(flips.count for flips in self.runs)
+        return sum(self.counts)
 
     def passes_in(self, index: int) -> int:
         """Return in how many runs a failure does not fail."""
@@ -104,6 +126,22 @@ class Stress(Record, frozen=True):
         others = (index for index in self.failures if self.passes_in(index))
         return tuple(sorted(others, key=lambda index: -self.passes_in(index)))
 
+    @property
+    def sentence(self) -> str:
+        """How many failures are robust, and which others hang by the thinnest threads."""
+        if not self.failures:
+            return "no case failed: which passes fail on a rung is in the table"
+        fragile = self.fragile
+        text = (
+            f"robust, as they fail on every rung: {len(self.robust)} of "
+            f"{counted(len(self.failures), 'failure')}"
+        )
+        if not fragile:
+            return text
+        shown = ", ".join(f"{i} ({self.passes_in(i)})" for i in fragile[:LISTED])
+        more = f" and {len(fragile) - LISTED} more" if len(fragile) > LISTED else ""
+        return f"{text}; others, with the number of runs in which they do not fail: {shown}{more}"
+
     def passes_in(self, index: int) -> int:
         """Return in how many runs of all rungs a failure does not fail."""
         return sum(rung.passes_in(index) for rung in self.rungs)
@@ -129,3 +167,221 @@ def stress_of(folder: Path) -> Stress | None:
     except UserError as error:
         raise UserError(f"{path} is not as it was written: {error}") from error
     return known
+
+
+# The ladder.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Change:
+    """A rung before it runs.
+
+    Attributes:
+        name: as of `Rung`.
+        about: as of `Rung`.
+        source: as of `Rung`.
+        plan: returns the plan of the rung by that of the campaign; raises `UserError` where it
+            cannot be.
+        case: returns a case of the rung by one of the campaign, and what draws at random; None for
+            the same coordinates.
+    """
+
+    name: str
+    about: str
+    source: str = ""
+    plan: Callable[[SimulationPlan], SimulationPlan] = lambda plan: plan
+    case: Callable[[Case, np.random.Generator], Case] | None = None
+
+
+PART_S: Final = 0.02
+"""Step of the rung with a shorter step than that of eq. (4)."""
+LAGS_S: Final = (0.2, 0.35, 0.5)
+POWER_W_PER_KG: Final = 34.0
+"""Power over mass: above this a car is of class 3, the highest. UN GTR No. 15, Annex 1."""
+ERROR_X_M: Final = 0.5
+ERROR_V_MPS: Final = 2.0 / 3.6
+"""Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
+CAR_LENGTH_M: Final = 5.0
+DEFAULT_DRAWS: Final = 5
+ERRORS_BY_UNIT: Final = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
+OF_VUT: Final = {"v_vut0_mps", *COORDINATES}
+"""Coordinates that are no state of another car."""
+
+
+def _with_step(plan: SimulationPlan) -> SimulationPlan:
+    return replace(plan, substeps=round(DT_S / PART_S))
+
+
+def _with_actuator(plan: SimulationPlan, **values: float) -> SimulationPlan:
+    act = plan.scenario.act
+    for name in values:
+        if getattr(act, name) not in (0.0, None):
+            raise UserError(f"the scenario has {name} of its own")
+    return _in_scenario(plan, replace(plan.scenario, act=replace(act, **values)))
+
+
+def _with_long_pov(plan: SimulationPlan) -> SimulationPlan:
+    length_m = plan.scenario.pov_length_m + CAR_LENGTH_M
+    return _in_scenario(plan, replace(plan.scenario, pov_length_m=length_m))
+
+
+def _in_scenario(plan: SimulationPlan, scenario: Scenario) -> SimulationPlan:
+    plan.criterion.check(scenario)
+    return replace(plan, scenario=scenario)
+
+
+def _start_off(case: Case, rng: np.random.Generator) -> Case:
+    """Return a case whose POV starts a little elsewhere, at another speed; within the pool."""
+    values: dict[str, Any] = {}
+    for dimension in case.scenario.dimensions(case.level):
+        name = dimension.field
+        most = ERRORS_BY_UNIT.get(case.scenario.notation[name].unit, 0.0)
+        if not most or name in OF_VUT:
+            continue
+        value = getattr(case, name) + rng.uniform(-most, most)
+        values[name] = min(max(value, dimension.low), dimension.high)
+    return replace(case, **values)
+
+
+NOTHING: Final = Change(name="nothing", about="nothing is changed")
+RUNGS: Final = (
+    NOTHING,
+    Change(
+        name="step",
+        about=f"a step of {PART_S:g} s, with a command held for {DT_S:g} s",
+        plan=_with_step,
+    ),
+    *(
+        Change(
+            name=f"lag-{lag_s:g}",
+            about=f"the acceleration of the VUT lags by {lag_s:g} s",
+            source="chosen; lags of cruise control: Xiao, Darbha and Gao (2008)",
+            plan=partial(_with_actuator, lag_s=lag_s),
+        )
+        for lag_s in LAGS_S
+    ),
+    Change(
+        name="power",
+        about=f"the VUT has {POWER_W_PER_KG:g} W/kg: it accelerates by P / (m v) at most",
+        source="UN GTR No. 15, Annex 1: lower limit of class 3",
+        plan=partial(_with_actuator, power_w_per_kg=POWER_W_PER_KG),
+    ),
+    Change(
+        name="start",
+        about=f"the POV starts within {ERROR_X_M:g} m and {ERROR_V_MPS:.2f} m/s of where it did",
+        source="accuracy of a radar, Autoliv NB24G1V2, user's manual, 3.1",
+        case=_start_off,
+    ),
+    Change(
+        name="long-pov",
+        about=f"cars of the mainline are {CAR_LENGTH_M:g} m longer, to the rear",
+        plan=_with_long_pov,
+    ),
+)
+"""The ladder; the first rung shows whether cases repeat at all."""
+
+
+def stress(
+    run: Run,
+    settings: CampaignSettings,
+    plan: SimulationPlan,
+    *,
+    draws: int = DEFAULT_DRAWS,
+    seed: int = 0,
+    workers: Workers | None = None,
+    on_cases: Callable[[int], None] = lambda _: None,
+) -> Stress:
+    """Run the cases of a campaign on every rung, and write what becomes of them into its folder.
+
+    Args:
+        run: the campaign.
+        settings: those of the campaign, except for what may be elsewhere.
+        plan: that of the settings.
+        draws: times that all cases run on a rung that draws at random.
+        seed: of the draws; the same for a case wherever it runs.
+        workers: where cases run, by default in this process.
+        on_cases: told how many have just ended.
+
+    Raises:
+        UserError: for a campaign without a verdict, or with a net or policies of another day.
+    """
+    for name, number, least in (("draws", draws, 1), ("seed", seed, 0)):
+        if number < least:
+            raise UserError(f"--{name} is {number}: it must be {least} or more")
+    same_system(run, record_of(settings, plan))
+    tested = [outcome for outcome in run.outcomes if outcome.is_tested]
+    if not tested:
+        raise UserError(f"{run.folder} has no case with a verdict: nothing can be stressed")
+    with workers_or_here(workers) as opened:
+        ladder = _Ladder(plan.for_cases(len(tested)), tested, draws, seed, opened, on_cases)
+        rungs = tuple(map(ladder.rung, RUNGS))
+    failing = tuple(outcome.index for outcome in failures(tested))
+    found = Stress(len(tested), failing, rungs, seed, run.vut)
+    content = json.dumps(to_plain(found), indent=1, allow_nan=False) + "\n"
+    replace_own(run.folder / STRESS, content.encode())
+    return found
+
+
+def runs_of(change: Change, draws: int) -> int:
+    """Return how many times all cases run for a change."""
+    return 1 if change.case is None else draws
+
+
+class _Ladder:
+    def __init__(
+        self,
+        plan: SimulationPlan,
+        tested: Sequence[Outcome],
+        draws: int,
+        seed: int,
+        workers: Workers,
+        on_cases: Callable[[int], None],
+    ) -> None:
+        self._plan, self._tested, self._draws, self._seed = plan, tested, draws, seed
+        self._workers, self._on_cases = workers, on_cases
+
+    def rung(self, change: Change) -> Rung:
+        """Run all cases with a change; one that cannot be is skipped with its reason."""
+        runs = runs_of(change, self._draws)
+        try:
+            flips = tuple(self._run(change, draw) for draw in range(runs))
+        except UserError as error:
+            if change is NOTHING:
+                raise
+            self._on_cases(runs * len(self._tested))
+            return Rung(change.name, change.about, change.source, (), str(error))
+        return Rung(change.name, change.about, change.source, flips)
+
+    def _run(self, change: Change, draw: int) -> Flips:
+        plan = change.plan(self._plan)
+        cases = [self._case(o.case, change, draw, plan.scenario) for o in self._tested]
+        found: dict[int, Verdict] = {}
+        for place, verdict in evaluate(plan, cases, self._workers, keep=_verdicts):
+            found[place] = verdict
+            self._on_cases(1)
+        return flips_of(self._tested, found)
+
+    def _case(self, case: Case, change: Change, draw: int, scenario: Scenario) -> Case:
+        if scenario is not case.scenario:
+            case = replace(case, scenario=scenario)
+        if change.case is None:
+            return case
+        return change.case(case, np.random.default_rng([self._seed, draw, case.seed]))
+
+
+def _verdicts(results: CaseResults) -> list[Verdict]:
+    return results.verdicts()
+
+
+def flips_of(tested: Sequence[Outcome], found: Mapping[int, Verdict]) -> Flips:
+    """Return which verdicts flip, by those of a run at the places of the recorded outcomes."""
+    passes: list[int] = []
+    fails: list[int] = []
+    without: list[int] = []
+    for place, outcome in enumerate(tested):
+        verdict = found[place]
+        if not verdict.is_tested:
+            without.append(outcome.index)
+        elif verdict.failed != outcome.failed:
+            (passes if outcome.failed else fails).append(outcome.index)
+    return Flips(tuple(passes), tuple(fails), tuple(without))

@@ -84,17 +84,24 @@ def convert(record: object, kind: type[T]) -> T:
 
     Raises `RecordError` for other values, and for names that a dataclass does not have.
     """
-    if is_dataclass(kind) and isinstance(record, dict):
-        known = list(_hints(kind))
-        for name in record:
-            if name not in known:
-                raise RecordError(_unknown(name, kind))
+    _check_names(record, kind)
     try:
         return msgspec.convert(record, kind)
     except msgspec.ValidationError as error:
         raise RecordError(_sentence(error, record, kind)) from error
     except RecursionError as error:
         raise RecordError("it is nested too deeply") from error
+
+
+def _check_names(record: object, kind: Any) -> None:
+    """Raise `RecordError` for a name that a dataclass, or one in its fields, does not have."""
+    if not (is_dataclass(kind) and isinstance(record, dict)):
+        return
+    hints = _hints(kind)  # type: ignore[arg-type]
+    for name, value in record.items():
+        if name not in hints:
+            raise RecordError(_unknown(name, kind))
+        _check_names(value, hints[name])
 
 
 def check_fields(value: Any) -> None:

@@ -10,19 +10,31 @@ further coordinates.
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.pickling import quickly_pickled
+from merge_sumo.values.imperfection import (
+    ACT,
+    PERFECT_ACTUATION,
+    PERFECT_SENSING,
+    SENSE,
+    Actuation,
+    Sensing,
+    with_numbers,
+)
 from merge_sumo.values.scenario import (
     AHEAD,
     ALL_LEVELS,
     BEHIND,
+    COORDINATES,
     OWN,
     POV,
     SVO,
@@ -35,6 +47,9 @@ from merge_sumo.values.scenario import (
 )
 
 FloatArray = NDArray[np.float64]
+_IMPERFECTIONS: Final = attrgetter(*COORDINATES)
+_NONE: Final = (None,) * len(COORDINATES)
+_PERFECT: Final = (PERFECT_SENSING, PERFECT_ACTUATION)
 
 
 X_POV0, V_POV0 = US23.dimensions(0)
@@ -58,11 +73,22 @@ class Case:
         svo_rad: its social value orientation; None below level 2.
         v_vut0_mps: speed of the VUT at the start.
         scenario: the scenario.
+
+    The others are numbers for ranges of the scenario's `sense` and `act`; None where it has none.
     """
 
     level: int
     svo_rad: float | None = None
     v_vut0_mps: float = V_VUT0_MPS
+    sense_delay_s: float | None = None
+    sense_noise_x_m: float | None = None
+    sense_noise_v_mps: float | None = None
+    sense_dropout: float | None = None
+    sense_range_m: float | None = None
+    sense_occluded_until_m: float | None = None
+    act_lag_s: float | None = None
+    act_delay_s: float | None = None
+    act_power_w_per_kg: float | None = None
     scenario: Scenario = field(repr=False)
 
     if TYPE_CHECKING:
@@ -100,6 +126,34 @@ class Case:
         """Acceleration of a level-0 POV, which it keeps whatever the VUT does."""
         return 0.0
 
+    @property
+    def sensing(self) -> Sensing:
+        """How the VUT senses other cars in this case, in numbers."""
+        return with_numbers(self.scenario.sense, SENSE, self)
+
+    @property
+    def actuation(self) -> Actuation:
+        """How it obeys its controller, in numbers."""
+        return with_numbers(self.scenario.act, ACT, self)
+
+    @property
+    def seed(self) -> int:
+        """A number that the case alone decides: seeds what is drawn at random in its episode."""
+        return zlib.crc32(repr((self.level, self.svo_rad, self.starts())).encode())
+
+    def _check_imperfections(self) -> None:
+        """Raise `UserError` where a number is missing for a range, or there without one."""
+        given, scenario = _IMPERFECTIONS(self), self.scenario
+        if given == _NONE and (scenario.sense, scenario.act) == _PERFECT:
+            return
+        wanted = scenario.imperfect_fields
+        for name, value in zip(COORDINATES, given, strict=True):
+            if (value is not None) != (name in wanted):
+                raise UserError(f"{name} belongs to a range of the scenario: give it there alone")
+        if wanted:
+            # Checks the numbers.
+            _ = self.sensing, self.actuation
+
 
 @quickly_pickled
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -118,6 +172,7 @@ class MergeCase(Case):
             raise UserError(f"x_pov0_m is {self.x_pov0_m}: choose between {-reach_m:g} and 0")
         self._check_speed("v_pov0_mps")
         self._check_speed("v_vut0_mps")
+        self._check_imperfections()
         in_traffic = self.scenario.vehicles > 2
         for name in ("headway_ahead_s", "headway_behind_s"):
             headway_s = getattr(self, name)

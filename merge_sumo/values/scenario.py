@@ -18,6 +18,15 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 from msgspec import Meta
 
 from merge_sumo.errors import UserError
+from merge_sumo.values.imperfection import (
+    ACT,
+    PERFECT_ACTUATION,
+    PERFECT_SENSING,
+    SENSE,
+    Actuation,
+    Imperfection,
+    Sensing,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -70,6 +79,19 @@ class Notation:
     digits: int
     symbol: str
 
+
+COORDINATES: Final = {
+    "sense_delay_s": Notation("sensing delay", "s", 2, "sensing delay (s)"),
+    "sense_noise_x_m": Notation("noise of x", "m", 2, "noise of $x$ (m)"),
+    "sense_noise_v_mps": Notation("noise of v", "m/s", 2, "noise of $v$ (m/s)"),
+    "sense_dropout": Notation("dropout", "", 2, "dropout"),
+    "sense_range_m": Notation("range", "m", 1, "range (m)"),
+    "sense_occluded_until_m": Notation("occluded until", "m", 1, "occluded until (m)"),
+    "act_lag_s": Notation("actuator lag", "s", 2, "actuator lag (s)"),
+    "act_delay_s": Notation("actuator delay", "s", 2, "actuator delay (s)"),
+    "act_power_w_per_kg": Notation("power", "W/kg", 1, "power (W/kg)"),
+}
+"""Coordinates of the pool, by the fields of a case: `SENSE` or `ACT`, and the field of those."""
 
 SVO: Final = Dimension("svo_rad", 0.0, math.pi / 2)
 """psi in [0, pi/2): the upper end itself is outside the pool."""
@@ -156,6 +178,8 @@ class Scenario:
         level0_v_mps: up to this speed, which it holds.
         reach_m: no vehicle starts farther from M than this.
         v_start_max_mps: no vehicle starts faster than this.
+        sense: how the VUT senses other cars.
+        act: how it obeys its controller.
     """
 
     kind: ClassVar[str]
@@ -207,6 +231,8 @@ class Scenario:
     level0_v_mps: float = 28.0
     reach_m: float = 900.0
     v_start_max_mps: float = 45.0
+    sense: Sensing = PERFECT_SENSING
+    act: Actuation = PERFECT_ACTUATION
 
     def __post_init__(self) -> None:
         """Check the numbers one by one, then together."""
@@ -231,6 +257,10 @@ class Scenario:
         yield "dx_crash_m", 0.0 < self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"
         yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
         yield "level0_v_mps", self.level0_v_mps > 0.0, "above 0"
+        known = COORDINATES.keys() & self.notation.keys()
+        for name, imperfection in self._imperfections():
+            fits = known.issuperset(f"{name}_{field}" for field in imperfection.ranged)
+            yield name, fits, f"numbers: a range is a coordinate that {self.kind} does not have"
 
     def _check_range(self, name: str) -> None:
         """Raise `UserError` where a number is not finite, or none of a road and its cars."""
@@ -245,9 +275,21 @@ class Scenario:
             raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
 
     def to_record(self) -> dict[str, Any]:
-        """Return the scenario as JSON keeps it; `kind` is left out where it is a merge."""
+        """Return the scenario as JSON keeps it.
+
+        `kind` is left out where it is a merge, and what is perfect of `sense` and `act`.
+        """
         kind = {} if self.kind == MergeScenario.kind else {"kind": self.kind}
-        return kind | asdict(self)
+        record = kind | asdict(self)
+        for name, known in self._imperfections():
+            del record[name]
+            record |= {} if known.is_perfect else {name: known.to_record()}
+        return record
+
+    def _imperfections(self) -> Iterator[tuple[str, Imperfection]]:
+        """Yield `sense` and `act` with their names."""
+        yield SENSE, self.sense
+        yield ACT, self.act
 
     @property
     def criterion(self) -> str:
@@ -331,9 +373,22 @@ class Scenario:
         ranges = [
             Dimension(name, *value)
             for name in self.notation
-            if isinstance(value := getattr(self, name, None), tuple)
+            if isinstance(value := self._given(name), tuple)
         ]
         return (*ranges, SVO) if level == 2 and SVO.field in self.notation else tuple(ranges)
+
+    def _given(self, coordinate: str) -> Any:
+        """Return what the scenario says of a coordinate: a number, a range, or None for nothing."""
+        if coordinate not in COORDINATES:
+            return getattr(self, coordinate, None)
+        prefix, _, name = coordinate.partition("_")
+        return getattr(getattr(self, prefix), name)
+
+    @property
+    def imperfect_fields(self) -> tuple[str, ...]:
+        """Fields of a case that are ranges of `sense` and `act`."""
+        known = (f"{name}_{field}" for name, of in self._imperfections() for field in of.ranged)
+        return tuple(known)
 
     @property
     def case_fields(self) -> tuple[str, ...]:
@@ -372,6 +427,7 @@ class MergeScenario(Scenario):
         "v_vut0_mps": Notation("v_VUT0", "m/s", 2, "$v_{VUT}^0$ (m/s)"),
         "headway_ahead_s": Notation("headway ahead", "s", 2, "headway ahead (s)"),
         "headway_behind_s": Notation("headway behind", "s", 2, "headway behind (s)"),
+        **COORDINATES,
         "svo_rad": Notation("psi", "rad", 2, "$\\psi$ (rad)"),
     }
     ends_as: ClassVar[str] = "MERGED"
@@ -468,7 +524,8 @@ class MergeScenario(Scenario):
     def case_fields(self) -> tuple[str, ...]:
         """Start and speed of the POV, speed of the VUT, orientation; in traffic, headways."""
         headways = ("headway_ahead_s", "headway_behind_s") if self.vehicles > 2 else ()
-        return ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad", *headways)
+        own = ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad")
+        return (*own, *headways, *self.imperfect_fields)
 
     def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return in which corridors the VUT has to be on the mainline in states (A, K), (K,).

@@ -1,0 +1,155 @@
+"""What lies between a controller and the road: how the VUT senses other cars, and how it obeys.
+
+Both are values of a scenario. Zero, which is the default, is perfect: the VUT knows the state of
+every car in the step in which it is asked, and its acceleration acts at once. A range makes a
+number a coordinate of the pool: a case calls it `sense_...` or `act_...`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final, Self, TypeVar
+
+from merge_sumo.errors import UserError
+from merge_sumo.system.suggestions import meant
+
+Bounds = tuple[float, float]
+Amount = float | Bounds
+"""A number, or a range: then it is a coordinate of the pool."""
+
+
+class Imperfection:
+    """What `Sensing` and `Actuation` have in common: numbers in their ranges, by name."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Check the numbers; raises `UserError`."""
+        for field, value in self._given():
+            low, high = RANGES[type(self)][field]
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not all(math.isfinite(x) and low <= x <= high for x in numbers):
+                raise UserError(f"{field} is {value}: choose {low:g} to {high:g}")
+            if isinstance(value, tuple) and not value[0] < value[1]:
+                raise UserError(f"{field} is {value}: a range is low to high")
+
+    def _given(self) -> Iterator[tuple[str, Amount]]:
+        """Yield (field, value) of what is not left out."""
+        for field in fields(self):  # type: ignore[arg-type]
+            if (value := getattr(self, field.name)) is not None:
+                yield field.name, value
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what is imperfect, as JSON keeps it."""
+        default = type(self)()
+        return {name: v for name, v in self._given() if v != getattr(default, name)}
+
+    @property
+    def is_perfect(self) -> bool:
+        """Whether it changes nothing, in any case."""
+        return not self.to_record()
+
+    @property
+    def ranged(self) -> tuple[str, ...]:
+        """Fields that are coordinates of the pool."""
+        return tuple(name for name, value in self._given() if isinstance(value, tuple))
+
+    def at_most(self, name: str) -> float:
+        """Return the largest value of a number that may be a range."""
+        value: Amount = getattr(self, name)
+        return value[1] if isinstance(value, tuple) else value
+
+    @classmethod
+    def parsed(cls, text: str, option: str) -> Self:
+        """Return what a person writes after an option: "delay_s=0.3,noise_x_m=0..0.5".
+
+        Raises `UserError`, with the option's name, for what it does not have.
+        """
+        known = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+        values: dict[str, Amount] = {}
+        for part in filter(None, map(str.strip, text.split(","))):
+            name, _, number = part.partition("=")
+            if name not in known or name in values:
+                twice = "is there twice" if name in known else "is unknown"
+                hint = meant(name, known) or f"choose from {', '.join(known)}"
+                raise UserError(f"{option}: {name!r:.60} {twice}: {hint.strip()}")
+            low, dots, high = number.partition("..")
+            try:
+                values[name] = (float(low), float(high)) if dots else float(low)
+            except ValueError:
+                raise UserError(
+                    f"{option}: {name} is {number!r:.60}: give a number, or a range as 0..0.5"
+                ) from None
+        try:
+            return cls(**values)
+        except UserError as error:
+            raise UserError(f"{option}: {error}") from error
+
+
+Kind = TypeVar("Kind", bound=Imperfection)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Sensing(Imperfection):
+    """How the VUT senses the other cars; its own state it knows.
+
+    Attributes:
+        delay_s: age of what it sees.
+        noise_x_m: standard deviation of the error of a position, in each step anew.
+        noise_v_mps: standard deviation of the error of a speed.
+        dropout: share of the steps in which nothing new arrives of a car; the last state is kept.
+        range_m: a car farther away than this, between front bumpers, is not seen.
+        occluded_until_m: no car is seen while the VUT is before this place.
+    """
+
+    delay_s: Amount = 0.0
+    noise_x_m: Amount = 0.0
+    noise_v_mps: Amount = 0.0
+    dropout: Amount = 0.0
+    range_m: Amount | None = None
+    occluded_until_m: Amount | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Actuation(Imperfection):
+    """How the VUT obeys the accelerations that its controller commands.
+
+    Attributes:
+        lag_s: time constant of a first-order lag of the acceleration.
+        delay_s: dead time: a command acts so much later.
+        power_w_per_kg: power over mass; above the speed P / (m a) it limits the acceleration.
+    """
+
+    lag_s: Amount = 0.0
+    delay_s: Amount = 0.0
+    power_w_per_kg: Amount | None = None
+
+
+RANGES: Final[dict[type, dict[str, Bounds]]] = {
+    Sensing: {
+        "delay_s": (0.0, 5.0),
+        "noise_x_m": (0.0, 100.0),
+        "noise_v_mps": (0.0, 100.0),
+        "dropout": (0.0, 1.0),
+        "range_m": (1.0, 5000.0),
+        "occluded_until_m": (-5000.0, 2000.0),
+    },
+    Actuation: {"lag_s": (0.0, 5.0), "delay_s": (0.0, 5.0), "power_w_per_kg": (1.0, 1000.0)},
+}
+"""What the numbers can be, by field."""
+PERFECT_SENSING: Final = Sensing()
+PERFECT_ACTUATION: Final = Actuation()
+
+SENSE: Final = "sense"
+ACT: Final = "act"
+
+
+def with_numbers(imperfection: Kind, prefix: str, case: Any) -> Kind:
+    """Return an imperfection with the numbers that a case has for its ranges."""
+    ranged = imperfection.ranged
+    if not ranged:
+        return imperfection
+    values: dict[str, Any] = {name: getattr(case, f"{prefix}_{name}") for name in ranged}
+    return replace(imperfection, **values)  # type: ignore[type-var]

@@ -1,0 +1,92 @@
+"""The actuator between a driver and its vehicle, against values by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from merge_sumo.drivers.actuation import ActuatedDriver
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.values.case import MergeCase
+from merge_sumo.values.imperfection import Actuation
+from merge_sumo.values.scenario import US23
+
+
+class Commands(Driver):
+    """Commands accelerations by step, the same in all corridors."""
+
+    def __init__(self, commands, corridors=1):
+        super().__init__(corridors)
+        self._commands = list(commands)
+
+    def act(self, scene):
+        return np.full(self.corridors, self._commands.pop(0))
+
+
+def executed(commands, v_mps=20.0, **act):
+    """Return what a vehicle does of commands, and which of them were clipped."""
+    actuation = Actuation(**act)
+    driver = ActuatedDriver(Commands(commands), actuation.at_most("delay_s"))
+    scenario = replace(US23, act=actuation)
+    driver.begin(0, MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
+    done, clipped = [], []
+    for step in range(len(commands)):
+        x, v = np.array([-100.0]), np.array([v_mps])
+        scene = Scene.of_pair(np.array([True]), np.array([step]), x, v, x, v)
+        done.append(float(driver.act(scene)[0]))
+        clipped.append(bool(driver.clipped()[0]))
+    return done, clipped
+
+
+def test_a_perfect_actuator_passes_every_bit_on():
+    commands = [0.1, -1 / 3, 2.0, -4.0, 1e-17]
+    assert executed(commands)[0] == commands
+
+
+def test_a_dead_time_shifts_the_commands():
+    commands = [1.0, -1.0, 0.5, 2.0, -4.0, 0.0]
+    assert executed(commands, delay_s=0.3)[0] == [0.0, 0.0, 0.0, 1.0, -1.0, 0.5]
+
+
+def test_a_part_of_a_step_is_a_mean_of_two_commands():
+    assert executed([1.0, 2.0, -4.0, 0.0], delay_s=0.125)[0] == [0.0, 0.75, 1.75, -2.5]
+
+
+@pytest.mark.parametrize("lag_s", [0.2, 0.355])
+def test_speeds_behind_a_lag_are_those_of_the_continuous_one(lag_s):
+    done, _ = executed([-4.0] * 12, lag_s=lag_s)
+    t_s = 0.1 * np.arange(1, 13)
+    speed = -4.0 * (t_s - lag_s * (1.0 - np.exp(-t_s / lag_s)))
+    assert 0.1 * np.cumsum(done) == pytest.approx(speed, abs=1e-12)
+
+
+def test_power_limits_acceleration_at_speed_and_never_braking():
+    assert executed([2.0, -4.0, 0.5], v_mps=25.0, power_w_per_kg=34.0)[0] == [34 / 25, -4.0, 0.5]
+    assert executed([2.0], v_mps=0.0, power_w_per_kg=34.0)[0] == [2.0]
+
+
+def test_a_command_outside_the_limits_counts_as_clipped_before_the_lag():
+    done, clipped = executed([-8.0, 1.0, 2.0 + 1e-12, 5.0], lag_s=0.5)
+    assert clipped == [True, False, False, True]
+    assert min(done) > -4.0
+
+
+def test_an_answer_that_is_no_number_is_passed_on_at_once():
+    done, _ = executed([1.0, np.nan, np.inf], delay_s=1.0, lag_s=0.3)
+    assert done[0] == 0.0
+    assert np.isnan(done[1])
+    assert done[2] == np.inf
+
+
+def test_an_episode_begins_with_nothing_commanded():
+    driver = ActuatedDriver(Commands([2.0, 2.0, 2.0]), 0.1)
+    scenario = replace(US23, act=Actuation(delay_s=0.1, lag_s=0.2))
+    case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario)
+    scene = Scene.of_pair(np.array([True]), np.array([0]), *np.full((4, 1), 20.0))
+    driver.begin(0, case)
+    assert driver.act(scene)[0] == 0.0
+    assert driver.act(scene)[0] > 0.0
+    driver.begin(0, case)
+    assert driver.act(scene)[0] == 0.0

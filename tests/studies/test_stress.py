@@ -1,0 +1,162 @@
+"""The ladder of a stress test: what flips is what a case of the rung does by itself."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import merge_sumo as ms
+from merge_sumo.engine.kinematic_world import EquationWorld
+from merge_sumo.engine.simulator import road_for
+from merge_sumo.errors import UserError
+from merge_sumo.studies.stress import RUNGS, STRESS, Flips, Rung, Stress, flips_of, stress_of
+from merge_sumo.system.records import to_plain
+from merge_sumo.values.imperfection import Actuation
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.score import Verdict
+
+TRIED: dict[str, dict[str, Any]] = {
+    "lag-0.5": {"act": Actuation(lag_s=0.5)},
+    "lag-0.2": {"act": Actuation(lag_s=0.2)},
+    "power": {"act": Actuation(power_w_per_kg=34.0)},
+    "long-pov": {"pov_length_m": 10.0},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stress") / "run"
+    return ms.campaign("design2", cases=60, level="all", seed=1, out=folder, fail_when="unsafe")
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    return ms.stress(run, draws=2).found
+
+
+def rung(found, name):
+    return next(rung for rung in found.rungs if rung.name == name)
+
+
+def test_nothing_flips_where_nothing_is_changed(found):
+    assert rung(found, "nothing").runs == (Flips(),)
+    assert found.failures
+    assert [one.skipped for one in found.rungs] == [""] * len(RUNGS)
+
+
+@pytest.mark.parametrize("name", TRIED)
+def test_verdicts_flip_as_the_cases_by_themselves_say(run, found, name):
+    (flips,) = rung(found, name).runs
+    scenario = replace(US23, **TRIED[name])
+    chosen = {*flips.passes[:2], *flips.fails[:2], *found.failures[:3]}
+    for row in (run.cases[index] for index in chosen):
+        now = ms.run_case("design2", row, level=row["level"], scenario=scenario, fail_when="unsafe")
+        index = row["index"]
+        assert now.failed == ((index in found.failures) != (index in (*flips.passes, *flips.fails)))
+
+
+def test_the_ladder_says_which_failures_are_robust(found):
+    passing = [set(flips.passes + flips.without_verdict) for r in found.rungs for flips in r.runs]
+    robust = [index for index in found.failures if not any(index in some for some in passing)]
+    assert list(found.robust) == robust
+    assert set(found.fragile) == set(found.failures) - set(robust)
+    assert found.runs == 2 + len(RUNGS) - 1
+
+
+def test_draws_differ_and_repeat(run, found):
+    assert len(set(rung(found, "start").runs)) == 2
+    again = ms.stress(run, draws=2).found
+    assert again == found
+    assert ms.stress(run, draws=2, seed=1).found != found
+
+
+def test_the_file_says_what_the_study_found_and_the_report_shows_it(run, found):
+    ms.stress(run, draws=2)
+    assert stress_of(run.folder) == found
+    page = Path(run.report()).read_text(encoding="utf-8")
+    assert "What hangs by a thread" in page
+    assert "robust ones first" in page
+    (run.folder / STRESS).unlink()
+    assert stress_of(run.folder) is None
+    page = Path(run.report()).read_text(encoding="utf-8")
+    assert "What hangs by a thread" not in page
+    assert "Ten worst failures, one of each region first" in page
+
+
+def test_robust_failures_come_first_in_the_report(run, found):
+    last = min(run.run.outcomes, key=lambda o: -(o.score if o.failed else -1e9)).index
+    flips = Flips(tuple(index for index in found.failures if index != last))
+    kept = replaced(found, rungs=(Rung("one", "one", runs=(flips,)),))
+    (run.folder / STRESS).write_text(json.dumps(to_plain(kept)))
+    page = Path(run.report()).read_text(encoding="utf-8")
+    listed = page[page.index("Ten worst failures") :]
+    assert listed.index(f'data-case="{last}"') == listed.index("data-case=")
+    (run.folder / STRESS).unlink()
+
+
+def replaced(found, **changes):
+    names = Stress.__struct_fields__
+    return Stress(**{name: changes.get(name, getattr(found, name)) for name in names})
+
+
+@pytest.mark.parametrize(
+    "text", ["{}", "no JSON", '{"cases": -1}', '{"cases": 1, "failures": ["a"]}']
+)
+def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_sentence(tmp_path, text):
+    (tmp_path / STRESS).write_text(text)
+    with pytest.raises(UserError, match="is not as it was written"):
+        stress_of(tmp_path)
+
+
+def test_flips_by_hand(run):
+    failed = next(o for o in run.run.outcomes if o.failed)
+    passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
+    fails, passes, ends = Verdict(-900.0, True), Verdict(-1.0, True), Verdict(-1.0, False)
+    both = [failed, passed]
+    assert flips_of(both, {0: fails, 1: passes}) == Flips()
+    assert flips_of(both, {0: passes, 1: fails}) == Flips((failed.index,), (passed.index,))
+    assert flips_of(both, {0: ends, 1: ends}) == Flips((), (), (failed.index, passed.index))
+
+
+def test_numbers_that_make_no_ladder_are_refused(run):
+    with pytest.raises(UserError, match="--draws is 0"):
+        ms.stress(run, draws=0)
+
+
+def test_a_scenario_with_a_lag_of_its_own_skips_the_rungs_that_add_one(tmp_path):
+    scenario = replace(US23, act=Actuation(lag_s=0.3))
+    own = ms.campaign("design1", cases=6, level=0, scenario=scenario, out=tmp_path / "run")
+    skipped = {one.name: one.skipped for one in ms.stress(own, draws=1).found.rungs}
+    assert skipped["lag-0.2"] == "the scenario has lag_s of its own"
+    assert [name for name, why in skipped.items() if why] == ["lag-0.2", "lag-0.35", "lag-0.5"]
+
+
+def test_sumo_own_drivers_are_stressed_but_for_the_step(tmp_path):
+    own = ms.campaign("sumo:Krauss", cases=4, level=0, sampler="uniform", out=tmp_path / "run")
+    skipped = {one.name: one.skipped for one in ms.stress(own, draws=1).found.rungs if one.skipped}
+    assert skipped == {"step": "--vut sumo:Krauss drives in a SUMO world only"}
+
+
+class TestAShorterStep:
+    def world(self, x_vut_m=-10.0):
+        world = EquationWorld(1, road_for(US23), US23, substeps=5)
+        world.place(0, [(-50.0, 30.0), (x_vut_m, 20.0)])
+        return world
+
+    def test_moves_by_eq_4_five_times(self):
+        world = self.world()
+        world.command(np.array([[0.0], [1.0]]))
+        # 20 m/s for 0.02 s, then 20.02 m/s, ... 20.08 m/s.
+        assert world.x_m[:, 0] == pytest.approx([-47.0, -10.0 + 2.004], abs=1e-12)
+        assert world.v_mps[:, 0] == pytest.approx([30.0, 20.1], abs=1e-12)
+
+    def test_ends_an_episode_in_the_part_in_which_the_vut_arrives(self):
+        world = self.world(-1.0)
+        world.command(np.zeros((2, 1)))
+        # After 0.06 s the VUT is at 0.2 m.
+        assert world.x_m[:, 0] == pytest.approx([-48.2, 0.2], abs=1e-12)
