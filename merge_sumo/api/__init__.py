@@ -51,6 +51,7 @@ from merge_sumo.api.results import (
     CampaignRun,
     CaseRun,
     CertificateResult,
+    CrosscheckResult,
     PerMergeResult,
     PolicyChecks,
     ProbabilityResult,
@@ -102,6 +103,7 @@ from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies import benchmark, certificate, reproduction, versions, vut_check
+from merge_sumo.studies import crosscheck as peers
 from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import stress as ladder
@@ -142,7 +144,8 @@ if TYPE_CHECKING:
 
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
 __all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign", "certify"]
-__all__ += ["check_scenario", "check_vut", "compare", "compare_runs", "dated", "export"]
+__all__ += ["check_scenario", "check_vut", "compare", "compare_runs", "crosscheck", "dated"]
+__all__ += ["export"]
 __all__ += [
     "export_policy",
     "failures_per_merge",
@@ -975,6 +978,48 @@ def stress(
             on_cases=counter.ended,
         )
     return StressResult(found, before.folder / ladder.STRESS)
+
+
+def crosscheck(
+    run: AnyRun,
+    *,
+    cases: int | None = None,
+    seed: int = 0,
+    net: AnyPath | None = None,
+    trust_vut: bool = False,
+    **given: Unpack[RerunKeywords],
+) -> CrosscheckResult:
+    """Let another simulator run a campaign, and compare; the same as `merge-sumo crosscheck`.
+
+    Writes `crosscheck.json` into the folder of the campaign. Needs the extra `peers`.
+
+    Args:
+        run: the campaign, or its folder.
+        cases: cases that drive there: those recorded, and fresh uniform ones where there are fewer;
+            of more, those with the lowest scores. By default those recorded.
+        seed: of the fresh cases.
+        net: net for that; must be the one of the campaign.
+        trust_vut: run the controller that a folder names although it was not made here.
+        given: how the drivers run, where it is to change, and where the cases run: see
+            `RerunKeywords`.
+    """
+    check_keywords("crosscheck", given, RerunKeywords)
+    before = _opened(run).run
+    fields, runner = given_again(None, given, {"vut": before.vut})
+    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
+    plan = resolve(settings, _path(net))
+    total = len(before.outcomes) if cases is None else cases
+    with runner.open(plan) as opened, runner.counter(peers.peer_name(), total) as counter:
+        found = peers.crosscheck(
+            before,
+            settings,
+            plan,
+            cases=cases,
+            seed=seed,
+            workers=opened,
+            on_cases=counter.ended,
+        )
+    return CrosscheckResult(found, before.folder / peers.CROSSCHECK)
 
 
 def reproduce(

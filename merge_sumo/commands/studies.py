@@ -1,4 +1,4 @@
-"""Commands that measure: truth, compare, certify, probability, failures-per-merge, reproduce."""
+"""Commands that measure: truths, probabilities, coverage, and whether other simulators agree."""
 
 from __future__ import annotations
 
@@ -256,6 +256,36 @@ def stress(given: Given, run: RunArgument) -> None:
     from merge_sumo import api
 
     given.print(api.stress(run, **given.keywords))
+
+
+@app.verb(
+    options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"),
+    own={
+        "cases": option(
+            int | None,
+            None,
+            "Cases that drive there: those recorded, and fresh uniform ones where there are fewer.",
+            show_default="those recorded",
+        ),
+        "seed": SEED,
+    },
+)
+def crosscheck(given: Given, run: RunArgument) -> None:
+    """Let another simulator, HighwayEnv, run a campaign, and compare with SUMO.
+
+    Its vehicles are given the recorded accelerations, and must be where SUMO had them; then VUT and
+    POVs drive them, and the criterion of the campaign must give the same verdicts. Writes
+    crosscheck.json into the folder of the campaign, for the report. Needs the extra peers.
+
+    Exit code 0 when both agree, 1 where vehicles move otherwise there.
+
+    Example:  merge-sumo crosscheck runs/design2 --cases 1000
+    """
+    from merge_sumo import api
+
+    result = api.crosscheck(run, **given.written)
+    given.print(result)
+    raise typer.Exit(0 if result.agrees else 1)
 
 
 @app.verb(

@@ -5,7 +5,7 @@ Whatever runs cases does it here. A worker keeps its simulator open from one chu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -14,6 +14,7 @@ from typing import Any, Final, TypeVar, overload
 
 import numpy as np
 
+from merge_sumo.engine.highway_env_simulator import HighwayEnvSimulator
 from merge_sumo.engine.kinematic_simulator import CHUNK, KinematicSimulator, SubstepSimulator
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.simulator import Simulator
@@ -265,6 +266,13 @@ def _open_simulator(plan: SimulationPlan, nothing: Sequence[None]) -> Sequence[N
         return nothing
 
 
+SIMULATORS: Final[Mapping[Engine, Callable[[SimulationPlan], Simulator]]] = {
+    Engine.SUMO: Simulator,
+    Engine.KINEMATIC: KinematicSimulator,
+    Engine.HIGHWAY_ENV: HighwayEnvSimulator,
+}
+"""What carries out the plans of an engine."""
+
 _kept: tuple[tuple[object, ...], Simulator] | None = None
 """The simulator of this process, with the key of its plan: it stays open between chunks."""
 _one_at_a_time = RLock()
@@ -292,7 +300,7 @@ def opened_simulator(plan: SimulationPlan) -> Iterator[Simulator]:
 def _simulator(plan: SimulationPlan) -> Simulator:
     if plan.substeps > 1:
         return SubstepSimulator(plan)
-    return KinematicSimulator(plan) if plan.engine is Engine.KINEMATIC else Simulator(plan)
+    return SIMULATORS[plan.engine](plan)
 
 
 def close_simulator() -> None:

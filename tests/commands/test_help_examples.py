@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import typer
 from campaigning import run_campaign
+from conftest import require
 from typer.testing import CliRunner
 
 from merge_sumo import cli
@@ -59,6 +61,8 @@ def test_there_are_examples_of_every_command():
 def test_runs(example, place, monkeypatch, tmp_path):
     monkeypatch.chdir(place)
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
+    if example.split()[1] == "crosscheck":
+        require(find_spec("highway_env") is not None, "highway-env is not installed")
     words = [word for word in shlex.split(example) if word != "--gui"]
     assert words.pop(0) == "merge-sumo"
     for place_of, word in enumerate(words[:-1]):
