@@ -169,6 +169,10 @@ class Driver(ABC):
         """
         return None
 
+    def parameters(self) -> Mapping[str, float]:
+        """Return the numbers that a spec may set as `?NAME=VALUE`, with their present values."""
+        return {}
+
     def signals(self) -> Mapping[int, Left]:
         """Return what the controllers left with their last answers, by corridor."""
         return NO_SIGNALS

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -66,6 +67,10 @@ class GapChoiceVut(Level0Vut):
         self._before_mps: FloatArray | None = None
         """Speeds of all vehicles a step ago, (A, K)."""
         self._wishes = np.full(corridors, NO_WISH, dtype=np.int8)
+
+    def parameters(self) -> Mapping[str, float]:
+        """Return the parameters of the choice."""
+        return asdict(self.choice)
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the profile, the lane and the lengths of the case's scenario."""

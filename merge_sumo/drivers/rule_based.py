@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -77,6 +78,10 @@ class RuleBasedVut(Level0Vut):
         self._actuator = np.zeros(corridors)
         self._a_min = np.full(corridors, US23.a_min_mps2)
         self._a_max = np.full(corridors, US23.a_max_mps2)
+
+    def parameters(self) -> Mapping[str, float]:
+        """Return the parameters of the design."""
+        return asdict(self.design)
 
     def begin(self, corridor: int, case: Case) -> None:
         """Reset the PID and the actuator of a corridor; take the limits of its scenario."""

@@ -94,6 +94,27 @@ def split_options(argument: str, spec: str) -> tuple[str, dict[str, str]]:
     return before, options
 
 
+def with_options(spec: str, options: Mapping[str, str]) -> str:
+    """Return a spec with options, in the place of those of the same name."""
+    before, given = split_options(spec, spec)
+    both = {**given, **options}
+    return f"{before}?{'&'.join(f'{name}={value}' for name, value in both.items())}"
+
+
+def numbers_of(given: Mapping[str, str], spec: str) -> dict[str, float]:
+    """Return options as numbers, whole ones as int; `UserError` for what is no finite number."""
+    numbers: dict[str, float] = {}
+    for name, text in given.items():
+        try:
+            value = float(text)
+            numbers[name] = int(text) if text.lstrip("+-").isdecimal() else value
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise UserError(f"--vut {spec}: {name} is {text!r}: give a number")
+    return numbers
+
+
 class Car(NamedTuple):
     """A car of the mainline.
 

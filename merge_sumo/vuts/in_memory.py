@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any, Final, Protocol, SupportsFloat
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import workers_or_cores
-from merge_sumo.vuts.base import Seen, Vut, VutOptions, text_of
+from merge_sumo.vuts.base import Seen, Vut, VutOptions, numbers_of, split_options, text_of
 from merge_sumo.vuts.python import SeenBatch, is_code, vut_of
 
 Answer = SupportsFloat | tuple[SupportsFloat, bool]
@@ -77,12 +77,16 @@ def is_here(spec: str) -> bool:
 
 def object_of(spec: str) -> Any:
     """Return the object that a spec names; None for a spec that is a text for everybody."""
-    return _objects.get(spec.partition(":")[2]) if is_here(spec) else None
+    return _objects.get(_name_in(spec)) if is_here(spec) else None
 
 
 def keep(spec: str, vut: Any) -> None:
     """Keep an object that came from another process, under the name that it has there."""
-    _objects[spec.partition(":")[2]] = vut
+    _objects[_name_in(spec)] = vut
+
+
+def _name_in(spec: str) -> str:
+    return spec.partition(":")[2].partition("?")[0]
 
 
 def travels(spec: str) -> bool:
@@ -131,17 +135,21 @@ def drivers_of(
 
 def here_vut(argument: str, options: VutOptions) -> Vut:
     """Return the VUT of `here:NAME`; `UserError` where that is an object of another process."""
-    if argument not in _objects:
+    name, given = split_options(argument, f"{HERE}:{argument}")
+    if name not in _objects:
         raise UserError(
             f"{HERE}:{argument} was an object of a Python process: name a VUT with --vut, or give "
             "the object again"
         )
-    return vut_of_object(_objects[argument], f"{HERE}:{argument}", options)
+    spec = f"{HERE}:{argument}"
+    return vut_of_object(_objects[name], spec, options, numbers_of(given, spec))
 
 
-def vut_of_object(thing: Any, name: str, options: VutOptions) -> Vut:
+def vut_of_object(
+    thing: Any, name: str, options: VutOptions, given: Mapping[str, float] | None = None
+) -> Vut:
     """Return the VUT that an object, a class or a function is; `UserError` for one that is none."""
-    vut = vut_of(thing, name, options)
+    vut = vut_of(thing, name, options, given)
     if vut is None:
         raise UserError(
             f"{text_of(thing, repr)[:80]} is no VUT: give a spec as after --vut, a class or an "

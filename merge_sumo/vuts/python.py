@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -30,10 +30,13 @@ from merge_sumo.vuts.base import (
     Vut,
     VutOptions,
     WrongAnswerError,
+    numbers_of,
     seen_at_start,
+    split_options,
     text_of,
 )
 from merge_sumo.vuts.blame_cell import ALL_CORRIDORS, NO_CORRIDOR, current_call
+from merge_sumo.vuts.parameters import Parameters
 from merge_sumo.vuts.signatures import check_call, check_methods, fits
 
 GROUP: Final = "merge_sumo.vuts"
@@ -45,29 +48,41 @@ def installed_vuts() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
-def installed_vut(name: str, options: VutOptions) -> Vut:
+def installed_vut(spec: str, options: VutOptions) -> Vut:
     """Return the VUT that an installed package registers; `UserError` when it cannot be loaded."""
+    name, given = split_options(spec, spec)
     try:
         target = installed_vuts()[name].load()
     except (Exception, SystemExit) as error:
         raise UserError(_cannot_load(name, error)) from error
-    return _named_vut(target, name, sys.modules.get(getattr(target, "__module__", "")), options)
+    module = sys.modules.get(getattr(target, "__module__", ""))
+    return _named_vut(target, spec, module, options, numbers_of(given, spec))
 
 
 def python_vut(spec: str, options: VutOptions) -> Vut:
-    """Return the VUT `module:Name` or `file.py:Name`; `UserError` when it cannot be loaded."""
-    source, _, name = spec.rpartition(":")
+    """Return the VUT `module:Name` or `file.py:Name`, with its parameters behind a "?".
+
+    Raises `UserError` when it cannot be loaded.
+    """
+    named, given = split_options(spec, spec)
+    source, _, name = named.rpartition(":")
     module = _load_file(Path(source)) if source.endswith(".py") else _load_module(source)
     target: Any = module
     for part in name.split("."):
         target = getattr(target, part, None)
     if target is None:
         raise UserError(f"{source} has no {name!r}: name a class or a function of it")
-    return _named_vut(target, spec, module, options)
+    return _named_vut(target, spec, module, options, numbers_of(given, spec))
 
 
-def _named_vut(target: Any, spec: str, module: ModuleType | None, options: VutOptions) -> Vut:
-    vut = vut_of(target, spec, options) if is_code(target) else None
+def _named_vut(
+    target: Any,
+    spec: str,
+    module: ModuleType | None,
+    options: VutOptions,
+    given: Mapping[str, float],
+) -> Vut:
+    vut = vut_of(target, spec, options, given) if is_code(target) else None
     if vut is None:
         raise UserError(
             f"{spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)`, a "
@@ -82,12 +97,14 @@ def is_code(target: Any) -> bool:
     return isinstance(target, type) or inspect.isroutine(target)
 
 
-def vut_of(target: Any, name: str, options: VutOptions) -> Vut | None:
+def vut_of(
+    target: Any, name: str, options: VutOptions, given: Mapping[str, float] | None = None
+) -> Vut | None:
     """Return the VUT that a class, a function or an object makes; None where it makes none.
 
     Each corridor has an object of its own: a new one of a class, a copy of an object. One that acts
-    in all corridors at once is not copied. Raises `UserError` where a method or a function cannot
-    be called as VUTs are.
+    in all corridors at once is not copied, unless parameters are `given`. Raises `UserError` where
+    a method or a function cannot be called as VUTs are, or has no such parameter.
     """
     if inspect.isroutine(target):
         check_call(target, ("seen",))
@@ -97,16 +114,20 @@ def vut_of(target: Any, name: str, options: VutOptions) -> Vut | None:
     batched, acts = (callable(getattr(target, method, None)) for method in ("act_batch", "act"))
     if not (batched or acts or (not is_class and callable(target) and fits(target, 1))):
         return None
+    parameters = Parameters.of(target, name, given or {}, in_order=int(not is_class or batched))
 
     def make(corridors: int, _world: World | None) -> Driver:
         def new(*arguments: int) -> Any:
             if is_class:
-                return _made(target, name, *arguments)
-            return target if batched or inspect.isroutine(target) else _copied(target, name)
+                made = _made(target, name, *arguments, **parameters.keywords)
+                return parameters.set_in(made)
+            if inspect.isroutine(target):
+                return parameters.bound(target)
+            return parameters.set_in(target if batched and not given else _copied(target, name))
 
         if batched:
-            return BatchedVut(corridors, lambda: new(corridors), options.deadline_s)
-        return PythonVut(corridors, new, options.deadline_s, acts=acts)
+            return BatchedVut(corridors, lambda: new(corridors), options.deadline_s, parameters)
+        return PythonVut(corridors, new, options.deadline_s, parameters, acts=acts)
 
     return Vut(make=make)
 
@@ -120,11 +141,17 @@ class PythonVut(PerCorridor):
     """
 
     def __init__(
-        self, corridors: int, new: Callable[[], Any], deadline_s: float, *, acts: bool
+        self,
+        corridors: int,
+        new: Callable[[], Any],
+        deadline_s: float,
+        parameters: Parameters,
+        *,
+        acts: bool,
     ) -> None:
         """Make an object for each corridor by `new`; `acts` says whether it has `act`."""
         super().__init__(corridors, deadline_s)
-        self._new, self._acts = new, acts
+        self._new, self._parameters, self._acts = new, parameters, acts
         self._objects: list[Any] = [None] * corridors
         for corridor in range(corridors):
             self.renew(corridor)
@@ -152,6 +179,10 @@ class PythonVut(PerCorridor):
             self.leave(corridor, left)
         return answer
 
+    def parameters(self) -> Mapping[str, float]:
+        """Return the parameters of the first object."""
+        return self._parameters.present(self._objects[0])
+
     def close(self) -> None:
         """Call `close` of every object that has it; what it raises is printed."""
         for vut in self._objects:
@@ -166,10 +197,16 @@ class BatchedVut(Driver):
     and `close()`.
     """
 
-    def __init__(self, corridors: int, make: Callable[[], Any], deadline_s: float) -> None:
+    def __init__(
+        self,
+        corridors: int,
+        make: Callable[[], Any],
+        deadline_s: float,
+        parameters: Parameters,
+    ) -> None:
         super().__init__(corridors)
         self._deadline = Deadline(deadline_s)
-        self._make = make
+        self._make, self._parameters = make, parameters
         self._object = make()
         self._renew_first = False
         self._raised: str | None = None
@@ -231,6 +268,10 @@ class BatchedVut(Driver):
         for corridor in np.flatnonzero(active & ~known).tolist():
             wrong = f"wishes {wishes[corridor]} instead of 1 or 0, to merge or not"
             self._wrong.setdefault(corridor, wrong)
+
+    def parameters(self) -> Mapping[str, float]:
+        """Return the parameters of the object."""
+        return self._parameters.present(self._object)
 
     def wishes(self) -> NDArray[np.int8] | None:
         """Return what the last answers wish, (K,); None where they do not say."""
@@ -298,10 +339,10 @@ def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
     )
 
 
-def _made(target: type, spec: str, *arguments: int) -> Any:
+def _made(target: type, spec: str, *arguments: int, **keywords: float) -> Any:
     current_call.note(NO_CORRIDOR)  # it goes on: each object may take its time
     try:
-        return target(*arguments)
+        return target(*arguments, **keywords)
     except (Exception, SystemExit) as error:
         given = f" with {arguments[0]} corridors" if arguments else " without arguments"
         what = f"{type(error).__name__}: {text_of(error)}"

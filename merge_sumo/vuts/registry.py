@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,14 +15,14 @@ from merge_sumo.drivers.gap_choice import GapChoice, GapChoiceVut
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
+from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedDesign, RuleBasedVut
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.hashing import Files, hashed
 from merge_sumo.system.registry import Registry
 from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import workers_or_cores
-from merge_sumo.vuts.base import Vut, VutOptions, split_options
+from merge_sumo.vuts.base import Vut, VutOptions, numbers_of, split_options
 from merge_sumo.vuts.fmu import fmu_vut
 from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
 from merge_sumo.vuts.in_memory import HERE, here_vut, keep, object_of
@@ -50,10 +51,12 @@ class VutKind:
     file_of: Callable[[str], str] = lambda _: ""
     """Returns the file that an argument names; "" for none."""
     no_pov: str = ""  # why it cannot drive a POV; "" where it can
+    no_parameters: str = ""
+    """Why a spec cannot set the parameters of its controller, in a clause; "" where it can."""
 
 
 def _python_file(spec: str) -> str:
-    source = spec.rpartition(":")[0]
+    source = _file_before_options(spec).rpartition(":")[0]
     return source if source.endswith(".py") else ""
 
 
@@ -65,30 +68,29 @@ def _built_in_vut(spec: str, options: VutOptions) -> Vut:
     name, given = split_options(spec, spec)
     make = built_in_vuts(options.policies)[name]
     if given:
-        make = partial(GapChoiceVut, choice=_gap_choice(name, given, spec))
+        make = _with_parameters(name, given, spec)
     return Vut(make=lambda corridors, _world: make(corridors), by_arrays=True)
 
 
-def _gap_choice(name: str, given: dict[str, str], spec: str) -> GapChoice:
-    """Return the parameters of `gap?NAME=VALUE&...`; `UserError` for what are none."""
-    known = [field.name for field in fields(GapChoice)] if name == GAP else []
-    values: dict[str, float] = {}
-    for option, text in given.items():
+def _with_parameters(name: str, given: dict[str, str], spec: str) -> Callable[[int], Driver]:
+    """Return what makes a built-in VUT with other parameters; `UserError` for what are none."""
+    present = PARAMETERS.get(name)
+    known = [] if present is None else [field.name for field in fields(present)]
+    for option in given:
         if option not in known:
             has = f"choose from {', '.join(known)}" if known else "it has none"
             raise UserError(f"--vut {spec}: {name} has no option {option!r}: {has}")
-        try:
-            values[option] = float(text)
-        except ValueError:
-            raise UserError(f"--vut {spec}: {option} is {text!r}: give a number") from None
+    values = {option: float(value) for option, value in numbers_of(given, spec).items()}
     try:
-        return GapChoice(**values)
+        if isinstance(present, GapChoice):
+            return partial(GapChoiceVut, choice=replace(present, **values))
+        return partial(RuleBasedVut, design=replace(DESIGNS[name], **values))
     except UserError as error:
         raise UserError(f"--vut {spec}: {error}") from error
 
 
 PYTHON: Final = VutKind(
-    form="MODULE:NAME or FILE.py:NAME",
+    form="MODULE:NAME[?PARAMETER=VALUE&...] or FILE.py:NAME",
     what="a class with act(seen), a function of seen, or a batched class",
     example="--vut my_vut.py:MyVut",
     prepare=python_vut,
@@ -111,6 +113,7 @@ KINDS: Final[Registry[VutKind]] = Registry(
             example='--vut traci --vut-command "python my_controller.py {port}"',
             prepare=traci_vut,
             by_command=True,
+            no_parameters="a TraCI client is a program with parameters of its own",
             no_pov=(
                 "a TraCI client drives the vehicle `vut` and no other; bring the POV as Python, an "
                 "FMU, a network or sumo:MODEL"
@@ -127,6 +130,7 @@ KINDS: Final[Registry[VutKind]] = Registry(
             form="onnx:FILE[?decision_period_s=SECONDS]",
             what="a network from the state to an acceleration, or to values of the 7 actions",
             example="--vut onnx:policy.onnx",
+            no_parameters="the parameters of a network are its weights",
             prepare=onnx_vut,
             hosted=True,
             file_of=_file_before_options,
@@ -135,6 +139,7 @@ KINDS: Final[Registry[VutKind]] = Registry(
             form="fmu:FILE[?VARIABLE=NAME&...]",
             what="an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables",
             example='--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"',
+            no_parameters="the options of an FMU are the names of its variables",
             prepare=fmu_vut,
             hosted=True,
             file_of=_file_before_options,
@@ -148,7 +153,9 @@ KINDS: Final[Registry[VutKind]] = Registry(
 
 
 GAP: Final = "gap"
-"""The built-in VUT that chooses a gap on an acceleration lane, and has options."""
+"""The built-in VUT that chooses a gap on an acceleration lane."""
+PARAMETERS: Final[Mapping[str, GapChoice | RuleBasedDesign]] = {GAP: GapChoice(), **DESIGNS}
+"""Parameters of the built-in VUTs that have any, which a spec may set: `design2?x1_m=150`."""
 LEARNED: Final = {"level1": "vut1", "level2": "vut2"}
 """The network of each learned VUT."""
 
@@ -256,6 +263,22 @@ def file_named(spec: str) -> str:
     return kind_of(spec).file_of(_argument(spec))
 
 
+def parameters_of(factory: VutFactory) -> dict[str, float]:
+    """Return the parameters of a VUT that a spec may set, with their present values.
+
+    A Python controller is made to tell its attributes. Of SUMO's drivers only those are known that
+    the spec sets. Raises `UserError` for a kind without parameters.
+    """
+    kind = kind_of(factory.spec)
+    if kind.no_parameters:
+        raise UserError(f"{factory.spec} has no parameters to change: {kind.no_parameters}")
+    if factory.vut.vut_type is not None:
+        _, given = split_options(factory.spec, factory.spec)
+        return numbers_of(given, factory.spec)
+    with closing(factory(1)) as driver:
+        return dict(driver.parameters())
+
+
 def _argument(spec: str) -> str:
     prefix, _, argument = spec.partition(":")
     return argument if prefix in KINDS else spec
@@ -269,7 +292,7 @@ def find_vut(spec: str, options: VutOptions) -> Vut:
     kind = kind_of(spec)
     if options.command is not None and not kind.by_command:
         raise UserError(f"--vut-command goes with --vut traci, not with {spec}")
-    if kind is INSTALLED and spec not in installed_vuts():
+    if kind is INSTALLED and spec.partition("?")[0] not in installed_vuts():
         raise UserError(_why_unknown(spec))
     if kind.hosted and not options.in_process and SUPPORTED:
         return hosted_vut(FINDER, spec, options)

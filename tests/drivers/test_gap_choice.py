@@ -109,10 +109,11 @@ def test_it_merges_in_sumo_and_a_longer_headway_merges_later(name):
         ("gap?headway=1", "gap has no option 'headway': choose from headway_s, brake_mps2"),
         ("gap?headway_s=long", "headway_s is 'long': give a number"),
         ("gap?headway_s=-1", "headway_s is -1.0: it must be a number from 0 up"),
-        ("gap?headway_s=nan", "headway_s is nan"),
+        ("gap?headway_s=nan", "headway_s is 'nan': give a number"),
         ("gap?brake_mps2=0", "brake_mps2 is 0"),
         ("gap?headway_s", "'headway_s' is not an option: write NAME=VALUE"),
-        ("design1?headway_s=1", "design1 has no option 'headway_s': it has none"),
+        ("design1?headway_s=1", "design1 has no option 'headway_s': choose from x1_m,"),
+        ("design2?x2_m=140", "x2_m is 140.0: stage 3 cannot begin before stage 2"),
         ("level1?x=1", "level1 has no option 'x': it has none"),
     ],
 )

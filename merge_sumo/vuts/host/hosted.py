@@ -139,9 +139,14 @@ class Host:
             self.kill()
             raise
 
-    def make(self, spec: str, corridors: int) -> None:
-        """Have the VUT's driver made; `UserError` when that cannot be."""
-        self._open(spec, About.MAKE, corridors)
+    def make(self, spec: str, corridors: int) -> Mapping[str, float]:
+        """Have the VUT's driver made, return its parameters; `UserError` when that cannot be."""
+        content = self._open(spec, About.MAKE, corridors)
+        try:
+            return wire.numbers_from_json(content)
+        except WireError:
+            self.kill()
+            raise UserError(f"the VUT {spec} broke the channel to its process") from None
 
     def ask(self, about: About, content: bytes = b"", *, patience_s: float | None = None) -> Frame:
         """Ask and return the answer; raises `HostDiedError` when there is none.
@@ -307,6 +312,7 @@ class HostedVut(Driver):
         self._signals: dict[int, Left] = {}
         self._wishes: NDArray[np.int8] | None = None
         self._files: set[Path] = set()
+        self._parameters: Mapping[str, float] = {}
         self._host = _first(self._started)
 
     def begin(self, corridor: int, case: Case) -> None:
@@ -355,6 +361,10 @@ class HostedVut(Driver):
         """Return what the VUT's last answers wish, (K,); None where none of them says."""
         return self._wishes
 
+    def parameters(self) -> Mapping[str, float]:
+        """Return the parameters of the VUT, as they were when it was made."""
+        return self._parameters
+
     def reason(self, corridor: int) -> str | None:
         """Return what the VUT did wrong in a corridor."""
         return self._reasons.get(corridor)
@@ -374,5 +384,5 @@ class HostedVut(Driver):
     def _started(self) -> Host:
         host = Host(self._finder, self._spec, self._options)
         self._files |= {Path(file) for file in host.facts["files"]}
-        host.make(self._spec, self.corridors)
+        self._parameters = host.make(self._spec, self.corridors)
         return host

@@ -101,7 +101,7 @@ class _Hosting:
         if question.about is About.MAKE:
             assert self._vut is not None, "opened first"  # noqa: S101
             self._driver = self._vut.make(wire.from_json(question.content, int), None)
-            return About.DONE, b""
+            return About.DONE, wire.to_json(dict(self._driver.parameters()))
         if question.about is About.FILES:
             return About.DONE, wire.to_json(self._files())
         assert self._driver is not None, "made first"  # noqa: S101

@@ -90,6 +90,19 @@ def from_json(content: bytes, kind: type[Any]) -> Any:
     return value
 
 
+def numbers_from_json(content: bytes) -> dict[str, float]:
+    """Return finite numbers by name that JSON says; `WireError` where it says something else."""
+    numbers = from_json(content, dict)
+    for value in numbers.values():
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not math.isfinite(value)
+        ):
+            raise WireError("it is no number")
+    return dict(numbers)
+
+
 _TOLD: Final = ("x_vut0_m", "level0_a_mps2", "level0_v_mps", "a_min_mps2", "a_max_mps2")
 """What a VUT is told of its scenario, besides the acceleration lane."""
 _NO_LANE: Final = (math.nan, math.nan)

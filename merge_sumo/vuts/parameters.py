@@ -1,0 +1,126 @@
+"""Parameters of a Python controller: the numbers that a spec sets, as in `my_vut.py:MyVut?gain=2`.
+
+A parameter is a keyword of the constructor, or of the function, that is the controller. One that
+the constructor does not have is an attribute, with a number, that the object has once it is made.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from inspect import Parameter
+from types import MemberDescriptorType
+from typing import Any, Self
+
+import numpy as np
+
+from merge_sumo.errors import UserError
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """How the parameters of a spec reach the objects of a controller.
+
+    Attributes:
+        spec: the spec, for messages.
+        keywords: those that the constructor or the function is called with.
+        attributes: those that an object is given after it was made.
+        known: all keywords that could be given, with their present values; None for one that has
+            no number by default.
+    """
+
+    spec: str
+    keywords: Mapping[str, float]
+    attributes: Mapping[str, float]
+    known: Mapping[str, float | None]
+
+    @classmethod
+    def of(cls, target: Any, spec: str, given: Mapping[str, float], in_order: int) -> Self:
+        """Return how `given` parameters reach a class, a function or an object.
+
+        `in_order` arguments are given by their place. Raises `UserError` for a parameter that a
+        function does not have.
+        """
+        is_code = isinstance(target, type) or inspect.isroutine(target)
+        defaults = _keywords(target, in_order) if is_code else {}
+        keywords = {name: value for name, value in given.items() if name in defaults}
+        attributes = {name: value for name, value in given.items() if name not in defaults}
+        if attributes and inspect.isroutine(target):
+            raise _unknown(spec, next(iter(attributes)), defaults)
+        known = {name: _number(keywords.get(name, value)) for name, value in defaults.items()}
+        return cls(spec, keywords, attributes, known)
+
+    def bound(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that has its keywords, and is called with what the VUT sees."""
+        if not self.keywords:
+            return function
+
+        def called(seen: Any) -> Any:
+            return function(seen, **self.keywords)
+
+        return called
+
+    def set_in(self, made: Any) -> Any:
+        """Give an object its attributes, and return it; `UserError` where it has none of them."""
+        if self.attributes:
+            present = self.present(made)
+            for name, value in self.attributes.items():
+                if name not in present:
+                    raise _unknown(self.spec, name, present)
+                try:
+                    setattr(made, name, value)
+                except Exception as error:
+                    raise UserError(f"--vut {self.spec}: {name} cannot be set") from error
+        return made
+
+    def present(self, made: Any) -> dict[str, float]:
+        """Return all parameters of an object, or of a function, that have a number."""
+        found = {} if inspect.isroutine(made) else _attributes(made)
+        return found | {name: value for name, value in self.known.items() if value is not None}
+
+
+def _keywords(function: Any, in_order: int) -> dict[str, Any]:
+    """Return the keywords of a function or a class, with their defaults, without those in order."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return {}
+    kinds = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
+    return {p.name: p.default for p in parameters[in_order:] if p.kind in kinds}
+
+
+def _attributes(made: Any) -> dict[str, float]:
+    """Return the public attributes of an object that are numbers; no code of it runs."""
+    try:
+        names = set(object.__getattribute__(made, "__dict__"))
+    except AttributeError:
+        names = set()
+    for owner in type(made).__mro__:
+        names |= set(vars(owner))
+    found: dict[str, float] = {}
+    for name in sorted(names, key=str):
+        value = inspect.getattr_static(made, name, None)
+        if isinstance(value, MemberDescriptorType):  # of __slots__
+            value = getattr(made, name, None)
+        number = _number(value)
+        if number is not None and not name.startswith("_"):
+            found[name] = number
+    return found
+
+
+def _number(value: Any) -> float | None:
+    """Return a value as a number; None for what is no finite one."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return None
+    number = value.item() if isinstance(value, np.generic) else value
+    return number if math.isfinite(number) else None
+
+
+def _unknown(spec: str, name: str, known: Mapping[str, Any]) -> UserError:
+    names = ", ".join(sorted(known))
+    return UserError(
+        f"--vut {spec}: it has no parameter {name!r}: "
+        + (f"choose from {names}" if names else "it has none")
+    )

@@ -1,0 +1,122 @@
+"""Parameters in a spec, `SPEC?NAME=VALUE`: how they reach controllers of each kind."""
+
+from __future__ import annotations
+
+import pytest
+
+from merge_sumo.drivers.rule_based import DESIGNS
+from merge_sumo.errors import UserError
+from merge_sumo.vuts.base import VutOptions, with_options
+from merge_sumo.vuts.in_memory import keep
+from merge_sumo.vuts.registry import VutFactory, parameters_of
+
+SOURCE = """
+class Vut:
+    late_m = 10.0
+
+    def __init__(self, gain=2.0, name="x"):
+        self.gain, self.shift, self._hidden, self.on = gain, 3, 1.0, True
+
+    def act(self, seen):
+        return self.gain
+
+
+class Slots:
+    __slots__ = ("a",)
+
+    def __init__(self):
+        self.a = 1.5
+
+    def act(self, seen):
+        return self.a
+
+
+class Batch:
+    def __init__(self, corridors, gain=1.0):
+        self.gain = gain
+
+    def act_batch(self, seen):
+        return seen.x_vut_m * 0 + self.gain
+
+
+def law(seen, gain=1.0):
+    return gain
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "vut.py"
+    path.write_text(SOURCE, encoding="utf-8")
+    return path
+
+
+def parameters(spec: str, *, in_process: bool = True) -> dict[str, float]:
+    return parameters_of(VutFactory(spec, VutOptions(in_process=in_process)))
+
+
+@pytest.mark.parametrize(
+    ("named", "expected"),
+    [
+        ("Vut", {"gain": 2.0, "late_m": 10.0, "shift": 3}),
+        ("Vut?gain=4&shift=5&late_m=0.5", {"gain": 4, "late_m": 0.5, "shift": 5}),
+        ("Slots?a=2.5", {"a": 2.5}),
+        ("Batch?gain=0.5", {"gain": 0.5}),
+        ("law", {"gain": 1.0}),
+        ("law?gain=3", {"gain": 3}),
+    ],
+)
+def test_a_python_controller_takes_keywords_and_attributes(file, named, expected):
+    assert parameters(f"{file}:{named}") == expected
+
+
+def test_a_hosted_controller_tells_the_same(file):
+    assert parameters(f"{file}:Vut?shift=5", in_process=False) == {
+        "gain": 2.0,
+        "late_m": 10.0,
+        "shift": 5,
+    }
+
+
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        ("Vut?nothing=1", "it has no parameter 'nothing': choose from gain, late_m, shift"),
+        ("Vut?_hidden=1", "it has no parameter '_hidden'"),
+        ("Vut?on=1", "it has no parameter 'on'"),
+        ("Batch?corridors=3", "it has no parameter 'corridors': choose from gain"),
+        ("law?seen=1", "it has no parameter 'seen': choose from gain"),
+        ("Vut?gain=fast", "gain is 'fast': give a number"),
+        ("Vut?gain=1&gain=2", "the option gain is there twice"),
+        ("Vut?gain", "'gain' is not an option: write NAME=VALUE"),
+    ],
+)
+def test_what_is_no_parameter_is_refused_in_a_sentence(file, named, said):
+    with pytest.raises(UserError, match="--vut") as refused:
+        parameters(f"{file}:{named}")
+    assert said in str(refused.value)
+
+
+def test_an_object_is_copied_before_it_is_changed():
+    class Vut:
+        gain = 2.0
+
+        def act(self, seen):
+            return self.gain
+
+    vut = Vut()
+    keep("here:Vut", vut)
+    assert parameters("here:Vut?gain=5") == {"gain": 5}
+    assert vut.gain == 2.0
+
+
+def test_a_built_in_design_keeps_what_is_not_set():
+    changed = parameters("design2?gap_m=20")
+    assert changed.pop("gap_m") == 20.0
+    assert changed == {name: getattr(DESIGNS["design2"], name) for name in changed}
+    assert len(changed) == 7
+
+
+def test_an_option_is_set_in_the_place_of_an_older_one():
+    assert with_options("a.py:V?x=1&y=2", {"y": "3", "z": "4"}) == "a.py:V?x=1&y=3&z=4"
+    assert with_options("design2", {"gap_m": "20"}) == "design2?gap_m=20"
