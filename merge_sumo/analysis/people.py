@@ -242,6 +242,13 @@ class PeopleSummary:
         )
 
     @property
+    def gate_found(self) -> str:
+        """What the gate `human failures` counts, in a phrase."""
+        if self.left_out:
+            return f"{counted(self.inside, 'failure')}; {self.left_out}"
+        return f"{counted(self.inside, 'failure')} within {self.people}"
+
+    @property
     def findings(self) -> list[str]:
         """The POV levels that do more than people in failures, each in a sentence."""
         return (

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from merge_sumo.analysis.people import PeopleSummary
 from merge_sumo.analysis.summary import Summary
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import counted, printable
@@ -204,12 +205,17 @@ def in_words(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
+HUMAN_FAILURES: Final = "human failures"
+"""The gate that counts failures in which the POV does no more than people."""
+
+
 @dataclass(frozen=True, slots=True)
 class Gate:
     """What a campaign must not show: more than `above` of something.
 
     Attributes:
-        what: "failures", "errors", "timeouts" (a number of cases) or "fmc" (at some POV level).
+        what: "failures", "human failures" (those in which the POV does no more than people),
+            "errors", "timeouts" (a number of cases) or "fmc" (at some POV level).
         above: the gate is met beyond this.
     """
 
@@ -221,7 +227,7 @@ class Gate:
         """The gate as it is written."""
         return f"{self.what}>{self.above}" if self.what == "fmc" else self.what
 
-    def check(self, verdict: Verdict, summary: Summary) -> GateResult:
+    def check(self, verdict: Verdict, summary: Summary, people: PeopleSummary) -> GateResult:
         """Return whether a campaign meets the gate, and what it shows."""
         if self.what == "fmc":
             level, most = max(
@@ -231,6 +237,8 @@ class Gate:
             )
             said = f"FMC {most:.4f} at level {level_name(level)}"
             return GateResult(self.name, most > self.above, said)
+        if self.what == HUMAN_FAILURES:
+            return GateResult(self.name, people.inside > 0, people.gate_found)
         number: int = getattr(verdict, self.what)
         return GateResult(self.name, number > 0, counted(number, self.what.removesuffix("s")))
 
@@ -259,13 +267,14 @@ def parse_gates(texts: Iterable[str]) -> list[Gate]:
 
 
 def _parse_gate(text: str) -> Gate:
-    if text in ("failures", "errors", "timeouts"):
+    if text in ("failures", HUMAN_FAILURES, "errors", "timeouts"):
         return Gate(text)
     what, sign, number = (part.strip() for part in text.partition(">"))
     if (what, sign) != ("fmc", ">"):
         raise UserError(
-            f"there is no gate {printable(text)!r}: choose failures, errors, timeouts or "
-            '"fmc>X" (in quotes, or the shell takes the ">")'
+            f"there is no gate {printable(text)!r}: choose failures, "
+            f'"{HUMAN_FAILURES}", errors, timeouts or "fmc>X" (in quotes, or the shell takes the '
+            '">")'
         )
     try:
         above = float(number)

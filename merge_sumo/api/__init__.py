@@ -179,10 +179,11 @@ def campaign(
         net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/<vut>-<date>` by default.
         given: which cases are chosen (`level`, `sampler`, `cases`, `batch`, `in_flight`, `seed`,
-            `v_vut0_mps`, `stop_after_converged`, `learn_from`), how a case is run and judged
-            (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`, `vut_command`,
-            `deadline_s`, `vut_memory_gib`, `in_process`), where it runs (`workers`, `dask`), and
-            who is told (`progress`, `on_case`, `check`, `gates`, `junit`); see `CampaignKeywords`.
+            `v_vut0_mps`, `stop_after_converged`, `audit`, `learn_from`), how a case is run and
+            judged (`people`, `scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
+            `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`), where it runs (`workers`,
+            `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`); see
+            `CampaignKeywords`.
 
     An interrupted campaign goes on with `resume`.
     """
@@ -543,9 +544,16 @@ def export(
     return list(exports.write_folders(loaded, wanted, target, export_format.write_case, road))
 
 
-def report(run: AnyRun) -> Path:
-    """Write the report of a campaign again and return its path; as `merge-sumo report`."""
-    return _opened(run).report()
+def report(run: AnyRun, *, people: float | None = None) -> Path:
+    """Write the report of a campaign again and return its path; as `merge-sumo report`.
+
+    Args:
+        run: the campaign, or its folder.
+        people: share of published drivers beside whom the report holds failures, instead of the
+            campaign's, which stays as it is.
+    """
+    opened = _opened(run)
+    return (opened if people is None else CampaignRun(opened.run, people=people)).report()
 
 
 def replay(folder: AnyRun, index: int | None = None, *, net: AnyPath | None = None) -> Replay:

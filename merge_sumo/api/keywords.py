@@ -91,6 +91,8 @@ class Settings(Setup, total=False):
         v_vut0_mps: initial speed of the VUT; the scenario's by default.
         stop_after_converged: stop when less than this share of new coverage is expected.
         audit: uniform cases among them, which bound what the campaign missed; none by default.
+        people: share of published drivers; a failure in which the POV does more than they do is
+            shown apart, whatever decides it. 1 by default: the hardest of them.
         learn_from: folders of earlier campaigns to learn the VUT from.
     """
 
@@ -103,6 +105,7 @@ class Settings(Setup, total=False):
     v_vut0_mps: float | None
     stop_after_converged: float | None
     audit: int | None
+    people: float
     learn_from: Sequence[Path | str] | None
 
 
@@ -136,7 +139,8 @@ class CampaignKeywords(Settings, Running, total=False):
     Attributes:
         on_case: called with the outcome of every case as it ends.
         check: called after every batch; may raise to stop there.
-        gates: "failures", "errors", "timeouts" or "fmc>X": what `passed` of the result depends on.
+        gates: "failures", "human failures", "errors", "timeouts" or "fmc>X": what `passed` of the
+            result depends on.
         junit: new file to write for CI: JUnit XML.
     """
 

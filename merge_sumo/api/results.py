@@ -13,6 +13,7 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.merging import MergeStatistics, merging_of, merging_record
+from merge_sumo.analysis.people import PeopleSummary, beside_people
 from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
@@ -83,10 +84,16 @@ def _cell(value: object) -> str:
 
 
 class CampaignRun(Result):
-    """A campaign that was run: its folder, read, and its gates; `UserError` for another folder."""
+    """A campaign that was run: its folder, read, and its gates; `UserError` for another folder.
 
-    def __init__(self, folder: Path | str | Run, gates: Iterable[str] = ()) -> None:
+    `people` is the share of people beside whom failures are held, by default the campaign's.
+    """
+
+    def __init__(
+        self, folder: Path | str | Run, gates: Iterable[str] = (), people: float | None = None
+    ) -> None:
         self._gates = parse_gates(gates)
+        self._people = people
         self._run = folder if isinstance(folder, Run) else Run(Path(folder))
         _ = self._run.levels  # A folder without levels is no campaign's.
 
@@ -141,6 +148,12 @@ class CampaignRun(Result):
         return summarise(self._run.outcomes, self._run.levels)
 
     @cached_property
+    def people(self) -> PeopleSummary:
+        """Failures beside published drivers: in which the POV does no more than they do."""
+        share = self._run.people if self._people is None else self._people
+        return beside_people(self._run.outcomes, share, self._run.levels)
+
+    @cached_property
     def merging(self) -> MergeStatistics | None:
         """Where on an acceleration lane the VUT merges, and by which gaps; None without a lane."""
         return merging_of(self._run.outcomes)
@@ -156,7 +169,7 @@ class CampaignRun(Result):
     @cached_property
     def gates(self) -> list[GateResult]:
         """The gates that were given, and whether the campaign meets them."""
-        return [gate.check(self.verdict, self.summary) for gate in self._gates]
+        return [gate.check(self.verdict, self.summary, self.people) for gate in self._gates]
 
     @property
     def passed(self) -> bool:
@@ -184,7 +197,7 @@ class CampaignRun(Result):
         from merge_sumo.studies.expectation import note_expectation
 
         note_expectation(self._run)
-        return write_report(self._run)
+        return write_report(self._run, people=self.people.share)
 
     def to_record(self) -> dict[str, Any]:
         """Return what `merge-sumo campaign --json` prints."""
@@ -193,6 +206,7 @@ class CampaignRun(Result):
             **asdict(self.summary),
             **self.verdict.to_record(),
             **merging_record(outcomes),
+            "people": self.people.to_record(),
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
@@ -224,6 +238,7 @@ class CampaignRun(Result):
         optional += (
             [] if self.summary.missed is None else [self.summary.missed.sentence("the pool")]
         )
+        optional.append(self.people.line)
         optional += [self.careful, f"report: {self.report_file}"]
         worst = failures(run.outcomes)[:1]
         folders = [run.folder / SCENARIOS / case_name(outcome.index) for outcome in worst]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.analysis.audit import CONFIDENCE, AuditCase, missed_share
+from merge_sumo.analysis.people import ALL_PEOPLE, check_share
 from merge_sumo.campaigns.audit import Audit, AuditedSampler
 from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.stopping import StoppingRule
@@ -55,6 +56,7 @@ class CampaignSettings:
     scenario: Scenario
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
+    people: float = ALL_PEOPLE
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -90,6 +92,7 @@ class CampaignSettings:
             )
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
+        check_share(self.people)
         self.stopping_rule()
 
     def _take_speed(self) -> None:

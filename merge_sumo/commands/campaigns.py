@@ -35,7 +35,10 @@ def _vut_option(help: str, show_default: str) -> Shared:
 
 
 @app.verb(
-    options=(*SETTINGS, "stop_after_converged", "audit", *SETUP, "net", *RUNNING, "trust_vut")
+    options=(
+        *(*SETTINGS, "stop_after_converged", "audit", *SETUP, "people", "net"),
+        *(*RUNNING, "trust_vut"),
+    )
 )
 def campaign(
     given: Given,
@@ -60,8 +63,9 @@ def campaign(
         list[str] | None,
         typer.Option(
             metavar="GATE",
-            help='Exit with 1 if there are failures, errors, timeouts, or "fmc>X": an FMC above X '
-            "at some level. May be given several times.",
+            help='Exit with 1 if there are failures, "human failures" (the POV does no more than '
+            'people), errors, timeouts, or "fmc>X": an FMC above X at some level. May be given '
+            "several times.",
             autocompletion=complete.gates,
         ),
     ] = None,
@@ -300,7 +304,17 @@ def replay(
     raise typer.Exit(0 if result.identical else 1)
 
 
-@app.verb()
+@app.verb(
+    own={
+        "people": option(
+            float | None,
+            None,
+            "Share of published drivers beside whom the report holds failures.",
+            metavar="SHARE",
+            show_default="the campaign's",
+        )
+    }
+)
 def report(given: Given, run: RunArgument) -> None:
     """Write the report of a campaign again and print its path.
 
@@ -308,7 +322,7 @@ def report(given: Given, run: RunArgument) -> None:
     """
     from merge_sumo import api
 
-    path = api.report(run)
+    path = api.report(run, **given.keywords)
     if given.as_json:
         print_json({"report": str(path)})
     else:

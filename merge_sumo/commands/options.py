@@ -27,7 +27,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("truth_cases", "dense", "quick", "distribution", "traffic", "density", "learn_from"),
         *("draws", "stop_after_converged", "audit"),
     ),
-    "Verdict": ("fail_when", "require", "gate", "tolerance", "rerun", "confidence"),
+    "Verdict": ("fail_when", "require", "people", "gate", "tolerance", "rerun", "confidence"),
     "Where it runs, and what it writes": (
         *("out", "resume", "force", "engine", "workers", "dask", "junit", "figure", "file_format"),
         *("gui", "debug", "quiet", "as_json"),
@@ -196,6 +196,13 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Requirement over time, instead of --fail-when, in signal temporal logic: "
         "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
         metavar="STL",
+    ),
+    "people": option(
+        float,
+        1.0,
+        "Share of published drivers: failures in which the POV brakes harder or slows down by more "
+        "are shown apart; 1 is the hardest of them.",
+        metavar="SHARE",
     ),
     "tolerance": option(
         float,

@@ -35,6 +35,7 @@ def write_report(
     summary: Summary | None = None,
     workers: Workers | None = None,
     on_part: OnPart = lambda _done, _total: None,
+    people: float | None = None,
 ) -> Path:
     """Write `report.html` into the folder of a run, in place of an older one; return its path.
 
@@ -43,7 +44,7 @@ def write_report(
     """
     check_report(run.folder)
     path = run.folder / REPORT
-    html = report_page(run, summary, workers, on_part)
+    html = report_page(run, summary, workers, on_part, people)
     replace_own(path, html.encode(errors="backslashreplace"))
     return path
 
@@ -68,9 +69,10 @@ def report_page(
     summary: Summary | None = None,
     workers: Workers | None = None,
     on_part: OnPart = lambda _done, _total: None,
+    people: float | None = None,
 ) -> str:
     """Return the report of a run as HTML."""
-    model = ReportModel(run, summary, workers, on_part)
+    model = ReportModel(run, summary, workers, on_part, people)
     words = shared_words(model)
     sections = sections_of(model, words)
     model.part_ended()
