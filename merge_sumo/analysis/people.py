@@ -66,6 +66,17 @@ class PublishedMeasure:
     people: int
     steps: tuple[Step, ...]
 
+    @property
+    def in_words(self) -> list[str]:
+        """The steps in words, in people where they are counted."""
+        counts = [step.share * self.people for step in self.steps]
+        counted_in = all(abs(count - round(count)) < ROUNDING for count in counts)
+        shares = [
+            f"{round(count)} of {self.people}" if counted_in else f"{step.share:.0%}"
+            for count, step in zip(counts, self.steps, strict=True)
+        ]
+        return [f"{of} above {s.above:g}" for of, s in zip(shares, self.steps, strict=True)]
+
     def place(self, value: float) -> Place:
         """Return the share of people who did at least `value`."""
         if value <= 0.0:

@@ -13,6 +13,7 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import Coordinate
 from merge_sumo.analysis.diagnosis import Diagnosis, Kind
+from merge_sumo.analysis.people import HEE_PEOPLE, Place
 from merge_sumo.analysis.predictions import prediction_error_m
 from merge_sumo.analysis.verdict import shortened
 from merge_sumo.reports.report_maps import maps_of
@@ -62,6 +63,7 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
         "coordinates": [_coordinate(c) for c in facts.coordinates],
         "vehicles": VEHICLES[: facts.run.scenario.vehicles],
         "ends": [end.value for end in End],
+        "drivers": HEE_PEOPLE,
         "severities": [severity.value for severity in Severity],
         "kinds": [kind.value for kind in Kind],
         "measures": _headings(facts),
@@ -127,6 +129,7 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
             "score": _rounded(o.score, 1),
             "region": facts.regions.get(o.index),
             **_avoidance(facts, o.index),
+            **_people(facts, o.index),
             "way_out": _rounded(o.measures.last_avoidable_s, 1),
             "vut_brakes": found.vut_brakes_s,
             "pov_brakes": found.pov_brakes_s,
@@ -153,6 +156,23 @@ def _avoidance(facts: ReportModel, index: int) -> dict[str, Any]:
         "latest_takeover": None if found is None else found.latest_takeover_s,
         "pov_careful": None if found is None else int(found.pov_careful),
     }
+
+
+def _people(facts: ReportModel, index: int) -> dict[str, Any]:
+    """Return the place of a failure beside people, and whether it is inside; of others nothing."""
+    if not facts.people.places:
+        return {}
+    place = facts.people.places.get(index)
+    slowdown = None if place is None else place.slowdown
+    return {
+        "inside": None if place is None else int(place.inside),
+        "braked_as_hard": None if place is None else _share_range(place.braking),
+        "slowed_as_much": None if slowdown is None else _share_range(slowdown),
+    }
+
+
+def _share_range(place: Place) -> tuple[float, float]:
+    return round(place.at_least, 3), round(place.at_most, 3)
 
 
 def _coordinate(c: Coordinate) -> dict[str, Any]:

@@ -15,6 +15,15 @@ from markupsafe import Markup
 
 from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
 from merge_sumo.analysis.merging import REAR_HEADWAY_S, SITES, SOURCE, merging_of
+from merge_sumo.analysis.people import (
+    BRAKING,
+    HEE_MEAN_MPS,
+    HEE_PEOPLE,
+    HEE_SOURCE,
+    MEAN_TTC_S,
+    POV_FIRST,
+    SLOWDOWN,
+)
 from merge_sumo.analysis.plausibility import notes_on
 from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
@@ -87,6 +96,7 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "counted": summary.cases - len(model.shown),
         "predicted": prediction_in_words(run.outcomes),
         "avoidance": _avoidance(model),
+        "people": model.people,
     }
 
 
@@ -153,6 +163,24 @@ def _merging(model: ReportModel) -> dict[str, Any] | None:
         "rows": [("all", found), *((name, one) for name, one in levels.items() if one)],
         "sites": SITES,
         "headway_s": REAR_HEADWAY_S,
+        "source": SOURCE,
+    }
+
+
+def _people(model: ReportModel) -> dict[str, Any] | None:
+    """Return what failures are beside people; None without failures."""
+    found = model.people
+    if not found.failures:
+        return None
+    return {
+        "braking": BRAKING,
+        "slowdown": SLOWDOWN,
+        "pov_first": POV_FIRST,
+        "mean_ttc_s": MEAN_TTC_S,
+        "headway_s": REAR_HEADWAY_S,
+        "drivers": HEE_PEOPLE,
+        "drivers_mps": HEE_MEAN_MPS,
+        "drivers_source": HEE_SOURCE,
         "source": SOURCE,
     }
 
@@ -303,6 +331,7 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "numbers": ReportSection(template=_own("numbers"), words=_numbers),
         "where": ReportSection(template=_own("where"), words=_maps),
         "merging": ReportSection(template=_own("merging"), words=_merging),
+        "people": ReportSection(template=_own("people"), words=_people),
         "words": ReportSection(template=_own("words"), words=_in_words),
         "stress": ReportSection(template=_own("stress"), words=_stress),
         "cases": ReportSection(template=_own("cases"), words=_cases),
