@@ -96,13 +96,14 @@ HEE_PEOPLE: Final = 23
 HEE_MEAN_MPS: Final = 23.7
 """Their speed at the start, in the mean; the standard deviation is 1.2 m/s."""
 BRAKING: Final = PublishedMeasure(
-    "pov_max_brake_mps2",
-    "hardest braking",
+    "pov_sustained_brake_mps2",
+    "hardest braking over 1.6 s",
     "m/s2",
     HEE_PEOPLE,
     (Step(0.66, 0.5), Step(1.4, 0.05), Step(2.06, 0.0)),
 )
-"""Median, 95 % and maximum of the hardest braking on a track, of fits over 1.6 s (`HEE_SOURCE`)."""
+"""Median, 95 % and maximum of the hardest braking on a track (`HEE_SOURCE`). These are fits over
+1.6 s: a shorter peak, as of a POV that brakes at 3 m/s2 for half a second, is less in them."""
 SLOWDOWN: Final = PublishedMeasure(
     "pov_slowdown_mps",
     "slow-down before the merge",
@@ -136,12 +137,13 @@ class FailurePlace:
     """A failure beside people.
 
     Attributes:
-        braking: share of people who braked at least as hard as the POV.
-        slowdown: share of people who slowed down by at least as much; None in old records.
+        braking: share of people who braked at least as hard as the POV; None in old records, as
+            the next.
+        slowdown: share of people who slowed down by at least as much.
         inside: whether no figure shows that the POV did more than the share of people.
     """
 
-    braking: Place
+    braking: Place | None
     slowdown: Place | None
     inside: bool
 
@@ -154,11 +156,14 @@ class LevelBesidePeople:
         failures: failures at the level.
         inside: those in which no figure shows that the POV did more than the share of people.
         fmc: failure mode coverage of those inside.
-        brakes_harder: failures in which the POV brakes harder than the share of people.
+        brakes_harder: failures in which the POV brakes harder over 1.6 s than the share of people.
+        peaks_harder: those in which it does so for a moment alone.
         slows_more: failures in which it slows down by more.
         slows_beyond: failures in which it slows down by more than the last figure, whatever the
             share: as one of the people did, and by how much is not published.
-        hardest_mps2: hardest braking of a POV; None without failures.
+        hardest_mps2: hardest braking of a POV over 1.6 s; None without failures, and in old
+            records.
+        peak_mps2: hardest braking of a POV; None without failures.
         most_mps: largest slow-down of a POV; None without failures, and in old records.
         pov_first: failures in which the POV is ahead at M.
         merged: failures in which the VUT reached M.
@@ -171,9 +176,11 @@ class LevelBesidePeople:
     inside: int
     fmc: float
     brakes_harder: int
+    peaks_harder: int
     slows_more: int
     slows_beyond: int
     hardest_mps2: float | None
+    peak_mps2: float | None
     most_mps: float | None
     pov_first: int
     merged: int
@@ -196,7 +203,7 @@ class PeopleSummary:
         left_out: why the figures say nothing of this scenario; empty where they do.
         levels: by POV level.
         places: by index of a failing case; empty where left out.
-        unknown: failures inside whose slow-down would decide and is not recorded.
+        unknown: failures inside of which a measure would decide that is not recorded.
     """
 
     share: float
@@ -219,7 +226,7 @@ class PeopleSummary:
     def limits(self) -> str:
         """What a POV inside does at most, in a phrase."""
         braking, slowdown = (published.limit(self.share) for published in PUBLISHED)
-        parts = [] if braking is None else [f"brakes at {braking:g} m/s2 or less"]
+        parts = [] if braking is None else [f"brakes at {braking:g} m/s2 or less over 1.6 s"]
         parts += [] if slowdown is None else [f"slows down by {slowdown:g} m/s or less"]
         return " and ".join(parts)
 
@@ -285,6 +292,12 @@ class PeopleSummary:
                     f"{car} {does} than {than} of {HEE_PEOPLE} published drivers in {number} of "
                     f"{failures}: a finding about {drivers}"
                 )
+        if one.peaks_harder:
+            yield (
+                f"{car} brakes at {one.peak_mps2:g} m/s2 for a moment, in {one.peaks_harder} of "
+                f"{failures} harder than {than} of {HEE_PEOPLE} published drivers over 1.6 s, and "
+                "not over 1.6 s itself, so that does not decide"
+            )
         if one.slows_beyond and SLOWDOWN.limit(self.share) is None:
             yield (
                 f"{car} slows down by more than {SLOWDOWN.steps[-1].above:g} m/s in "
@@ -374,22 +387,32 @@ def beside_people(
         level: _level([o for o in failing if o.case.level == level], places, share, level)
         for level in every
     }
-    unknown = 0
-    if SLOWDOWN.limit(share) is not None:
-        unknown = sum(place.inside and place.slowdown is None for place in places.values())
+    unknown = sum(places[o.index].inside and _is_unknown(o, share) for o in failing if places)
     return PeopleSummary(share, left_out, of_levels, places, unknown)
 
 
 def place_of(outcome: Outcome, share: float = ALL_PEOPLE) -> FailurePlace:
     """Return the place of what the POV did among people."""
     measures = outcome.measures
-    values = (measures.pov_max_brake_mps2, measures.pov_slowdown_mps)
+    values = [measures.value(published.name) for published in PUBLISHED]
     limits = [published.limit(share) for published in PUBLISHED]
-    return FailurePlace(
-        BRAKING.place(values[0]),
-        None if values[1] is None else SLOWDOWN.place(values[1]),
-        not any(map(_exceeds, values, limits)),
+    braking, slowdown = (
+        None if value is None else published.place(value)
+        for value, published in zip(values, PUBLISHED, strict=True)
     )
+    return FailurePlace(braking, slowdown, inside=not any(map(_exceeds, values, limits)))
+
+
+def _is_unknown(outcome: Outcome, share: float) -> bool:
+    """Return whether a measure is not recorded that could show that the POV is outside.
+
+    Sustained braking is never harder than the hardest braking, which is always recorded.
+    """
+    measures = outcome.measures
+    if measures.pov_slowdown_mps is not None:
+        return False
+    may_slow = SLOWDOWN.limit(share) is not None
+    return may_slow or _exceeds(measures.pov_max_brake_mps2, BRAKING.limit(share))
 
 
 def _exceeds(value: float | None, limit: float | None) -> bool:
@@ -407,15 +430,23 @@ def _level(
     inside = [o for o in failing if o.index not in places or places[o.index].inside]
     measured = [o.measures for o in failing]
     slowdowns = [m.pov_slowdown_mps for m in measured]
+    brakings = [m.pov_sustained_brake_mps2 for m in measured]
+    harder = [_exceeds(braking, limits[0]) for braking in brakings]
+    peaks = [_exceeds(m.pov_max_brake_mps2, limits[0]) for m in measured]
     behind = [m.pet_s for m in measured if m.merged_first == "VUT"]
     return LevelBesidePeople(
         failures=len(failing),
         inside=len(inside),
         fmc=fmc(to_unit((o.case for o in inside), level)),
-        brakes_harder=sum(_exceeds(m.pov_max_brake_mps2, limits[0]) for m in measured),
+        brakes_harder=sum(harder),
+        peaks_harder=sum(
+            peak and not sustained and braking is not None
+            for peak, sustained, braking in zip(peaks, harder, brakings, strict=True)
+        ),
         slows_more=sum(_exceeds(slowdown, limits[1]) for slowdown in slowdowns),
         slows_beyond=sum(_exceeds(slowdown, SLOWDOWN.steps[-1].above) for slowdown in slowdowns),
-        hardest_mps2=max((m.pov_max_brake_mps2 for m in measured), default=None),
+        hardest_mps2=max((a for a in brakings if a is not None), default=None),
+        peak_mps2=max((m.pov_max_brake_mps2 for m in measured), default=None),
         most_mps=max((v for v in slowdowns if v is not None), default=None),
         pov_first=sum(m.merged_first == "POV" for m in measured),
         merged=sum(m.merged_first is not None for m in measured),

@@ -163,16 +163,17 @@ def _people(facts: ReportModel, index: int) -> dict[str, Any]:
     if not facts.people.places:
         return {}
     place = facts.people.places.get(index)
-    slowdown = None if place is None else place.slowdown
+    if place is None:
+        return dict.fromkeys(("inside", "braked_as_hard", "slowed_as_much"))
     return {
-        "inside": None if place is None else int(place.inside),
-        "braked_as_hard": None if place is None else _share_range(place.braking),
-        "slowed_as_much": None if slowdown is None else _share_range(slowdown),
+        "inside": int(place.inside),
+        "braked_as_hard": _share_range(place.braking),
+        "slowed_as_much": _share_range(place.slowdown),
     }
 
 
-def _share_range(place: Place) -> tuple[float, float]:
-    return round(place.at_least, 3), round(place.at_most, 3)
+def _share_range(place: Place | None) -> tuple[float, float] | None:
+    return None if place is None else (round(place.at_least, 3), round(place.at_most, 3))
 
 
 def _coordinate(c: Coordinate) -> dict[str, Any]:

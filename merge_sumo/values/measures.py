@@ -178,9 +178,18 @@ OURS: Final = (
         worse="high",
     ),
     Measure(
+        "pov_sustained_brake_mps2",
+        "largest mean deceleration of the POV over 1.6 s, or over an episode that is shorter; None "
+        "in records of versions without it, as the next",
+        unit="m/s2",
+        label="braking of the POV over 1.6 s",
+        column="POV brakes over 1.6 s",
+        missing=0.0,
+        worse="high",
+    ),
+    Measure(
         "pov_slowdown_mps",
-        "speed of the POV at the start minus its lowest speed up to t1; None in records of "
-        "versions without it",
+        "speed of the POV at the start minus its lowest speed up to t1",
         unit="m/s",
         label="slow-down of the POV",
         column="POV slows by",

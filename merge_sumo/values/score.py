@@ -64,6 +64,8 @@ MU_SAFETY: Final = 450.0
 MU_TASK: Final = 45.0
 GAP_SCALE_M: Final = 15.0
 """Length over which P_safety decays with the gap; tens of metres, so that a surrogate sees it."""
+SUSTAINED_STEPS: Final = 16
+"""Steps over which braking counts as sustained: 1.6 s, as in figures of people (`people.py`)."""
 TTC_SHARE: Final = 1.0 / 9.0
 """Part of P_safety that a short time to collision can cost; the gap has the rest."""
 
@@ -101,6 +103,7 @@ class Measures:
     brake_after_mps2: float | None = None
     vut_max_brake_mps2: float = 0.0
     pov_max_brake_mps2: float = 0.0
+    pov_sustained_brake_mps2: float | None = None
     pov_slowdown_mps: float | None = None
     impact_speed_mps: float | None = None
     merged_first: Literal["VUT", "POV"] | None = None
@@ -134,6 +137,7 @@ class Measures:
             "t_end_s": trajectory.t_end_s,
             "vut_max_brake_mps2": hardest_mps2[VUT],
             "pov_max_brake_mps2": hardest_mps2[trajectory.nearest],
+            "pov_sustained_brake_mps2": sustained_brake_mps2(v_pov_mps),
             "pov_slowdown_mps": float(v_pov_mps[0] - v_pov_mps.min()),
             "clipped_steps": trajectory.clipped_steps,
             "error": None if trajectory.error is None else as_reason(trajectory.error),
@@ -262,7 +266,7 @@ class Outcome:
         return cls(known.index, known.batch, case, measures, *told)
 
 
-LATER: Final = ("pov_slowdown_mps",)
+LATER: Final = ("pov_sustained_brake_mps2", "pov_slowdown_mps")
 """Measures that records of the last release do not have: they are None there."""
 FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
 """Measures of the follow-up."""
@@ -432,6 +436,14 @@ def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> 
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
+
+
+def sustained_brake_mps2(v_mps: FloatArray) -> float:
+    """Return the largest mean deceleration over 1.6 s of speeds, (T + 1,), or over all of them."""
+    steps = min(SUSTAINED_STEPS, len(v_mps) - 1)
+    if steps < 1:
+        return 0.0
+    return max(0.0, float((v_mps[:-steps] - v_mps[steps:]).max())) / (steps * DT_S)
 
 
 def time_to_collision(dx_m: float, dv_mps: float) -> float | None:

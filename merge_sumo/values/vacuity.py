@@ -131,6 +131,7 @@ def measure_ranges(scenario: Scenario, speeds: Speeds) -> dict[str, Range]:
         "impact_speed_mps": Range(0.0, speeds.impact_mps),
         "vut_max_brake_mps2": Range(0.0, -scenario.a_min_mps2),
         "pov_max_brake_mps2": Range(0.0, -scenario.a_min_mps2),
+        "pov_sustained_brake_mps2": Range(0.0, -scenario.a_min_mps2),
         "pov_slowdown_mps": Range(0.0, speeds.car_mps),
         "last_avoidable_s": ANY,
         "clipped_steps": Range(0.0, float(scenario.max_steps)),

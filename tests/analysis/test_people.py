@@ -29,15 +29,14 @@ ONE, TWO, FIVE = 1 / 23, 2 / 23, 5 / 23
 
 
 def failing(index, brake_mps2, slowdown_mps=0.0, level=1, scenario=US23, **measured):
-    """Return a failure in which the POV brakes and slows down by so much."""
+    """Return a failure in which the POV brakes, over 1.6 s, and slows down by so much."""
     case = MergeCase(level=level, x_pov0_m=-250.0 - index, v_pov0_mps=30.0, scenario=scenario)
     measures = Measures(
         end=End.MERGED,
         t_end_s=9.0,
         score=-700.0,
-        pov_max_brake_mps2=brake_mps2,
         pov_slowdown_mps=slowdown_mps,
-        **measured,
+        **{"pov_max_brake_mps2": brake_mps2, "pov_sustained_brake_mps2": brake_mps2} | measured,
     )
     return Outcome(index, 0, case, measures)
 
@@ -107,7 +106,7 @@ class TestFailuresBesidePeople:
         found = beside_people(self.OUTCOMES, 0.95)
         assert [i for i, place in found.places.items() if place.inside] == [2, 3]
         assert (found.levels[1].brakes_harder, found.levels[1].slows_more) == (2, 2)
-        assert "brakes at 1.4 m/s2 or less and slows down by 2 m/s or less" in found.line
+        assert "brakes at 1.4 m/s2 or less over 1.6 s and slows down by 2 m/s or less" in found.line
 
     def test_name_the_level_that_does_more_than_people(self):
         first, second = beside_people(self.OUTCOMES).findings
@@ -124,13 +123,22 @@ class TestFailuresBesidePeople:
         met = replace(met, case=replace(met.case, scenario=traffic, **case))
         assert beside_people([met]).findings[0].startswith("the car met at level 1 brakes harder")
 
-    def test_of_records_without_the_slow_down_are_decided_by_braking(self):
-        old = [failing(0, 1.0, None), failing(1, 3.0, None)]
+    def test_are_inside_with_a_peak_that_does_not_last(self):
+        found = beside_people([failing(0, 1.9, 5.0, pov_max_brake_mps2=3.0), failing(1, 1.0)])
+        assert found.inside == 2
+        assert (found.levels[1].hardest_mps2, found.levels[1].peak_mps2) == (1.9, 3.0)
+        assert found.findings[0] == (
+            "level 1 brakes at 3 m/s2 for a moment, in 1 of 2 failures harder than any of 23 "
+            "published drivers over 1.6 s, and not over 1.6 s itself, so that does not decide"
+        )
+
+    def test_of_old_records_are_inside_and_counted_where_a_measure_would_decide(self):
+        old = [failing(i, a, None, pov_sustained_brake_mps2=None) for i, a in ((0, 1.0), (1, 3.0))]
         found = beside_people(old, 0.95)
-        assert [place.inside for place in found.places.values()] == [True, False]
-        assert (found.unknown, beside_people(old).unknown) == (1, 0)
-        assert found.places[0].slowdown is None
-        assert found.levels[1].most_mps is None
+        assert (found.inside, found.unknown, beside_people(old).unknown) == (2, 2, 1)
+        assert found.places[1].braking is found.places[1].slowdown is None
+        assert found.levels[1].hardest_mps2 is found.levels[1].most_mps is None
+        assert found.findings == []
 
     def test_are_all_inside_where_the_figures_are_of_faster_roads(self):
         roundabout = named_scenario("roundabout")

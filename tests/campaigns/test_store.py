@@ -68,6 +68,7 @@ any_measures = st.builds(
     brake_after_mps2=maybe,
     vut_max_brake_mps2=number,
     pov_max_brake_mps2=number,
+    pov_sustained_brake_mps2=maybe,
     pov_slowdown_mps=maybe,
     impact_speed_mps=maybe,
     merged_first=st.sampled_from([None, "VUT", "POV"]),
@@ -208,13 +209,14 @@ class TestReading:
             read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 1", field)
 
-    def test_of_the_last_release_has_no_slow_down_of_the_pov(self):
+    def test_of_the_last_release_says_less_of_the_pov(self):
         outcome, _ = episode(0)
         record = outcome.to_record()
-        assert record.pop("pov_slowdown_mps") > 0.0
+        later = "pov_sustained_brake_mps2", "pov_slowdown_mps"
+        assert all(record.pop(name) > 0.0 for name in later)
         lines = json.dumps(record).encode() + b"\n"
         (read,), _ = read_outcomes(lines, "outcomes.jsonl", scenario=US23)
-        assert read.measures == replace(outcome.measures, pov_slowdown_mps=None)
+        assert read.measures == replace(outcome.measures, **dict.fromkeys(later))
 
     def test_refuses_a_record_with_a_field_that_nobody_knows(self):
         record = {**episode(0)[0].to_record(), "scroe": -1.0}

@@ -14,7 +14,14 @@ from hypothesis import strategies as st
 
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, POV, US23, VUT
-from merge_sumo.values.score import FAILURE_SCORE, Outcome, is_close, measure, time_to_collision
+from merge_sumo.values.score import (
+    FAILURE_SCORE,
+    Outcome,
+    is_close,
+    measure,
+    sustained_brake_mps2,
+    time_to_collision,
+)
 from merge_sumo.values.trajectory import End, Trajectory
 
 CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
@@ -147,6 +154,15 @@ class TestMeasures:
         assert measures.pov_max_brake_mps2 == pytest.approx(1.5)
         assert measures.vut_max_brake_mps2 == pytest.approx(2.5)
         assert measure(eq4(-300.0, 30.0, 1.0, -50.0, 20.0, 1.0)).vut_max_brake_mps2 == 0.0
+
+    def test_sustained_braking_is_the_hardest_mean_over_1_6_s(self):
+        # 3 m/s2 for half a second among 1 m/s2: (1.5 + 1.1) m/s in 1.6 s.
+        v_mps = 30.0 - np.cumsum([0.0, *([0.1] * 20), *([0.3] * 5), *([0.1] * 20)])
+        assert sustained_brake_mps2(v_mps) == pytest.approx(2.6 / 1.6)
+        assert sustained_brake_mps2(v_mps[20:26]) == pytest.approx(3.0), "shorter than 1.6 s"
+        assert sustained_brake_mps2(v_mps[:1]) == sustained_brake_mps2(v_mps[::-1]) == 0.0
+        measures = measure(eq4(-300.0, 30.0, -1.5, -50.0, 20.0, 0.0))
+        assert measures.pov_sustained_brake_mps2 == pytest.approx(1.5)
 
     def test_slow_down_is_from_the_start_to_the_lowest_speed(self):
         # 1.5 m/s2 for the 2.5 s and more that the VUT takes for 50 m at 20 m/s.

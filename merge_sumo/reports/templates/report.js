@@ -75,8 +75,10 @@ function conduct(i) { // what both did, by their speeds
 const ofDrivers = ([low, high]) => `${low < high ? `${fixed(100 * low, 0)} to ` : ""}${fixed(100 * high, 0)} %`;
 function besidePeople(i) { // what the car that the VUT meets does in a failure
   const met = NAMES[vehicles[cases.nearest[i]]], slowed = cases.slowed_as_much[i];
-  const slows = slowed === null ? "" : ` and slows down by ${fixed(cases.pov_slowdown_mps[i], 1)} m/s (${ofDrivers(slowed)})`;
-  return `The ${met} brakes at up to ${fixed(cases.pov_max_brake_mps2[i], 1)} m/s² (as ${ofDrivers(cases.braked_as_hard[i])} of ${data.drivers} published drivers did)${slows}: ${cases.inside[i] ? "inside" : "outside"} what people do.`;
+  if (slowed === null) return "";
+  const brakes = `brakes at ${fixed(cases.pov_sustained_brake_mps2[i], 1)} m/s² over 1.6 s, as ${ofDrivers(cases.braked_as_hard[i])} of ${data.drivers} published drivers did`;
+  const slows = `slows down by ${fixed(cases.pov_slowdown_mps[i], 1)} m/s (${ofDrivers(slowed)})`;
+  return `The ${met} ${brakes}, and ${slows}: ${cases.inside[i] ? "inside" : "outside"} what people do.`;
 }
 function placeOfMerge(i) { // on an acceleration lane
   const share = cases.lane_share[i];
@@ -120,7 +122,7 @@ function words(i) {
     if (until !== null) parts.push(`The last time at which the fuzzy safety model (fsm) can take over and avoid it is ${fixed(until, 1)} s.`);
     if (cases.pov_careful[i]) parts.push("A careful driver in the POV's place avoids it, too.");
   }
-  return parts.join(" ");
+  return parts.filter(Boolean).join(" ");
 }
 
 /* ---------- grids: the surrogate's chance, the truth's outline ---------- */
