@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, Final, TypedDict
 
 from merge_sumo.campaigns.campaign import OnCase
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -17,6 +17,7 @@ from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports.progress import Counter
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.system.workers import HERE_S, Workers
+from merge_sumo.values.imperfection import Actuation, Sensing
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
 
@@ -47,6 +48,9 @@ class Setup(Hosting, total=False):
     Attributes:
         scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
         follow_up_s: time in s for which both drive on after the merge; the scenario's by default.
+        sense: how the VUT senses other cars: a `Sensing`, or a text as after `--sense`; by default
+            as the scenario says.
+        act: how it obeys its controller: an `Actuation`, or a text as after `--act`.
         fail_when: what counts as a failure: the name of a criterion, or a condition over the
             measures; by default the criterion of the scenario, "paper" in merges.
         require: what must hold over time instead, in signal temporal logic.
@@ -54,6 +58,8 @@ class Setup(Hosting, total=False):
 
     scenario: Scenario | Path | str
     follow_up_s: float | None
+    sense: Sensing | str | None
+    act: Actuation | str | None
     fail_when: str | None
     require: str | None
 
@@ -202,23 +208,36 @@ def check_keywords(function: str, given: Mapping[str, Any], known: Any) -> None:
         raise TypeError(f"{function}() got an unexpected keyword argument {unknown[0]!r}{hint}")
 
 
-def scenario_of(scenario: Scenario | Path | str, follow_up_s: float | None = None) -> Scenario:
-    """Return the scenario that a person names, with a follow-up of this duration in s if given."""
+OF_SCENARIO: Final = {"follow_up_s": "--follow-up", "sense": "--sense", "act": "--act"}
+"""Keywords that change the scenario, and their options."""
+
+
+def scenario_of(scenario: Scenario | Path | str, **changes: Any) -> Scenario:
+    """Return the scenario that a person names, with changes that a person states.
+
+    These are `follow_up_s`, `sense` and `act`, as of `Setup`; None changes nothing.
+    """
     named = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
-    return named if follow_up_s is None else replace(named, follow_up_s=follow_up_s)
+    values = {name: value for name, value in changes.items() if value is not None}
+    for name, kind in (("sense", Sensing), ("act", Actuation)):
+        if isinstance(text := values.get(name), str):
+            values[name] = kind.parsed(text, f"--{name}")
+    return replace(named, **values) if values else named
 
 
 def recordable(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return keywords as the fields of `CampaignSettings`, without `level`.
 
-    Drivers are specs by now. Raises `UserError` for a follow-up of a scenario that is not named.
+    Drivers are specs by now. Raises `UserError` for what is of a scenario that is not named.
     """
-    fields = {name: value for name, value in given.items() if name not in ("level", "follow_up_s")}
-    follow_up_s = given.get("follow_up_s")
+    fields = {n: value for n, value in given.items() if n not in ("level", *OF_SCENARIO)}
+    changes = {name: given.get(name) for name in OF_SCENARIO}
     if "scenario" in fields:
-        fields["scenario"] = scenario_of(fields["scenario"], follow_up_s)
-    elif follow_up_s is not None:
-        raise UserError("--follow-up is of the scenario: name that, too, with --scenario")
+        fields["scenario"] = scenario_of(fields["scenario"], **changes)
+    else:
+        for name, option in OF_SCENARIO.items():
+            if changes[name] is not None:
+                raise UserError(f"{option} is of the scenario: name that, too, with --scenario")
     if fields.get("fail_when", "") is None:
         del fields["fail_when"]
     if fields.get("policies") is not None:

@@ -19,7 +19,20 @@ from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
         *("vut", "vut_command", "level", "pov", "policies", "scenario", "net", "v_vut0"),
-        *("mainline", "ramp", "point", "follow_up", "case", "at", "x", "v", "psi", "headway_ahead"),
+        *(
+            "mainline",
+            "ramp",
+            "point",
+            "follow_up",
+            "sense",
+            "act",
+            "case",
+            "at",
+            "x",
+            "v",
+            "psi",
+            "headway_ahead",
+        ),
         *("headway_behind", "only", "check"),
     ),
     "How many cases, and which": (
@@ -120,6 +133,21 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Time for which both drive on after the merge, with measures of its own.",
         metavar="SECONDS",
         show_default="the scenario's, 0",
+    ),
+    "sense": option(
+        str | None,
+        None,
+        "How the VUT senses other cars: delay_s, noise_x_m, noise_v_mps, dropout, range_m, "
+        "occluded_until_m; a range, as delay_s=0..0.5, is tested as a whole.",
+        metavar="NAME=NUMBER,...",
+        show_default="the scenario's, perfectly",
+    ),
+    "act": option(
+        str | None,
+        None,
+        "How the VUT obeys its controller: lag_s, delay_s, power_w_per_kg; with ranges as --sense.",
+        metavar="NAME=NUMBER,...",
+        show_default="the scenario's, perfectly",
     ),
     "x": option(float | None, None, "Initial position of the POV in m; M is 0.", "--x"),
     "v": option(float | None, None, "Initial speed of the POV in m/s.", "--v"),
@@ -258,5 +286,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
 }
 
 HOSTING: Final = ("vut_command", "deadline", "vut_memory", "in_process")
-SETUP: Final = ("scenario", "policies", "pov", "fail_when", "require", "follow_up", *HOSTING)
+OF_SCENARIO: Final = ("follow_up", "sense", "act")
+SETUP: Final = ("scenario", "policies", "pov", "fail_when", "require", *OF_SCENARIO, *HOSTING)
 RUNNING: Final = ("workers", "dask", "quiet")

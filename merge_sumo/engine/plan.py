@@ -77,7 +77,15 @@ class SimulationPlan:
     policies_sha256: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Note the learned drivers, unless they are given."""
+        """Note the learned drivers, unless they are given.
+
+        Raises `UserError` where the VUT cannot sense as the scenario says.
+        """
+        if not self.scenario.sense.is_perfect and self.vut.vut.vut_type is not None:
+            raise UserError(
+                f"the VUT {self.vut.spec} sees other cars in SUMO itself, where --sense does not "
+                "reach: leave it away (--act is for every VUT)"
+            )
         if not self.policies_sha256:
             object.__setattr__(self, "policies_sha256", self.povs.sha256())
 

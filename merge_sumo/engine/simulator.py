@@ -10,6 +10,7 @@ from typing import Any, Self
 from merge_sumo.drivers.actuation import ActuatedDriver
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.lane import LanePov
+from merge_sumo.drivers.sensing import SensedDriver
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import PovLibrary, Povs
@@ -67,7 +68,7 @@ class Simulator:
     ) -> None:
         """Start the drivers of a world, which are told of SUMO's; `opened` closes all."""
         self.world = world
-        self.vut = through_actuator(plan.vut(world.corridors, sumo), plan.scenario)
+        self.vut = imperfect(plan.vut(world.corridors, sumo), plan.scenario)
         opened.callback(self.vut.close)
         self.pov = povs_for(plan.scenario, plan.povs, world.corridors, sumo)
         opened.callback(self.pov.close)
@@ -96,11 +97,16 @@ class Simulator:
         self.close()
 
 
-def through_actuator(vut: Driver, scenario: Scenario) -> Driver:
-    """Return the driver of a VUT behind the actuator of a scenario, itself behind a perfect one."""
-    if scenario.act.is_perfect:
-        return vut
-    return ActuatedDriver(vut, scenario.act.at_most("delay_s"))
+def imperfect(vut: Driver, scenario: Scenario) -> Driver:
+    """Return the driver of a VUT behind the sensors and the actuator of a scenario.
+
+    It is the driver itself where both are perfect.
+    """
+    if not scenario.sense.is_perfect:
+        vut = SensedDriver(vut, scenario)
+    if not scenario.act.is_perfect:
+        vut = ActuatedDriver(vut, scenario.act.at_most("delay_s"))
+    return vut
 
 
 def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None = None) -> Driver:

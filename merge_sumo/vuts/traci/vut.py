@@ -83,6 +83,8 @@ class TraciVut(Driver):
         super().__init__(corridors)
         self._port, self._command, self._options = port, command, options
         self._shadow = Shadow(road, scenario)
+        self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
+        self._begins_m[VUT] = -road.ramp.before_m
         self._lane_m, self._brake_mps2 = lane_of(scenario), -scenario.a_min_mps2
         self._door: Door | None = None
         self._program: Program | None = None
@@ -138,7 +140,9 @@ class TraciVut(Driver):
 
     def _acceleration_mps2(self, scene: Scene) -> float:
         """Show the vehicles, and return what the client commands for the coming step."""
-        x_m, v_mps = scene.x_m[:, 0].tolist(), scene.v_mps[:, 0].tolist()
+        # A car that is not sensed may be shown farther away than the road begins.
+        x_m = np.maximum(scene.x_m[:, 0], self._begins_m).tolist()
+        v_mps = scene.v_mps[:, 0].tolist()
         states = {
             name: (x, v, (v - self._before_mps.get(name, v)) / DT_S)
             for name, x, v in zip(VEHICLES, x_m, v_mps, strict=False)
