@@ -53,7 +53,9 @@ class SensedDriver(Driver):
         """The last measured positions and speeds, (D, 2, A, K), a ring of rows; NaN if not seen."""
         self._row = 0
         steps = scenario.max_steps + round(scenario.follow_up_s / DT_S) + self._before + 1
-        self._random = np.zeros((steps, 3, cars, corridors))
+        random = ("noise_x_m", "noise_v_mps", "dropout")
+        self._is_random = any(scenario.sense.at_most(name) > 0.0 for name in random)
+        self._random = np.zeros((steps if self._is_random else 1, 3, cars, corridors))
         self._wait, self._drives_on_s = np.zeros(corridors, dtype=np.int64), np.zeros(corridors)
         """Rows back to what the VUT sees, and for how long cars have driven on since."""
         self._noise = np.zeros((2, corridors))
@@ -70,10 +72,11 @@ class SensedDriver(Driver):
         self._take(corridor, case.sensing)
         self._far_m[corridor] = far_m(scenario)
         self._level0[:, corridor] = scenario.level0_a_mps2, scenario.level0_v_mps
-        rng = np.random.default_rng([STREAM, case.seed])
-        steps, _, cars, _ = self._random.shape
-        self._random[:, :ARRIVES, :, corridor] = rng.standard_normal((steps, 2, cars))
-        self._random[:, ARRIVES, :, corridor] = rng.random((steps, cars))
+        if self._is_random:
+            rng = np.random.default_rng([STREAM, case.seed])
+            steps, _, cars, _ = self._random.shape
+            self._random[:, :ARRIVES, :, corridor] = rng.standard_normal((steps, 2, cars))
+            self._random[:, ARRIVES, :, corridor] = rng.random((steps, cars))
         x_m, v_mps = np.array(case.starts()).T
         one = slice(corridor, corridor + 1)
         for step in range(-self._before, 1):
@@ -81,8 +84,14 @@ class SensedDriver(Driver):
             self._measure(self._row + step, np.array([step]), np.array(state)[..., None], one)
         start = np.array((x_m, v_mps))[..., None]
         told = tuple(map(tuple, self._shown(self._row, start, one)[..., 0].T.tolist()))
-        same = {"level": case.level, "svo_rad": case.svo_rad, "v_vut0_mps": case.v_vut0_mps}
-        self._driver.begin(corridor, ToldCase(**same, scenario=scenario, told=told))
+        seen = ToldCase(
+            level=case.level,
+            svo_rad=case.svo_rad,
+            v_vut0_mps=case.v_vut0_mps,
+            scenario=scenario,
+            told=told,
+        )
+        self._driver.begin(corridor, seen)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the driver to what it sees, (K,)."""
@@ -113,7 +122,8 @@ class SensedDriver(Driver):
         """Measure states, (2, A, K), of corridors at their steps, (K,), into a row."""
         rows = len(self._seen)
         places = np.arange(self.corridors)[corridors]
-        number = np.minimum(step + self._before, len(self._random) - 1)
+        number = step + self._before
+        is_first, number = number == 0, np.minimum(number, len(self._random) - 1)
         random = self._random[number, :, :, places].transpose(1, 2, 0)
         seen = state + self._noise[:, None, corridors] * random[:ARRIVES]
         seen[V] = np.maximum(seen[V], 0.0)
@@ -122,7 +132,7 @@ class SensedDriver(Driver):
         hidden |= x_vut_m < self._occluded_until_m[corridors]
         seen[:, hidden] = np.nan
         # Before the first step nothing has arrived that could stay.
-        lost = (random[ARRIVES] < self._dropout[corridors]) & (number > 0)
+        lost = (random[ARRIVES] < self._dropout[corridors]) & ~is_first
         last = self._seen[(row - 1) % rows][..., corridors]
         self._seen[row % rows][..., corridors] = np.where(lost, last, seen)
 

@@ -14,6 +14,8 @@ from __future__ import annotations
 import json
 import math
 import tempfile
+from contextlib import closing
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +24,11 @@ import numpy as np
 
 from merge_sumo import api
 from merge_sumo.campaigns.store import Run
+from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.policies import policies_of
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.povs import Povs
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.reports.report_model import ReportModel
@@ -29,9 +36,11 @@ from merge_sumo.reports.report_sections import ReportSection, shared_words
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.values.case import Case, Pool, from_unit, to_unit
+from merge_sumo.sumo.world import World
+from merge_sumo.values.case import Case, FloatArray, MergeCase, Pool, ToldCase, from_unit, to_unit
 from merge_sumo.values.criteria import NamedCriterion
 from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.imperfection import Sensing
 from merge_sumo.values.measures import Measure
 from merge_sumo.values.scenario import DT_S, US23, VUT, Scenario
 from merge_sumo.values.scenario_kinds import SCENARIO_KINDS, scenario_of_record
@@ -394,6 +403,50 @@ class ScenarioKindContract:
             assert Outcome.from_json(line, scenario) == outcome
 
 
+LATE_STEPS: Final = 2
+"""By so many steps the sensors are late."""
+
+
+def assert_sees_late(factory: VutFactory) -> None:
+    """Assert that a VUT with late sensors answers to the log of its episode, shifted.
+
+    It drives once with such sensors; then it is asked again, without any, about the positions and
+    speeds of the POV that many steps before, and those of the VUT at the time.
+    """
+    late = replace(US23, sense=Sensing(delay_s=LATE_STEPS * DT_S))
+    case = MergeCase(level=1, x_pov0_m=-260.0, v_pov0_mps=29.0, scenario=late)
+    road, povs = road_of(), Povs(policies=policies_of(US23))
+    plan = SimulationPlan(
+        scenario=late, road=road, vut=factory, povs=povs, criterion=Criterion(), corridors=1
+    )
+    with Simulator(plan) as simulator:
+        (_, ran) = next(simulator.run([case]))
+    assert ran.error is None
+    seen = shifted(ran.motion, LATE_STEPS)
+    told = tuple(map(tuple, seen[0, :, :2].tolist()))
+    with World(1, road, scenario=US23) as world, closing(factory(1, world)) as driver:
+        driver.begin(0, ToldCase(level=1, scenario=US23, told=told))
+        answers = []
+        for step, state in enumerate(seen[:-1]):
+            x_m, v_mps = state[:, 0, None], state[:, 1, None]
+            scene = Scene(np.array([True]), np.array([step]), x_m, v_mps)
+            answers.append(float(driver.act(scene)[0]))
+    obeyed = np.clip(answers, US23.a_min_mps2, US23.a_max_mps2)
+    assert np.array_equal(obeyed, ran.a_vut_mps2[:-1]), "it answers to something else"
+
+
+def shifted(motion: FloatArray, steps: int) -> FloatArray:
+    """Return a motion, (T + 1, A, 3), with the other cars where they were some steps before.
+
+    Before the start they drove as they start.
+    """
+    before = np.repeat(motion[:1], steps, axis=0)
+    before[:, :, 0] += before[:, :, 1] * (np.arange(-steps, 0) * DT_S)[:, None]
+    late = np.concatenate((before, motion))[: len(motion)]
+    late[:, VUT] = motion[:, VUT]
+    return late
+
+
 class VutContract:
     """What a campaign relies on in a VUT, at a point and on an acceleration lane.
 
@@ -420,6 +473,12 @@ class VutContract:
             for index in (0, 7):
                 alone = api.run_case(self.vut, recorded=(run.folder, index))
                 assert alone.measures == run.outcome(index).measures
+
+    def test_sees_with_late_sensors_what_was_before(self) -> None:
+        """SUMO's own drivers see in SUMO, and have no sensors."""
+        factory = VutFactory(self.vut, VutOptions())
+        if factory.vut.vut_type is None:
+            assert_sees_late(factory)
 
     def test_is_found_again_by_its_name(self) -> None:
         """A worker is told the name and makes it anew."""

@@ -1,0 +1,311 @@
+"""The sensors between the road and a VUT, against values by hand; every kind of VUT takes them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from controllers import STOCK_CLIENT, program
+from plans import plan_for
+from vut_contract import factory, in_process
+
+import merge_sumo as ms
+from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.sensing import SensedDriver, far_m
+from merge_sumo.engine.simulator import Simulator, imperfect
+from merge_sumo.errors import UserError
+from merge_sumo.testing.contracts import assert_sees_late
+from merge_sumo.values.case import MergeCase
+from merge_sumo.values.imperfection import Actuation, Sensing
+from merge_sumo.values.scenario import POV, US23, VUT
+
+FAR_M = -522.0
+"""340 m, where a POV may start, behind -182 m, where the VUT starts."""
+LAWS = """
+import numpy as np
+def law(x_pov, v_pov, x_vut):
+    return 0.05 * (v_pov - 27.0) + 0.001 * (x_vut - x_pov)
+def each(seen):
+    return float(law(seen.x_pov_m, seen.v_pov_mps, seen.x_vut_m))
+class Reset:
+    def reset(self, seen):
+        self.offset = 0.001 * seen.x_pov_m
+    def act(self, seen):
+        return each(seen) + self.offset
+class All:
+    def __init__(self, corridors):
+        pass
+    def act_batch(self, seen):
+        return law(seen.x_pov_m, seen.v_pov_mps, seen.x_vut_m)
+"""
+TRACI_LAW = (
+    STOCK_CLIENT
+    + """
+traci.simulationStep()
+while traci.simulation.getMinExpectedNumber() > 0:
+    if {"vut", "pov"} <= set(traci.vehicle.getIDList()):
+        command = 0.05 * (traci.vehicle.getSpeed("pov") - 27.0)
+        traci.vehicle.setSpeedMode("vut", 0)
+        traci.vehicle.setSpeed("vut", traci.vehicle.getSpeed("vut") + 0.1 * command)
+    traci.simulationStep()
+"""
+)
+
+
+class Sees(Driver):
+    """Keeps what it sees."""
+
+    def __init__(self, corridors=1):
+        super().__init__(corridors)
+        self.cases, self.scenes = [], []
+
+    def begin(self, corridor, case):
+        self.cases.append(case)
+
+    def act(self, scene):
+        self.scenes.append(scene)
+        return np.zeros(self.corridors)
+
+
+def case_with(x_pov0_m=-200.0, v_pov0_mps=30.0, **sense: Any) -> MergeCase:
+    scenario = replace(US23, sense=Sensing(**sense))
+    return MergeCase(level=0, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, scenario=scenario)
+
+
+def seen_of(case, steps=8, v_vut_mps=18.0):
+    """Return the POV as a VUT sees it, (T, 2), as both drive at constant speed; and as it is."""
+    inner = Sees()
+    driver = SensedDriver(inner, case.scenario)
+    driver.begin(0, case)
+    (x_pov, v_pov), (x_vut, _) = case.starts()
+    true = []
+    for step in range(steps):
+        state = x_pov + 0.1 * step * v_pov, v_pov, x_vut + 0.1 * step * v_vut_mps, v_vut_mps
+        true.append(state)
+        columns = (np.array([value]) for value in state)
+        driver.act(Scene.of_pair(np.array([True]), np.array([step]), *columns))
+    seen = np.array([[scene.x_pov_m[0], scene.v_pov_mps[0]] for scene in inner.scenes])
+    own = np.array([[scene.x_vut_m[0], scene.v_vut_mps[0]] for scene in inner.scenes])
+    assert np.array_equal(own, np.array(true)[:, 2:])
+    told = inner.cases[0].starts()
+    assert told[POV] == tuple(seen[0])
+    assert told[VUT] == case.starts()[VUT]
+    return seen, np.array(true)[:, :2]
+
+
+class TestByHand:
+    def test_perfect_sensors_change_no_bit(self):
+        seen, true = seen_of(case_with(-200.1, 30.3))
+        assert np.array_equal(seen, true)
+
+    def test_a_delay_shifts_what_was_seen_and_the_road_existed_before_the_start(self):
+        seen, true = seen_of(case_with(delay_s=0.3))
+        assert np.array_equal(seen[3:], true[:-3])
+        assert seen[:3, 0] == pytest.approx([-209.0, -206.0, -203.0], abs=1e-12)
+        assert (seen[:, 1] == 30.0).all()
+
+    def test_between_two_steps_a_car_drives_by_eq_4(self):
+        seen, _ = seen_of(case_with(delay_s=0.25))
+        assert seen[:, 0] == pytest.approx(-207.5 + 3.0 * np.arange(8), abs=1e-9)
+
+    def test_noise_has_its_size_and_depends_on_the_case_alone(self):
+        case = case_with(noise_x_m=2.0, noise_v_mps=0.5)
+        seen, true = seen_of(case, steps=250)
+        error = seen - true
+        assert error.std(axis=0) == pytest.approx([2.0, 0.5], rel=0.15)
+        assert abs(np.corrcoef(error.T)[0, 1]) < 0.2
+        assert np.array_equal(seen_of(case, steps=250)[0], seen)
+        other, true = seen_of(replace(case, x_pov0_m=-200.5), steps=250)
+        assert abs(np.corrcoef(error[:, 0], (other - true)[:, 0])[0, 1]) < 0.2
+
+    def test_no_measured_speed_is_negative(self):
+        seen, _ = seen_of(case_with(v_pov0_mps=0.0, noise_v_mps=5.0), steps=50)
+        assert seen[:, 1].min() == 0.0
+
+    def test_of_a_dropout_the_last_state_stays(self):
+        seen, true = seen_of(case_with(dropout=0.4), steps=250)
+        new = seen[:, 0] == true[:, 0]
+        assert new.mean() == pytest.approx(0.6, abs=0.1)
+        last = np.maximum.accumulate(np.where(new, np.arange(250), -1))
+        from_start = last >= 0
+        assert np.array_equal(seen[from_start], true[last[from_start]])
+        assert seen_of(case_with(dropout=1.0))[0][:, 0] == pytest.approx(-203.0)
+
+    def test_a_car_out_of_range_is_shown_out_of_the_way_at_the_speed_of_the_vut(self):
+        # It comes nearer by 1.2 m a step: 18 m, 16.8 m, 15.6 m, 14.4 m.
+        seen, true = seen_of(case_with(range_m=15.0))
+        assert seen[:3].tolist() == [[FAR_M, 18.0]] * 3
+        assert np.array_equal(seen[3:], true[3:])
+
+    def test_a_gore_hides_cars_until_the_vut_is_there(self):
+        # The VUT is at -182, -180.2, -178.4, -176.6 m.
+        seen, true = seen_of(case_with(occluded_until_m=-178.0))
+        assert seen[:3].tolist() == [[FAR_M, 18.0]] * 3
+        assert np.array_equal(seen[3:], true[3:])
+
+    def test_what_was_not_seen_arrives_late_too(self):
+        seen, true = seen_of(case_with(occluded_until_m=-178.0, delay_s=0.2))
+        assert seen[:5].tolist() == [[FAR_M, 18.0]] * 5
+        assert np.array_equal(seen[5:], true[3:-2])
+
+    def test_a_car_that_is_not_seen_is_as_far_away_as_one_may_start(self):
+        assert far_m(US23) == FAR_M
+        one_lane = replace(US23, mainline=("main_in", "main_out"), ramp=("main_in", "main_out"))
+        assert far_m(one_lane) == -182.0 + 340.0
+
+
+def test_corridors_are_independent():
+    cases = [case_with(-200.0 - k, noise_x_m=1.0, dropout=0.2, delay_s=0.15) for k in range(3)]
+    inner = Sees(3)
+    driver = SensedDriver(inner, cases[0].scenario)
+    true = np.array([case.starts() for case in cases])  # (K, A, 2)
+    for step in range(6):
+        if step == 0:
+            for k, case in enumerate(cases):
+                driver.begin(k, case)
+        x_m = true[:, :, 0] + 0.1 * step * true[:, :, 1]
+        driver.act(Scene(np.full(3, True), np.full(3, step), x_m.T, true[:, :, 1].T))
+    together = np.array([scene.x_pov_m for scene in inner.scenes])
+    for k, case in enumerate(cases):
+        assert np.array_equal(together[:, k], seen_of(case, steps=6)[0][:, 0])
+
+
+def test_in_traffic_the_car_that_is_met_is_chosen_among_those_that_are_seen():
+    from merge_sumo.road.scenario_file import named_scenario
+
+    scenario = replace(named_scenario("us23-traffic"), sense=Sensing(range_m=40.0))
+    case = scenario.case_type(
+        level=0,
+        x_pov0_m=-300.0,
+        v_pov0_mps=30.0,
+        headway_ahead_s=3.0,
+        headway_behind_s=3.0,
+        scenario=scenario,
+    )
+    inner = Sees()
+    driver = SensedDriver(inner, scenario)
+    driver.begin(0, case)
+    x_m, v_mps = np.array(case.starts()).T[..., None]
+    facing = np.array([POV])
+    driver.act(Scene(np.array([True]), np.array([0]), x_m, v_mps, facing=facing))
+    (scene,) = inner.scenes
+    # The car ahead, at -210 m, is 28 m away; the POV and the car behind are not seen.
+    assert scene.x_m[:, 0].tolist() == [far_m(scenario), -182.0, -210.0, far_m(scenario)]
+    assert scene.facing.tolist() == [2]
+
+
+def test_nothing_stands_between_a_perfect_road_and_a_vut():
+    driver = Sees()
+    assert imperfect(driver, US23) is driver
+
+
+@pytest.mark.parametrize("vut", ["design2", "level1"])
+def test_zeros_of_a_range_give_the_same_bits(vut):
+    scenario = replace(
+        US23,
+        sense=Sensing(delay_s=(0.0, 1.0), noise_x_m=(0.0, 1.0), dropout=(0.0, 0.5)),
+        act=Actuation(lag_s=(0.0, 1.0), delay_s=(0.0, 1.0)),
+    )
+    start: dict[str, Any] = {"level": 1, "x_pov0_m": -250.0, "v_pov0_mps": 29.0}
+    zeros: dict[str, Any] = dict.fromkeys(scenario.imperfect_fields, 0.0)
+    cases = [MergeCase(**start, scenario=US23), MergeCase(**start, **zeros, scenario=scenario)]
+    motions = []
+    for case in cases:
+        with Simulator(plan_for(vut, scenario=case.scenario)) as simulator:
+            ((_, ran),) = simulator.run([case])
+            motions.append(ran.motion)
+    assert np.array_equal(motions[0], motions[1])
+
+
+class TestEveryKindOfVut:
+    @pytest.mark.parametrize("name", ["each", "Reset", "All"])
+    def test_in_python_answers_to_the_log_of_before(self, tmp_path, name):
+        (tmp_path / "laws.py").write_text(LAWS)
+        assert_sees_late(in_process(f"{tmp_path / 'laws.py'}:{name}"))
+
+    def test_in_a_process_of_its_own(self, tmp_path):
+        (tmp_path / "laws.py").write_text(LAWS)
+        assert_sees_late(factory(f"{tmp_path / 'laws.py'}:Reset"))
+
+    @pytest.mark.slow
+    def test_behind_traci(self, tmp_path):
+        pytest.importorskip("traci")
+        assert_sees_late(factory("traci", command=program(tmp_path, TRACI_LAW)))
+
+    @pytest.mark.slow
+    def test_behind_traci_no_car_is_shown_where_there_is_no_road(self, tmp_path):
+        command = program(tmp_path, TRACI_LAW)
+        ran = ms.run_case(
+            "traci",
+            vut_command=command,
+            x_pov0_m=-250.0,
+            v_pov0_mps=29.0,
+            sense="occluded_until_m=-60",
+        )
+        assert ran.measures.error is None
+
+    @pytest.mark.parametrize("name", ["level1", "level2", "design2", "careful", "gap"])
+    def test_of_this_package(self, name):
+        assert_sees_late(factory(name))
+
+    def test_but_for_those_that_see_in_sumo(self):
+        with pytest.raises(UserError, match="sees other cars in SUMO itself"):
+            ms.run_case("sumo:IDM", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0.1")
+
+
+class TestSettings:
+    def test_are_recorded_and_run_again(self, tmp_path):
+        run = ms.campaign(
+            "design2",
+            level=0,
+            cases=12,
+            sense="delay_s=0..0.5,noise_x_m=0.5",
+            act=Actuation(lag_s=0.2),
+            out=tmp_path / "run",
+        )
+        recorded = run.run.settings["scenario"]
+        assert recorded["sense"] == {"delay_s": [0.0, 0.5], "noise_x_m": 0.5}
+        assert recorded["act"] == {"lag_s": 0.2}
+        delays = [row["sense_delay_s"] for row in run.cases]
+        assert 0.0 <= min(delays) < 0.2
+        assert 0.3 < max(delays) <= 0.5
+        assert ms.rerun(run).changed == []
+        again = ms.run_case(recorded=(run, 3))
+        assert again.measures == run.run.outcome(3).measures
+        assert "sensing delay" in run.report().read_text(encoding="utf-8")
+
+    def test_of_a_scenario_file(self, tmp_path):
+        (tmp_path / "late.toml").write_text("[sense]\ndelay_s = [0.0, 1.0]\n[act]\nlag_s = 0.3\n")
+        ran = ms.run_case(
+            "design2",
+            {"x_pov0_m": -250.0, "v_pov0_mps": 29.0, "sense_delay_s": 0.4},
+            scenario=tmp_path / "late.toml",
+        )
+        assert ran.trajectory.case.sensing == Sensing(delay_s=0.4)
+        assert ran.trajectory.case.actuation == Actuation(lag_s=0.3)
+
+    @pytest.mark.parametrize(
+        ("text", "said"),
+        [
+            ("delay=1", "--sense: 'delay' is unknown: did you mean delay_s?"),
+            ("delay_s", "--sense: delay_s is '': give a number, or a range as 0..0.5"),
+            ("delay_s=x", "--sense: delay_s is 'x': give a number, or a range as 0..0.5"),
+            ("delay_s=1,delay_s=2", "--sense: 'delay_s' is there twice"),
+            ("delay_s=9", "--sense: delay_s is 9.0: choose 0 to 5"),
+            ("delay_s=nan", "--sense: delay_s is nan: choose 0 to 5"),
+            ("delay_s=0.5..0.2", "--sense: delay_s is (0.5, 0.2): a range is low to high"),
+            ("dropout=0..2", "--sense: dropout is (0.0, 2.0): choose 0 to 1"),
+        ],
+    )
+    def test_that_make_no_sensors_are_refused_in_a_sentence(self, text, said):
+        with pytest.raises(UserError) as error:
+            ms.run_case("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense=text)
+        assert str(error.value).startswith(said)
+
+    def test_of_a_range_need_a_number_in_a_case(self):
+        with pytest.raises(UserError, match="sense_delay_s=NUMBER is missing"):
+            ms.run_case("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0..1")
+        with pytest.raises(UserError, match="sense_delay_s=NUMBER is none of the coordinates"):
+            ms.run_case("design2", {"sense_delay_s": 0.1}, x_pov0_m=-250.0, v_pov0_mps=29.0)
