@@ -86,6 +86,7 @@ from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
+from merge_sumo.reports.board import write_board
 from merge_sumo.reports.campaign_panel import CampaignPanel
 from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
 from merge_sumo.reports.export_format import EXPORTS
@@ -554,6 +555,18 @@ def report(run: AnyRun, *, people: float | None = None) -> Path:
     """
     opened = _opened(run)
     return (opened if people is None else CampaignRun(opened.run, people=people)).report()
+
+
+def board(run: AnyRun, *, certificate: AnyPath | None = None, people: float | None = None) -> Shown:
+    """Write the page of a campaign for a safety board, and its JSON; as `merge-sumo board`.
+
+    Args:
+        run: the campaign, or its folder.
+        certificate: folder of a certificate of the same VUT, as `certify` writes it.
+        people: as of `report`.
+    """
+    html, record = write_board(_opened(run).run, _path(certificate), people=people)
+    return Shown({"board": str(html), "record": str(record)}, [str(html), str(record)])
 
 
 def replay(folder: AnyRun, index: int | None = None, *, net: AnyPath | None = None) -> Replay:

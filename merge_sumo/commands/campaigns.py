@@ -23,6 +23,15 @@ COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behin
 SETUP_OF_A_CASE: Final = tuple(name for name in SETUP if name != "in_process")
 
 
+PEOPLE_OF_REPORT: Final = option(
+    float | None,
+    None,
+    "Share of published drivers beside whom failures are held.",
+    metavar="SHARE",
+    show_default="the campaign's",
+)
+
+
 def _vut_option(help: str, show_default: str) -> Shared:
     return option(
         str | None,
@@ -305,17 +314,7 @@ def replay(
     raise typer.Exit(0 if result.identical else 1)
 
 
-@app.verb(
-    own={
-        "people": option(
-            float | None,
-            None,
-            "Share of published drivers beside whom the report holds failures.",
-            metavar="SHARE",
-            show_default="the campaign's",
-        )
-    }
-)
+@app.verb(own={"people": PEOPLE_OF_REPORT})
 def report(given: Given, run: RunArgument) -> None:
     """Write the report of a campaign again and print its path.
 
@@ -328,6 +327,30 @@ def report(given: Given, run: RunArgument) -> None:
         print_json({"report": str(path)})
     else:
         show(path)
+
+
+@app.verb(
+    own={
+        "certificate": option(
+            Path | None,
+            None,
+            "Folder of a certificate of the same VUT, as `certify` writes it.",
+            metavar="DIR",
+        ),
+        "people": PEOPLE_OF_REPORT,
+    }
+)
+def board(given: Given, run: RunArgument) -> None:
+    """Write the page of a campaign for a safety board, and the same as JSON for a safety case.
+
+    board.html prints on A4 and board.json holds its sentences; each number names its file and key.
+    Nothing is simulated: what no study has left in the folder is said with its command.
+
+    Example:  merge-sumo board runs/design2
+    """
+    from merge_sumo import api
+
+    given.print(api.board(run, **given.keywords))
 
 
 @app.verb(

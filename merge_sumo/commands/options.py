@@ -33,14 +33,17 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
             "psi",
             "headway_ahead",
         ),
-        *("headway_behind", "only", "check"),
+        *("headway_behind", "only", "a_min", "check"),
     ),
     "How many cases, and which": (
         *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
         *("truth_cases", "dense", "quick", "distribution", "traffic", "density", "learn_from"),
         *("draws", "stop_after_converged", "audit"),
     ),
-    "Verdict": ("fail_when", "require", "people", "gate", "tolerance", "rerun", "confidence"),
+    "Verdict": (
+        *("fail_when", "require", "people", "gate", "tolerance", "rerun", "confidence"),
+        *("certificate",),
+    ),
     "Where it runs, and what it writes": (
         *("out", "resume", "force", "engine", "workers", "dask", "junit", "figure", "file_format"),
         *("gui", "debug", "quiet", "as_json"),

@@ -51,7 +51,11 @@ def write_report(
 
 def check_report(folder: Path) -> None:
     """Raise `UserError` where `report.html` in a folder is something else than our report."""
-    path = folder / REPORT
+    check_page(folder / REPORT)
+
+
+def check_page(path: Path) -> None:
+    """Raise `UserError` where a path is taken by something else than a page of ours."""
     check_own(path)
     try:
         with path.open("rb") as file:

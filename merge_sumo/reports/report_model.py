@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import Final, TypeVar
 
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
@@ -62,7 +63,7 @@ class ReportModel:
         are held, by default the campaign's.
         """
         self.run = run
-        self.road = _road_of(run)
+        self.road = road_of_run(run)
         self.summary = summary or summarise(run.outcomes, run.levels)
         self.verdict = judge(run.outcomes)
         self.levels = list(self.summary.levels)
@@ -164,7 +165,7 @@ def _is_told(outcome: Outcome) -> bool:
     return outcome.is_tested and outcome.score is not None
 
 
-def _road_of(run: Run) -> Corridor:
+def road_of_run(run: Run) -> Corridor:
     """Return the road of a run, or the shipped one to draw on where that is not there any more."""
     try:
         return road_for(run.scenario)
@@ -174,6 +175,12 @@ def _road_of(run: Run) -> Corridor:
 
 def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
     """Return the ground truth that is cached for what this run tested, if there is one."""
+    kept = kept_truth(run, road, level)
+    return None if kept is None else kept[0]
+
+
+def kept_truth(run: Run, road: Corridor, level: int) -> tuple[Truth, Path] | None:
+    """Return the ground truth of `_truth`, and its file in the cache."""
     settings, fixed = run.settings, run.scenario.v_vut0_mps
     same = (
         settings.get("net_sha256") == road.sha256
@@ -194,4 +201,4 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
         criterion=run.criterion,
         versions=versions(),
     )
-    return TruthKey(plan, level, TRUTH_CASES[level], seed=0).read(run.scenario)
+    return TruthKey(plan, level, TRUTH_CASES[level], seed=0).read_with_path(run.scenario)

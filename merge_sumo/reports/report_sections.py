@@ -32,6 +32,7 @@ from merge_sumo.campaigns import repeats
 from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
+from merge_sumo.reports.board_statements import BoardModel
 from merge_sumo.reports.headline import (
     avoidable_text,
     harmful_merges_text,
@@ -45,7 +46,7 @@ from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportMode
 from merge_sumo.studies.counterfactuals import in_a_sentence
 from merge_sumo.studies.stress import NOTHING
 from merge_sumo.studies.truth import TRUTH_CASES
-from merge_sumo.system.printable import counted, printable
+from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.registry import Registry
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import MergeScenario, lane_of, level_name
@@ -147,6 +148,11 @@ def _maps(model: ReportModel) -> dict[str, Any]:
         "severities": meanings(scenario),
         "covered": any(len(scenario.dimensions(level)) <= 3 for level in model.levels),
     }
+
+
+def _board(model: ReportModel) -> dict[str, Any]:
+    topics = BoardModel(model.run, people=model.people.share, summary=model.summary).topics()
+    return {"topics": topics, "command": f"merge-sumo board {quoted(model.run.folder)}"}
 
 
 def _merging(model: ReportModel) -> dict[str, Any] | None:
@@ -330,6 +336,7 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "untested": ReportSection(template=_own("untested"), words=_untested),
         "numbers": ReportSection(template=_own("numbers"), words=_numbers),
         "where": ReportSection(template=_own("where"), words=_maps),
+        "board": ReportSection(template=_own("board"), words=_board),
         "merging": ReportSection(template=_own("merging"), words=_merging),
         "people": ReportSection(template=_own("people"), words=_people),
         "words": ReportSection(template=_own("words"), words=_in_words),

@@ -46,7 +46,7 @@ from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, make_place, new_folder, replace_own
 from merge_sumo.system.hashing import Files, changed
 from merge_sumo.system.printable import two_digits
-from merge_sumo.system.records import convert, decode
+from merge_sumo.system.records import Record, convert, decode, read_record
 from merge_sumo.system.signature import signed, user_key, verified
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray
@@ -391,6 +391,60 @@ class Certificate:
     def certain(self) -> bool:
         """Whether no ball of the radius fails throughout."""
         return not any(of.failures or of.untold or of.otherwise for of in self.levels.values())
+
+
+class CertificateFound(Record, frozen=True):
+    """The result in the file of a certificate.
+
+    Attributes:
+        certain: whether no ball of the radius fails throughout.
+        sentence: the result in words.
+        levels: `LevelResult` by level.
+    """
+
+    certain: bool
+    sentence: str
+    levels: dict[str, LevelResult]
+
+
+class CertificateFile(Record, frozen=True):
+    """What the file of a certificate says.
+
+    Attributes:
+        radius: of the balls, as a share of the axes.
+        levels: the lattice of each level.
+        block: cases in a file.
+        engine: what moved the vehicles.
+        settings: what was tested.
+        files: hashes of the files of the VUT.
+        found: the result; None before the end.
+        sha256: hash of all other keys.
+    """
+
+    radius: float
+    levels: dict[str, Any]
+    block: int
+    engine: str
+    settings: dict[str, Any]
+    files: dict[str, str | None]
+    found: CertificateFound | None
+    sha256: str
+
+
+def certificate_of(folder: Path) -> CertificateFile:
+    """Return what the folder of a certificate says; `UserError` where it is not as it was written.
+
+    Its blocks are not read: `tools/check_certificate.py` checks them.
+    """
+    path = folder / CERTIFICATE
+    known = read_record(path, CertificateFile)
+    if known is None:
+        raise UserError(f"{folder} is no certificate: it has no {CERTIFICATE}")
+    record = decode(regular(path).read_bytes(), dict[str, Any])
+    written = record.pop("sha256")
+    if written != hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest():
+        raise UserError(f"{path} is not as it was written: its hash is another one")
+    return known
 
 
 def certify(

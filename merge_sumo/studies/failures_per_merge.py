@@ -46,6 +46,7 @@ from merge_sumo.studies.probability import (
 )
 from merge_sumo.studies.stratified import UPPER_RISK, Draws, Estimate, Strata, estimate
 from merge_sumo.system.folders import write_new
+from merge_sumo.system.records import Record, read_record
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import MergeScenario, Scenario, as_merge
 from merge_sumo.values.score import Outcome
@@ -168,6 +169,43 @@ class FailuresPerMerge:
             "cases": self.cases,
             "without_verdict": self.without_verdict,
         }
+
+
+class PerMergeFile(Record, frozen=True):
+    """What the file of a result says; its fields are those of `FailuresPerMerge`.
+
+    Attributes:
+        counted: what is counted, and what is not, in a sentence.
+        seed: of the draws.
+        engine: what moved the vehicles.
+        campaign: settings of the campaign that it is of.
+    """
+
+    least: float
+    most: float
+    low: float
+    high: float
+    levels: dict[str, OverMixtures]
+    parts: list[dict[str, Any]]
+    traffic: Traffic
+    x_m: Bounds
+    v_mps: Bounds
+    outside: Bounds
+    counted: str
+    confidence: float
+    cases: int
+    without_verdict: int
+    seed: int
+    engine: str
+    campaign: dict[str, Any]
+
+
+def per_merge_of(folder: Path) -> PerMergeFile | None:
+    """Return what the folder of a campaign says of failures per merge; None where it says nothing.
+
+    Raises `UserError` for a file that is not as it was written.
+    """
+    return read_record(folder / RESULT, PerMergeFile)
 
 
 def _range(ends: Bounds, digits: str) -> str:

@@ -37,6 +37,7 @@ from merge_sumo.studies.stratified import (
     of_cells,
 )
 from merge_sumo.system.folders import add_to, check_new_file, write_new
+from merge_sumo.system.records import Record, read_record
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, FloatArray
@@ -115,6 +116,41 @@ def failure_probability(
     }
     write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
     return result
+
+
+class ProbabilityFile(Record, frozen=True):
+    """What the file of an estimate says; its fields are those of `Estimate`.
+
+    Attributes:
+        distribution: how often cases occur, as it was stated.
+        seed: of the draws.
+        engine: what moved the vehicles.
+        campaign: settings of the campaign that it is of.
+    """
+
+    probability: float
+    low: float
+    high: float
+    confidence: float
+    low_risk: float
+    high_risk: float
+    cases: int
+    failures: int
+    without_verdict: int
+    strata: list[dict[str, Any]]
+    plain: dict[str, float]
+    distribution: dict[str, Any]
+    seed: int
+    engine: str
+    campaign: dict[str, Any]
+
+
+def probability_of(folder: Path) -> ProbabilityFile | None:
+    """Return what the folder of a campaign says of a probability; None where it says nothing.
+
+    Raises `UserError` for a file that is not as it was written.
+    """
+    return read_record(folder / RESULT, ProbabilityFile)
 
 
 def check_numbers(cases: int, confidence: float, seed: int) -> None:

@@ -244,11 +244,21 @@ class TruthKey:
         engines: Iterable[Engine] = (Engine.SUMO, Engine.KINEMATIC),
     ) -> Truth | None:
         """Return the truth that is kept, by the first of some engines; None where none is."""
+        found = self.read_with_path(scenario, cache, engines)
+        return None if found is None else found[0]
+
+    def read_with_path(
+        self,
+        scenario: Scenario,
+        cache: Path | None = None,
+        engines: Iterable[Engine] = (Engine.SUMO, Engine.KINEMATIC),
+    ) -> tuple[Truth, Path] | None:
+        """Return the truth of `read`, and its file."""
         for engine in engines:
             path = replace(self, engine=engine).path(cache)
             truth = read_truth(path, self.level, self.cases, scenario)
             if truth is not None:
-                return truth
+                return truth, path
         return None
 
 

@@ -79,6 +79,22 @@ def decode(content: bytes | str, kind: Any = Any) -> Any:
         raise RecordError(f"it is no JSON ({error})") from error
 
 
+def read_record(path: Path, kind: type[T]) -> T | None:
+    """Return what a JSON file says as a value of a type; None without the file.
+
+    Raises `UserError` for a file that is not as it was written.
+    """
+    try:
+        known: T = decode(regular(path).read_bytes(), kind)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except UserError as error:
+        raise UserError(f"{path} is not as it was written: {error}") from error
+    return known
+
+
 def convert(record: object, kind: type[T]) -> T:
     """Return plain values, as JSON and TOML have them, as a value of a type.
 

@@ -1,0 +1,606 @@
+"""What a safety board asks of a campaign, answered in sentences whose numbers name their source.
+
+The page and the JSON file show one list of topics. A number enters a sentence as a `Figure`, which
+holds its value, and the file and the key that it is from; so no sentence has a number without one.
+What was not run is said with the command that runs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.analysis.exposure import read_distribution
+from merge_sumo.analysis.people import (
+    ALL_PEOPLE,
+    BRAKING,
+    HEE_PEOPLE,
+    HEE_SOURCE,
+    PUBLISHED,
+    SLOWDOWN,
+    PeopleSummary,
+    beside_people,
+    none_of,
+)
+from merge_sumo.analysis.people import CONFIDENCE as PEOPLE_CONFIDENCE
+from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
+from merge_sumo.analysis.verdict import Verdict, judge
+from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
+from merge_sumo.errors import UserError
+from merge_sumo.reports.report_model import kept_truth, road_of_run
+from merge_sumo.studies.certificate import CERTIFICATE, certificate_of
+from merge_sumo.studies.counterfactuals import AVOIDANCE, read_avoidance
+from merge_sumo.studies.crosscheck import CROSSCHECK, Verdicts, crosscheck_of
+from merge_sumo.studies.failures_per_merge import RESULT as PER_MERGE
+from merge_sumo.studies.failures_per_merge import per_merge_of
+from merge_sumo.studies.probability import RESULT as PROBABILITY
+from merge_sumo.studies.probability import probability_of
+from merge_sumo.studies.stress import STRESS, stress_of
+from merge_sumo.system.printable import printable, quoted, two_digits
+from merge_sumo.values.criteria import CRITERIA
+from merge_sumo.values.fmc import fmc, radius_for
+from merge_sumo.values.scenario import OWN, MergeScenario, level_name
+from merge_sumo.values.score import FAILURE_SCORE
+from merge_sumo.values.severity import meanings
+
+OF_A_CAMPAIGN: Final = (
+    *("vut", "levels", "scenario", "fail_when", "require", "v_vut0_mps"),
+    *("policies_sha256", "net_sha256"),
+)
+"""Settings in which a study is the same as the campaign that it is of."""
+Value = float | int | str
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A number or a name in a sentence.
+
+    Attributes:
+        value: as its source has it.
+        shown: as the sentence writes it.
+        file: file of the run folder that it is from, or a publication.
+        key: where in the file, as "levels.1.high"; lines of a JSON-lines file by what they have.
+    """
+
+    value: Value
+    shown: str
+    file: str
+    key: str
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """A sentence, its figures, and the command that answers what it leaves open, if any."""
+
+    text: str
+    figures: tuple[Figure, ...] = ()
+    command: str = ""
+
+    @property
+    def sources(self) -> list[tuple[str, list[str]]]:
+        """The files of its figures, and the keys in each."""
+        keys: dict[str, dict[str, None]] = {}
+        for figure in self.figures:
+            keys.setdefault(figure.file, {})[figure.key] = None
+        return [(file, list(of_file)) for file, of_file in keys.items()]
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A question, and the sentences that answer it.
+
+    Attributes:
+        name: by which files and links name it.
+        question: the question.
+        statements: the answer; the first sentence stands for it where there is room for one.
+    """
+
+    name: str
+    question: str
+    statements: tuple[Statement, ...]
+
+
+def say(text: str, *figures: Figure, command: str = "") -> Statement:
+    """Return a statement: a text with a place, "{}", for each figure."""
+    return Statement(text.format(*(figure.shown for figure in figures)), figures, command)
+
+
+def figure(value: Value, file: str, key: str, digits: str = "") -> Figure:
+    """Return a figure; `digits` is a format, of whole numbers by default with commas."""
+    if isinstance(value, str):
+        return Figure(value, printable(value), file, key)
+    whole = isinstance(value, int) and not digits
+    return Figure(value, format(value, digits or ("," if whole else "g")), file, key)
+
+
+def share(value: float, file: str, key: str) -> Figure:
+    """Return a share as a figure in percent."""
+    return Figure(value, f"{two_digits(100.0 * value)} %", file, key)
+
+
+def _in_1000(per_merge: float, key: str) -> Figure:
+    """Return a number per merge as a figure in 1,000 merges."""
+    return Figure(per_merge, two_digits(1000.0 * per_merge), PER_MERGE, key)
+
+
+def _driver(people: PeopleSummary) -> str:
+    """Return what a sentence calls the driver that is held against people."""
+    return "the other driver" if people.car == "the POV" else people.car
+
+
+def _as_text(text: str) -> str:
+    """Return a text that `say` leaves as it is."""
+    return text.replace("{", "{{").replace("}", "}}")
+
+
+class BoardModel:
+    """What a page for the board says of a run; `UserError` where a file is of another campaign."""
+
+    def __init__(
+        self,
+        run: Run,
+        certificate: Path | None = None,
+        *,
+        people: float | None = None,
+        summary: Summary | None = None,
+    ) -> None:
+        """Read the run, what studies left in its folder, and the folder of a certificate.
+
+        `people` is the share of people beside whom failures are held, by default the campaign's;
+        `summary` is that of the run, where it is known.
+        """
+        self.run = run
+        self.summary = summary or summarise(run.outcomes, run.levels)
+        self.verdict: Verdict = judge(run.outcomes)
+        held = run.people if people is None else people
+        self.people = beside_people(run.outcomes, held, run.levels)
+        self.avoidance = read_avoidance(run)
+        self.per_merge = per_merge_of(run.folder)
+        self.probability = probability_of(run.folder)
+        self.stress = stress_of(run.folder)
+        self.crosscheck = crosscheck_of(run.folder)
+        self.certificate_folder = certificate
+        self.certificate = None if certificate is None else certificate_of(certificate)
+        if self.per_merge is not None:
+            self._check(self.per_merge.campaign, run.folder / PER_MERGE)
+        if self.probability is not None:
+            self._check(self.probability.campaign, run.folder / PROBABILITY)
+        if certificate is not None and self.certificate is not None:
+            self._check(self.certificate.settings, certificate / CERTIFICATE)
+
+    def _check(self, settings: Mapping[str, Any], path: Path) -> None:
+        for name in OF_A_CAMPAIGN:
+            if settings.get(name) != self.run.settings.get(name):
+                raise UserError(f"{path} is of another campaign: its {name} differs")
+        for name in ("vut_files", "pov_files"):
+            one, other = settings.get(name) or {}, self.run.settings.get(name) or {}
+            if differing := [
+                file for file in one.keys() & other.keys() if one[file] != other[file]
+            ]:
+                raise UserError(f"{path} is of another campaign: {min(differing)} is another one")
+
+    def topics(self) -> list[Topic]:
+        """Return the topics in the order of the page."""
+        found = (
+            ("tested", "What was tested?", self._tested()),
+            ("against", "Against whom?", self._against()),
+            ("failure", "What counts as a failure?", self._failure()),
+            ("found", "What was found?", self._found()),
+            ("remains", "How much was searched, and what may remain?", self._remains()),
+            ("often", "How often would that be on a road?", self._often()),
+            ("people", "Would a person do this?", self._people()),
+            ("avoidable", "Would a careful driver have avoided it?", self._avoidable()),
+            ("robust", "Is it robust, or does it hang by a thread?", self._robust()),
+            ("simulators", "Is it this simulator?", self._simulators()),
+            ("unsaid", "What does this page not say?", self._unsaid()),
+        )
+        return [Topic(name, question, tuple(said)) for name, question, said in found]
+
+    def _command(self, verb: str, further: str = "") -> str:
+        return f"merge-sumo {verb} {quoted(self.run.folder)}{further}"
+
+    def _lines(self, value: int, what: str = "") -> Figure:
+        """Return a number of lines of the outcomes as a figure."""
+        return figure(value, OUTCOMES, f"lines with {what}" if what else "lines")
+
+    @property
+    def _failing(self) -> str:
+        """What the lines of failures have."""
+        return f"score < {FAILURE_SCORE:g}" if self.run.criterion.is_papers else "margin < 0"
+
+    # What was tested, and against whom.
+
+    def _tested(self) -> Iterator[Statement]:
+        run, settings = self.run, self.run.settings
+        versions = settings.get("versions")
+        known = versions if isinstance(versions, dict) else {}
+        yield say(
+            "The vehicle under test (VUT), {}, was simulated in {} merges of the scenario {}, with "
+            "merge-sumo {} and SUMO {}.",
+            figure(run.vut, SETTINGS, "vut"),
+            self._lines(self.summary.cases),
+            figure(run.scenario.name, SETTINGS, "scenario.name"),
+            figure(str(known.get("merge-sumo")), SETTINGS, "versions.merge-sumo"),
+            figure(str(known.get("libsumo")), SETTINGS, "versions.libsumo"),
+        )
+        yield from self._starts()
+        yield say(
+            "The sampler {} (seed {}) chose the cases in search of failures, so the share of "
+            "failures among them is no frequency.",
+            figure(str(settings.get("sampler")), SETTINGS, "sampler"),
+            figure(int(settings.get("seed") or 0), SETTINGS, "seed"),
+        )
+
+    def _starts(self) -> Iterator[Statement]:
+        scenario = self.run.scenario
+        if not isinstance(scenario, MergeScenario):
+            return
+        x_m, v_mps, slow_mps = scenario.x_pov0_m, scenario.v_pov0_mps, scenario.bounds("v_vut0_mps")
+        text = (
+            "In each, another driver starts on the mainline, {} to {} m before the merge point M "
+            "at {} to {} m/s, and the VUT on the ramp, {} m before M"
+        )
+        ends = [
+            *(Figure(x, f"{-x:g}", SETTINGS, "scenario.x_pov0_m") for x in reversed(x_m)),
+            *(figure(v, SETTINGS, "scenario.v_pov0_mps") for v in v_mps),
+            Figure(scenario.x_vut0_m, f"{-scenario.x_vut0_m:g}", SETTINGS, "scenario.x_vut0_m"),
+        ]
+        if slow_mps[0] == slow_mps[1]:
+            ends.append(figure(slow_mps[0], SETTINGS, "scenario.v_vut0_mps"))
+            yield say(f"{text} at {{}} m/s. All such starts are the pool.", *ends)
+        else:
+            ends += [figure(v, SETTINGS, "scenario.v_vut0_mps") for v in slow_mps]
+            yield say(f"{text} at {{}} to {{}} m/s. All such starts are the pool.", *ends)
+
+    def _against(self) -> Iterator[Statement]:
+        for level, found in self.summary.levels.items():
+            cases = self._lines(found.cases, f"level = {level}")
+            if level == OWN:
+                pov = figure(self.run.pov, SETTINGS, "pov")
+                yield say("Level own, {} cases: the other driver is {}.", cases, pov)
+                continue
+            about = self.run.scenario.level_about.get(level, "drives as the scenario says")
+            yield say(f"Level {level}, {{}} cases: the other driver {_as_text(about)}.", cases)
+        policies = self.run.settings.get("policies")
+        if {1, 2} & set(self.summary.levels):
+            library = "the default library" if policies is None else f"the library {policies}"
+            yield say(
+                "Drivers of levels 1 and 2 are trained networks, {}. They are models of driving "
+                "and no recordings of people.",
+                Figure(str(policies), printable(library), SETTINGS, "policies"),
+            )
+
+    def _failure(self) -> Iterator[Statement]:
+        criterion, scenario = self.run.criterion, self.run.scenario
+        named = CRITERIA.get(criterion.text)
+        yield say(
+            "What fails: {}.",
+            Figure(
+                criterion.text,
+                scenario.said(criterion.words if named is None else named.about),
+                SETTINGS,
+                "fail_when" if criterion.require is None else "require",
+            ),
+        )
+        meaning = "; ".join(f"{word}: {means}" for word, means in meanings(scenario).items())
+        yield Statement(f"Severity, whatever counts as a failure: {meaning}.")
+
+    # What was found.
+
+    def _found(self) -> Iterator[Statement]:
+        verdict, failing = self.verdict, self._failing
+        if not verdict.tested:
+            yield say("Nothing was tested: {} cases ran.", self._lines(verdict.cases))
+        elif not verdict.failures:
+            tested = self._lines(verdict.tested, "neither error nor timeout")
+            yield say("None of {} tested cases fails.", tested)
+        else:
+            yield say(
+                "{} of {} cases fail; in {} of them bodies touch.",
+                self._lines(verdict.failures, failing),
+                self._lines(verdict.cases),
+                self._lines(verdict.contacts, f"{failing}, severity = contact"),
+            )
+        if verdict.errors or verdict.timeouts:
+            yield say(
+                "{} cases ended in an error and {} by the timeout: they say nothing about merging.",
+                self._lines(verdict.errors, "end = VUT_ERROR or SIM_ERROR"),
+                self._lines(verdict.timeouts, "end = TIMEOUT, not failing"),
+            )
+        for level, found in self.summary.levels.items():
+            yield self._found_at(level, found)
+        worst = failures(self.run.outcomes)
+        if worst:
+            index, dx_m = worst[0].index, worst[0].measures.dx_m
+            figures = [figure(index, OUTCOMES, "index of the failing line with the lowest score")]
+            if dx_m is not None:
+                figures.append(Figure(dx_m, f"{abs(dx_m):.1f}", OUTCOMES, f"line {index}: dx_m"))
+            text = "The worst case is {}"
+            text += "." if dx_m is None else ": front bumpers {} m apart as the VUT merges."
+            yield say(text, *figures, command=self._command("replay", f" {index} --gui"))
+
+    def _found_at(self, level: int, found: LevelSummary) -> Statement:
+        at = f"level = {level}"
+        counts = (
+            self._lines(found.failures, f"{at}, {self._failing}"),
+            self._lines(found.cases, at),
+        )
+        text = f"Level {level_name(level)}: {{}} of {{}} cases fail"
+        if not found.failures:
+            return say(f"{text}.", *counts)
+        regions = figure(found.regions, OUTCOMES, f"regions of the failing lines with {at}")
+        some = "region" if found.regions == 1 else "separate regions"
+        return say(f"{text}, in {{}} {some} of starts.", *counts, regions)
+
+    # What may remain.
+
+    def _remains(self) -> Iterator[Statement]:
+        missed = self.summary.missed
+        if missed is None:
+            yield Statement(
+                "Not known: how much of the pool fails far from every failure that was found. A "
+                "campaign with audit cases bounds it.",
+                command=self._again("--audit 100"),
+            )
+        else:
+            yield say(
+                "At most {} of the pool fails far from every failure that was found, with {} "
+                "confidence: {} audit cases, chosen uniformly, showed {} such failures.",
+                share(missed.at_most, OUTCOMES, "bound by the lines with audit"),
+                share(missed.confidence, OUTCOMES, "confidence of the bound"),
+                self._lines(missed.cases, "audit"),
+                figure(missed.missed, OUTCOMES, "lines with audit, missed"),
+            )
+        for level, found in self.summary.levels.items():
+            yield from self._searched(level, found)
+        yield from self._chance()
+        yield self._certified()
+
+    def _again(self, option: str) -> str:
+        vut, seed = self.run.settings.get("vut"), self.run.settings.get("seed") or 0
+        return f"merge-sumo campaign --vut {quoted(str(vut))} --seed {seed} {option}"
+
+    def _searched(self, level: int, found: LevelSummary) -> Iterator[Statement]:
+        at, dims = f"level = {level}", len(self.run.scenario.dimensions(level))
+        text, figures = f"Level {level_name(level)}: ", []
+        if found.unseen is not None:
+            text += "the largest ball of starts without a case has a radius of {} of the axes"
+            figures.append(share(found.unseen.radius, OUTCOMES, f"lines with {at}: starts"))
+            if found.failures:
+                text += "; the volume within {} of a failure (FMC; the pool is 1) is {}"
+                key = f"failing lines with {at}: starts"
+                figures.append(figure(radius_for(dims), OUTCOMES, "radius of the FMC"))
+                figures.append(figure(found.fmc, OUTCOMES, key, ".4f"))
+            yield say(f"{text}.", *figures)
+        kept = kept_truth(self.run, road_of_run(self.run), level)
+        if kept is None:
+            return
+        truth, path = kept
+        name, failing = level_name(level), truth.failures
+        yield say(
+            f"Level {name}, for comparison: of {{}} uniform cases {{}} fail, FMC {{}}.",
+            figure(len(truth.points), path.name, "points"),
+            figure(len(failing), path.name, f"score < {FAILURE_SCORE:g}"),
+            figure(fmc(failing), path.name, f"points with score < {FAILURE_SCORE:g}", ".4f"),
+        )
+
+    def _chance(self) -> Iterator[Statement]:
+        known = self.probability
+        if known is None:
+            return
+        uniform = read_distribution(None, self.run.levels, self.run.scenario).record()
+        given = (
+            "if all starts and levels were alike"
+            if known.distribution == uniform
+            else ("under the stated distribution of starts and levels")
+        )
+        yield say(
+            f"A case of the pool fails with a probability of {{}} ({{}} to {{}}, {{}} confidence) "
+            f"{given}: {{}} fresh cases.",
+            share(known.probability, PROBABILITY, "probability"),
+            share(known.low, PROBABILITY, "low"),
+            share(known.high, PROBABILITY, "high"),
+            share(known.confidence, PROBABILITY, "confidence"),
+            figure(known.cases, PROBABILITY, "cases"),
+        )
+
+    def _certified(self) -> Statement:
+        known = self.certificate
+        if known is None:
+            return Statement(
+                "Not certified: that no region of failures of a stated size was missed.",
+                command=f"merge-sumo certify --vut {quoted(str(self.run.settings.get('vut')))}; "
+                + self._command("board", " --certificate DIR"),
+            )
+        if known.found is None:
+            return Statement("The certificate is not complete.")
+        return say(
+            "Certificate, ball radius {} of the axes: {}.",
+            share(known.radius, CERTIFICATE, "radius"),
+            figure(known.found.sentence, CERTIFICATE, "found.sentence"),
+        )
+
+    # How often, and by whose fault.
+
+    def _often(self) -> Iterator[Statement]:
+        known = self.per_merge
+        if known is None:
+            yield Statement(
+                "Not run: with how many mainline cars a merge fails in traffic of published "
+                "density and speeds.",
+                command=self._command("failures-per-merge", " --traffic exid-5"),
+            )
+            return
+        density = known.traffic.density_veh_per_km or 0.0
+        yield say(
+            "In 1,000 merges in the traffic {} ({} cars/km), failures with {} to {} cars of the "
+            "mainline are expected, whatever the mixture of levels is ({} confidence); so at most "
+            "{} of 1,000 merges fail with a car that is counted.",
+            figure(known.traffic.name, PER_MERGE, "traffic.name"),
+            figure(density, PER_MERGE, "traffic.density_veh_per_km"),
+            _in_1000(known.low, "low"),
+            _in_1000(known.high, "high"),
+            share(known.confidence, PER_MERGE, "confidence"),
+            _in_1000(known.high, "high"),
+        )
+        for level, one in known.levels.items():
+            yield say(
+                f"If all drivers were of level {level_name(int(level))}: {{}} to {{}} cars in "
+                "1,000 merges.",
+                _in_1000(one.low, f"levels.{level}.low"),
+                _in_1000(one.high, f"levels.{level}.high"),
+            )
+        yield say(
+            "Source of the traffic: {}. {}.",
+            figure(known.traffic.source, PER_MERGE, "traffic.source"),
+            Figure(known.counted, printable(known.counted).capitalize(), PER_MERGE, "counted"),
+        )
+
+    def _people(self) -> Iterator[Statement]:
+        known, failing = self.people, self._failing
+        if not known.failures:
+            yield Statement("No failure is there to ask it of.")
+            return
+        if known.left_out:
+            yield Statement(f"Not known: {known.left_out}.")
+            return
+        people, which = figure(HEE_PEOPLE, HEE_SOURCE, "people"), f"failing ({failing})"
+        braking, slowdown = (published.limit(known.share) for published in PUBLISHED)
+        some = "the hardest" if known.share == ALL_PEOPLE else f"{100.0 * known.share:g} %"
+        text = f"In {{}} of {{}} failures {_driver(known)} does no more than {some} of {{}} "
+        text += "published drivers on a motorway, who brake at {} m/s2 or less over 1.6 s"
+        names = " and ".join(published.name for published in PUBLISHED)
+        figures = [
+            self._lines(known.inside, f"{which}, {names} within the figures"),
+            self._lines(known.failures, which),
+            people,
+            figure(braking or 0.0, HEE_SOURCE, BRAKING.about),
+        ]
+        if slowdown is not None:
+            text += " and slow down by {} m/s or less"
+            figures.append(figure(slowdown, HEE_SOURCE, SLOWDOWN.about))
+        yield say(f"{text}.", *figures)
+        if known.unknown:
+            unknown = self._lines(known.unknown, f"{which}, {BRAKING.name} = null")
+            yield say("In {} of these it is not recorded what would decide.", unknown)
+        for level, one in known.levels.items():
+            if one.failures and one.hardest_mps2 is not None:
+                at = f"{which}, level = {level}"
+                yield say(
+                    f"Level {level_name(level)}: in {{}} of {{}} failures {_driver(known)} brakes "
+                    "harder than that; the hardest is {} m/s2.",
+                    self._lines(one.brakes_harder, f"{at}, {BRAKING.name} > {braking:g}"),
+                    self._lines(one.failures, at),
+                    figure(one.hardest_mps2, OUTCOMES, f"{at}: largest {BRAKING.name}", ".3g"),
+                )
+        yield say(
+            "What none of {} drivers does may still be what up to {} of drivers do ({} "
+            "confidence): a failure outside is rare beside these people, and not impossible.",
+            people,
+            share(none_of(HEE_PEOPLE), HEE_SOURCE, "1 - 0.05^(1/people)"),
+            share(PEOPLE_CONFIDENCE, HEE_SOURCE, "confidence"),
+        )
+
+    def _avoidable(self) -> Iterator[Statement]:
+        known = list(self.avoidance.values())
+        if not self.verdict.failures:
+            yield Statement("No failure is there to avoid.")
+        elif not known:
+            yield Statement("Not known: the failures were not run again with careful drivers.")
+        else:
+            careful, pov = sum(o.by_careful for o in known), sum(o.pov_careful for o in known)
+            yield say(
+                "A careful and competent driver in the place of the VUT avoids {} of {} failures; "
+                "a careful driver in the place of the other one avoids {}.",
+                figure(careful, AVOIDANCE, "lines with careful in avoided_by"),
+                figure(len(known), AVOIDANCE, "lines"),
+                figure(pov, AVOIDANCE, "lines with pov_careful"),
+            )
+
+    # Robustness and other simulators.
+
+    def _robust(self) -> Iterator[Statement]:
+        known = self.stress
+        if known is None:
+            yield Statement(
+                "Not run: whether failures remain with an actuator lag, noise of the start, a "
+                "smaller step and a longer car.",
+                command=self._command("stress"),
+            )
+            return
+        yield say(
+            "{} of {} failures remain failures in all {} runs of the stress test.",
+            figure(len(known.robust), STRESS, "failures in no passes and no without_verdict"),
+            figure(len(known.failures), STRESS, "failures"),
+            figure(known.runs, STRESS, "rungs.runs"),
+        )
+        for rung in known.rungs:
+            flips = known.share(rung)
+            if flips is None:
+                yield say(
+                    "{}: not run ({}).",
+                    figure(rung.about, STRESS, f"rungs.{rung.name}.about"),
+                    figure(rung.skipped, STRESS, f"rungs.{rung.name}.skipped"),
+                )
+            else:
+                yield say(
+                    "{}: {} of verdicts flip.",
+                    figure(rung.about, STRESS, f"rungs.{rung.name}.about"),
+                    share(flips, STRESS, f"rungs.{rung.name}.runs"),
+                )
+
+    def _simulators(self) -> Iterator[Statement]:
+        known = self.crosscheck
+        if known is None:
+            yield Statement(
+                "Not run: whether another simulator agrees on motion and verdicts.",
+                command=self._command("crosscheck"),
+            )
+            return
+        if known.verdicts is None:
+            yield say(
+                "{} cannot host these drivers: {}.",
+                figure(known.peer, CROSSCHECK, "peer"),
+                figure(known.why_no_verdicts, CROSSCHECK, "why_no_verdicts"),
+            )
+        else:
+            yield from self._same_verdicts(known.peer, known.verdicts)
+        yield say(
+            "The recorded motion of {} cases differs from that of {} by {} m at most.",
+            figure(known.motion.cases, CROSSCHECK, "motion.cases"),
+            figure(known.peer, CROSSCHECK, "peer"),
+            figure(known.motion.largest_m, CROSSCHECK, "motion.largest_m", ".1g"),
+        )
+
+    def _same_verdicts(self, peer: str, verdicts: Verdicts) -> Iterator[Statement]:
+        cases = figure(verdicts.cases, CROSSCHECK, "verdicts.recorded + verdicts.fresh")
+        yield say(
+            "In another simulator, {}, {} of {} cases end as in SUMO; {} of them fail in SUMO.",
+            figure(peer, CROSSCHECK, "peer"),
+            figure(verdicts.same, CROSSCHECK, "verdicts.recorded + verdicts.fresh - differences"),
+            cases,
+            figure(verdicts.failures, CROSSCHECK, "verdicts.failures"),
+        )
+        if verdicts.differences:
+            explained = sum(one.is_explained for one in verdicts.differences)
+            yield say(
+                "Of the {} others {} have a reason that is none of the simulators.",
+                figure(len(verdicts.differences), CROSSCHECK, "verdicts.differences"),
+                figure(explained, CROSSCHECK, "verdicts.differences: reason"),
+            )
+
+    def _unsaid(self) -> Sequence[Statement]:
+        return [Statement(text) for text in UNSAID]
+
+
+UNSAID: Final = (
+    "No rate of crashes per kilometre or per year: a failure as defined above is no crash on a "
+    "road, and nobody has measured how common these encounters are.",
+    "No proof of safety: a search shows failures and cannot show that there are none.",
+    "Nothing of tyres, steering, sensors or software timing beyond the equations of motion, except "
+    "where a stress test above says so.",
+    "Nothing of other roads, weather, or more cars than the scenario has.",
+    "Nothing of how many people drive like a level: the shares of levels are unknown.",
+)
