@@ -55,6 +55,7 @@ from merge_sumo.api.results import (
     PerMergeResult,
     PolicyChecks,
     ProbabilityResult,
+    RepairResult,
     StressResult,
     TruthResult,
 )
@@ -75,7 +76,7 @@ from merge_sumo.campaigns.scenario_suggestion import (
     suggested_lane_m,
     unseen,
 )
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
@@ -93,6 +94,7 @@ from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import Bars, TrainingBars, is_watched
+from merge_sumo.reports.repair_page import repair_page
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction_page
 from merge_sumo.reports.running_page import RunningPage
@@ -107,12 +109,14 @@ from merge_sumo.studies import benchmark, certificate, reproduction, versions, v
 from merge_sumo.studies import crosscheck as peers
 from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability as estimates
+from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.benchmark import Benchmark
 from merge_sumo.studies.certificate import runs_points_on
 from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
+from merge_sumo.studies.probability import same_system
 from merge_sumo.studies.truth import Truth
 from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
 from merge_sumo.studies.vut_check import VutCheck
@@ -126,6 +130,7 @@ from merge_sumo.system.folders import (
     check_own,
     dated,
     link_latest,
+    replace_own,
     write_new,
 )
 from merge_sumo.system.interrupt import Stopped
@@ -155,8 +160,8 @@ __all__ += [
     "open_in_gui",
     "open_run",
 ]
-__all__ += ["probability", "replay", "report", "reproduce", "rerun", "resume", "run_case"]
-__all__ += ["scenarios", "stress", "train", "truth", "truths", "vuts"]
+__all__ += ["probability", "repair", "replay", "report", "reproduce", "rerun", "resume"]
+__all__ += ["run_case", "scenarios", "stress", "train", "truth", "truths", "vuts"]
 
 AnyPath = Path | str
 AnyRun = CampaignRun | Path | str
@@ -1041,6 +1046,128 @@ def crosscheck(
             on_cases=counter.ended,
         )
     return CrosscheckResult(found, before.folder / peers.CROSSCHECK)
+
+
+def repair(
+    run: AnyRun,
+    params: Iterable[str],
+    *,
+    vut: AnyVut | None = None,
+    cost: str = mending.Cost.TIME,
+    trials: int = mending.DEFAULT_TRIALS,
+    rounds: int = mending.DEFAULT_ROUNDS,
+    cases: int | None = None,
+    seed: int = 0,
+    net: AnyPath | None = None,
+    out: AnyPath | None = None,
+    resume: bool = False,
+    trust_vut: bool = False,
+    check: Callable[[], None] | None = None,
+    **given: Unpack[RerunKeywords],
+) -> RepairResult:
+    """Search for values of a controller's parameters that repair it; as `merge-sumo repair`.
+
+    Args:
+        run: the campaign, or its folder.
+        params: parameters that may change, with their ranges: "headway_s=0.5..3".
+        vut: as of `campaign`; the campaign's, as its files are now, by default.
+        cost: "time" to the merge, or "braking": of what the repair is to cost least.
+        trials: trials of a round.
+        rounds: most rounds of search and fresh campaign.
+        cases: cases of a fresh campaign; by default as many as the campaign has.
+        seed: same seed, same result.
+        net: net for that; must be the one of the campaign.
+        out: new folder to write; `runs/repair-<campaign>-<date>` by default.
+        resume: go on in the folder `out`.
+        trust_vut: run the controller that a folder names although it was not made here.
+        check: called after every trial and every batch; may raise to stop there.
+        given: how the drivers run, where it is to change, and where the cases run: see
+            `RerunKeywords`.
+    """
+    check_keywords("repair", given, RerunKeywords)
+    mending.require_optuna()
+    if cost not in list(mending.Cost):
+        raise UserError(f"--cost is {cost!r}: choose {' or '.join(mending.Cost)}")
+    ranges = tuple(map(mending.Range.parsed, params))
+    asked = mending.RepairSettings(ranges, mending.Cost(cost), trials, rounds, cases, seed)
+    before = _opened(run).run
+    folder = dated(f"repair-{before.folder.name}") if out is None else Path(out)
+    if not resume:
+        check_new(folder)
+    fields, runner = given_again(vut, given, {})
+    runner = replace(runner, check=check)
+    today = settings_today(before, fields, trust=trust_vut)
+    plan = resolve(today, _path(net))
+    same_system(before, record_of(today, plan))
+    motions: dict[tuple[str, int], Trajectory] = {}
+    bars: list[Bars] = []
+
+    @contextmanager
+    def opened() -> Iterator[Workers]:
+        with runner.open(plan) as workers, Bars(shown=runner.progress) as shown:
+            bars[:] = [shown]
+            yield workers
+
+    def on_trial(trial: mending.Trial) -> None:
+        done = sum(one.round == trial.round for one in search.trials)
+        bars[0].counted(f"round {trial.round}", done, max(trials, done), "trials")
+
+    def fresh(spec: str, number: int) -> tuple[Run, RunComparison]:
+        campaign = folder / mending.CAMPAIGN.format(number)
+        ran = _fresh_campaign(
+            mending.fresh_settings(today, asked, spec, number), campaign, net, runner
+        )
+        motions.clear()
+        compared = versions.compare_runs(
+            before,
+            ran,
+            net=plan.road,
+            given={} if today.policies is None else {"policies": today.policies},
+            trust=trust_vut,
+            on_motion=lambda of, index, motion: motions.update({(of, index): motion}),
+        )
+        return ran, compared
+
+    search = mending.Search(
+        *(before, plan.with_engine(None), asked),
+        partial(mending.RepairJournal, folder, resume=resume),
+        open_workers=opened,
+        check=runner.checks,
+        on_trial=on_trial,
+    )
+    found = search.repaired(fresh)
+    mending.write_repair(found, folder)
+    page = folder / mending.PAGE
+    replace_own(page, repair_page(found, before).encode(errors="backslashreplace"))
+    last = found.last
+    if last.compared is not None and last.campaign is not None:
+        changes = comparison_page(last.compared, before, last.campaign, motions)
+        replace_own(folder / mending.CHANGES, changes.encode(errors="backslashreplace"))
+    return RepairResult(found, folder, page)
+
+
+def _fresh_campaign(
+    settings: CampaignSettings, folder: Path, net: AnyPath | None, runner: Runner
+) -> Run:
+    """Run a campaign into a folder, or go on with it where it has begun."""
+    plan = resolve(settings, _path(net))
+    begun = folder.exists()
+    if begun:
+        check_report(folder)
+
+    def run(opened: Workers, panel: CampaignPanel, on_case: OnCase) -> Run:
+        if not begun:
+            return run_campaign(
+                settings, plan, folder, on_case, workers=opened, check=runner.checks
+            )
+        return resume_campaign(
+            *(settings, plan, folder, on_case),
+            on_before=panel.ran_before,
+            workers=opened,
+            check=runner.checks,
+        )
+
+    return _concluded(settings, plan, folder, run, runner).run
 
 
 def reproduce(

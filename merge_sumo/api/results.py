@@ -34,6 +34,7 @@ from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.crosscheck import Crosscheck, Verdicts
 from merge_sumo.studies.failures_per_merge import FailuresPerMerge, OverMixtures, Part
+from merge_sumo.studies.repair import MEASURED_BY, Repair, record_of_repair
 from merge_sumo.studies.stratified import Estimate
 from merge_sumo.studies.stress import Stress
 from merge_sumo.studies.truth import REAL_REGION, Truth
@@ -692,6 +693,86 @@ def _verdict_lines(verdicts: Verdicts) -> list[str]:
         )
     more = len(verdicts.differences) - MOST_ROWS
     return [*lines, f"            and {more} more"] if more > 0 else lines
+
+
+@dataclass(frozen=True, repr=False)
+class RepairResult(Result):
+    """Values of a controller's parameters that repair it, or that there are none.
+
+    Attributes:
+        repair: `spec`, the repaired controller, and what is known of it.
+        folder: folder that was written.
+        page: page in it.
+    """
+
+    repair: Repair
+    folder: Path
+    page: Path
+
+    @property
+    def verified(self) -> bool:
+        """Whether values were found and hold in a fresh campaign."""
+        return self.repair.verified
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {**record_of_repair(self.repair), "folder": str(self.folder), "page": str(self.page)}
+
+    def lines(self) -> list[str]:
+        """Return the values, what they cost, what a fresh campaign says, and the command."""
+        found, chosen = self.repair, self.repair.chosen
+        failing = f"{counted(len(found.failing), 'case')} of {found.cases}"
+        if chosen is None:
+            return [
+                f"{found.vut}: no values in these ranges let any of the {failing} pass that do not "
+                "today, unless others fail that pass",
+                f"  these stay: {_indices(found.stays)}",
+                f"page: {self.page}",
+            ]
+        stays = f", {len(found.stays)} still do not: {_indices(found.stays)}" if found.stays else ""
+        lines = [
+            f"{found.vut}: {failing} did not pass; with other values "
+            f"{len(found.failing) - len(found.stays)} of them pass{stays}; none that passed fails"
+        ]
+        for one in found.settings.ranges:
+            today, value = found.today[one.name], chosen.values[one.name]
+            lines.append(f"  {one.name}: {today:g}" + (f" -> {value:g}" if value != today else ""))
+        extra = (
+            f"{chosen.extra[cost]:+.2f} {unit} of {cost}" for cost, (_, unit) in MEASURED_BY.items()
+        )
+        lines.append(f"  cost, mean of a case: {', '.join(extra)}")
+        for number, tested in enumerate(found.rounds, start=1):
+            if tested.campaign is not None and tested.compared is not None:
+                levels = ", ".join(
+                    f"level {level_name(level)} {of.fmc_a:.4f} -> {of.fmc_b:.4f}"
+                    for level, of in tested.compared.levels.items()
+                )
+                cases = counted(len(tested.campaign.outcomes), "case")
+                lines.append(f"fresh campaign {number}, {cases}: FMC {levels}")
+        lines += _verification(found)
+        return [
+            *lines,
+            f"the repaired controller: merge-sumo campaign --vut {quoted(found.spec or '')}",
+            f"page: {self.page}",
+        ]
+
+
+MOST_INDICES: Final = 30
+
+
+def _indices(indices: Sequence[int]) -> str:
+    """Return indices of cases in words."""
+    more = f" and {len(indices) - MOST_INDICES} more" if len(indices) > MOST_INDICES else ""
+    return ", ".join(map(str, indices[:MOST_INDICES])) + more
+
+
+def _verification(found: Repair) -> list[str]:
+    """Return what the last fresh campaign says against the values."""
+    compared = found.last.compared
+    if compared is None or found.verified:
+        return []
+    broke = [f"{counted(found.broke, 'case')} fail that passed"] if found.broke else []
+    return [f"not verified: {sentence}" for sentence in (*broke, *compared.worse(0.0))]
 
 
 class PolicyChecks(Result, dict[str, "PolicyCheck"]):

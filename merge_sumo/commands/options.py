@@ -38,6 +38,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "How many cases, and which": (
         *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
         *("truth_cases", "dense", "quick", "distribution", "traffic", "density", "learn_from"),
+        *("param", "cost", "trials", "rounds"),
         *("draws", "stop_after_converged", "audit"),
     ),
     "Verdict": (

@@ -289,6 +289,82 @@ def crosscheck(given: Given, run: RunArgument) -> None:
 
 
 @app.verb(
+    options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"),
+    own={
+        "vut": option(
+            str | None,
+            None,
+            "The controller to repair.",
+            metavar="SPEC",
+            show_default="the campaign's, as its files are now",
+            autocompletion=complete.vuts,
+        ),
+        "cost": option(
+            str,
+            "time",
+            "What the repair is to cost least of, as a mean over the cases: time to the merge, or "
+            "braking of the VUT.",
+            metavar="time|braking",
+        ),
+        "trials": option(int, 60, "Sets of values that a round tries."),
+        "rounds": option(
+            int, 2, "Most rounds: the failures of a fresh campaign join the cases of the next."
+        ),
+        "cases": option(
+            int | None, None, "Cases of a fresh campaign.", show_default="as many as the campaign"
+        ),
+        "seed": option(int, 0, "Same seed, same values."),
+    },
+)
+def repair(
+    given: Given,
+    run: RunArgument,
+    param: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME=LOW..HIGH",
+            help="A parameter that may change: of a built-in VUT or of SUMO's model, a keyword of "
+            "the constructor, or an attribute. May be given several times.",
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="New folder to write.", show_default="runs/repair-RUN-DATE")
+    ] = None,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Go on with the repair in this folder.")
+    ] = None,
+) -> None:
+    """Find the smallest change of a controller's parameters that removes its failures.
+
+    optuna proposes values; the failures, near misses and a share of the other cases of the campaign
+    run with each. No case that passed may fail. Of the values with the fewest failures those are
+    chosen that cost least, and of these the smallest change. Then all cases run, and a fresh
+    campaign with another seed is compared with the one before. Needs the extra repair.
+
+    Exit code 0 when values were found and the fresh campaign shows nothing that broke or grew, else
+    1: then it says which cases stay.
+
+    Example:  merge-sumo repair runs/design1 --param gap_m=10..40 --param x2_m=10..90
+    """
+    from merge_sumo import api
+
+    if out is not None and resume is not None:
+        raise UserError("--resume names the folder: leave --out away")
+    folder = resume or out or api.dated(f"repair-{run.name}")
+
+    def how_to_go_on() -> str | None:
+        same = f"stopped; go on with the same command and --resume {quoted(folder)}"
+        return same if folder.exists() else None
+
+    with stoppable("trial or batch", how_to_go_on) as check:
+        result = api.repair(
+            run, param, out=folder, resume=resume is not None, check=check, **given.written
+        )
+    given.print(result)
+    raise typer.Exit(0 if result.verified else 1)
+
+
+@app.verb(
     options=["dense", "policies", "dask", "quiet"],
     own={
         "seeds": option(

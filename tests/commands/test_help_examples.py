@@ -20,7 +20,10 @@ from merge_sumo.values.scenario import US23
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {"--cases": "20", "--seeds": "1", "--radius": "0.3"}
-MORE = {"compare": ["--cases", "20", "--truth-cases", "100"]}
+MORE = {
+    "compare": ["--cases", "20", "--truth-cases", "100"],
+    "repair": ["--trials", "8", "--rounds", "1", "--cases", "20"],
+}
 ELSEWHERE = {"train", "reproduce"}
 """These take minutes: tests/training/test_training.py and the README's commands run them small."""
 
@@ -63,6 +66,8 @@ def test_runs(example, place, monkeypatch, tmp_path):
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
     if example.split()[1] == "crosscheck":
         require(find_spec("highway_env") is not None, "highway-env is not installed")
+    if example.split()[1] == "repair":
+        require(find_spec("optuna") is not None, "optuna is not installed")
     words = [word for word in shlex.split(example) if word != "--gui"]
     assert words.pop(0) == "merge-sumo"
     for place_of, word in enumerate(words[:-1]):
@@ -71,6 +76,6 @@ def test_runs(example, place, monkeypatch, tmp_path):
     if "--batch" not in words:
         words += MORE.get(words[0], [])
     done = CliRunner().invoke(cli.app, words)
-    # Their ways to say "worse" and "not certain".
-    failed = words[0] in ("compare-runs", "certify") and done.exit_code == 1
+    # Their ways to say "worse", "not certain" and "not repaired".
+    failed = words[0] in ("compare-runs", "certify", "repair") and done.exit_code == 1
     assert done.exit_code == 0 or failed, done.output

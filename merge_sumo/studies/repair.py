@@ -1,0 +1,762 @@
+"""Repair: values of a controller's parameters with which the failures of a campaign pass.
+
+A trial is a set of values. The failures of the campaign, its near misses and a share of its other
+cases run with it. optuna proposes the trials of a search with several objectives: the cases that
+still fail, the extra cost, and the change of the values; what breaks a case that passed is a
+constraint. Of the trials that break nothing the choice is, in this order:
+
+1. the fewest cases that fail;
+2. the least extra cost, in steps of `COST_STEP`: nothing where the cost is that of today or less;
+3. the smallest change: the sum over the parameters of the change as a share of the range.
+
+The chosen values are then taken back towards those of today, parameter by parameter, as far as
+the choice stays as good, and all cases of the campaign must pass that passed before. A fresh
+campaign, which learns from nothing, tests the result. Its failures join the cases of the next
+round of the search.
+
+settings.json           in the folder of a repair: what was asked
+trials.jsonl            one line per trial, in their order, synced
+campaign-1/             the fresh campaign of the first round
+repair.json             the result
+repair.html             its page, and changes.html that of the last comparison
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from importlib.metadata import version
+from importlib.util import find_spec
+from operator import itemgetter
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import numpy as np
+from msgspec import Meta, field
+
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES, Run
+from merge_sumo.engine.evaluate import CaseResults, evaluate
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.errors import UserError
+from merge_sumo.studies.versions import Change, RunComparison
+from merge_sumo.system.arrays import regular
+from merge_sumo.system.folders import add_to, make_folder, replace_own
+from merge_sumo.system.printable import quoted
+from merge_sumo.system.records import Record, decode, to_plain
+from merge_sumo.system.suggestions import meant
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import Case
+from merge_sumo.values.score import Outcome
+from merge_sumo.vuts.base import with_options
+from merge_sumo.vuts.registry import VutFactory, parameters_of
+
+if TYPE_CHECKING:
+    import optuna
+
+SETTINGS: Final = "settings.json"
+TRIALS: Final = "trials.jsonl"
+RESULT: Final = "repair.json"
+CAMPAIGN: Final = "campaign-{}"
+PAGE: Final = "repair.html"
+CHANGES: Final = "changes.html"
+DEFAULT_TRIALS: Final = 60
+DEFAULT_ROUNDS: Final = 2
+SHARE: Final = 0.2
+"""Share of the passing cases, besides near misses, that run in each trial."""
+DIGITS: Final = 3
+"""A value is rounded to so many digits of its range: 0.5..3 to thousandths."""
+COST_STEP: Final = 0.1
+"""Extra costs are compared in steps of 0.1 s, or of 0.1 m/s2. Chosen, not tuned."""
+BISECTIONS: Final = 4
+"""Steps by which a value is taken back towards that of today."""
+RESERVE: Final = 0.25
+"""Where a value cannot be taken back to that of today it goes on so far, as a share of its
+change: between the cases that ran are others. Chosen, not tuned."""
+CONFIRMED: Final = 5
+"""Most trials that run all cases, the best first."""
+
+
+class Cost(StrEnum):
+    """What a repair may cost."""
+
+    TIME = "time"
+    BRAKING = "braking"
+
+
+MEASURED_BY: Final = {Cost.TIME: ("t_end_s", "s"), Cost.BRAKING: ("vut_max_brake_mps2", "m/s2")}
+"""The measure of a cost, whose mean over the cases is compared, and its unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """The values that a parameter may take.
+
+    Attributes:
+        name: the parameter.
+        low: its least value.
+        high: its largest value.
+    """
+
+    name: str
+    low: float
+    high: float
+
+    @classmethod
+    def parsed(cls, text: str) -> Range:
+        """Return the range of NAME=LOW..HIGH; `UserError` for what is none."""
+        name, _, bounds = text.partition("=")
+        try:
+            low, high = map(float, bounds.split("..", 1))
+        except ValueError:
+            low = high = math.nan
+        if not name.strip() or not (math.isfinite(low) and math.isfinite(high)):
+            raise UserError(f"--param {text}: write NAME=LOW..HIGH, as headway_s=0.5..3")
+        if not low < high:
+            raise UserError(f"--param {text}: the range is empty: give the lower end first")
+        return cls(name.strip(), low, high)
+
+    def rounded(self, value: float) -> float:
+        """Return a value of the range with few digits."""
+        digits = DIGITS - math.floor(math.log10(self.high - self.low))
+        return min(max(round(value, digits), self.low), self.high)
+
+
+Index = Annotated[int, Meta(ge=0)]
+
+
+class Trial(Record, frozen=True):
+    """Values, and what became of the cases with them.
+
+    Cases are named by their index in the campaign; those of fresh campaigns have later numbers.
+
+    Attributes:
+        round: round of the search, from 1.
+        values: the values by parameter.
+        fails: cases that do not pass now, of those that did not with today's values.
+        broke: cases that passed with today's values and do not pass now.
+        extra: by cost, its mean over the cases minus that with today's values.
+        differs: whether any case ended otherwise than with today's values.
+        all_cases: whether all cases ran.
+        refused: why the controller does not take the values; empty where it does.
+    """
+
+    round: int
+    values: dict[str, float]
+    fails: tuple[Index, ...] = ()
+    broke: tuple[Index, ...] = ()
+    extra: dict[str, float] = field(default_factory=dict)
+    differs: bool = True
+    all_cases: bool = False
+    refused: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it was run and broke nothing."""
+        return not self.refused and not self.broke
+
+
+@dataclass(frozen=True, slots=True)
+class RepairSettings:
+    """What is searched for.
+
+    Attributes:
+        ranges: the parameters that may change.
+        cost: what the repair is to cost least of.
+        trials: trials of a round, as proposed by optuna.
+        rounds: most rounds of search and fresh campaign.
+        cases: cases of a fresh campaign.
+        seed: same seed, same result.
+    """
+
+    ranges: tuple[Range, ...]
+    cost: Cost = Cost.TIME
+    trials: int = DEFAULT_TRIALS
+    rounds: int = DEFAULT_ROUNDS
+    cases: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raise `UserError` for values that make no search."""
+        names = [one.name for one in self.ranges]
+        if not names:
+            raise UserError("name what may change: --param NAME=LOW..HIGH")
+        for name in names:
+            if names.count(name) > 1:
+                raise UserError(f"--param {name} is given twice: give each parameter once")
+        least = 1 + 2 * len(names)
+        for option, number, lowest in (
+            ("trials", self.trials, least),
+            ("rounds", self.rounds, 1),
+            ("cases", self.cases or 1, 1),
+            ("seed", self.seed, 0),
+        ):
+            if number < lowest:
+                why = " for today's values and both ends of each range" * (option == "trials")
+                raise UserError(f"--{option} is {number}: it must be {lowest} or more{why}")
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """A round: what was chosen, and what the fresh campaign says of it.
+
+    Attributes:
+        chosen: the trial, with all cases; None where no trial is better than today's values.
+        campaign: the fresh campaign.
+        compared: the campaign before (A) and the fresh one (B).
+    """
+
+    chosen: Trial | None
+    campaign: Run | None = None
+    compared: RunComparison | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Repair:
+    """What a repair found.
+
+    Attributes:
+        vut: the controller as it is.
+        settings: what was asked.
+        today: today's values.
+        failing: indices of the cases of the campaign that do not pass with today's values.
+        cases: number of cases of the campaign.
+        rounds: the rounds.
+        trials: all trials, in their order.
+    """
+
+    vut: str
+    settings: RepairSettings
+    today: Mapping[str, float]
+    failing: tuple[int, ...]
+    cases: int
+    rounds: tuple[Round, ...]
+    trials: tuple[Trial, ...]
+
+    @property
+    def last(self) -> Round:
+        """The round that counts: the last one that chose values, if any did."""
+        return next((one for one in reversed(self.rounds) if one.chosen), self.rounds[-1])
+
+    @property
+    def chosen(self) -> Trial | None:
+        """The chosen values; None where no values help."""
+        return self.last.chosen
+
+    @property
+    def spec(self) -> str | None:
+        """The repaired controller as a spec."""
+        return None if self.chosen is None else spec_with(self.vut, self.chosen.values, self.today)
+
+    @property
+    def stays(self) -> tuple[int, ...]:
+        """Indices of the cases of the campaign that still do not pass."""
+        if self.chosen is None:
+            return self.failing
+        return tuple(index for index in self.chosen.fails if index < self.cases)
+
+    @property
+    def broke(self) -> int:
+        """Number of cases of the last fresh campaign that fail, and pass with today's values."""
+        compared = self.last.compared
+        return 0 if compared is None else sum(c.change is Change.BROKE for c in compared.cases)
+
+    @property
+    def verified(self) -> bool:
+        """Whether values were found and the fresh campaign shows nothing that broke or grew."""
+        compared = self.last.compared
+        return compared is not None and not self.broke and not compared.worse(0.0)
+
+    def change(self, trial: Trial) -> float:
+        """Return by how much a trial changes today's values."""
+        return change_of(trial.values, self.today, self.settings.ranges)
+
+    def pareto(self) -> list[Trial]:
+        """Return the trials of the last round that no other is better than in all objectives."""
+        last = max(trial.round for trial in self.trials)
+        held = [trial for trial in self.trials if trial.holds and trial.round == last]
+        aims = [(len(t.fails), _extra(t, self.settings.cost), self.change(t)) for t in held]
+        return [
+            trial
+            for trial, own in zip(held, aims, strict=True)
+            if not any(other != own and _no_worse(other, own) for other in aims)
+        ]
+
+
+def _no_worse(one: Sequence[float], other: Sequence[float]) -> bool:
+    return all(a <= b for a, b in zip(one, other, strict=True))
+
+
+def _extra(trial: Trial, cost: Cost) -> float:
+    """Return the extra cost of a trial, 0 where it costs no more than today."""
+    return max(trial.extra.get(cost, 0.0), 0.0)
+
+
+def change_of(
+    values: Mapping[str, float], today: Mapping[str, float], ranges: Sequence[Range]
+) -> float:
+    """Return the sum over the parameters of the change as a share of the range."""
+    return sum(abs(values[r.name] - today[r.name]) / (r.high - r.low) for r in ranges)
+
+
+def spec_with(
+    vut: str, values: Mapping[str, float], today: Mapping[str, float] | None = None
+) -> str:
+    """Return the spec of a controller with values of its parameters, but not with `today`'s."""
+    known = today or {}
+    changed = {name: f"{v:.12g}" for name, v in values.items() if known.get(name) != v}
+    return with_options(vut, changed) if changed else vut
+
+
+def fresh_settings(
+    today: CampaignSettings, asked: RepairSettings, spec: str, number: int
+) -> CampaignSettings:
+    """Return the settings of the fresh campaign of a round: another seed, and no earlier lesson.
+
+    `today` are those of the campaign before.
+    """
+    cases = today.cases if asked.cases is None else asked.cases
+    few: dict[str, Any] = {
+        name: None if (known := getattr(today, name)) is None or known > cases else known
+        for name in ("batch", "in_flight", "audit")
+    }
+    return replace(
+        today,
+        vut=spec,
+        seed=today.seed + asked.seed + number,
+        cases=cases,
+        learn_from=(),
+        stop_after_converged=None,
+        **few,
+    )
+
+
+def require_optuna() -> None:
+    """Raise `UserError` where optuna is not installed."""
+    if find_spec("optuna") is None:
+        raise UserError("repair needs optuna: run `pip install 'merge-sumo[repair]'`")
+
+
+def todays_values(vut: VutFactory, ranges: Sequence[Range]) -> dict[str, float]:
+    """Return today's values of the parameters; `UserError` where one is unknown or out of range."""
+    known = parameters_of(vut)
+    is_sumo = vut.vut.vut_type is not None
+    for one in ranges:
+        if one.name not in known and is_sumo:
+            raise UserError(
+                f"--param {one.name}: its value today is not known; name it, as in "
+                f"--vut {quoted(spec_with(vut.spec, {one.name: one.low}))}"
+            )
+        if one.name not in known:
+            hint = meant(one.name, known)
+            names = f"{hint}choose from {', '.join(sorted(known))}" if known else "it has none"
+            raise UserError(f"--param {one.name}: {vut.spec} has no such parameter: {names}")
+        if not one.low <= known[one.name] <= one.high:
+            raise UserError(
+                f"--param {one.name}={one.low:g}..{one.high:g}: it is {known[one.name]:g} today, "
+                "which is not in that range: give a range around it"
+            )
+    return {one.name: float(known[one.name]) for one in ranges}
+
+
+class RepairJournal:
+    """The folder of a repair: what was asked, and its trials in their order.
+
+    A resumed repair asks for the same trials again and takes those that are recorded.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
+        """Begin a new folder, or go on in one; `UserError` where it is of another repair."""
+        self.folder, self._recorded = folder, list[Trial]()
+        if not resume:
+            make_folder(folder)
+            replace_own(folder / SETTINGS, (json.dumps(settings, indent=1) + "\n").encode())
+            return
+        before = _read(folder / SETTINGS)
+        known = decode(before, dict[str, Any])
+        asked = json.loads(json.dumps(settings))
+        for name in asked:
+            if known.get(name) != asked[name]:
+                raise UserError(
+                    f"{folder} was begun with another {name}: go on with the same command, or "
+                    "begin a new folder"
+                )
+        if (folder / TRIALS).exists():
+            lines = _read(folder / TRIALS).splitlines(keepends=True)
+            whole = [line for line in lines if line.endswith(b"\n")]
+            self._recorded = [decode(line, Trial) for line in whole]
+            if len(whole) < len(lines):
+                replace_own(folder / TRIALS, b"".join(whole))
+        self._written = bool(self._recorded)
+
+    _written = False
+
+    def recorded(self, trial: Trial) -> Trial | None:
+        """Return the next recorded trial, which is one of these values; None after the last."""
+        if not self._recorded:
+            return None
+        known = self._recorded.pop(0)
+        same = (known.round, known.values, known.all_cases)
+        if same != (trial.round, trial.values, trial.all_cases):
+            raise UserError(
+                f"{self.folder / TRIALS} has other trials than this search: begin a new folder"
+            )
+        return known
+
+    def add(self, trial: Trial) -> None:
+        """Record a trial."""
+        line = json.dumps(to_plain(trial), allow_nan=False) + "\n"
+        add_to(self.folder / TRIALS, line.encode(), new=not self._written)
+        self._written = True
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return regular(path).read_bytes()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+
+
+Fresh = Callable[[str, int], tuple[Run, RunComparison]]
+"""Runs the fresh campaign of a spec in a round, and compares the campaign before with it."""
+
+
+class Search:
+    """The search for values, round by round."""
+
+    def __init__(
+        self,
+        run: Run,
+        plan: SimulationPlan,
+        settings: RepairSettings,
+        begin: Callable[[Mapping[str, Any]], RepairJournal],
+        *,
+        open_workers: Callable[[], AbstractContextManager[Workers]],
+        check: Callable[[], None] = lambda: None,
+        on_trial: Callable[[Trial], None] = lambda _: None,
+    ) -> None:
+        """Take a campaign and the plan of its cases.
+
+        `begin` gives the journal once there is something to repair. `check` is called after every
+        trial and may raise to stop there; `on_trial` is told of it.
+        """
+        self._plan, self._settings, self._begin = plan, settings, begin
+        self._record = {
+            "cases_sha256": hashlib.sha256(_read(run.folder / OUTCOMES)).hexdigest(),
+            "vut": plan.vut.spec,
+            "vut_files": plan.vut.files,
+            "parameters": [asdict(one) for one in settings.ranges],
+            **{name: getattr(settings, name) for name in ("cost", "trials", "rounds", "cases")},
+            "seed": settings.seed,
+            "versions": {**plan.versions, "optuna": version("optuna")},
+        }
+        self._open, self._check, self._on_trial = open_workers, check, on_trial
+        self._workers: Workers | None = None
+        self._ranges = {one.name: one for one in settings.ranges}
+        self.today = todays_values(plan.vut, settings.ranges)
+        self.cases: list[Case] = [outcome.case for outcome in run.outcomes]
+        self._own = len(self.cases)
+        self._before: list[Outcome] = []
+        """What becomes of the cases with today's values."""
+        self.trials: list[Trial] = []
+        self._round = 1
+        self._journal: RepairJournal | None = None
+
+    def repaired(self, fresh: Fresh) -> Repair:
+        """Search, test and search again; return what was found.
+
+        Raises `UserError` where no case fails, and for a parameter without an effect.
+        """
+        rounds = list[Round]()
+        failing: tuple[int, ...] = ()
+        for number in range(1, self._settings.rounds + 1):
+            self._round = number
+            with self._opened():
+                self._run_today()
+                failing = failing or tuple(i for i in range(self._own) if not self._passed(i))
+                if not failing:
+                    raise UserError(
+                        f"every case passes with {self._plan.vut.spec}: nothing is to be repaired"
+                    )
+                self._journal = self._journal or self._begin(self._record)
+                chosen = self._search(rounds[-1].chosen if rounds else None)
+            if chosen is None:
+                rounds.append(Round(None))
+                break
+            spec = spec_with(self._plan.vut.spec, chosen.values, self.today)
+            campaign, compared = fresh(spec, number)
+            rounds.append(Round(chosen, campaign, compared))
+            against = [o.case for o in campaign.outcomes if not _passes(o)]
+            if not against:
+                break
+            self.cases += against
+        return Repair(
+            vut=self._plan.vut.spec,
+            settings=self._settings,
+            today=self.today,
+            failing=failing,
+            cases=self._own,
+            rounds=tuple(rounds),
+            trials=tuple(self.trials),
+        )
+
+    @contextmanager
+    def _opened(self) -> Iterator[None]:
+        with self._open() as self._workers:
+            yield
+        self._workers = None
+
+    def _passed(self, index: int) -> bool:
+        return _passes(self._before[index])
+
+    def _run_today(self) -> None:
+        """Run the cases that have not run with today's values."""
+        new = range(len(self._before), len(self.cases))
+        self._before += self._outcomes(self._plan, new)
+
+    def _outcomes(self, plan: SimulationPlan, indices: Sequence[int]) -> list[Outcome]:
+        """Return the outcomes of cases by their numbers, in order."""
+        cases = [self.cases[index] for index in indices]
+        ran = evaluate(plan.for_cases(len(cases)), cases, self._workers, _outcomes_of)
+        return [outcome for _, outcome in sorted(ran, key=itemgetter(0))]
+
+    def _selected(self) -> list[int]:
+        """Return the cases of a trial: what does not pass, near misses, and a share of the rest."""
+        failing = [i for i in range(len(self.cases)) if not self._passed(i)]
+        passing = [i for i in range(len(self.cases)) if self._passed(i)]
+        passing.sort(key=lambda i: (self._before[i].score or 0.0, i))
+        near, rest = passing[: len(failing)], passing[len(failing) :]
+        rng = np.random.default_rng([self._settings.seed, self._round])
+        drawn = rng.choice(len(rest), math.ceil(SHARE * len(rest)), replace=False)
+        return sorted({*failing, *near, *(rest[k] for k in drawn.tolist())})
+
+    def _search(self, earlier: Trial | None) -> Trial | None:
+        """Return the best trial of a round, with all cases; None where none helps."""
+        selected = self._selected()
+        first = [self.today, *([] if earlier is None else [earlier.values])]
+        if earlier is None:
+            first += [
+                {**self.today, one.name: end}
+                for one in self._settings.ranges
+                for end in (one.low, one.high)
+            ]
+        found = [self._proposed(study, selected) for study in self._studies(first)]
+        if earlier is None:
+            self._check_effect(found)
+        present = found[0]
+        better = sorted((t for t in found if t.holds), key=self._rank)
+        for trial in better[:CONFIRMED]:
+            if len(trial.fails) >= len(present.fails):
+                return None
+            trimmed = self._trimmed(trial, selected)
+            everywhere = self._trial(trimmed.values, range(len(self.cases)), all_cases=True)
+            if everywhere.holds:
+                return everywhere
+        return None
+
+    def _studies(self, first: Sequence[Mapping[str, float]]) -> Iterator[optuna.Study]:
+        """Give the study of optuna once for each of its trials."""
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        # Startup trials are drawn at random: a few for each parameter.
+        startup = max(10, len(first) + 4 * len(self._ranges))
+        seed = self._settings.seed * 1000 + self._round
+        sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=startup, multivariate=True)
+        study = optuna.create_study(directions=["minimize"] * 3, sampler=sampler)
+        for values in first:
+            study.enqueue_trial(dict(values))
+        for _ in range(self._settings.trials):
+            yield study
+
+    def _proposed(self, study: optuna.Study, selected: Sequence[int]) -> Trial:
+        """Ask for a trial, run it and tell what became of it."""
+        import optuna
+
+        asked = study.ask(
+            {
+                name: optuna.distributions.FloatDistribution(one.low, one.high)
+                for name, one in self._ranges.items()
+            }
+        )
+        values = {name: self._ranges[name].rounded(asked.params[name]) for name in self._ranges}
+        # Today's values have all their digits.
+        is_todays = all(asked.params[name] == value for name, value in self.today.items())
+        trial = self._trial(self.today if is_todays else values, selected)
+        if trial.refused:
+            study.tell(asked, state=optuna.trial.TrialState.FAIL)
+            return trial
+        asked.set_constraint("broke", float(len(trial.broke)))
+        study.tell(asked, [len(trial.fails), _extra(trial, self._settings.cost), self._size(trial)])
+        return trial
+
+    def _trial(
+        self, values: Mapping[str, float], indices: Sequence[int], *, all_cases: bool = False
+    ) -> Trial:
+        """Return a trial that is recorded, or run it on cases and record it."""
+        assert self._journal is not None, "begun before"  # noqa: S101
+        wanted = Trial(self._round, dict(values), all_cases=all_cases)
+        trial = self._journal.recorded(wanted)
+        if trial is None:
+            trial = self._ran(wanted, indices)
+            self._journal.add(trial)
+            self._check()
+        self.trials.append(trial)
+        self._on_trial(trial)
+        return trial
+
+    def _ran(self, wanted: Trial, indices: Sequence[int]) -> Trial:
+        spec = spec_with(self._plan.vut.spec, wanted.values, self.today)
+        is_todays = wanted.values == self.today
+        try:
+            if is_todays:
+                after = [self._before[index] for index in indices]
+            else:
+                vut = VutFactory(spec, self._plan.vut.options)
+                after = self._outcomes(replace(self._plan, vut=vut), indices)
+        except UserError as error:
+            return Trial(wanted.round, wanted.values, refused=str(error))
+        pairs = [(i, self._before[i], now) for i, now in zip(indices, after, strict=True)]
+        both = [(old, now) for _, old, now in pairs if old.is_tested and now.is_tested]
+        return Trial(
+            wanted.round,
+            wanted.values,
+            fails=tuple(i for i, old, now in pairs if not _passes(old) and not _passes(now)),
+            broke=tuple(i for i, old, now in pairs if _passes(old) and not _passes(now)),
+            extra={
+                cost: fmean(_of(now, name) - _of(old, name) for old, now in both) if both else 0.0
+                for cost, (name, _) in MEASURED_BY.items()
+            },
+            differs=any(old.measures != now.measures for _, old, now in pairs),
+            all_cases=wanted.all_cases,
+        )
+
+    def _check_effect(self, found: Sequence[Trial]) -> None:
+        """Raise `UserError` for a parameter of which both ends change nothing."""
+        for place, one in enumerate(self._settings.ranges):
+            ends = found[1 + 2 * place : 3 + 2 * place]
+            if not any(trial.differs or trial.refused for trial in ends):
+                raise UserError(
+                    f"--param {one.name} has no effect on any case, be it {one.low:g} or "
+                    f"{one.high:g}: leave it out, or name what the controller reads"
+                )
+
+    def _size(self, trial: Trial) -> float:
+        return change_of(trial.values, self.today, self._settings.ranges)
+
+    def _aims(self, trial: Trial) -> tuple[int, int]:
+        """Return what is compared before the change: failures, and steps of extra cost."""
+        extra = _extra(trial, self._settings.cost)
+        return len(trial.fails), math.ceil(round(extra / COST_STEP, 9))
+
+    def _rank(self, trial: Trial) -> tuple[float, ...]:
+        return *self._aims(trial), self._size(trial)
+
+    def _trimmed(self, best: Trial, selected: Sequence[int]) -> Trial:
+        """Return a trial with values as near to today's as the choice allows, with a reserve."""
+        aims, kept = self._aims(best), best
+
+        def as_good(name: str, value: float) -> bool:
+            nonlocal kept
+            trial = self._trial({**kept.values, name: self._ranges[name].rounded(value)}, selected)
+            good = trial.holds and self._aims(trial) <= aims
+            kept = trial if good else kept
+            return good
+
+        by_change = sorted(
+            self._settings.ranges,
+            key=lambda one: (
+                -abs(kept.values[one.name] - self.today[one.name]) / (one.high - one.low)
+            ),
+        )
+        for one in by_change:
+            today, good = self.today[one.name], kept.values[one.name]
+            if good == today:
+                continue
+            before = self._trial({**kept.values, one.name: today}, selected)
+            if before.holds and self._aims(before) <= aims:
+                kept = before
+                continue
+            bad = today
+            for _ in range(BISECTIONS):
+                middle = (bad + good) / 2.0
+                if as_good(one.name, middle):
+                    good = middle
+                else:
+                    bad = middle
+            as_good(one.name, good + RESERVE * (good - today))
+        return kept
+
+
+def _passes(outcome: Outcome) -> bool:
+    """Return whether the VUT reached M and the case is no failure."""
+    return outcome.is_tested and not outcome.failed
+
+
+def _of(outcome: Outcome, name: str) -> float:
+    return float(outcome.measures.value(name) or 0.0)
+
+
+def _outcomes_of(results: CaseResults) -> list[Outcome]:
+    """Return the outcomes of a chunk, without motions."""
+    return [result.outcome(0) for result in results]
+
+
+def record_of_repair(repair: Repair) -> dict[str, Any]:
+    """Return what `repair.json` holds."""
+    chosen = repair.chosen
+    return {
+        "vut": repair.vut,
+        "repaired": repair.spec,
+        "verified": repair.verified,
+        "parameters": [
+            {
+                "name": one.name,
+                "low": one.low,
+                "high": one.high,
+                "today": repair.today[one.name],
+                "repaired": None if chosen is None else chosen.values[one.name],
+            }
+            for one in repair.settings.ranges
+        ],
+        "cost": repair.settings.cost.value,
+        "cases": repair.cases,
+        "failing": list(repair.failing),
+        "stays": list(repair.stays),
+        "extra": {} if chosen is None else chosen.extra,
+        "change": None if chosen is None else repair.change(chosen),
+        "broke": repair.broke,
+        "rounds": [_round_record(one) for one in repair.rounds],
+        "trials": len(repair.trials),
+        "pareto": [to_plain(trial) for trial in repair.pareto()],
+        "seed": repair.settings.seed,
+    }
+
+
+def _round_record(one: Round) -> dict[str, Any]:
+    if one.chosen is None or one.campaign is None or one.compared is None:
+        return {"values": None}
+    return {
+        "values": one.chosen.values,
+        "campaign": str(one.campaign.folder),
+        "cases": len(one.campaign.outcomes),
+        "failures": sum(not _passes(outcome) for outcome in one.campaign.outcomes),
+        "levels": {
+            str(level): {"fmc_before": of.fmc_a, "fmc_after": of.fmc_b, "fmc_broke": of.fmc_broke}
+            for level, of in one.compared.levels.items()
+        },
+    }
+
+
+def write_repair(repair: Repair, folder: Path) -> Path:
+    """Write the result into the folder of a repair, and return its path."""
+    path = folder / RESULT
+    content = json.dumps(record_of_repair(repair), indent=1, allow_nan=False) + "\n"
+    replace_own(path, content.encode())
+    return path

@@ -1,0 +1,249 @@
+"""Repair: values of parameters that are known in closed form, and controllers beyond repair."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from merge_sumo import api
+from merge_sumo.errors import UserError
+from merge_sumo.studies import repair as mending
+from merge_sumo.studies.repair import BISECTIONS, RESERVE, Range, Trial
+
+pytest.importorskip("optuna")
+
+SOURCE = """
+class Base:
+    def __init__(self):
+        self.first_x_m = None
+
+    def reset(self, seen):
+        self.first_x_m = seen.x_pov_m
+
+    def act(self, seen):
+        return -self.braking_mps2() if seen.t_s < 0.05 else 1.0
+
+
+class Brakes(Base):
+    '''Brakes once by so much, whatever it sees.'''
+
+    def __init__(self, brake=3.0, unused=1.0):
+        self.brake, self.unused = brake, unused
+
+    def braking_mps2(self):
+        return self.brake
+
+
+class Edge(Base):
+    '''Brakes by 3 m/s2 where the POV starts before an edge.'''
+
+    edge_m = -220.0
+
+    def braking_mps2(self):
+        return 3.0 if self.first_x_m < self.edge_m else 0.0
+
+
+class Sides(Base):
+    '''Brakes on one side of -260 m, whatever the value: the other side then passes.'''
+
+    def __init__(self, side=1.0):
+        self.side = side
+
+    def braking_mps2(self):
+        return 3.0 if (self.first_x_m + 260.0) * self.side > 0.0 else 0.0
+"""
+CRITERION = "vut_max_brake_mps2 > 2"
+HERE = {"workers": 1, "progress": False}
+FEW = {"trials": 8, "rounds": 1, **HERE}
+
+
+@pytest.fixture(scope="module")
+def campaigns(tmp_path_factory):
+    """Return a function that gives the campaign of a class, which ran once."""
+    folder = tmp_path_factory.mktemp("repair")
+    (folder / "vut.py").write_text(SOURCE, encoding="utf-8")
+    known: dict[str, Path] = {}
+
+    def campaign(name: str) -> Path:
+        if name not in known:
+            run = api.campaign(
+                f"{folder / 'vut.py'}:{name}",
+                level=0,
+                cases=20,
+                sampler="uniform",
+                fail_when=CRITERION,
+                in_process=True,
+                out=folder / name,
+                **HERE,
+            )
+            known[name] = run.folder
+        return known[name]
+
+    return campaign
+
+
+def test_a_threshold_that_is_known_is_found_with_its_reserve(campaigns, tmp_path):
+    # It fails where it brakes by more than 2 m/s2: the least change of 3 is to 2.
+    run = campaigns("Brakes")
+    result = api.repair(run, ["brake=0..4"], out=tmp_path / "out", **FEW)
+    found = result.repair
+    assert found.failing == tuple(range(20))
+    assert found.stays == ()
+    assert result.verified
+    chosen = found.chosen.values["brake"]
+    # After the bisections the boundary is known to 1/16 of the way to the first value found, which
+    # is 3 at most; the reserve goes on by a quarter of the change.
+    error = 3.0 / 2**BISECTIONS
+    assert 2.0 - RESERVE * (1.0 + error) - error <= chosen <= 2.0
+    assert found.spec == f"{run.parent / 'vut.py'}:Brakes?brake={chosen:g}"
+    assert found.change(found.chosen) == pytest.approx((3.0 - chosen) / 4.0)
+    # The case brakes by `chosen` for one step instead of by 3.
+    assert found.chosen.extra["braking"] == pytest.approx(chosen - 3.0)
+    record = json.loads((tmp_path / "out/repair.json").read_text())
+    assert record["repaired"] == found.spec
+    assert record["rounds"][0]["levels"]["0"]["fmc_after"] == 0.0
+    page = (tmp_path / "out/repair.html").read_text()
+    assert f"Brakes?brake={chosen:g}" in page
+    assert "default-src 'none'" in page
+    assert (tmp_path / "out/changes.html").exists()
+    # The fresh campaign is one like any other: another seed, and the spec as its record.
+    fresh = api.open_run(tmp_path / "out/campaign-1")
+    assert fresh.settings["seed"] == 1
+    assert fresh.settings["vut"] == found.spec
+
+
+def test_only_the_cases_decide_on_an_attribute(campaigns, tmp_path):
+    run = api.open_run(campaigns("Edge"))
+    starts_m = [row["x_pov0_m"] for row in run.cases]
+    failing = tuple(i for i, x_m in enumerate(starts_m) if x_m < -220.0)
+    result = api.repair(run, ["edge_m=-345..-200"], out=tmp_path / "out", **FEW)
+    assert result.repair.failing == failing
+    assert result.repair.stays == ()
+    assert result.repair.chosen.values["edge_m"] <= min(starts_m)
+
+
+def test_a_failure_that_moves_is_no_repair(campaigns, tmp_path):
+    run = campaigns("Sides")
+    result = api.repair(run, ["side=-1..1"], out=tmp_path / "out", **FEW)
+    assert result.repair.chosen is None
+    assert result.repair.stays == result.repair.failing
+    assert not result.verified
+    assert any(trial.broke and not trial.fails for trial in result.repair.trials)
+    assert "these stay" in str(result)
+    assert not (tmp_path / "out/campaign-1").exists()
+    assert "No values in these ranges" in (tmp_path / "out/repair.html").read_text()
+
+
+def test_without_a_value_that_helps_it_says_which_cases_stay(campaigns, tmp_path):
+    result = api.repair(campaigns("Brakes"), ["brake=2.5..4"], out=tmp_path / "out", **FEW)
+    assert result.repair.stays == tuple(range(20))
+    assert not result.verified
+
+
+@pytest.mark.slow
+def test_it_goes_on_where_it_was_stopped_and_workers_change_nothing(campaigns, tmp_path):
+    run, whole = campaigns("Edge"), tmp_path / "whole"
+    few = {**FEW, "trials": 6}
+    api.repair(run, ["edge_m=-345..-200"], out=whole, **{**few, "workers": 2})
+    calls = 0
+
+    def stop() -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 4:
+            raise KeyboardInterrupt
+
+    part = tmp_path / "part"
+    with pytest.raises(KeyboardInterrupt):
+        api.repair(run, ["edge_m=-345..-200"], out=part, check=stop, **few)
+    lines = (part / "trials.jsonl").read_bytes()
+    assert lines.count(b"\n") == 4
+    (part / "trials.jsonl").write_bytes(lines + b'{"round": 1, "val')
+    with pytest.raises(UserError, match="begun with another trials"):
+        api.repair(run, ["edge_m=-345..-200"], out=part, resume=True, **{**few, "trials": 7})
+    api.repair(run, ["edge_m=-345..-200"], out=part, resume=True, **few)
+    assert (part / "trials.jsonl").read_bytes() == (whole / "trials.jsonl").read_bytes()
+    outcomes = [folder / "campaign-1/outcomes.jsonl" for folder in (whole, part)]
+    assert outcomes[0].read_bytes() == outcomes[1].read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("params", "said"),
+    [
+        ([], "name what may change: --param NAME=LOW..HIGH"),
+        (["brake"], "--param brake: write NAME=LOW..HIGH"),
+        (["brake=1..x"], "write NAME=LOW..HIGH"),
+        (["brake=1..nan"], "write NAME=LOW..HIGH"),
+        (["=1..2"], "write NAME=LOW..HIGH"),
+        (["brake=4..1"], "the range is empty: give the lower end first"),
+        (["brake=0..2"], "it is 3 today, which is not in that range"),
+        (["brake=0..4", "brake=1..4"], "--param brake is given twice"),
+        (["brak=0..4"], "no such parameter: did you mean brake?"),
+        (["unused=0..4"], "--param unused has no effect on any case, be it 0 or 4"),
+    ],
+)
+def test_what_cannot_be_searched_for_is_refused_in_a_sentence(campaigns, tmp_path, params, said):
+    with pytest.raises(UserError) as refused:
+        api.repair(campaigns("Brakes"), params, out=tmp_path / "out", **FEW)
+    assert said in str(refused.value)
+
+
+def test_too_few_trials_and_other_costs_are_refused(campaigns, tmp_path):
+    run, given = campaigns("Brakes"), {"out": tmp_path / "out", **FEW}
+    with pytest.raises(UserError, match="--trials is 2: it must be 3 or more"):
+        api.repair(run, ["brake=0..4"], **{**given, "trials": 2})
+    with pytest.raises(UserError, match="--cost is 'money': choose time or braking"):
+        api.repair(run, ["brake=0..4"], cost="money", **given)
+    with pytest.raises(UserError, match="the parameters of a network are its weights"):
+        mending.todays_values(_Network(), (Range("gain", 0.0, 1.0),))  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()
+
+
+class _Network:
+    spec = "onnx:policy.onnx"
+
+
+def test_nothing_that_is_there_is_overwritten(campaigns, tmp_path):
+    (tmp_path / "out").mkdir()
+    with pytest.raises(UserError, match="exists: choose another name with --out"):
+        api.repair(campaigns("Brakes"), ["brake=0..4"], out=tmp_path / "out", **FEW)
+    with pytest.raises(UserError, match="cannot be read"):
+        api.repair(campaigns("Brakes"), ["brake=0..4"], out=tmp_path / "out", resume=True, **FEW)
+
+
+def test_without_failures_and_without_optuna_it_says_so(campaigns, tmp_path, monkeypatch):
+    vut = f"{campaigns('Brakes').parent / 'vut.py'}:Brakes?brake=1"
+    with pytest.raises(UserError, match=r"every case passes with .*: nothing is to be repaired"):
+        api.repair(campaigns("Brakes"), ["brake=0..4"], vut=vut, out=tmp_path / "out", **FEW)
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(mending, "find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"needs optuna: run `pip install 'merge-sumo\[repair\]'`"):
+        api.repair(campaigns("Brakes"), ["brake=0..4"], out=tmp_path / "out", **FEW)
+
+
+def test_the_controller_of_a_folder_from_elsewhere_does_not_run(campaigns, tmp_path):
+    copied = shutil.copytree(campaigns("Brakes"), tmp_path / "sent")
+    with pytest.raises(UserError, match="say --trust-vut if you trust it"):
+        api.repair(copied, ["brake=0..4"], out=tmp_path / "out", **FEW)
+
+
+def test_values_have_few_digits_and_stay_in_their_range():
+    assert Range.parsed("headway_s=0.5..3").rounded(1.23456) == 1.235
+    assert Range.parsed("x_m=-345..-200").rounded(-344.96) == -345.0
+    assert Range("tiny", 0.0, 1e-5).rounded(1.23456e-6) == 1.23e-6
+
+
+def test_of_trials_the_pareto_set_is_that_none_is_better_than():
+    settings = mending.RepairSettings((Range("a", 0.0, 1.0),))
+
+    def trial(a: float, fails: int, extra_s: float, broke: int = 0) -> Trial:
+        cases = tuple(range(fails))
+        return Trial(1, {"a": a}, cases, tuple(range(broke)), {"time": extra_s, "braking": 0.0})
+
+    best = [trial(0.0, 4, 0.0), trial(0.2, 2, 0.3), trial(0.6, 0, 0.1), trial(0.4, 0, 0.5)]
+    worse = [trial(0.7, 0, 0.1), trial(0.1, 0, 0.0, broke=1), trial(0.5, 3, 0.4)]
+    found = mending.Repair("v", settings, {"a": 0.0}, (0, 1, 2, 3), 4, (), (*worse, *best))
+    assert found.pareto() == best
