@@ -67,7 +67,7 @@ class TestOptions:
             for option in ("as_json", "quiet", "workers", "level")
         }
         assert set(COMMANDS) == has["as_json"]
-        fresh = {"crosscheck", "failures-per-merge", "probability", "stress"}
+        fresh = {"crosscheck", "failures-per-merge", "probability", "repair", "stress"}
         runs_cases = {"campaign", "certify", "compare", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
         assert has["quiet"] == {*runs_cases, "reproduce", "train"}

@@ -1,10 +1,13 @@
 """Repair: values of parameters that are known in closed form, and controllers beyond repair."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -56,8 +59,8 @@ class Sides(Base):
         return 3.0 if (self.first_x_m + 260.0) * self.side > 0.0 else 0.0
 """
 CRITERION = "vut_max_brake_mps2 > 2"
-HERE = {"workers": 1, "progress": False}
-FEW = {"trials": 8, "rounds": 1, **HERE}
+HERE: dict[str, Any] = {"workers": 1, "progress": False}
+FEW: dict[str, Any] = {"trials": 8, "rounds": 1, **HERE}
 
 
 @pytest.fixture(scope="module")
