@@ -397,7 +397,10 @@ def compare_runs(
     why = compared.worse(tolerance)
     if given.as_json:
         campaigns = {
-            name.lower(): run.verdict.to_record() | {"careful": run.careful}
+            name.lower(): {
+                **run.verdict.to_record(),
+                **{"careful": run.careful, "people": run.people.to_record()},
+            }
             for name, run in runs.items()
         }
         print_json({**campaigns, **compared.to_record(), **_judgement(why, tolerance)})
@@ -416,6 +419,8 @@ def compare_runs(
 def _print_comparison(compared: RunComparison, runs: dict[str, CampaignRun]) -> None:
     for name, run in runs.items():
         show(f"{name}: {run.folder} ({run.run.vut}): {run.verdict.counts}")
+        if run.people.line is not None:
+            show(f"  {run.people.line}")
         if run.careful is not None:
             show(f"  {run.careful}")
         for line in run.verdict.trouble_lines():

@@ -8,7 +8,9 @@ import math
 from dataclasses import replace
 
 import pytest
+from handmade import write_run
 
+import merge_sumo as ms
 from merge_sumo.analysis.people import (
     BRAKING,
     HEE_PEOPLE,
@@ -17,8 +19,10 @@ from merge_sumo.analysis.people import (
     beside_people,
     none_of,
 )
+from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.studies.history import history_of
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import OWN, US23
@@ -166,3 +170,45 @@ def test_what_none_of_23_drivers_does_may_be_that_of_one_of_eight():
     assert (1.0 - share) ** 23 == pytest.approx(0.05)
     assert f"{share:.1%}" == "12.2%"
     assert "up to 12.2% of drivers" in beside_people([]).caveat
+
+
+class TestTheShareOfACampaign:
+    def test_is_recorded_and_changed_by_resuming_and_by_a_report_of_another_share(self, tmp_path):
+        few = {"level": 1, "cases": 20, "sampler": "uniform", "workers": 1}
+        run = ms.campaign("design2", out=tmp_path / "run", people=0.95, **few)
+        outcomes = (run.folder / "outcomes.jsonl").read_bytes()
+        assert run.settings["people"] == run.people.share == 0.95
+        page = ms.report(run.folder, people=0.5)
+        assert Run(run.folder).people == 0.95
+        assert run.report() == page
+        again = ms.resume(run.folder, people=0.9, workers=1)
+        assert Run(run.folder).people == again.people.share == 0.9
+        assert (run.folder / "outcomes.jsonl").read_bytes() == outcomes
+
+    def test_is_refused_before_the_first_case(self, tmp_path):
+        with pytest.raises(UserError, match="--people is 0:"):
+            ms.campaign("design2", out=tmp_path / "run", people=0)
+        with pytest.raises(UserError, match="--people is 3:"):
+            ms.report(write_run(tmp_path / "other", 20).folder, people=3)
+
+    def test_of_a_folder_that_names_none_is_that_of_the_hardest(self, tmp_path):
+        run = write_run(tmp_path / "run", 20, levels=(1,))
+        assert "people" not in run.settings
+        assert run.people == 1.0
+        found = ms.open_run(run.folder)
+        assert found.people.inside == len(failures(run.outcomes)) > 0
+        assert found.to_record()["people"]["levels"]["1"]["outside"] == 0
+        assert any(line.startswith("beside people: ") for line in found.lines())
+        strange = write_run(tmp_path / "strange", 20, people="most")
+        with pytest.raises(UserError, match="something else than a share as people"):
+            _ = strange.people
+
+    def test_is_of_each_version_in_a_history(self, tmp_path):
+        runs = [write_run(tmp_path / str(s), 20, levels=(1,), people=s) for s in (1.0, 0.5)]
+        found = history_of(runs)
+        number = len(failures(runs[0].outcomes))
+        assert [version.people.inside for version in found.versions] == [number, 0]
+        assert found.notes == ("The campaigns hold failures beside different shares of people.",)
+        page = tmp_path / "history.html"
+        ms.history(runs, out=page)
+        assert "failures inside what people do" in page.read_text()
