@@ -33,22 +33,33 @@ class Tried(NamedTuple):
     scenario: str
     vut: str
     level: int
+    imperfect: tuple[object, ...] = ()
 
     @property
     def asked(self) -> tuple[object, ...]:
         """Return the options that each command takes."""
         criterion = ("--fail-when", CRITERION, "--follow-up", FOLLOW_UP_S)
         tried = ("--vut", self.vut, "--level", self.level, "--scenario", self.scenario)
-        return *tried, *criterion
+        return *tried, *criterion, *self.imperfect
 
 
 TRIED = {
     "us23": Tried("us23", "design2", 0),
     "roundabout": Tried("roundabout", "roundabout", 1),
     "us23-traffic": Tried("us23-traffic", "design2", 0),
+    "imperfect": Tried(
+        *("us23", "design2", 0),
+        (
+            *("--sense", "delay_s=0..0.6,noise_x_m=0.5,noise_v_mps=0.2,dropout=0.1"),
+            *("--act", "lag_s=0.3"),
+        ),
+    ),
 }
 CASES, BATCH = 12, 6
-OF_A_CASE = ("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s")
+OF_A_CASE = (
+    *("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s"),
+    "sense_delay_s",
+)
 
 
 class World:

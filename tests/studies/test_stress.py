@@ -20,6 +20,8 @@ from merge_sumo.values.imperfection import Actuation
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Verdict
 
+FAIL_WHEN = "bumper_gap_m < 15"
+"""Two fifths of the cases fail: no sampler need look for them."""
 TRIED: dict[str, dict[str, Any]] = {
     "lag-0.5": {"act": Actuation(lag_s=0.5)},
     "lag-0.2": {"act": Actuation(lag_s=0.2)},
@@ -31,7 +33,9 @@ TRIED: dict[str, dict[str, Any]] = {
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stress") / "run"
-    return ms.campaign("design2", cases=60, level="all", seed=1, out=folder, fail_when="unsafe")
+    return ms.campaign(
+        "design2", level=0, sampler="uniform", cases=80, fail_when=FAIL_WHEN, out=folder
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +59,9 @@ def test_verdicts_flip_as_the_cases_by_themselves_say(run, found, name):
     scenario = replace(US23, **TRIED[name])
     chosen = {*flips.passes[:2], *flips.fails[:2], *found.failures[:3]}
     for row in (run.cases[index] for index in chosen):
-        now = ms.run_case("design2", row, level=row["level"], scenario=scenario, fail_when="unsafe")
+        now = ms.run_case(
+            "design2", row, level=row["level"], scenario=scenario, fail_when=FAIL_WHEN
+        )
         index = row["index"]
         assert now.failed == ((index in found.failures) != (index in (*flips.passes, *flips.fails)))
 
@@ -70,33 +76,25 @@ def test_the_ladder_says_which_failures_are_robust(found):
 
 def test_draws_differ_and_repeat(run, found):
     assert len(set(rung(found, "start").runs)) == 2
-    again = ms.stress(run, draws=2).found
-    assert again == found
     assert ms.stress(run, draws=2, seed=1).found != found
+    assert ms.stress(run, draws=2).found == found
 
 
-def test_the_file_says_what_the_study_found_and_the_report_shows_it(run, found):
-    ms.stress(run, draws=2)
+def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run, found):
     assert stress_of(run.folder) == found
-    page = Path(run.report()).read_text(encoding="utf-8")
-    assert "What hangs by a thread" in page
-    assert "robust ones first" in page
-    (run.folder / STRESS).unlink()
-    assert stress_of(run.folder) is None
-    page = Path(run.report()).read_text(encoding="utf-8")
+    page = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "What hangs by a thread" not in page
     assert "Ten worst failures, one of each region first" in page
-
-
-def test_robust_failures_come_first_in_the_report(run, found):
-    last = min(run.run.outcomes, key=lambda o: -(o.score if o.failed else -1e9)).index
-    flips = Flips(tuple(index for index in found.failures if index != last))
+    robust = found.failures[-1]
+    flips = Flips(tuple(index for index in found.failures if index != robust))
     kept = replaced(found, rungs=(Rung("one", "one", runs=(flips,)),))
     (run.folder / STRESS).write_text(json.dumps(to_plain(kept)))
     page = Path(run.report()).read_text(encoding="utf-8")
-    listed = page[page.index("Ten worst failures") :]
-    assert listed.index(f'data-case="{last}"') == listed.index("data-case=")
     (run.folder / STRESS).unlink()
+    assert stress_of(run.folder) is None
+    assert "What hangs by a thread" in page
+    listed = page[page.index("Ten worst failures, robust ones first") :]
+    assert listed.index(f'data-case="{robust}"') == listed.index("data-case=")
 
 
 def replaced(found, **changes):
