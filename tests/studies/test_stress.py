@@ -87,12 +87,14 @@ def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run
     assert "Ten worst failures, one of each region first" in page
     robust = found.failures[-1]
     flips = Flips(tuple(index for index in found.failures if index != robust))
-    kept = replaced(found, rungs=(Rung("one", "one", runs=(flips,)),))
+    kept = replaced(found, rungs=(Rung("one", "<b>one</b>", runs=(flips,)),))
     (run.folder / STRESS).write_text(json.dumps(to_plain(kept)))
     page = Path(run.report()).read_text(encoding="utf-8")
     (run.folder / STRESS).unlink()
     assert stress_of(run.folder) is None
     assert "What hangs by a thread" in page
+    assert "&lt;b&gt;one&lt;/b&gt;" in page
+    assert "<b>one</b>" not in page
     listed = page[page.index("Ten worst failures, robust ones first") :]
     assert listed.index(f'data-case="{robust}"') == listed.index("data-case=")
 
