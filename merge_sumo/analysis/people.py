@@ -359,8 +359,8 @@ def left_out_in(scenario: Scenario) -> str:
     fastest_mps = scenario.fastest_start_mps
     if fastest_mps < HEE_MEAN_MPS:
         return (
-            f"left out: the published drivers drive at {HEE_MEAN_MPS:g} m/s in the mean, on a "
-            f"motorway, and the mainline starts at {fastest_mps:g} m/s or less here"
+            f"no figures of people fit: the published drivers drive at {HEE_MEAN_MPS:g} m/s in the "
+            f"mean, on a motorway, and the mainline starts at {fastest_mps:g} m/s or less here"
         )
     return ""
 

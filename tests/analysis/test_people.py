@@ -151,8 +151,8 @@ class TestFailuresBesidePeople:
         found = beside_people([replace(failing(0, 4.0), case=case)])
         assert (found.inside, found.places, found.findings) == (1, {}, [])
         assert found.line == (
-            "beside people: left out: the published drivers drive at 23.7 m/s in the mean, on a "
-            "motorway, and the mainline starts at 12 m/s or less here"
+            "beside people: no figures of people fit: the published drivers drive at 23.7 m/s in "
+            "the mean, on a motorway, and the mainline starts at 12 m/s or less here"
         )
 
     def test_say_nothing_without_failures(self):
