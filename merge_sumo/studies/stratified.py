@@ -357,6 +357,8 @@ def upper_end(share: FloatArray, cases: IntArray, failures: IntArray, risk: floa
     bound U that was found, falls with each p_h; so a box has no candidate if its lowest corner is
     none, and else its highest corner bounds it. Boxes are refined where the bound may be.
     """
+    if (failures == cases).all():
+        return 1.0
     if len(share) == 1:
         return clopper_pearson(int(failures[0]), int(cases[0]), risk)[1]
     own, rest = OWN_RISK * risk / (2 * len(share)), (1.0 - OWN_RISK) * risk

@@ -209,6 +209,11 @@ class TestTheInterval:
         more = np.minimum(np.add(failures, [1, 0, 0]), 20)
         assert estimate_counts(share, cases, more)[1] >= high - 0.01
 
+    def test_begins_at_zero_where_no_case_fails_and_ends_at_one_where_all_do(self):
+        share, cases = [0.7, 0.2, 0.1], [20, 20, 20]
+        assert estimate_counts(share, cases, [0, 0, 0])[0] == 0.0
+        assert estimate_counts(share, cases, cases)[1] == 1.0
+
     def test_of_plain_cases_is_the_exact_binomial_one(self):
         # Clopper and Pearson by hand: no failure in n gives 1 - (alpha/2)^(1/n).
         assert clopper_pearson(0, 100, 0.025) == pytest.approx((0.0, 1.0 - 0.025 ** (1 / 100)))
