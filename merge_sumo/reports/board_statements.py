@@ -274,7 +274,7 @@ class BoardModel:
 
     def _failure(self) -> Iterator[Statement]:
         criterion, scenario = self.run.criterion, self.run.scenario
-        named = CRITERIA.get(criterion.text)
+        named = CRITERIA[criterion.text] if criterion.text in CRITERIA else None
         yield say(
             "What fails: {}.",
             Figure(
