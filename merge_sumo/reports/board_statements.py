@@ -274,12 +274,12 @@ class BoardModel:
 
     def _failure(self) -> Iterator[Statement]:
         criterion, scenario = self.run.criterion, self.run.scenario
-        named = CRITERIA[criterion.text] if criterion.text in CRITERIA else None
+        is_named = criterion.text in CRITERIA
         yield say(
             "What fails: {}.",
             Figure(
                 criterion.text,
-                scenario.said(criterion.words if named is None else named.about),
+                scenario.said(CRITERIA[criterion.text].about if is_named else criterion.words),
                 SETTINGS,
                 "fail_when" if criterion.require is None else "require",
             ),
