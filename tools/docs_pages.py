@@ -16,7 +16,7 @@ from typing import Any, Final
 ROOT = Path(__file__).resolve().parent.parent
 SHOWN = (
     *("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "tests/README.md"),
-    *("policies/README.md", "policies/roundabout/README.md"),
+    *("policies/README.md", "policies/roundabout/README.md", "policies/human/README.md"),
     *("scenarios/README.md", "sumo_net/README.md"),
 )
 """Pages that stand beside what they are about, and not in docs/."""

@@ -21,8 +21,16 @@ from merge_sumo.drivers.levelk import (
     actions_mps2,
     features,
 )
-from merge_sumo.drivers.policies import NETWORKS, load_driver, load_network, read_manifest
-from merge_sumo.engine.povs import PovLibrary
+from merge_sumo.drivers.policies import (
+    HUMAN,
+    NETWORKS,
+    load_driver,
+    load_network,
+    policies_in,
+    policies_of,
+    read_manifest,
+)
+from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.sumo.world import World
 from merge_sumo.training import check as checking
@@ -71,11 +79,14 @@ def picture(vut, level, count):
     return fmc(points), np.bincount(regions(points)) if len(points) else np.array([])
 
 
-def test_the_library_is_complete_and_its_manifest_says_how_it_was_made():
-    manifest = read_manifest()
+@pytest.mark.parametrize("folder", [policies_of(US23), policies_in(HUMAN)], ids=["paper", HUMAN])
+def test_the_library_is_complete_and_its_manifest_says_how_it_was_made(folder):
+    manifest = read_manifest(folder)
     assert tuple(manifest) == NETWORKS
     for name, entry in manifest.items():
-        assert load_network(name).sees_svo == (name == "pov2")
+        network, limited = load_network(name, folder), folder.name == HUMAN and name[:3] == "pov"
+        assert network.sees_svo == (name == "pov2")
+        assert network.a_min_mps2 == entry.get("a_min_mps2") == (-2.0 if limited else None)
         assert entry["command"].startswith(f"merge-sumo train --only {name} ")
         assert RewardWeights(**entry["reward_weights"]) == RewardWeights()
         assert entry["check"]["avoidable_collisions"] == 0
@@ -248,6 +259,37 @@ class TestALimitOfBraking:
         after, _, _ = game.advance(state, np.zeros(1), game.actions_mps2[:1])
         assert after[0, 1] == pytest.approx(29.0)  # half a second of -2 m/s2
         assert after[0, 3] == pytest.approx(18.0)  # and of -4 m/s2
+
+
+class TestTheLibraryOfPeople:
+    """`--policies human`, whose POVs brake by 2 m/s2 at most."""
+
+    POVS = Povs(policies=policies_in(HUMAN))
+
+    def test_has_the_vut_of_the_paper_s_library_against_which_pov2_was_trained(self):
+        paper, human = read_manifest(), read_manifest(self.POVS.policies)
+        assert human["vut1"] == paper["vut1"]
+
+    @pytest.mark.parametrize("level", [1, 2])
+    def test_brakes_no_harder_than_people_did(self, level):
+        cases = uniform_cases(level, 300, seed=4)
+        with World(32, scenario=US23) as world:
+            pov, vut = PovLibrary(32, self.POVS), VutFactory("design2")(32)
+            found = [measure(t) for _, t in rollout(world, pov, vut, cases)]
+        hardest = max(m.pov_max_brake_mps2 for m in found)
+        assert 1.5 <= hardest <= 2.0
+
+    def test_is_for_those_alone_who_name_it(self):
+        named_so = dataclasses.replace(US23, name=HUMAN)
+        assert policies_of(named_so) == policies_of(US23) != self.POVS.policies
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("name", NETWORKS)
+    def test_loses_little_over_300_cases_that_training_never_saw(self, name):
+        found = checking.check_policy(name, self.POVS.policies, scenario=US23)
+        assert found.mean_regret <= 0.01
+        assert found.p99_regret <= 0.15
+        assert found.avoidable_collisions == 0
 
 
 class TestTheExampleRuns:

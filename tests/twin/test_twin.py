@@ -18,7 +18,7 @@ from plans import POVS, plan_for
 from merge_sumo.analysis.predictions import prediction_error_m, prediction_in_words, surprises
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
-from merge_sumo.drivers.policies import policies_of
+from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.engine.povs import Povs
 from merge_sumo.engine.simulator import road_for
@@ -50,8 +50,8 @@ SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2, scen
 SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 
 
-def ran(vut: str, level: int, points, scenario=US23):
-    plan = plan_for(vut, scenario=scenario, corridors=16)
+def ran(vut: str, level: int, points, scenario=US23, povs=None):
+    plan = plan_for(vut, scenario=scenario, povs=povs, corridors=16)
     pool = Pool(levels=(level,), scenario=scenario)
     done = run_cases(plan, pool.cases(points, level))
     return [
@@ -76,18 +76,21 @@ def whole(tmp_path_factory) -> Run:
 
 class TestGames:
     @pytest.mark.parametrize(
-        ("name", "level"),
-        [("us23", 0), ("us23", 1), ("us23", 2), ("us23-traffic", 1), ("roundabout", 2)],
+        ("name", "level", "library"),
+        [
+            *(("us23", level, None) for level in (0, 1, 2)),
+            *(("us23-traffic", 1, None), ("roundabout", 2, None)),
+            *(("us23", level, HUMAN) for level in (1, 2)),
+        ],
     )
-    def test_end_as_sumo_ends_them(self, name, level, tmp_path):
+    def test_end_as_sumo_ends_them(self, name, level, library, tmp_path):
         (tmp_path / "slows.py").write_text(SLOWS)
         scenario = named_scenario(name)
         dims = len(scenario.dimensions(level))
         points = np.random.default_rng(level).random((24, dims))
-        outcomes, _ = ran(f"{tmp_path / 'slows.py'}:vut", level, points, scenario)
-        games = TwinRollout(
-            Pool(levels=(level,), scenario=scenario), Povs(policies=policies_of(scenario))
-        )
+        povs = Povs(policies=policies_in(library) if library else policies_of(scenario))
+        outcomes, _ = ran(f"{tmp_path / 'slows.py'}:vut", level, points, scenario, povs)
+        games = TwinRollout(Pool(levels=(level,), scenario=scenario), povs)
 
         def slows(inputs):
             return np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
