@@ -52,6 +52,7 @@ from merge_sumo.api.results import (
     CaseRun,
     CertificateResult,
     CrosscheckResult,
+    ExplanationResult,
     PerMergeResult,
     PolicyChecks,
     ProbabilityResult,
@@ -93,7 +94,7 @@ from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
-from merge_sumo.reports.progress import Bars, TrainingBars, is_watched
+from merge_sumo.reports.progress import Bars, Counter, TrainingBars, is_watched
 from merge_sumo.reports.repair_page import repair_page
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction_page
@@ -105,7 +106,14 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies import benchmark, certificate, reproduction, versions, vut_check
+from merge_sumo.studies import (
+    benchmark,
+    certificate,
+    explanation,
+    reproduction,
+    versions,
+    vut_check,
+)
 from merge_sumo.studies import crosscheck as peers
 from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability as estimates
@@ -153,6 +161,7 @@ __all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign", "certify"
 __all__ += ["check_scenario", "check_vut", "compare", "compare_runs", "crosscheck", "dated"]
 __all__ += ["export"]
 __all__ += [
+    "explain",
     "export_policy",
     "failures_per_merge",
     "history",
@@ -309,6 +318,7 @@ def _write_findings(
     # The careful drivers are models of merges.
     if isinstance(plan.scenario, MergeScenario):
         note_avoidance(done, plan, workers=opened, check=checks, on_part=careful)
+    explanation.note_explanations(done, plan, workers=opened, check=checks)
     link_latest(done.folder)
     # Learned on another machine, surrogates may differ in a last bit. More workers than cores
     # would learn each surrogate more often than that saves time.
@@ -1168,6 +1178,42 @@ def _fresh_campaign(
         )
 
     return _concluded(settings, plan, folder, run, runner).run
+
+
+def explain(
+    run: AnyRun,
+    indices: Iterable[int] | int = (),
+    *,
+    net: AnyPath | None = None,
+    trust_vut: bool = False,
+    **given: Unpack[RerunKeywords],
+) -> ExplanationResult:
+    """Find the smallest changes with which failures pass; the same as `merge-sumo explain`.
+
+    Args:
+        run: the campaign, or its folder, into which `explanations.jsonl` is written.
+        indices: its failures; the ten that the report lists by default.
+        net: net for that; must be the one of the campaign.
+        trust_vut: run the controller that the folder names although it was not made here.
+        given: how the drivers run, where it is to change, and where the cases run: see
+            `RerunKeywords`.
+    """
+    check_keywords("explain", given, RerunKeywords)
+    before = _opened(run).run
+    target = before.folder / explanation.EXPLANATIONS
+    check_own(target)
+    chosen = explanation.listed_failures(before, _listed(indices))
+    fields, runner = given_again(None, given, {"vut": before.vut})
+    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
+    plan = resolve(settings, _path(net)).with_engine(None)
+    with (
+        runner.open(plan) as opened,
+        Counter("explained", len(chosen), "failures", shown=runner.progress) as counter,
+    ):
+        found = explanation.explain(
+            before, settings, plan, chosen, workers=opened, on_failures=counter.ended
+        )
+    return ExplanationResult(before, tuple(found), target)
 
 
 def reproduce(

@@ -255,7 +255,29 @@ def stress(given: Given, run: RunArgument) -> None:
     """
     from merge_sumo import api
 
-    given.print(api.stress(run, **given.keywords))
+    given.print(api.stress(run, **given.written))
+
+
+@app.verb(options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"))
+def explain(
+    given: Given,
+    run: RunArgument,
+    case: Annotated[
+        list[int] | None,
+        typer.Argument(help="Indices of failures in outcomes.jsonl; ten if left out."),
+    ] = None,
+) -> None:
+    """Say why failures fail: the smallest changes of their start with which they pass.
+
+    Each coordinate by itself, all of them together, and other POVs in the very same start: such
+    cases run, and what is said of one runs twice. A campaign does this for the ten failures that
+    its report lists if the VUT is of this package; `report` shows the others afterwards, too.
+
+    Example:  merge-sumo explain runs/design1
+    """
+    from merge_sumo import api
+
+    given.print(api.explain(run, case or (), **given.written))
 
 
 @app.verb(

@@ -135,6 +135,8 @@ def commands(run: Path, out: Path) -> list[tuple[object, ...]]:
     return [
         ("campaign", "--resume", run, "--quiet"),
         ("rerun", run, 0),
+        ("explain", run),
+        ("stress", run),
         ("run", "--case", run, 0),
         ("compare-runs", run, run),
         ("probability", run, "--cases", 10, "--out", out / "p.json"),

@@ -67,7 +67,8 @@ class TestOptions:
             for option in ("as_json", "quiet", "workers", "level")
         }
         assert set(COMMANDS) == has["as_json"]
-        fresh = {"crosscheck", "failures-per-merge", "probability", "repair", "stress"}
+        again = {"crosscheck", "explain", "repair", "stress"}
+        fresh = {*again, "failures-per-merge", "probability"}
         runs_cases = {"campaign", "certify", "compare", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
         assert has["quiet"] == {*runs_cases, "reproduce", "train"}
