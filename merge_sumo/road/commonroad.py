@@ -31,7 +31,7 @@ NOWHERE: Final = {"geoNameId": "-999", "gpsLatitude": "999", "gpsLongitude": "99
 TAGS: Final = ("critical", "merging_lanes", "simulated")
 CONNECTED_M: Final = 0.5
 """A lane goes on in the next one of a path where that begins within this of its end."""
-TILT_RAD: Final = 1e-6
+TILT_RAD: Final = 1e-4
 _Element = etree._Element
 
 
@@ -65,8 +65,8 @@ def obstacle_ids(road: Corridor, vehicles: int) -> list[int]:
 def straight_road(scenario: Scenario) -> Corridor:
     """Return a road of one straight lane for both paths, along which lane coordinates run.
 
-    It points a millionth of a radian away from the x axis: CommonRoad-CriMe 0.4.5 takes a heading
-    of 0 for an unknown one.
+    It points `TILT_RAD` away from the x axis: CommonRoad-CriMe 0.4.5 takes a heading that it rounds
+    to 0 for an unknown one.
     """
     ends_m = -scenario.reach_m, scenario.room_after_m
     shape = tuple((x_m * math.cos(TILT_RAD), x_m * math.sin(TILT_RAD), 0.0) for x_m in ends_m)
