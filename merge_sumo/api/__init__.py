@@ -1021,6 +1021,7 @@ def crosscheck(
     *,
     cases: int | None = None,
     seed: int = 0,
+    crime: AnyPath | None = None,
     net: AnyPath | None = None,
     trust_vut: bool = False,
     **given: Unpack[RerunKeywords],
@@ -1034,6 +1035,7 @@ def crosscheck(
         cases: cases that drive there: those recorded, and fresh uniform ones where there are fewer;
             of more, those with the lowest scores. By default those recorded.
         seed: of the fresh cases.
+        crime: Python of an environment with commonroad-crime, which then measures merges, too.
         net: net for that; must be the one of the campaign.
         trust_vut: run the controller that a folder names although it was not made here.
         given: how the drivers run, where it is to change, and where the cases run: see
@@ -1053,6 +1055,7 @@ def crosscheck(
             cases=cases,
             seed=seed,
             workers=opened,
+            crime=_path(crime),
             on_cases=counter.ended,
         )
     return CrosscheckResult(found, before.folder / peers.CROSSCHECK)

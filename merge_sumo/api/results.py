@@ -670,6 +670,9 @@ class CrosscheckResult(Result):
             lines.append(f"  verdicts  not compared: {found.why_no_verdicts}")
         else:
             lines += _verdict_lines(found.verdicts)
+        if found.measured is not None:
+            lines.append(f"  measures  {found.measured.tool}, {found.measured.cases} merges:")
+            lines += [f"            {one.sentence}" for one in found.measured.measures]
         return [*lines, f"written: {self.file}"]
 
 

@@ -46,8 +46,8 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("certificate",),
     ),
     "Where it runs, and what it writes": (
-        *("out", "resume", "force", "engine", "workers", "dask", "junit", "figure", "file_format"),
-        *("gui", "debug", "quiet", "as_json"),
+        *("out", "resume", "force", "engine", "crime", "workers", "dask", "junit", "figure"),
+        *("file_format", "gui", "debug", "quiet", "as_json"),
     ),
     "Trust and limits": ("trust_vut", "deadline", "vut_memory", "in_process"),
 }

@@ -290,6 +290,12 @@ def explain(
             show_default="those recorded",
         ),
         "seed": SEED,
+        "crime": option(
+            Path | None,
+            None,
+            "Python of an environment with commonroad-crime, to compare measures, too.",
+            metavar="PYTHON",
+        ),
     },
 )
 def crosscheck(given: Given, run: RunArgument) -> None:
@@ -297,7 +303,8 @@ def crosscheck(given: Given, run: RunArgument) -> None:
 
     Its vehicles are given the recorded accelerations, and must be where SUMO had them; then VUT and
     POVs drive them, and the criterion of the campaign must give the same verdicts. Writes
-    crosscheck.json into the folder of the campaign, for the report. Needs the extra peers.
+    crosscheck.json into the folder of the campaign, for the report. Needs the extra peers. With
+    --crime, CommonRoad-CriMe measures 20 of the merges.
 
     Exit code 0 when both agree, 1 where vehicles move otherwise there.
 

@@ -34,7 +34,7 @@ from merge_sumo.values.trajectory import End, Trajectory
 
 PROGRAM: Final = Path(__file__).with_name("crime_program.py")
 TOOL: Final = "CommonRoad-CriMe"
-MOST: Final = 40
+MOST: Final = 20
 """Cases that it measures, some seconds each."""
 START_S: Final = 120.0
 CASE_S: Final = 10.0
@@ -242,7 +242,10 @@ def _answer(python: Path, scenes: Sequence[dict[str, Any]]) -> Answer:
             "`python -m venv crime && crime/bin/pip install commonroad-crime`, and give "
             "crime/bin/python"
         )
-    answer: Answer = decode(done.stdout, Answer)
+    try:
+        answer: Answer = decode(done.stdout, Answer)
+    except UserError as error:
+        raise UserError(f"--crime {python}: its answer is not as it should be ({error})") from error
     if len(answer.values) != len(scenes):
         raise UserError(f"--crime {python}: it has measured {len(answer.values)} cases")
     return answer

@@ -29,6 +29,7 @@ from merge_sumo.engine.highway_env_simulator import HighwayEnvWorld, peer_name, 
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.studies.crime import measured_by
 from merge_sumo.studies.probability import same_system
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
@@ -133,11 +134,10 @@ class MeasureCheck(Record, frozen=True):
     Attributes:
         name: our measure.
         peer_name: its name there.
-        cases: cases in which both have a value, or neither has one.
-        same: cases in which the values are the same, once the definition of the other tool is
-            taken: to its rounding.
-        largest: largest difference otherwise; None where there is none.
-        definition: in what the definitions differ, in a sentence; empty where they do not.
+        cases: cases of which the other tool was asked for it.
+        same: cases in which its value is what its definition gives by our record, to its rounding.
+        largest: largest difference in the others where both have a value; None where none is.
+        definition: in what the definitions differ, in a clause.
     """
 
     name: str
@@ -146,6 +146,15 @@ class MeasureCheck(Record, frozen=True):
     same: Count
     largest: Deviation | None
     definition: str
+
+    @property
+    def sentence(self) -> str:
+        """How it compares, in a sentence without its full stop."""
+        apart = "" if self.largest is None else f", the others to {self.largest:.2g}"
+        return (
+            f"{self.name} and {self.peer_name}: {self.same} of {self.cases} as defined there"
+            f"{apart} ({self.definition})"
+        )
 
 
 class Measured(Record, frozen=True):
@@ -220,6 +229,7 @@ def crosscheck(
     cases: int | None = None,
     seed: int = 0,
     workers: Workers | None = None,
+    crime: Path | None = None,
     on_cases: OnCases = lambda _: None,
 ) -> Crosscheck:
     """Let another simulator run a campaign; return what agrees, and write it into its folder.
@@ -233,6 +243,7 @@ def crosscheck(
             of more, those with the lowest scores. By default those recorded.
         seed: of the fresh cases.
         workers: where cases run, by default in this process.
+        crime: Python of an environment with commonroad-crime, which then measures merges, too.
         on_cases: told how many cases have just run.
 
     Raises:
@@ -247,6 +258,7 @@ def crosscheck(
     known = run.trajectories(outcome.index for outcome in run.outcomes)
     plan = plan.with_log(run.folder.resolve() / LOG)
     why = why_sumo_alone(plan)
+    measured = None if crime is None else _measured(crime, run, plan)
     with workers_or_here(workers) as processes:
         motion = motion_of(plan, known, processes)
         verdicts = None
@@ -259,12 +271,29 @@ def crosscheck(
         motion=motion,
         verdicts=verdicts,
         why_no_verdicts=why or "",
-        measured=None,
+        measured=measured,
         vut=run.vut,
         seed=seed,
     )
     write_crosscheck(run.folder, found)
     return found
+
+
+def _measured(crime: Path, run: Run, plan: SimulationPlan) -> Measured:
+    """Return how measures by CommonRoad-CriMe compare with ours."""
+    tool, compared = measured_by(crime, run, plan.road)
+    checks = [
+        MeasureCheck(
+            name=one.definition.name,
+            peer_name=one.definition.peer_name,
+            cases=one.cases,
+            same=one.same,
+            largest=one.largest,
+            definition=one.definition.says,
+        )
+        for one in compared
+    ]
+    return Measured(tool=tool, cases=max(one.cases for one in compared), measures=tuple(checks))
 
 
 def write_crosscheck(folder: Path, found: Crosscheck) -> None:
