@@ -82,6 +82,7 @@ from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers
+from merge_sumo.engine.highway_env_simulator import peer_name
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import ONE as ONE_LEVEL
 from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
@@ -1047,7 +1048,7 @@ def crosscheck(
     settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
     plan = resolve(settings, _path(net))
     total = len(before.outcomes) if cases is None else cases
-    with runner.open(plan) as opened, runner.counter(peers.peer_name(), total) as counter:
+    with runner.open(plan) as opened, runner.counter(peer_name(), total) as counter:
         found = peers.crosscheck(
             before,
             settings,

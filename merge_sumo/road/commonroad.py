@@ -222,7 +222,7 @@ def _problem(trajectory: Trajectory, road: Corridor, number: int) -> _Element:
 def _states(trajectory: Trajectory, road: Corridor, row: int) -> list[tuple[float, ...]]:
     """Return (x, y, orientation, speed, acceleration) of the centre of a car at all steps."""
     length_m = _length_m(trajectory.case.scenario, row)
-    states = []
+    states: list[tuple[float, ...]] = []
     for (x_m, v_mps, a_mps2), merged in zip(
         trajectory.motion[:, row].tolist(), merged_rows(trajectory).tolist(), strict=True
     ):

@@ -19,6 +19,6 @@ for name in sys.argv[1:]:
     assert len(problems.planning_problem_dict) == 1
     for car in scenario.dynamic_obstacles:
         assert car.initial_center_lanelet_ids, "each car starts on a lane"
-        written = [int(one.text) for one in root.iterfind(".//trajectory/state/time/exact")]
+        written = [int(one.text or 0) for one in root.iterfind(".//trajectory/state/time/exact")]
         assert car.prediction.final_time_step == max(written)
     print(f"{Path(name).name}: valid, and read back")  # noqa: T201
