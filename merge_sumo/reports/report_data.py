@@ -19,6 +19,7 @@ from merge_sumo.analysis.verdict import shortened
 from merge_sumo.reports.report_maps import maps_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
 from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.studies.explanation import in_sentences
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.measures import Measure
@@ -79,6 +80,9 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
         "maps": _maps(facts),
         "search": _search(facts),
         "replay": f"merge-sumo replay {_quoted(facts.run.folder)}",
+        "why": _explanations(facts),
+        "explain": f"merge-sumo explain {_quoted(facts.run.folder)}",
+        "report": f"merge-sumo report {_quoted(facts.run.folder)}",
         **_road(facts.road),
         **_lane(scenario),
     }
@@ -174,6 +178,22 @@ def _people(facts: ReportModel, index: int) -> dict[str, Any]:
 
 def _share_range(place: Place | None) -> tuple[float, float] | None:
     return None if place is None else (round(place.at_least, 3), round(place.at_most, 3))
+
+
+def _explanations(facts: ReportModel) -> dict[int, dict[str, Any]]:
+    """Return by index the sentences on a failure, and its changes by coordinate."""
+    found = {}
+    for o in facts.shown:
+        known = facts.explanations.get(o.index)
+        if known is not None:
+            found[o.index] = {
+                "sentences": in_sentences(known, o, facts.avoidance.get(o.index)),
+                "alone": {
+                    one.field: [one.lowest, one.below, one.above, one.highest]
+                    for one in known.alone
+                },
+            }
+    return found
 
 
 def _coordinate(c: Coordinate) -> dict[str, Any]:

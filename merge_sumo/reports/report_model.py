@@ -26,6 +26,7 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.studies.counterfactuals import read_avoidance
 from merge_sumo.studies.expectation import read_expectation
+from merge_sumo.studies.explanation import read_explanations
 from merge_sumo.studies.stress import stress_of
 from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey
 from merge_sumo.system.workers import Workers
@@ -83,6 +84,7 @@ class ReportModel:
         spread = sorted(spread_failures(self.worst), key=lambda o: o.index not in robust)
         self.spread = spread[:LISTED]
         self.avoidance = read_avoidance(run)
+        self.explanations = read_explanations(run)
         self.repeats = read_repeats(run)
         self.near = sorted(
             (o for o in run.outcomes if _is_told(o) and not o.failed),

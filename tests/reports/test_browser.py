@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import re
 import shutil
 from collections.abc import Iterator, Sequence
@@ -30,7 +31,15 @@ from merge_sumo.reports.running_page import running_page
 from merge_sumo.reports.version_pages import comparison_page, write_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
+from merge_sumo.studies.explanation import (
+    EXPLANATIONS,
+    Alone,
+    Explanation,
+    OtherPov,
+    in_sentences,
+)
 from merge_sumo.studies.versions import compare_runs
+from merge_sumo.system.records import to_plain
 from merge_sumo.values.scenario import POV, US23
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
@@ -810,6 +819,50 @@ def test_failures_in_which_the_pov_does_more_than_people_are_marked_and_filtered
         assert page.locator("[data-filter=people][data-value=inside] b").inner_text() == str(
             len(inside) + len(outside)
         )
+
+
+def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
+    run = write_run(tmp_path / "run", error=None)
+    first, second = [o for o in failures(run.outcomes) if o.case.level == 1][:2]
+    alone = (
+        Alone("x_pov0_m", 1.0, -100.0, 60.0, -3.1, 12.0),
+        Alone("v_pov0_mps", 0.06, -5.0, 5.0, -0.4, None),
+    )
+    povs = (OtherPov(0, None, True), OtherPov(2, 0.3, False))
+    known = Explanation(first.index, alone, {"x_pov0_m": -3.1}, povs, 400)
+    line = json.dumps(to_plain(known))
+    (run.folder / EXPLANATIONS).write_text(f"{line}\n", encoding="utf-8")
+    sentences = in_sentences(known, first)
+    moments = [
+        t for t in (first.measures.last_avoidable_s, first.measures.t_end_s) if t is not None
+    ]
+    with shown(browser, report.write_report(run)) as page:
+        page.evaluate(f"location.hash = '#case-{first.index}'")
+        page.locator("#why-known").wait_for()
+        assert page.inner_text("#why-words") == " ".join(sentences)
+        assert "It passes if the POV starts 3.1 m further back, 0.40 m/s slower" in sentences[0]
+        texts = page.locator("#why-changes text:not(.edge)").all_text_contents()
+        x, v = (f"{first.case.x_pov0_m:.1f}".replace("-", "\u2212"), first.case.v_pov0_mps)
+        assert texts == [f"x_POV0 {x} m", "\u22123.1", "+12.0", f"v_POV0 {v:.2f} m/s", "\u22120.40"]
+        # What fails is between the two changes that pass: 15.1 m of the 36 m that are drawn.
+        stuck, track = (page.locator(f"#why-changes .{name}").first for name in ("stuck", "track"))
+        assert _box(stuck)["width"] / _box(track)["width"] == pytest.approx(15.1 / 36.0, abs=0.01)
+        drawn = page.locator("#why-time text.named").all_text_contents()
+        assert [float(text.split()[-2]) for text in drawn] == [round(t, 1) for t in moments]
+        before = _box(page.locator("#why-time .now"))["x"]
+        page.evaluate("at(0)")
+        assert _box(page.locator("#why-time .now"))["x"] < before - 50
+        page.evaluate(f"location.hash = '#case-{second.index}'")
+        page.locator("#why-ask").wait_for()
+        assert not page.locator("#why-known").is_visible()
+        command = (
+            f"merge-sumo explain {run.folder} {second.index} && merge-sumo report {run.folder}"
+        )
+        assert page.inner_text("#why-command") == command
+        passed = next(o.index for o in run.outcomes if not o.failed)
+        page.evaluate(f"location.hash = '#case-{passed}'")
+        page.wait_for_function(f"chosen === place.get({passed})")
+        assert not page.locator("#why").is_visible()
 
 
 LEAVES = """

@@ -515,12 +515,63 @@ function showMotion(i) {
       lines: [...(other ? [{ name: "gap beside", points: over(otherGap) }] : []), ...others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }))],
     }),
   ];
-  charts.push(...signalCharts(i, end));
+  charts.push(...signalCharts(i, end), ...whyCharts(i));
   slider.max = final;
   byId("views").classList.toggle("two", other !== null);
   views[0].show(moving, `Case ${cases.index[i]}`);
   views[1].show(other, `Case ${cases.index[beside] ?? ""}`);
   at(failed(i) || other ? final : 0);
+}
+function whyCharts(i) { // why it failed: until when something could be done, and with which changes it passes
+  const found = data.why[cases.index[i]];
+  byId("why").hidden = !failed(i);
+  byId("why-known").hidden = !found;
+  byId("why-ask").hidden = Boolean(found);
+  byId("why-command").textContent = `${data.explain} ${cases.index[i]} && ${data.report}`;
+  if (!found) return [];
+  byId("why-words").textContent = found.sentences.join(" ");
+  drawChanges(byId("why-changes"), i, found.alone);
+  return [moments(byId("why-time"), i)];
+}
+function moments(svg, i) { // both distances to M, and the last moments at which something helps
+  const { rows, x } = moving, end = (rows - 1) * DT;
+  const lines = vehicles.map((name, who) => ({ name, points: x[who].map((place, t) => [t * DT, -place]) }));
+  const dots = [{ name: "merged", x: end, y: -x[VUT][rows - 1] }];
+  const yRange = range(lines.flatMap(({ points }) => points.map(([, y]) => y)));
+  const chart = plot(svg, { xRange: [0, end], yRange, xLabel: "time, s", lines, dots }), [top, bottom] = [8, 162];
+  const never = cases.kind[i] !== null && cases.way_out[i] === null, closes = never ? 0 : cases.way_out[i];
+  if (closes !== null) draw(svg, "rect", { class: "danger", x: chart.X(closes), y: top, width: chart.to - chart.X(closes), height: bottom - top });
+  const takeover = cases.latest_takeover?.[i] ?? null;
+  const flags = [[takeover, "take-over until"], [closes, never ? "never a way out from" : "way out until"], [end, "ends at"]];
+  for (const [row, [t, what]] of flags.entries()) {
+    if (t === null) continue;
+    draw(svg, "line", { class: "moment", x1: chart.X(t), x2: chart.X(t), y1: top + 14 * row, y2: bottom });
+    const late = chart.X(t) > 140; // its text is before the line
+    draw(svg, "text", { class: "named", x: chart.X(t) + (late ? -4 : 4), y: top + 10 + 14 * row, "text-anchor": late ? "end" : "start" }, `${what} ${fixed(t, 1)} s`);
+  }
+  return chart;
+}
+function drawChanges(svg, i, alone) { // a bar for each coordinate: what fails around the case, and the nearest passes
+  const own = coordinates.filter(({ field }) => field in alone), height = 56, [left, right] = [62, 298];
+  svg.setAttribute("viewBox", `0 0 360 ${own.length * height}`);
+  svg.replaceChildren();
+  for (const [row, c] of own.entries()) {
+    const [lowest, below, above, highest] = alone[c.field], value = cases[c.field][i], y = row * height;
+    const reach = 1.5 * Math.max(-(below ?? lowest), above ?? highest) || 1; // as far as needed
+    const low = Math.max(lowest, -reach), high = Math.max(Math.min(highest, reach), low + 1e-9);
+    const X = (change) => left + (change - low) / (high - low) * (right - left);
+    draw(svg, "text", { x: left, y: y + 13 }, `${c.name} ${valueText(c, value)}`);
+    draw(svg, "rect", { class: "track", x: left, y: y + 20, width: right - left, height: 12 });
+    const [from, to] = [below ?? low, above ?? high];
+    draw(svg, "rect", { class: "stuck", x: X(from), y: y + 20, width: X(to) - X(from), height: 12 });
+    draw(svg, "line", { class: "now", x1: X(0), x2: X(0), y1: y + 17, y2: y + 35 });
+    for (const [change, anchor, aside] of [[below, "end", -8], [above, "start", 8]]) {
+      if (change === null) continue;
+      draw(svg, "circle", { class: "passes", cx: X(change), cy: y + 26, r: 4 });
+      draw(svg, "text", { x: X(change) + aside, y: y + 30, "text-anchor": anchor }, `${change < 0 ? "\u2212" : "+"}${fixed(Math.abs(change), c.digits)}`);
+    }
+    for (const change of [low, high]) draw(svg, "text", { class: "edge", x: X(change), y: y + 45, "text-anchor": "middle" }, fixed(value + change, c.digits));
+  }
 }
 function signalCharts(i, end) { // what the VUT has left for each step: numbers as a line, words as bars
   const box = byId("signals"), left = Object.entries(data.signals[cases.index[i]] ?? {});
