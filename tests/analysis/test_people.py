@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from handmade import write_run
@@ -174,7 +175,7 @@ def test_what_none_of_23_drivers_does_may_be_that_of_one_of_eight():
 
 class TestTheShareOfACampaign:
     def test_is_recorded_and_changed_by_resuming_and_by_a_report_of_another_share(self, tmp_path):
-        few = {"level": 1, "cases": 20, "sampler": "uniform", "workers": 1}
+        few: dict[str, Any] = {"level": 1, "cases": 20, "sampler": "uniform", "workers": 1}
         run = ms.campaign("design2", out=tmp_path / "run", people=0.95, **few)
         outcomes = (run.folder / "outcomes.jsonl").read_bytes()
         assert run.settings["people"] == run.people.share == 0.95
@@ -210,5 +211,5 @@ class TestTheShareOfACampaign:
         assert [version.people.inside for version in found.versions] == [number, 0]
         assert found.notes == ("The campaigns hold failures beside different shares of people.",)
         page = tmp_path / "history.html"
-        ms.history(runs, out=page)
+        ms.history([run.folder for run in runs], out=page)
         assert "failures inside what people do" in page.read_text()

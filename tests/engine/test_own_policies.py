@@ -33,7 +33,7 @@ from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23, MergeScenario
 from merge_sumo.values.trajectory import End
 
-SMALL = {"levels": (1,), "cases": 24, "batch": 8, "seed": 2, "sampler": "uniform"}
+SMALL: dict[str, Any] = {"levels": (1,), "cases": 24, "batch": 8, "seed": 2, "sampler": "uniform"}
 
 
 @pytest.fixture(scope="module")
