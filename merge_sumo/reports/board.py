@@ -24,7 +24,7 @@ PAGE: Final = "board.html"
 RECORD: Final = "board.json"
 SCHEMA: Final = "merge-sumo board 1"
 """Name and version of what `board.json` holds."""
-IN_SHORT: Final = ("often", "people", "simulators")
+IN_SHORT: Final = ("often", "people", "simulators", "robust")
 """Topics whose first sentence stands at the top of the page."""
 
 
@@ -83,8 +83,8 @@ def _hashes(model: BoardModel, topics: list[Topic]) -> dict[str, str]:
         folders.append(model.certificate_folder)
     found: dict[str, str] = {}
     for name in sorted(named | {SETTINGS, OUTCOMES}):
-        for folder in folders:
-            path = folder / name
+        paths = [folder / name for folder in folders]
+        for path in [*paths, model.kept.get(name, paths[0])]:
             if path.is_file():
                 found[name] = hashlib.sha256(regular(path).read_bytes()).hexdigest()
                 break

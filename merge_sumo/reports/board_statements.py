@@ -154,6 +154,8 @@ class BoardModel:
         self.run = run
         self.summary = summary or summarise(run.outcomes, run.levels)
         self.verdict: Verdict = judge(run.outcomes)
+        self.kept: dict[str, Path] = {}
+        """Files of the cache that sentences name, by name."""
         held = run.people if people is None else people
         self.people = beside_people(run.outcomes, held, run.levels)
         self.avoidance = read_avoidance(run)
@@ -378,13 +380,15 @@ class BoardModel:
         if kept is None:
             return
         truth, path = kept
-        name, failing = level_name(level), truth.failures
-        yield say(
-            f"Level {name}, for comparison: of {{}} uniform cases {{}} fail, FMC {{}}.",
-            figure(len(truth.points), path.name, "points"),
-            figure(len(failing), path.name, f"score < {FAILURE_SCORE:g}"),
-            figure(fmc(failing), path.name, f"points with score < {FAILURE_SCORE:g}", ".4f"),
-        )
+        self.kept[path.name] = path
+        failing, key = truth.failures, f"points with score < {FAILURE_SCORE:g}"
+        text = f"Level {level_name(level)}, for comparison: of {{}} uniform cases {{}} fail"
+        figures = [figure(len(truth.points), path.name, "points")]
+        figures.append(figure(len(failing), path.name, key))
+        if len(failing):
+            text += ", FMC {}"
+            figures.append(figure(fmc(failing), path.name, key, ".4f"))
+        yield say(f"{text}.", *figures)
 
     def _chance(self) -> Iterator[Statement]:
         known = self.probability
@@ -445,13 +449,12 @@ class BoardModel:
             share(known.confidence, PER_MERGE, "confidence"),
             _in_1000(known.high, "high"),
         )
+        parts, figures = [], []
         for level, one in known.levels.items():
-            yield say(
-                f"If all drivers were of level {level_name(int(level))}: {{}} to {{}} cars in "
-                "1,000 merges.",
-                _in_1000(one.low, f"levels.{level}.low"),
-                _in_1000(one.high, f"levels.{level}.high"),
-            )
+            parts.append(f"{{}} to {{}} at level {level_name(int(level))}")
+            figures.append(_in_1000(one.low, f"levels.{level}.low"))
+            figures.append(_in_1000(one.high, f"levels.{level}.high"))
+        yield say(f"If all drivers were of one level: {'; '.join(parts)}.", *figures)
         yield say(
             "Source of the traffic: {}. {}.",
             figure(known.traffic.source, PER_MERGE, "traffic.source"),
@@ -466,7 +469,7 @@ class BoardModel:
         if known.left_out:
             yield Statement(f"Not known: {known.left_out}.")
             return
-        people, which = figure(HEE_PEOPLE, HEE_SOURCE, "people"), f"failing ({failing})"
+        people, which = figure(HEE_PEOPLE, HEE_SOURCE, "people"), failing
         braking, slowdown = (published.limit(known.share) for published in PUBLISHED)
         some = "the hardest" if known.share == ALL_PEOPLE else f"{100.0 * known.share:g} %"
         text = f"In {{}} of {{}} failures {_driver(known)} does no more than {some} of {{}} "
@@ -481,6 +484,17 @@ class BoardModel:
         if slowdown is not None:
             text += " and slow down by {} m/s or less"
             figures.append(figure(slowdown, HEE_SOURCE, SLOWDOWN.about))
+        beyond = sum(one.slows_beyond for one in known.levels.values())
+        if beyond and slowdown is None:
+            # Beside the count in the same sentence, as it may be read alone.
+            step = SLOWDOWN.steps[-1]
+            text += "; but in {} it slows down by more than {} m/s, as {} of them did, and by how "
+            text += "much is not published"
+            figures += [
+                self._lines(beyond, f"{which}, {SLOWDOWN.name} > {step.above:g}"),
+                figure(step.above, HEE_SOURCE, SLOWDOWN.about),
+                figure(round(step.share * HEE_PEOPLE), HEE_SOURCE, SLOWDOWN.about),
+            ]
         yield say(f"{text}.", *figures)
         if known.unknown:
             unknown = self._lines(known.unknown, f"{which}, {BRAKING.name} = null")
@@ -536,19 +550,21 @@ class BoardModel:
             figure(len(known.failures), STRESS, "failures"),
             figure(known.runs, STRESS, "rungs.runs"),
         )
+        ran = [(rung, flips) for rung in known.rungs if (flips := known.share(rung)) is not None]
+        if ran:
+            parts, figures = [], []
+            for rung, flips in ran:
+                key = f"rungs.{rung.name}"
+                parts.append("{} ({})")
+                figures.append(share(flips, STRESS, f"{key}.runs"))
+                figures.append(figure(rung.about, STRESS, f"{key}.about"))
+            yield say(f"Share of verdicts that flip: {'; '.join(parts)}.", *figures)
         for rung in known.rungs:
-            flips = known.share(rung)
-            if flips is None:
+            if rung.skipped:
                 yield say(
-                    "{}: not run ({}).",
+                    "Not run: {} ({}).",
                     figure(rung.about, STRESS, f"rungs.{rung.name}.about"),
                     figure(rung.skipped, STRESS, f"rungs.{rung.name}.skipped"),
-                )
-            else:
-                yield say(
-                    "{}: {} of verdicts flip.",
-                    figure(rung.about, STRESS, f"rungs.{rung.name}.about"),
-                    share(flips, STRESS, f"rungs.{rung.name}.runs"),
                 )
 
     def _simulators(self) -> Iterator[Statement]:
@@ -572,6 +588,10 @@ class BoardModel:
             figure(known.motion.cases, CROSSCHECK, "motion.cases"),
             figure(known.peer, CROSSCHECK, "peer"),
             figure(known.motion.largest_m, CROSSCHECK, "motion.largest_m", ".1g"),
+        )
+        yield Statement(
+            "That is about hosting, motion and scoring. It says nothing of people, nor of the "
+            "dynamics of real vehicles."
         )
 
     def _same_verdicts(self, peer: str, verdicts: Verdicts) -> Iterator[Statement]:
