@@ -1113,7 +1113,7 @@ def repair(
     today = settings_today(before, fields, trust=trust_vut)
     plan = resolve(today, _path(net))
     same_system(before, record_of(today, plan))
-    motions: dict[tuple[str, int], Trajectory] = {}
+    motions: dict[Path, dict[tuple[str, int], Trajectory]] = {}
     bars: list[Bars] = []
 
     @contextmanager
@@ -1131,14 +1131,14 @@ def repair(
         ran = _fresh_campaign(
             mending.fresh_settings(today, asked, spec, number), campaign, net, runner
         )
-        motions.clear()
+        seen = motions[ran.folder] = {}
         compared = versions.compare_runs(
             before,
             ran,
             net=plan.road,
             given={} if today.policies is None else {"policies": today.policies},
             trust=trust_vut,
-            on_motion=lambda of, index, motion: motions.update({(of, index): motion}),
+            on_motion=lambda of, index, motion: seen.update({(of, index): motion}),
         )
         return ran, compared
 
@@ -1153,9 +1153,10 @@ def repair(
     mending.write_repair(found, folder)
     page = folder / mending.PAGE
     replace_own(page, repair_page(found, before).encode(errors="backslashreplace"))
-    last = found.last
-    if last.compared is not None and last.campaign is not None:
-        changes = comparison_page(last.compared, before, last.campaign, motions)
+    best = found.best
+    if best.compared is not None and best.campaign is not None:
+        seen = motions[best.campaign.folder]
+        changes = comparison_page(best.compared, before, best.campaign, seen)
         replace_own(folder / mending.CHANGES, changes.encode(errors="backslashreplace"))
     return RepairResult(found, folder, page)
 

@@ -772,7 +772,7 @@ def _indices(indices: Sequence[int]) -> str:
 
 def _verification(found: Repair) -> list[str]:
     """Return what the last fresh campaign says against the values."""
-    compared = found.last.compared
+    compared = found.best.compared
     if compared is None or found.verified:
         return []
     broke = [f"{counted(found.broke, 'case')} fail that passed"] if found.broke else []

@@ -337,7 +337,7 @@ def crosscheck(given: Given, run: RunArgument) -> None:
         ),
         "trials": option(int, 60, "Sets of values that a round tries."),
         "rounds": option(
-            int, 2, "Most rounds: the failures of a fresh campaign join the cases of the next."
+            int, 3, "Most rounds: the failures of a fresh campaign join the cases of the next."
         ),
         "cases": option(
             int | None, None, "Cases of a fresh campaign.", show_default="as many as the campaign"

@@ -15,7 +15,7 @@ from merge_sumo.reports.version_pages import STYLES, Frame, axis_end
 from merge_sumo.studies.repair import CHANGES, MEASURED_BY, Repair, Trial, change_of
 from merge_sumo.system.printable import quoted
 
-FRAME: Final = Frame(56.0, 512.0, 12.0, 250.0)
+FRAME: Final = Frame(56.0, 512.0, 22.0, 250.0)
 MOST_STAYING: Final = 50
 """Cases that are listed of those that still fail."""
 MOST_TRADES: Final = 20
@@ -81,7 +81,7 @@ def _trades(repair: Repair) -> list[Trial]:
 def _trade_off(repair: Repair) -> TradeOff:
     """Return the picture of the last round's trials."""
     cost = repair.settings.cost
-    last = repair.last.chosen.round if repair.last.chosen else 1
+    last = repair.best.chosen.round if repair.best.chosen else 1
     shown = [t for t in repair.trials if t.round == last and not t.refused and not t.all_cases]
     extra = [trial.extra[cost] for trial in shown]
     low, high = min(0.0, *extra), max(0.0, *extra)

@@ -7,14 +7,19 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.studies import repair as mending
-from merge_sumo.studies.repair import BISECTIONS, RESERVE, Range, Trial
+from merge_sumo.studies.repair import BISECTIONS, RESERVE, Range, Round, Trial
+from merge_sumo.values.case import MergeCase, to_unit
+from merge_sumo.values.fmc import RADIUS
+from merge_sumo.values.scenario import US23
 
 pytest.importorskip("optuna")
 
@@ -231,6 +236,35 @@ def test_the_controller_of_a_folder_from_elsewhere_does_not_run(campaigns, tmp_p
     copied = shutil.copytree(campaigns("Brakes"), tmp_path / "sent")
     with pytest.raises(UserError, match="say --trust-vut if you trust it"):
         api.repair(copied, ["brake=0..4"], out=tmp_path / "out", **FEW)
+
+
+def test_a_failure_of_a_fresh_campaign_brings_cases_around_it():
+    case = MergeCase(level=2, x_pov0_m=-180.0, v_pov0_mps=30.0, svo_rad=0.7, scenario=US23)
+    found = mending.with_neighbours([case], np.random.default_rng(0))
+    assert found[0] is case
+    assert len(found) == 1 + mending.NEIGHBOURS
+    offsets = to_unit(found, 2) - to_unit([case], 2)
+    assert np.abs(offsets).max() <= RADIUS
+    assert offsets[1:].any(axis=1).all()
+    assert (offsets[:, 0] <= 0.0).all(), "the case is at the end of the pool"
+
+
+def test_the_round_with_the_least_fmc_counts():
+    settings = mending.RepairSettings((Range("a", 0.0, 1.0),))
+
+    def tested(a: float, fmc_b: float) -> Round:
+        levels = {level: SimpleNamespace(fmc_b=fmc_b / 2.0) for level in (0, 1)}
+        return Round(Trial(1, {"a": a}), None, SimpleNamespace(levels=levels))  # type: ignore[arg-type]
+
+    def chosen(*rounds: Round) -> Trial | None:
+        return mending.Repair("v", settings, {"a": 0.0}, (0,), 1, rounds, ()).chosen
+
+    rounds = tested(0.1, 0.4), tested(0.2, 0.1), tested(0.3, 0.3)
+    assert chosen(*rounds) is rounds[1].chosen
+    assert chosen(rounds[0], Round(None)) is rounds[0].chosen
+    assert chosen(Round(None)) is None
+    # Of equal ones the later, which more cases have tried.
+    assert chosen(rounds[0], again := tested(0.5, 0.4)) is again.chosen
 
 
 def test_values_have_few_digits_and_stay_in_their_range():
