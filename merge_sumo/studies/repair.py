@@ -41,7 +41,7 @@ import numpy as np
 from msgspec import Meta, field
 
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import OUTCOMES, Run
+from merge_sumo.campaigns.store import OUTCOMES, Run, spread_failures
 from merge_sumo.engine.evaluate import CaseResults, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
@@ -83,6 +83,9 @@ change: between the cases that ran are others. Chosen, not tuned."""
 NEIGHBOURS: Final = 10
 """Cases that each failure of a fresh campaign brings to the next round besides itself. Chosen, not
 tuned: without any, four failures of design2 moved a threshold by 1 %, just past these four."""
+MOST_AGAINST: Final = 40
+"""Failures of a fresh campaign that join the next round: the worst of each region, the second of
+each, and so on."""
 CONFIRMED: Final = 5
 """Most trials that run all cases, the best first."""
 
@@ -502,7 +505,10 @@ class Search:
             spec = spec_with(self._plan.vut.spec, chosen.values, self.today)
             campaign, compared = fresh(spec, number)
             rounds.append(Round(chosen, campaign, compared))
-            against = [o.case for o in campaign.outcomes if not _passes(o)]
+            untested = [o for o in campaign.outcomes if not o.is_tested]
+            against = [o.case for o in (*spread_failures(campaign.outcomes), *untested)][
+                :MOST_AGAINST
+            ]
             if not against:
                 break
             rng = np.random.default_rng([self._settings.seed, number, 1])
