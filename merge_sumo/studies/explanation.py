@@ -283,16 +283,20 @@ def _confirm(
     passes = _passes(replace(plan, engine=Engine.SUMO), [case for _, case, _ in said], workers)
     for (index, case, expected), passed in zip(said, passes, strict=True):
         if passed != expected:
-            what = "passes" if passed else "does not pass"
             if case == cases[index]:
-                raise UserError(
-                    f"case {index} {what} now: the VUT is another than that of the campaign, or "
-                    "does not repeat itself, and nothing can be said of its changes"
-                )
+                raise _other_vut(index)
+            what = "passes" if passed else "does not pass"
             raise UserError(
                 f"a case near case {index} {what} when it runs a second time: the VUT does not "
                 "repeat itself, and nothing can be said of its changes"
             )
+
+
+def _other_vut(index: int) -> UserError:
+    return UserError(
+        f"case {index} passes now: the VUT is another than that of the campaign, or does not "
+        "repeat itself, and nothing can be said of its changes"
+    )
 
 
 def _passes(plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None) -> list[bool]:
@@ -397,7 +401,9 @@ def _search(outcome: Outcome, levels: Sequence[int]) -> Search:
     others = [replace(case, level=level, svo_rad=svo_rad) for level, svo_rad in povs]
     sides = [(axis, sign) for axis in range(len(axes)) for sign in (-1, 1)]
     grids = [known.along(axis, axes[axis].grid(sign)) for axis, sign in sides]
-    passes = yield others + known.cases(grids)
+    still, *passes = yield [case, *others, *known.cases(grids)]
+    if still:
+        raise _other_vut(outcome.index)
     known.tell(grids, passes[len(others) :])
     between = [known.along(axis, known.gap(axis, sign)) for axis, sign in sides]
     wanted = [*between, known.ball(FIRST_POINTS)]
@@ -424,7 +430,7 @@ def _search(outcome: Outcome, levels: Sequence[int]) -> Search:
             OtherPov(level, svo_rad, passed)
             for (level, svo_rad), passed in zip(povs, passes, strict=False)
         ),
-        cases=len(known.verdicts) + len(others),
+        cases=1 + len(known.verdicts) + len(others),
     )
 
 

@@ -95,7 +95,7 @@ def psi_of(text):
         return [None]
     if text == "any psi":
         return [number / 10.0 for number in range(16)]
-    values = []
+    values: list[int] = []
     for run in text.removeprefix("psi ").split(", "):
         first, _, last = run.partition(" to ")
         values += range(round(10 * float(first)), round(10 * float(last or first)) + 1)
@@ -212,6 +212,7 @@ def test_the_smallest_change_by_hand(tmp_path):
 
 
 class TestTheFile:
+    @pytest.mark.slow
     def test_is_the_same_wherever_its_cases_ran(self, made, tmp_path):
         again = shutil.copytree(made.folder, tmp_path / "run")
         before = (again / EXPLANATIONS).read_bytes()
@@ -249,7 +250,7 @@ class TestWhatCannotBeExplained:
         ("now", "words"),
         [
             ("return -0.5 if seen.t_s < 4.0 else 0.5", "the VUT is another than that"),
-            ("return next(TURNS)", "the VUT"),
+            pytest.param("return next(TURNS)", "the VUT", marks=pytest.mark.slow),
         ],
     )
     def test_is_a_controller_that_is_another_now_or_decides_by_chance(self, tmp_path, now, words):
