@@ -663,8 +663,7 @@ class CrosscheckResult(Result):
         lines = [
             f"{found.vut} in {found.peer} beside SUMO:",
             f"  motion    {counted(motion.cases, 'recorded case')}, {motion.steps:,} steps: "
-            f"positions within {motion.largest_m:.0e} m, speeds within {motion.largest_mps:.0e} "
-            "m/s",
+            + motion.in_words,
         ]
         if found.verdicts is None:
             lines.append(f"  verdicts  not compared: {found.why_no_verdicts}")

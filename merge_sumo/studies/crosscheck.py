@@ -69,6 +69,12 @@ class Motion(Record, frozen=True):
     largest_mps: Deviation
     worst_case: Count | None
 
+    @property
+    def in_words(self) -> str:
+        """The largest differences, in a phrase."""
+        speeds = f"within {self.largest_mps:.0e} m/s" if self.largest_mps else "equal"
+        return f"positions within {self.largest_m:.0e} m, speeds {speeds}"
+
 
 class Difference(Record, frozen=True):
     """A case with another verdict, or another end, in the other simulator.
