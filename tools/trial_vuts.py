@@ -92,6 +92,12 @@ class Delayed:
         return np.asarray(np.where(near, chosen, profile(seen.v_vut_mps)))
 
 
+class SlowerDelayed(Delayed):
+    """The same on what it saw 1 s ago: a version that reacts more slowly."""
+
+    DELAY = 10
+
+
 class Rss:
     """Brakes while the longitudinal distance to the POV, as if on one lane, is not safe."""
 

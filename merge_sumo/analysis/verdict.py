@@ -207,6 +207,8 @@ def in_words(parts: Sequence[str]) -> str:
 
 HUMAN_FAILURES: Final = "human failures"
 """The gate that counts failures in which the POV does no more than people."""
+REGRESSIONS: Final = "regressions"
+"""The gate that counts the cases that fail and pass with an earlier version of the VUT."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +217,7 @@ class Gate:
 
     Attributes:
         what: "failures", "human failures" (those in which the POV does no more than people),
-            "errors", "timeouts" (a number of cases) or "fmc" (at some POV level).
+            "errors", "timeouts", "regressions" (a number of cases) or "fmc" (at some POV level).
         above: the gate is met beyond this.
     """
 
@@ -227,8 +229,14 @@ class Gate:
         """The gate as it is written."""
         return f"{self.what}>{self.above}" if self.what == "fmc" else self.what
 
-    def check(self, verdict: Verdict, summary: Summary, people: PeopleSummary) -> GateResult:
-        """Return whether a campaign meets the gate, and what it shows."""
+    def check(
+        self, verdict: Verdict, summary: Summary, people: PeopleSummary, regressions: int = 0
+    ) -> GateResult:
+        """Return whether a campaign meets the gate, and what it shows.
+
+        `regressions` are the cases that fail and pass with the version that the campaign is
+        against.
+        """
         if self.what == "fmc":
             level, most = max(
                 ((level, of_level.fmc) for level, of_level in summary.levels.items()),
@@ -239,7 +247,8 @@ class Gate:
             return GateResult(self.name, most > self.above, said)
         if self.what == HUMAN_FAILURES:
             return GateResult(self.name, people.inside > 0, people.gate_found)
-        number: int = getattr(verdict, self.what)
+        regressed = self.what == REGRESSIONS
+        number: int = regressions if regressed else getattr(verdict, self.what)
         return GateResult(self.name, number > 0, counted(number, self.what.removesuffix("s")))
 
 
@@ -257,24 +266,31 @@ class GateResult:
         return f"gate {self.name}: {'met' if self.met else 'not met'} ({self.found})"
 
 
-def parse_gates(texts: Iterable[str]) -> list[Gate]:
-    """Return the gates that `--gate` names, each once; `UserError` for what is none."""
+def parse_gates(texts: Iterable[str], *, against: bool = False) -> list[Gate]:
+    """Return the gates that `--gate` names, each once; `UserError` for what is none.
+
+    `against` is whether the campaign is against an earlier version of the VUT.
+    """
     gates: dict[str, Gate] = {}
     for text in texts:
         gate = _parse_gate(text)
+        if gate.what == REGRESSIONS and not against:
+            raise UserError(
+                f"--gate {REGRESSIONS} needs an earlier version of the VUT: name it with --against"
+            )
         gates[gate.name] = gate
     return list(gates.values())
 
 
 def _parse_gate(text: str) -> Gate:
-    if text in ("failures", HUMAN_FAILURES, "errors", "timeouts"):
+    if text in ("failures", HUMAN_FAILURES, "errors", "timeouts", REGRESSIONS):
         return Gate(text)
     what, sign, number = (part.strip() for part in text.partition(">"))
     if (what, sign) != ("fmc", ">"):
         raise UserError(
             f"there is no gate {printable(text)!r}: choose failures, "
-            f'"{HUMAN_FAILURES}", errors, timeouts or "fmc>X" (in quotes, or the shell takes the '
-            '">")'
+            f'"{HUMAN_FAILURES}", errors, timeouts, {REGRESSIONS} or "fmc>X" (in quotes, or the '
+            'shell takes the ">")'
         )
     try:
         above = float(number)

@@ -194,9 +194,9 @@ def campaign(
         vut: vehicle under test: a spec, a class, a function, or an object.
         net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/<vut>-<date>` by default.
-        given: which cases are chosen (`level`, `sampler`, `cases`, `batch`, `in_flight`, `seed`,
-            `v_vut0_mps`, `stop_after_converged`, `audit`, `learn_from`), how a case is run and
-            judged (`people`, `scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
+        given: which cases are chosen (`level`, `against`, `sampler`, `cases`, `batch`, `in_flight`,
+            `seed`, `v_vut0_mps`, `stop_after_converged`, `audit`, `learn_from`), how a case is run
+            and judged (`people`, `scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
             `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`), where it runs (`workers`,
             `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`); see
             `CampaignKeywords`.
@@ -278,7 +278,7 @@ def _concluded(
     case. An interruption has a note on how to go on.
     """
     gates = list(runner.gates)
-    parse_gates(gates)
+    parse_gates(gates, against=settings.against is not None)
     junit = _path(runner.junit)
     if junit is not None:
         check_junit(junit, folder)

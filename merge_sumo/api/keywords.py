@@ -100,6 +100,8 @@ class Settings(Setup, total=False):
         people: share of published drivers; a failure in which the POV does more than they do is
             shown apart, whatever decides it. 1 by default: the hardest of them.
         learn_from: folders of earlier campaigns to learn the VUT from.
+        against: an earlier version of the VUT, anything that `vut` takes but "traci": the sampler
+            looks for cases that the VUT alone fails.
     """
 
     level: int | str
@@ -113,6 +115,7 @@ class Settings(Setup, total=False):
     audit: int | None
     people: float
     learn_from: Sequence[Path | str] | None
+    against: AnyVut | None
 
 
 class Running(TypedDict, total=False):
@@ -145,8 +148,8 @@ class CampaignKeywords(Settings, Running, total=False):
     Attributes:
         on_case: called with the outcome of every case as it ends.
         check: called after every batch; may raise to stop there.
-        gates: "failures", "human failures", "errors", "timeouts" or "fmc>X": what `passed` of the
-            result depends on.
+        gates: "failures", "human failures", "errors", "timeouts", "fmc>X", or "regressions" with
+            `against`: what `passed` of the result depends on.
         junit: new file to write for CI: JUnit XML.
     """
 
@@ -261,7 +264,9 @@ def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSetting
     """
     runner, given = runner_of(given)
     spec, pov_spec, workers = drivers_of(vut, given.get("pov"), runner.workers, stacklevel=4)
-    fields = with_criterion(recordable({"scenario": US23, **given, "pov": pov_spec}))
+    against, workers = _earlier_of(given, workers)
+    drivers = {"pov": pov_spec, **against}
+    fields = with_criterion(recordable({"scenario": US23, **given, **drivers}))
     scenario, level = fields["scenario"], str(given.get("level", "all"))
     policies = policies_folder(fields.get("policies"), scenario)
     levels = parse_levels(level, policies, scenario.levels, own=pov_spec is not None)
@@ -287,8 +292,17 @@ def given_again(
         drivers["vut"], drivers["pov"], runner.workers, stacklevel=4
     )
     specs = {"vut": spec, "pov": pov_spec}
-    fields = recordable({**given, **{n: specs[n] for n in named}})
+    against, workers = _earlier_of(given, workers)
+    fields = recordable({**given, **{n: specs[n] for n in named}, **against})
     return fields, replace(runner, workers=_within_reach(workers, given))
+
+
+def _earlier_of(given: Mapping[str, Any], workers: int | None) -> tuple[dict[str, str], int | None]:
+    """Return the spec of an earlier version that is given, by keyword, and how many workers."""
+    if given.get("against") is None:
+        return {}, workers
+    spec, _, workers = drivers_of(given["against"], None, workers, stacklevel=5)
+    return {"against": spec}, workers
 
 
 def _within_reach(workers: int | None, given: Mapping[str, Any]) -> int | None:

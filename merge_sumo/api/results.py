@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -25,11 +26,13 @@ from merge_sumo.analysis.verdict import (
     parse_gates,
     shortened,
 )
+from merge_sumo.campaigns.against import AGAINST
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
-from merge_sumo.campaigns.store import Run, failures
+from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
 from merge_sumo.reports.motion import lines_of, verdict_of
+from merge_sumo.reports.version_pages import AGAINST_PAGE
 from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.crosscheck import Crosscheck, Verdicts
@@ -39,7 +42,8 @@ from merge_sumo.studies.repair import MEASURED_BY, Repair, record_of_repair
 from merge_sumo.studies.stratified import Estimate
 from merge_sumo.studies.stress import Stress
 from merge_sumo.studies.truth import REAL_REGION, Truth
-from merge_sumo.system.printable import counted, quoted
+from merge_sumo.studies.versions import Change, RunComparison, compare_against
+from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.suggestions import either
 from merge_sumo.values.criterion import Criterion
@@ -94,9 +98,9 @@ class CampaignRun(Result):
     def __init__(
         self, folder: Path | str | Run, gates: Iterable[str] = (), people: float | None = None
     ) -> None:
-        self._gates = parse_gates(gates)
         self._people = people
         self._run = folder if isinstance(folder, Run) else Run(Path(folder))
+        self._gates = parse_gates(gates, against=self._run.settings.get(AGAINST) is not None)
         _ = self._run.levels  # A folder without levels is no campaign's.
 
     @property
@@ -169,9 +173,22 @@ class CampaignRun(Result):
         return in_a_sentence(read_avoidance(self._run).values())
 
     @cached_property
+    def against(self) -> RunComparison | None:
+        """What changed from the version that the campaign is against; None where it is none."""
+        return compare_against(self._run)
+
+    @property
+    def regressions(self) -> Table:
+        """The cases that fail and pass with that version, the worst first."""
+        cases = [] if self.against is None else self.against.cases
+        broke = [case.index for case in cases if case.change is Change.BROKE]
+        return Table(self._run.outcome(index) for index in broke)
+
+    @cached_property
     def gates(self) -> list[GateResult]:
         """The gates that were given, and whether the campaign meets them."""
-        return [gate.check(self.verdict, self.summary, self.people) for gate in self._gates]
+        regressions, people = len(self.regressions), self.people
+        return [gate.check(self.verdict, self.summary, people, regressions) for gate in self._gates]
 
     @property
     def passed(self) -> bool:
@@ -215,6 +232,7 @@ class CampaignRun(Result):
             "careful": self.careful,
             "fail_when": criterion.text,
             "notes": notes_on(outcomes, criterion),
+            **({} if self.against is None else {AGAINST: self.against.to_record()}),
             "repeats": [repeat.to_record() for repeat in self.repeats],
             "run": str(self.folder),
             "report": str(self.report_file),
@@ -241,11 +259,27 @@ class CampaignRun(Result):
             [] if self.summary.missed is None else [self.summary.missed.sentence("the pool")]
         )
         optional.append(self.people.line)
+        optional += self._against_lines()
         optional += [self.careful, f"report: {self.report_file}"]
         worst = failures(run.outcomes)[:1]
         folders = [run.folder / SCENARIOS / case_name(outcome.index) for outcome in worst]
         optional += [f"worst case: merge-sumo replay {quoted(path)} --gui" for path in folders]
         return [line for line in optional if line is not None]
+
+    def _against_lines(self) -> list[str]:
+        if self.against is None:
+            return []
+        changes = Counter(case.change for case in self.against.cases)
+        counts = (
+            f"{counted(changes[Change.BROKE], 'case')} broke",
+            f"{changes[Change.FIXED]} fixed",
+            f"{changes[Change.BOTH_FAIL]} fail with both",
+        )
+        earlier = printable(str(self.settings[AGAINST])[:NAME_CHARACTERS])
+        return [
+            f"against {earlier}: {', '.join(counts)}",
+            f"what broke: {self.folder / AGAINST_PAGE}",
+        ]
 
     def remarks(self) -> list[str]:
         """Return what decided whether the campaign passed: the gates, and whether it tested."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.campaigns.against import AGAINST, PairedSearch, by_batch
 from merge_sumo.campaigns.in_flight import Flight, by_rounds, conduct_in_flight
 from merge_sumo.campaigns.ownership import FILES
+from merge_sumo.campaigns.plan import resolve_earlier
 from merge_sumo.campaigns.prefetch import ChunkResults, Prefetch, RunChunks, proposals
 from merge_sumo.campaigns.repeats import repeat, write_repeats
 from merge_sumo.campaigns.sampler_copy import search_on_two_cores
@@ -36,8 +38,10 @@ from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
 from merge_sumo.system.hashing import Files, sha256_of
 from merge_sumo.system.workers import Workers
+from merge_sumo.twin.pair import TwinPair
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.scenario import DX_CRASH_M
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.output import LOG
@@ -117,12 +121,16 @@ def run_campaign(
     """
     check_new(folder)
     check_new(folder / SCENARIOS / case_name(settings.cases))
-    plan = _plan_in(folder, settings, plan, workers)
-    with workers_or_here(workers) as available:
-        open_simulators(plan, available, first=settings.in_flight is not None)
-        record = record_of(settings, plan)
-        with Journal.create(folder, record) as journal:
-            return _run(settings, plan, record, journal, available, None, on_case, check)
+    both = _with_earlier(folder, settings, plan, workers)
+    with workers_or_here(workers) as available, ExitStack() as journals:
+        for _, of_version, planned in both:
+            open_simulators(planned, available, first=of_version.in_flight is not None)
+        opened = []
+        for at, of_version, planned in both:
+            record = record_of(of_version, planned)
+            journal = journals.enter_context(Journal.create(at, record))
+            opened.append(_Open(of_version, planned, record, journal))
+        return _run(*opened, workers=available, on_case=on_case, check=check)
 
 
 def resume_campaign(
@@ -154,27 +162,38 @@ def resume_campaign(
         check: called after every batch.
         warn: called with a sentence on what was dropped.
     """
-    check_own(folder / SCENARIOS)
-    journal, before, dropped = Journal.reopen(folder)
-    plan = _plan_in(folder, settings, plan, workers)
-    with journal, workers_or_here(workers) as available:
-        record, changes, rewrite = _compared(before, settings, plan, force=force)
-        if dropped:
-            warn(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
-        open_simulators(plan, available, first=settings.in_flight is not None)
-        if before.settings.get(FORCED) or changes:
-            forced = {"from_case": len(before.outcomes), "differs": changes}
-            record[FORCED] = [*_forced(before), *([forced] if changes else [])]
-        if before.ran_again:
-            record[RAN_AGAIN] = before.ran_again
-        if rewrite:
-            journal.rewrite_settings(record)
-        else:
-            journal.note_own(record)
+    check_own(folder / SCENARIOS, folder / AGAINST)
+    with workers_or_here(workers) as available, ExitStack() as journals:
+        opened: list[_Open] = []
+        compared: list[tuple[Changes, bool]] = []
+        for at, of_version, planned in _with_earlier(folder, settings, plan, workers):
+            journal, before, dropped = Journal.reopen(at)
+            journals.enter_context(journal)
+            record, changes, rewrite = _compared(before, of_version, planned, force=force)
+            opened.append(_Open(of_version, planned, record, journal, before))
+            compared.append((changes, rewrite))
+            if dropped:
+                warn(f"{at}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
+        for earlier in opened[1:]:
+            earlier.keep_cases_of(opened[0])
+        for one, (changes, rewrite) in zip(opened, compared, strict=True):
+            open_simulators(one.plan, available, first=one.settings.in_flight is not None)
+            one.go_on(changes, rewrite=rewrite)
         if (on_outcome := on_before or on_case) is not None:
-            for outcome in before.outcomes:
+            for outcome in opened[0].history:
                 on_outcome(outcome)
-        return _run(settings, plan, record, journal, available, before, on_case, check)
+        return _run(*opened, workers=available, on_case=on_case, check=check)
+
+
+def _with_earlier(
+    folder: Path, settings: CampaignSettings, plan: SimulationPlan, workers: Workers | None
+) -> list[tuple[Path, CampaignSettings, SimulationPlan]]:
+    """Return folder, settings and plan of a campaign, then of the version that it is against."""
+    both = [(folder, settings, plan)]
+    earlier = resolve_earlier(settings, plan)
+    if earlier is not None:
+        both.append((folder / AGAINST, settings.earlier, earlier))
+    return [(at, of, _plan_in(at, of, planned, workers)) for at, of, planned in both]
 
 
 Changes = dict[str, tuple[Any, Any]]
@@ -244,52 +263,161 @@ def _files_now(recorded: Mapping[str, Any], name: str, known: Files) -> Files:
     return again | known
 
 
+class _Open:
+    """A campaign whose folder is open: what runs, and what the folder has.
+
+    Attributes:
+        settings: what to run.
+        plan: how its cases run.
+        journal: writes the folder.
+        before: what the folder had; None for a new one.
+        history: the outcomes of that.
+    """
+
+    def __init__(
+        self,
+        settings: CampaignSettings,
+        plan: SimulationPlan,
+        record: dict[str, Any],
+        journal: Journal,
+        before: Run | None = None,
+    ) -> None:
+        """Take settings, plan, what `campaign.json` holds, and the folder."""
+        self.settings, self.plan, self.journal, self.before = settings, plan, journal, before
+        self.history: list[Outcome] = [] if before is None else before.outcomes
+        self._record, self._noted = record, _Noted(record)
+
+    def go_on(self, changes: Changes, *, rewrite: bool) -> None:
+        """Write the record of a campaign that goes on, with what differs; see `_compared`."""
+        before, record = self.before, self._record
+        assert before is not None, "it goes on"  # noqa: S101
+        if before.settings.get(FORCED) or changes:
+            forced = {"from_case": len(before.outcomes), "differs": changes}
+            record[FORCED] = [*_forced(before), *([forced] if changes else [])]
+        if before.ran_again:
+            record[RAN_AGAIN] = before.ran_again
+        if rewrite:
+            self.journal.rewrite_settings(record)
+        else:
+            self.journal.note_own(record)
+        self._noted = _Noted(record)
+
+    def run_chunks(self, workers: Workers) -> RunChunks:
+        """Return what runs chunks of cases, and notes what the results say."""
+        return self._noted.noting(partial(evaluate_chunks, self.plan, workers=workers))
+
+    def append(self, *batches: Batch) -> None:
+        """Write batches, and what their results said."""
+        self.journal.append(*batches)
+        if self._noted.update(self._record):
+            self.journal.rewrite_settings(self._record)
+
+    def recorded(self) -> Batch:
+        """Return the outcomes before with their trajectories."""
+        before = self.before
+        return [] if before is None else [(o, before.trajectory(o.index)) for o in self.history]
+
+    def keep_cases_of(self, other: _Open) -> None:
+        """Drop the cases that another campaign of the same cases does not have.
+
+        Raises `UserError` where cases are missing.
+        """
+        count = len(other.history)
+        if self.before is None or [o.case for o in self.history[:count]] != [
+            o.case for o in other.history
+        ]:
+            raise UserError(
+                f"{self.journal.folder} has other cases than {other.journal.folder}: take both "
+                "from a copy"
+            )
+        if len(self.history) > count:
+            self.journal.keep(self.before, count)
+
+    def ended(self, outcomes: list[Outcome], workers: Workers) -> Run:
+        """Run some of all cases a second time; return the campaign."""
+        done = Run(self.journal.folder, outcomes)
+        repeats = repeat(done, self.settings, partial(evaluate, self.plan, workers=workers))
+        if repeats:
+            write_repeats(done, repeats)
+        return done
+
+
 def _run(
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    record: dict[str, Any],
-    journal: Journal,
+    campaign: _Open,
+    against: _Open | None = None,
+    *,
     workers: Workers,
-    before: Run | None,
     on_case: OnCase | None,
     check: Callable[[], None],
 ) -> Run:
     """Run what is missing of a campaign, then some cases a second time; export the worst."""
-    history = [] if before is None else before.outcomes
-    picks = make_sampler(settings.sampler, settings.pool, settings.seed, _twin(settings, plan))
-    search_on_two_cores(picks, workers, settings.cases - len(history))
-    sampler, audit = settings.audited(picks), settings.audit_plan
-    motions = None
-    if before is not None and sampler.uses_predictions:
-        motions = {o.index: before.trajectory(o.index).motion for o in history}
-    noted, ended = _Noted(record), list(history)
-    run_all = noted.noting(partial(evaluate_chunks, plan, workers=workers))
-    if settings.in_flight is None:
-        search = _in_batches(settings, sampler, workers, run_all, on_case, history, motions)
-    else:
-        flight = Flight(
-            *(sampler, settings.cases, settings.in_flight, history, motions),
-            by_rounds(settings.stopping_rule(), settings.in_flight),
-        )
-        search = conduct_in_flight(flight, run_all, workers.chunk_size, on_case)
-    with closing(search):
+    settings, ended = campaign.settings, list(campaign.history)
+    audit = settings.audit_plan
+    with closing(_search(campaign, against, workers, on_case)) as search:
         for together in search:
             if audit is not None:
                 together = audit.mark_batches(together, ended)  # noqa: PLW2901
-            journal.append(*together)
+            campaign.append(*together)
             ended += [outcome for batch in together for outcome, _ in batch]
-            if noted.update(record):
-                journal.rewrite_settings(record)
             check()
-    done = Run(journal.folder, ended)
-    repeats = repeat(done, settings, partial(evaluate, plan, workers=workers))
-    if repeats:
-        write_repeats(done, repeats)
+    done = campaign.ended(ended, workers)
     for outcome in spread_failures(done.outcomes)[:EXPORTED_FAILURES]:
-        folder = journal.folder / SCENARIOS / case_name(outcome.index)
+        folder = done.folder / SCENARIOS / case_name(outcome.index)
         if not os.path.lexists(folder):  # written whole, before the campaign was stopped
-            export_case(done, outcome.index, folder, plan.road)
+            export_case(done, outcome.index, folder, campaign.plan.road)
     return done
+
+
+def _search(
+    campaign: _Open, against: _Open | None, workers: Workers, on_case: OnCase | None
+) -> Generator[list[Batch], None, None]:
+    """Return what runs the missing cases; it yields batches that ended together."""
+    if against is not None:
+        return _against(campaign, against, workers, on_case)
+    settings, plan, history = campaign.settings, campaign.plan, campaign.history
+    picks = make_sampler(settings.sampler, settings.pool, settings.seed, twin_of(settings, plan))
+    search_on_two_cores(picks, workers, settings.cases - len(history))
+    sampler = settings.audited(picks)
+    motions = None
+    if campaign.before is not None and sampler.uses_predictions:
+        motions = {o.index: t.motion for o, t in campaign.recorded()}
+    run_all = campaign.run_chunks(workers)
+    if settings.in_flight is None:
+        return _in_batches(settings, sampler, workers, run_all, on_case, history, motions)
+    flight = Flight(
+        *(sampler, settings.cases, settings.in_flight, history, motions),
+        by_rounds(settings.stopping_rule(), settings.in_flight),
+    )
+    return conduct_in_flight(flight, run_all, workers.chunk_size, on_case)
+
+
+def _against(
+    campaign: _Open, against: _Open, workers: Workers, on_case: OnCase | None
+) -> Generator[list[Batch], None, None]:
+    """Run the missing cases with both versions; yield the batches of the new one.
+
+    A batch of the earlier version is written before.
+    """
+    settings = campaign.settings
+    twins = twins_of(settings, campaign.plan, against.plan)
+    sampler = make_sampler(settings.sampler, settings.pool, settings.seed, twins)
+    search = PairedSearch(
+        sampler, twins if sampler.uses_predictions else None, settings.stopping_rule()
+    )
+    search.tell(campaign.recorded(), against.recorded())
+    both = search.batches(
+        *(by_batch(one.run_chunks(workers), workers.chunk_size) for one in (campaign, against)),
+        cases=settings.cases,
+        batch=settings.batch,
+        last=campaign.history[-1] if campaign.history else None,
+        on_case=on_case,
+    )
+    ran = list(against.history)
+    for of_new, of_old in both:
+        against.append(of_old)
+        ran += [outcome for outcome, _ in of_old]
+        yield [of_new]
+    against.ended(ran, workers)
 
 
 def _in_batches(
@@ -350,12 +478,19 @@ class _Noted:
         return True
 
 
-def _twin(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
+def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
     """Return the twin of the VUT, which has learned from earlier campaigns."""
     learned = lessons(settings.learn_from, settings.scenario)
     others = [motion for motions in learned.values() for motion in motions]
     lines = centre_lines(plan.road)
     return Twin(settings.pool, plan.povs, settings.seed, others, plan.criterion, lines)
+
+
+def twins_of(settings: CampaignSettings, new: SimulationPlan, old: SimulationPlan) -> TwinPair:
+    """Return the twins of both versions of a campaign against an earlier one."""
+    papers = settings.criterion.is_papers
+    limit_m = settings.scenario.dx_crash_m if papers else DX_CRASH_M
+    return TwinPair(twin_of(settings, new), twin_of(settings, old), limit_m)
 
 
 def _plan_in(

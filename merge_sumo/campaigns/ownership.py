@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +18,8 @@ RECORD: Final = "campaign.json"
 """File of a campaign's folder that names its code, with all other settings."""
 FILES: Final = ("vut_files", "pov_files")
 """Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
+OTHERS: Final = ("pov", "against")
+"""Keys of `campaign.json` that name a controller beside the VUT."""
 
 
 def note_run(folder: Path, at: Path, record: Mapping[str, Any], *, begun: bool) -> None:
@@ -26,17 +28,18 @@ def note_run(folder: Path, at: Path, record: Mapping[str, Any], *, begun: bool) 
     `folder` is the folder as far as it is written, `at` the path that it has or will take, `begun`
     whether this user began the campaign there.
     """
-    vut, command, pov = _named(record)
-    if runs_code(vut, command) or (pov is not None and runs_code(pov, None)):
+    vut, command, others = _named(record)
+    if runs_code(vut, command) or any(runs_code(spec, None) for spec in others.values()):
         note_own(folder, at, RECORD, _code(record), begun=begun)
 
 
 def check_own_code(folder: Path, recorded: Mapping[str, Any], given: Mapping[str, object]) -> None:
     """Raise `UserError` where a folder has code run that neither is this user's nor was `given`."""
-    vut, command, pov = _named({**recorded, **given})
+    vut, command, others = _named({**recorded, **given})
     vut_given = ("vut" if command is None else "vut_command") in given
-    for spec, started, named in ((vut, command, vut_given), (pov, None, "pov" in given)):
-        if spec is None or named or not runs_code(spec, started):
+    own = ((spec, None, name in given) for name, spec in others.items())
+    for spec, started, named in ((vut, command, vut_given), *own):
+        if named or not runs_code(spec, started):
             continue
         why = doubt(folder, RECORD, _code(recorded))
         if why is not None:
@@ -46,16 +49,19 @@ def check_own_code(folder: Path, recorded: Mapping[str, Any], given: Mapping[str
             )
 
 
-def _named(record: Mapping[str, Any]) -> tuple[str, str | None, str | None]:
-    vut, command, pov = (record.get(name) for name in ("vut", "vut_command", "pov"))
-    return str(vut), None if command is None else str(command), None if pov is None else str(pov)
+def _named(record: Mapping[str, Any]) -> tuple[str, str | None, dict[str, str]]:
+    """Return the VUT, its command, and the other controllers by the name of their setting."""
+    command = record.get("vut_command")
+    others = {name: str(record[name]) for name in OTHERS if record.get(name) is not None}
+    return str(record.get("vut")), None if command is None else str(command), others
 
 
 def _code(record: Mapping[str, Any]) -> Code:
     """Return the code that a record names, with its files as far as they are as recorded."""
-    vut, command, pov = _named(record)
+    vut, command, others = _named(record)
     here = Path(os.path.realpath(Path.cwd()))
-    named = _files_named(vut, command, pov)
+    specs = (vut, *others.values())
+    named = _files_named(specs, command)
     files = {str(here / path): sha256_of(path) for path in named if path.is_file()}
     for name in FILES:
         known = record.get(name)
@@ -64,16 +70,19 @@ def _code(record: Mapping[str, Any]) -> Code:
             if sha256 is not None and sha256_of(Path(file)) == sha256:
                 files[str(here / file)] = sha256
     relative = command is not None or not all(
-        any(path.is_absolute() for path in _files_named(spec, None, None))
-        for spec in (vut, pov)
-        if spec is not None and runs_code(spec, None)
+        any(path.is_absolute() for path in _files_named([spec], None))
+        for spec in specs
+        if runs_code(spec, None)
     )
-    return Code((vut, command, pov), files, str(here) if relative else "")
+    # Without a version that a campaign is against, the names are those of earlier releases.
+    against = [others["against"]] if "against" in others else []
+    code_named = (vut, command, others.get("pov"), *against)
+    return Code(code_named, files, str(here) if relative else "")
 
 
-def _files_named(vut: str, command: str | None, pov: str | None) -> list[Path]:
+def _files_named(specs: Iterable[str], command: str | None) -> list[Path]:
     """Return the files that specs and the words of a command name."""
-    names = [path for spec in (vut, pov or "") if (path := file_named(spec))]
+    names = [path for spec in specs if (path := file_named(spec))]
     with suppress(ValueError):
         names += shlex.split(command or "")
     return [Path(name) for name in names if "\0" not in name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -31,3 +32,14 @@ def resolve(settings: CampaignSettings, net: Path | None = None) -> SimulationPl
         povs=povs,
         criterion=settings.criterion,
     )
+
+
+def resolve_earlier(settings: CampaignSettings, plan: SimulationPlan) -> SimulationPlan | None:
+    """Return the plan of the version that a campaign is against; None where it is against none.
+
+    It is the plan of the campaign with another VUT, which is loaded as by `resolve`.
+    """
+    if settings.against is None:
+        return None
+    options = settings.earlier.vut_options(plan.povs.policies)
+    return replace(plan, vut=VutFactory(settings.against, options))

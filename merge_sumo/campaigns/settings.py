@@ -28,6 +28,7 @@ from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, OWN, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.registry import kind_of
 
 DEFAULT_CASES: Final = 800
 
@@ -52,6 +53,7 @@ class CampaignSettings:
     in_process: bool = False
     policies: str | None = None
     pov: str | None = None
+    against: str | None = None
     learn_from: tuple[str, ...] = ()
     scenario: Scenario
     fail_when: str = PAPER_CRITERION.fail_when
@@ -85,6 +87,8 @@ class CampaignSettings:
             )
         if self.in_flight is not None:
             self._check_in_flight(self.in_flight)
+        if self.against is not None:
+            self._check_against(self.against)
         if self.audit is not None and self.audit > self.cases:
             raise UserError(
                 f"--audit is {self.audit} and --cases is {self.cases}: audit cases are among the "
@@ -114,6 +118,7 @@ class CampaignSettings:
             ("--vut-command", self.vut_command),
             ("--policies", self.policies),
             ("--pov", self.pov),
+            ("--against", self.against),
             *(("--learn-from", folder) for folder in self.learn_from),
         ):
             if text is not None and not _is_text(text):
@@ -147,6 +152,35 @@ class CampaignSettings:
                 f"--in-flight is for samplers that learn from outcomes: --sampler {self.sampler} "
                 "waits for none, and keeps all workers busy without it"
             )
+
+    def _check_against(self, against: str) -> None:
+        for option, given in (
+            ("--in-flight", self.in_flight),
+            ("--audit", self.audit),
+            ("--learn-from", self.learn_from or None),
+        ):
+            if given is not None:
+                raise UserError(
+                    f"{option} does not go with --against, which runs each batch with two "
+                    "versions: leave one of them away"
+                )
+        if kind_of(against).by_command:
+            raise UserError(
+                f"--against is {against}: --vut-command starts one controller; name an earlier "
+                "version that needs no command"
+            )
+        if against == self.vut:
+            raise UserError(f"--against is {against}, and so is --vut: name two versions")
+
+    @property
+    def earlier(self) -> CampaignSettings:
+        """The settings of the version that this campaign is against, with the same cases.
+
+        Raises `UserError` where the campaign is against none.
+        """
+        if self.against is None:
+            raise UserError("the campaign has no --against")
+        return replace(self, vut=self.against, against=None, vut_command=None)
 
     def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
         """Return what says of the outcomes so far whether the search is over, if anything does."""

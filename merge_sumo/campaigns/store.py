@@ -457,14 +457,9 @@ class Journal:
         try:
             journal = cls(folder, place, outcomes, begun=begun_here(folder, SETTINGS))
             run = Run(folder)
-            whole = run.outcomes[: run.whole_batches()]
-            dropped = len(run.outcomes) - len(whole) + run.torn
-            run.outcomes = whole
+            dropped = len(run.outcomes) - run.whole_batches() + run.torn
             if dropped:
-                outcomes.seek(0)
-                length = sum(len(line) for line, _ in zip(outcomes, whole, strict=False))
-                outcomes.truncate(length)
-                os.fsync(outcomes.fileno())
+                journal.keep(run, run.whole_batches())
         except OSError as error:
             undo.close()
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
@@ -472,6 +467,14 @@ class Journal:
             undo.close()
             raise
         return journal, run, dropped
+
+    def keep(self, run: Run, cases: int) -> None:
+        """Drop the outcomes of a run behind its first cases, from the folder and from memory."""
+        del run.outcomes[cases:]
+        self._outcomes.seek(0)
+        length = sum(len(line) for line, _ in zip(self._outcomes, run.outcomes, strict=False))
+        self._outcomes.truncate(length)
+        os.fsync(self._outcomes.fileno())
 
     def append(self, *batches: Batch) -> None:
         """Write batches and sync them to the disk: several at once take little more time than one.

@@ -17,7 +17,18 @@ if TYPE_CHECKING:
     from merge_sumo.api import CampaignRun, CaseRun, RunComparison
 
 SETTINGS: Final = (
-    *("vut", "level", "sampler", "cases", "batch", "in_flight", "seed", "learn_from", "v_vut0"),
+    *(
+        "vut",
+        "against",
+        "level",
+        "sampler",
+        "cases",
+        "batch",
+        "in_flight",
+        "seed",
+        "learn_from",
+        "v_vut0",
+    ),
 )
 COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
 SETUP_OF_A_CASE: Final = tuple(name for name in SETUP if name != "in_process")
@@ -73,8 +84,8 @@ def campaign(
         typer.Option(
             metavar="GATE",
             help='Exit with 1 if there are failures, "human failures" (the POV does no more than '
-            'people), errors, timeouts, or "fmc>X": an FMC above X at some level. May be given '
-            "several times.",
+            'people), errors, timeouts, "fmc>X": an FMC above X at some level, or, with '
+            "--against, regressions. May be given several times.",
             autocompletion=complete.gates,
         ),
     ] = None,
@@ -90,6 +101,8 @@ def campaign(
     nothing was tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
+
+    Example:  merge-sumo campaign --vut design1 --against design2 --level 0 --cases 40
     """
     from merge_sumo import api
 

@@ -128,6 +128,7 @@ def gates(incomplete: str) -> Completions:
         (HUMAN_FAILURES, "a case fails in which the POV does no more than people"),
         ("errors", "a case errs"),
         ("timeouts", "a case never ends"),
+        ("regressions", "a case fails that passes with --against"),
     )
     return _matching(incomplete, [*known, ("fmc>", "coverage of failures above a number")])
 

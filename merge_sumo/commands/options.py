@@ -18,7 +18,7 @@ from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
-        *("vut", "vut_command", "level", "pov", "policies", "scenario", "net", "v_vut0"),
+        *("vut", "vut_command", "against", "level", "pov", "policies", "scenario", "net", "v_vut0"),
         *(
             "mainline",
             "ramp",
@@ -108,6 +108,14 @@ SEED: Final = option(int, 0, "Same seed, same cases.")
 OPTIONS: Final[Mapping[str, Shared]] = {
     "vut": (VutOption, ""),
     "level": option(str, "all", "POV level: 0, 1, 2, own or all.", autocompletion=complete.levels),
+    "against": option(
+        str | None,
+        None,
+        "An earlier version of the VUT, of any kind but traci: each case runs with both, and the "
+        "sampler looks for those that the VUT alone fails.",
+        metavar="SPEC",
+        autocompletion=complete.vuts,
+    ),
     "pov": option(
         str | None,
         None,

@@ -3,7 +3,9 @@
 Every case is a test case, in a test suite per POV level, so that a CI system shows the share that
 passes: what the criterion calls a failure and a timeout are a `failure`, an error of the VUT or of
 the simulation an `error`. The type of a failure is its severity: contact, conflict, harsh or safe.
-A first suite has the gates, and whether anything was tested. Times are simulated seconds.
+A first suite has the gates, and whether anything was tested. A campaign against an earlier version
+of the VUT has a suite of the cases that one of both fails, in which what broke is a `failure`.
+Times are simulated seconds.
 """
 
 from __future__ import annotations
@@ -17,9 +19,12 @@ from lxml import etree
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.merging import place_in_words
 from merge_sumo.analysis.verdict import GateResult, Verdict, message_of
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.against import AGAINST
+from merge_sumo.campaigns.store import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
+from merge_sumo.studies.versions import Change, compare_against
 from merge_sumo.system.folders import check_new, check_new_file, write_new
+from merge_sumo.system.printable import printable
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
@@ -27,6 +32,9 @@ from merge_sumo.values.trajectory import End
 CLASS: Final = "merge-sumo"
 FAILED: Final = "failed"
 """Type of a failure without a severity: the VUT never reached M, and the criterion speaks of it."""
+
+REGRESSION: Final = "regression"
+"""Type of a case that fails and passes with an earlier version."""
 
 
 def check_junit(path: Path, folder: Path) -> None:
@@ -58,6 +66,7 @@ def junit(
     """Return a campaign as the element `testsuites`."""
     root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
     _gates(root, verdict, gates)
+    _against(root, run)
     for level in levels:
         suite = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
         for outcome in run.outcomes:
@@ -80,6 +89,22 @@ def _gates(root: etree._Element, verdict: Verdict, gates: Sequence[GateResult]) 
         test = _test(suite, gate.name, f"{CLASS}.gates", 0.0)
         if gate.met:
             _wrong(test, "failure", "GATE", gate.sentence)
+    _count(suite)
+
+
+def _against(root: etree._Element, run: Run) -> None:
+    """Add what changed from the version that a campaign is against, if it is against one."""
+    compared = compare_against(run)
+    if compared is None:
+        return
+    earlier = printable(str(run.settings[AGAINST])[:NAME_CHARACTERS])
+    suite = etree.SubElement(root, "testsuite", name=f"against {earlier}")
+    for one in compared.cases:
+        name = f"case {one.index}: {described(one.case)}"
+        time_s = 0.0 if one.b is None else one.b.measures.t_end_s
+        test = _test(suite, name, f"{CLASS}.against", time_s)
+        if one.change is Change.BROKE:
+            _wrong(test, "failure", REGRESSION, one.became)
     _count(suite)
 
 

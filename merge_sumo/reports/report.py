@@ -21,6 +21,7 @@ from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.report_sections import head_words, sections_of, shared_words
+from merge_sumo.reports.version_pages import AGAINST_PAGE, write_against
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
 from merge_sumo.system.workers import Workers
 
@@ -39,19 +40,22 @@ def write_report(
 ) -> Path:
     """Write `report.html` into the folder of a run, in place of an older one; return its path.
 
-    See `ReportModel` for the other arguments. Raises `UserError` when it cannot be written, or what
-    is there is no report of ours.
+    A campaign against an earlier version of the VUT has a page of what broke beside it. See
+    `ReportModel` for the other arguments. Raises `UserError` when it cannot be written, or what is
+    there is no report of ours.
     """
     check_report(run.folder)
     path = run.folder / REPORT
     html = report_page(run, summary, workers, on_part, people)
     replace_own(path, html.encode(errors="backslashreplace"))
+    write_against(run)
     return path
 
 
 def check_report(folder: Path) -> None:
     """Raise `UserError` where `report.html` in a folder is something else than our report."""
     check_page(folder / REPORT)
+    check_own(folder / AGAINST_PAGE)
 
 
 def check_page(path: Path) -> None:

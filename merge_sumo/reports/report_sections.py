@@ -43,10 +43,12 @@ from merge_sumo.reports.lane_picture import picture_of
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
+from merge_sumo.reports.version_pages import AGAINST_PAGE
 from merge_sumo.studies.counterfactuals import in_a_sentence
 from merge_sumo.studies.crosscheck import crosscheck_of
 from merge_sumo.studies.stress import NOTHING
 from merge_sumo.studies.truth import TRUTH_CASES
+from merge_sumo.studies.versions import Change, compare_against
 from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.registry import Registry
 from merge_sumo.values.fmc import radius_for
@@ -334,6 +336,20 @@ def _duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{seconds / 60.0:.1f} min"
 
 
+def _against(model: ReportModel) -> dict[str, Any] | None:
+    """Return what changed from the version that a campaign is against; None where it is none."""
+    compared = compare_against(model.run)
+    if compared is None:
+        return None
+    levels = compared.levels.items()
+    return {
+        "earlier": _shown(model.run.settings["against"]),
+        "page": AGAINST_PAGE,
+        "rows": [(level_name(level), one, one.changes) for level, one in levels],
+        "change": Change,
+    }
+
+
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> Any:
     """Yield (name, value) of settings, nested ones with their path."""
     for name, value in settings.items():
@@ -362,6 +378,7 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "numbers": ReportSection(template=_own("numbers"), words=_numbers),
         "where": ReportSection(template=_own("where"), words=_maps),
         "board": ReportSection(template=_own("board"), words=_board),
+        "against": ReportSection(template=_own("against"), words=_against),
         "merging": ReportSection(template=_own("merging"), words=_merging),
         "people": ReportSection(template=_own("people"), words=_people),
         "words": ReportSection(template=_own("words"), words=_in_words),

@@ -19,13 +19,14 @@ from merge_sumo.analysis.diagnosis import Kind
 from merge_sumo.analysis.merging import SOURCE, MergeStatistics
 from merge_sumo.analysis.people import LevelBesidePeople
 from merge_sumo.analysis.verdict import in_words
+from merge_sumo.campaigns.against import AGAINST, earlier_run
 from merge_sumo.campaigns.store import Run
 from merge_sumo.reports.lane_picture import picture_of
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.static_map import map_of
 from merge_sumo.studies.history import History, LevelOfVersion, RegionChange
-from merge_sumo.studies.versions import Change, ComparedCase, RunComparison
-from merge_sumo.system.folders import write_new
+from merge_sumo.studies.versions import Change, ComparedCase, RunComparison, compare_against
+from merge_sumo.system.folders import replace_own, write_new
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Bounds, lane_of, level_name
@@ -119,6 +120,8 @@ class Chart:
     dot: tuple[float, float] | None = None
 
 
+AGAINST_PAGE: Final = f"{AGAINST}.html"
+"""Page in the folder of a campaign against an earlier version."""
 STYLES: Final = ("report.css", "history.css")
 
 
@@ -134,13 +137,30 @@ Motions = Mapping[tuple[str, int], Trajectory]
 """What a VUT did in a case of the other's campaign, by that campaign, "A" or "B", and index."""
 
 
+def write_against(run: Run) -> None:
+    """Write the page of a campaign against an earlier version into its folder; else do nothing."""
+    compared, earlier = compare_against(run), earlier_run(run)
+    if compared is None or earlier is None:
+        return
+    recorded = earlier.trajectories(case.index for case in compared.cases[:SHOWN])
+    motions = {("B", index): trajectory for index, trajectory in recorded.items()}
+    html = comparison_page(compared, earlier, run, motions, same_cases=True)
+    replace_own(run.folder / AGAINST_PAGE, html.encode(errors="backslashreplace"))
+
+
 def comparison_page(
-    compared: RunComparison, a: Run, b: Run, motions: Motions, tolerance: float = 0.0
+    compared: RunComparison,
+    a: Run,
+    b: Run,
+    motions: Motions,
+    tolerance: float = 0.0,
+    *,
+    same_cases: bool = False,
 ) -> str:
     """Return the page of a comparison of two campaigns as HTML, with both motions of each case.
 
     `motions` are those of the cases that were run again with the other VUT; B may be worse by
-    `tolerance`.
+    `tolerance`. `same_cases` says that both campaigns have the same cases.
     """
     runs, lane_m = {"A": a, "B": b}, lane_of(a.scenario)
     shown = [_shown(case, runs, motions) for case in compared.cases[:SHOWN]]
@@ -156,6 +176,7 @@ def comparison_page(
         styles=STYLES,
         runs=runs,
         compared=compared,
+        same_cases=same_cases,
         why=compared.worse(tolerance),
         tolerance=tolerance,
         counts=_counts(compared),

@@ -3,8 +3,9 @@
 Two campaigns have different cases, so `compare_runs` runs the failures, errors and timeouts of each
 with the VUT of the other: then both VUTs have been tried on the same cases, those in which at least
 one of them failed or gave no verdict. `rerun` runs the recorded cases of one campaign with a
-changed VUT. Both return a `RunComparison`; A is the version before, B the version after. Volumes
-are failure mode coverages (FMC) of what is known of both.
+changed VUT. `compare_against` reads a campaign that ran both versions in the same cases
+(`campaigns/against.py`). All return a `RunComparison`; A is the version before, B the version
+after. Volumes are failure mode coverages (FMC) of what is known of both.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any, Final
 from merge_sumo.analysis.merging import MergeStatistics, merging_of
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.verdict import judge
+from merge_sumo.campaigns.against import earlier_run
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.repeats import cause
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
@@ -495,6 +497,32 @@ def _run_again(
     return again
 
 
+# One campaign of both versions, which ran the same cases.
+
+
+def compare_against(run: Run) -> RunComparison | None:
+    """Return what changed to a campaign's VUT from the version that the campaign is against.
+
+    A is that version, B the VUT; both ran all cases. None where the campaign is against none.
+    """
+    earlier = earlier_run(run)
+    if earlier is None:
+        return None
+    before = earlier.outcomes[: len(run.outcomes)]
+    cases = _telling(before, run.outcomes, "B")
+    evidence = f"both ran the same {counted(len(before), 'case')}"
+    return _comparison(cases, before, run.outcomes, run.levels, evidence, same_cases=True)
+
+
+def _telling(before: Sequence[Outcome], after: Sequence[Outcome], run: str) -> list[ComparedCase]:
+    """Return the same cases of A and B in which one failed or gave no verdict."""
+    return [
+        ComparedCase(run, a.index, a, b)
+        for a, b in zip(before, after, strict=True)
+        if any(o.failed or not o.is_tested for o in (a, b))
+    ]
+
+
 # One campaign: its recorded cases with a changed VUT.
 
 
@@ -616,13 +644,10 @@ def rerun(
             by_index[old.index] = now.outcome(old.index, old.batch)
             on_case(1)
     after = [by_index[outcome.index] for outcome in before]
-    cases = [
-        ComparedCase("A", a.index, a, b)
-        for a, b in zip(before, after, strict=True)
-        if any(o.failed or not o.is_tested for o in (a, b))
-    ]
     evidence = f"{counted(len(before), 'case')} ran again"
-    compared = _comparison(cases, before, after, levels, evidence, same_cases=True)
+    compared = _comparison(
+        _telling(before, after, "A"), before, after, levels, evidence, same_cases=True
+    )
     unrepeated = _unrepeated(before, after) if _same_vut(run, settings) else ()
     return Rerun(settings.vut, before, after, compared, unrepeated)
 

@@ -1,0 +1,46 @@
+"""The twins of two versions of a VUT: together they predict where the versions differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from merge_sumo.samplers.prediction_skill import Query
+from merge_sumo.twin.twin import Twin
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.regression import regression_gaps_m
+from merge_sumo.values.score import Outcome
+
+
+class TwinPair:
+    """Predicts what stands for the gap of a regression; see `Predictor` and `regression`.
+
+    Each member of the new version's twin is paired with the member of the old version's twin that
+    learned from the same cases.
+    """
+
+    def __init__(self, new: Twin, old: Twin, limit_m: float) -> None:
+        """Take a twin of each version; a predicted gap below `limit_m` is a failure."""
+        self._new, self._old, self._limit_m = new, old, limit_m
+
+    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
+        """Take outcomes of the new version and their motions, (T + 1, A, 3), by index."""
+        self._new.tell(outcomes, motions)
+
+    def tell_old(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
+        """Take outcomes of the old version and their motions, in the same way."""
+        self._old.tell(outcomes, motions)
+
+    def can_predict(self, level: int) -> bool:
+        """Return whether both twins can predict cases of a level."""
+        return self._new.can_predict(level) and self._old.can_predict(level)
+
+    def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
+        """Return what stands for the gap of a regression in each query; see `Predictor`."""
+        return [
+            np.asarray(regression_gaps_m(new_m, old_m, self._limit_m))
+            for new_m, old_m in zip(
+                self._new.predict(queries), self._old.predict(queries), strict=True
+            )
+        ]

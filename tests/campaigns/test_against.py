@@ -1,0 +1,205 @@
+"""A campaign against an earlier version finds what the new one fails that passed before."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import assert_refused
+from campaigning import resume_campaign, run_campaign
+from scipy.spatial import cKDTree
+
+from merge_sumo.campaigns.against import AGAINST, earlier_run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run
+from merge_sumo.engine.evaluate import evaluation_workers
+from merge_sumo.errors import UserError
+from merge_sumo.samplers.candidates import spread_out
+from merge_sumo.studies.versions import Change, compare_against
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.fmc import RADIUS
+from merge_sumo.values.scenario import DT_S, US23, V_VUT0_MPS
+
+OLD = "def f(seen):\n    return 0.0\n"
+NEW = "def f(seen):\n    return 0.5 if seen.t_s < 3.0 else 0.0\n"
+"""The old version keeps its speed, and the new one arrives some 0.8 s earlier."""
+
+
+def gap_m(case: Case, accelerates_s: float) -> float:
+    """Return the gap at M to a POV that keeps its speed, by eq. (4)."""
+    x_m, v_mps, step = US23.x_vut0_m, V_VUT0_MPS, 0
+    while x_m < 0.0:
+        x_m += v_mps * DT_S
+        v_mps += 0.5 * DT_S if step * DT_S < accelerates_s - 1e-9 else 0.0
+        step += 1
+    return case.x_pov0_m + case.v_pov0_mps * step * DT_S - x_m
+
+
+def broke(case: Case) -> bool:
+    """Return whether the new version alone fails, by the formula."""
+    return abs(gap_m(case, 3.0)) < 6.0 <= abs(gap_m(case, 0.0))
+
+
+@pytest.fixture(autouse=True)
+def both(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+    Path("old.py").write_text(OLD)
+    Path("new.py").write_text(NEW)
+
+
+def settings(**changes) -> CampaignSettings:
+    values = {"vut": "new.py:f", "against": "old.py:f", "levels": (0,), "cases": 20, "seed": 3}
+    values["in_process"] = True  # quicker than a process for each version
+    return CampaignSettings(scenario=US23, **{**values, **changes})
+
+
+def lines(folder: Path) -> bytes:
+    return (folder / OUTCOMES).read_bytes() + (folder / AGAINST / OUTCOMES).read_bytes()
+
+
+class TestFinds:
+    def test_most_of_a_known_difference_region(self):
+        run = run_campaign(settings(cases=40), Path("run"))
+        compared = compare_against(run)
+        found = [one.case for one in compared.cases if one.change is Change.BROKE]
+        # Each case has the verdict of the formula, with both versions.
+        assert found == [case for case in found if broke(case)]
+        assert len(found) == sum(broke(outcome.case) for outcome in run.outcomes)
+        pool = Pool(levels=(0,), scenario=US23)
+        points = spread_out(4000, 2, np.random.default_rng(0))
+        truth = points[[broke(case) for case in pool.cases(points, 0)]]
+        assert len(truth) > 100
+        distance, _ = cKDTree(to_unit(found, 0)).query(truth)
+        assert (distance <= RADIUS).mean() >= 0.9
+
+    def test_nothing_where_the_versions_drive_alike(self):
+        Path("new.py").write_text("def f(seen):\n    return 0.0 * seen.t_s\n")
+        run = run_campaign(settings(), Path("run"))
+        assert {one.change for one in compare_against(run).cases} <= {Change.BOTH_FAIL}
+
+    def test_the_old_version_is_a_campaign_of_its_own(self):
+        run = run_campaign(settings(cases=10), Path("run"))
+        earlier = earlier_run(run)
+        assert earlier.settings["vut"] == "old.py:f"
+        assert [o.case for o in earlier.outcomes] == [o.case for o in run.outcomes]
+        assert all(o.measures.dx_m == pytest.approx(gap_m(o.case, 0.0)) for o in earlier.outcomes)
+
+
+class TestBytes:
+    @pytest.fixture
+    def whole(self) -> bytes:
+        run_campaign(settings(), Path("whole"))
+        return lines(Path("whole"))
+
+    def test_are_the_same_on_workers(self, whole):
+        with evaluation_workers(2) as workers:
+            run_campaign(settings(), Path("run"), workers=workers)
+        assert lines(Path("run")) == whole
+
+    def test_are_the_same_after_a_stop_between_the_two_versions(self, whole):
+        left = 2
+
+        def stop() -> None:
+            nonlocal left
+            left -= 1
+            if not left:
+                raise Stopped(signal.SIGINT)
+
+        with pytest.raises(Stopped):
+            run_campaign(settings(), Path("run"), check=stop)
+        ran = len(Run(Path("run")).outcomes)
+        # The batch of the old version is written first: here the new one's was not.
+        kept = (Path("run") / OUTCOMES).read_bytes().splitlines(keepends=True)[:10]
+        (Path("run") / OUTCOMES).write_bytes(b"".join(kept))
+        assert len(kept) < ran == len(Run(Path("run") / AGAINST).outcomes)
+        resume_campaign(Path("run"))
+        assert lines(Path("run")) == whole
+
+    def test_are_the_same_after_a_torn_line_of_the_old_version(self, whole):
+        shutil.copytree("whole", "run")
+        for folder in (Path("run"), Path("run") / AGAINST):
+            (folder / OUTCOMES).write_bytes((folder / OUTCOMES).read_bytes()[:-30])
+        resume_campaign(Path("run"), trust=True)
+        assert lines(Path("run")) == whole
+
+
+class TestRefuses:
+    def test_to_go_on_where_the_old_version_has_fewer_cases(self):
+        run_campaign(settings(cases=15), Path("run"))
+        old = Path("run") / AGAINST
+        text = (old / OUTCOMES).read_bytes().splitlines(keepends=True)
+        (old / OUTCOMES).write_bytes(b"".join(text[:10]))
+        with pytest.raises(UserError, match="has other cases than"):
+            resume_campaign(Path("run"), {"cases": 20})
+        with pytest.raises(UserError, match="has other cases than"):
+            compare_against(Run(Path("run")))
+
+    @pytest.mark.parametrize(
+        ("changes", "sentence"),
+        [
+            ({"in_flight": 4}, "--in-flight does not go with --against"),
+            ({"audit": 4}, "--audit does not go with --against"),
+            ({"learn_from": ("run",)}, "--learn-from does not go with --against"),
+            ({"against": "traci"}, "name an earlier version that needs no command"),
+            ({"against": "new.py:f"}, "name two versions"),
+        ],
+    )
+    def test_what_does_not_go_together(self, changes, sentence):
+        with pytest.raises(UserError, match=sentence):
+            settings(**changes)
+
+    def test_a_changed_old_version(self):
+        run_campaign(settings(cases=10), Path("run"))
+        Path("old.py").write_text(OLD + "\n")
+        with pytest.raises(UserError, match=r"vut_files.*old\.py differs: .*against"):
+            resume_campaign(Path("run"), {"cases": 20})
+        assert json.loads((Path("run") / SETTINGS).read_text())["cases"] == 10
+
+    def test_to_run_the_old_version_that_a_received_folder_names(self, monkeypatch):
+        Path("old.py").write_text(f"open({str(Path('it-ran').absolute())!r}, 'w')\n{OLD}")
+        run_campaign(settings(vut="design2", cases=10), Path("run"))
+        Path("it-ran").unlink(missing_ok=True)
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(Path("theirs").absolute()))
+        with pytest.raises(UserError, match=r"the controller that it names, old\.py:f"):
+            resume_campaign(Path("run"), {"cases": 20})
+        assert not Path("it-ran").exists()
+
+    def test_a_link_in_the_place_of_the_old_version(self):
+        run_campaign(settings(cases=10), Path("run"))
+        shutil.move(Path("run") / AGAINST, "elsewhere")
+        (Path("run") / AGAINST).symlink_to(Path("elsewhere").absolute())
+        with pytest.raises(UserError, match="link"):
+            resume_campaign(Path("run"), {"cases": 20})
+
+
+class TestCommand:
+    def test_gate_and_page_say_what_broke(self, call):
+        command = ("campaign", "--vut", "new.py:f", "--against", "old.py:f", "--level", "0")
+        command = (*command, "--cases", "25", "--seed", "3", "--out", "run", "-q")
+        said = call(*command, "--gate", "regressions", "--junit", "run.xml", "--json")
+        assert said.code == 1
+        result = json.loads(said.out)
+        count = result["against"]["levels"]["0"]["changes"]["broke"]
+        assert count == sum(broke(outcome.case) for outcome in Run(Path("run")).outcomes) > 0
+        assert f"gate regressions: met ({count} regression" in said.err
+        page = Path("run/against.html").read_text()
+        assert f'<h2 id="change-1">Broke: {count}</h2>' in page
+        assert "new.py:f" in page
+        assert "old.py:f" in page
+        assert "against.html" in Path("run/report.html").read_text()
+        assert (
+            f'failures="{count}"' in Path("run.xml").read_text().split("against old.py:f")[1][:99]
+        )
+
+    def test_gate_needs_an_earlier_version(self, call):
+        said = call("campaign", "--vut", "new.py:f", "--gate", "regressions", "--out", "run")
+        assert_refused(said, "--gate regressions needs an earlier version")
+        assert not Path("run").exists()
