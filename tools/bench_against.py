@@ -2,11 +2,11 @@
 
     python tools/bench_against.py --seeds 10 --first 1000
 
-Three pairs of versions, at one level each: `design2` that regulates its gap later, a controller
-with a longer reaction time, and `gap`, on an acceleration lane, that accepts shorter gaps. A dense
-truth of each version has the same uniform cases; those that the new version alone fails are the
-regressions of the truth. The share of these within the radius of the FMC of a regression that was
-found is printed after 40 cases, as median with the least and the most over the seeds:
+Pairs of versions, at one level each: `design2` that gives way later, a controller with a longer
+reaction time, and `gap`, on an acceleration lane, that accepts shorter gaps. A dense truth of each
+version has the same space-filling cases; those that the new version alone fails are the regressions
+of the truth. The share of these within the radius of the FMC of a regression that was found is
+printed after 40 cases, as median with the least and the most over the seeds:
 
 - of a campaign against the old version;
 - of two independent campaigns of as many cases and `compare-runs`, which runs the failures of each
@@ -32,7 +32,6 @@ from merge_sumo.campaigns.against import PairedSearch
 from merge_sumo.campaigns.campaign import conduct, twin_of, twins_of
 from merge_sumo.campaigns.plan import resolve, resolve_earlier
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.drivers.rule_based import DESIGNS
 from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.road.scenario_file import named_scenario
@@ -43,8 +42,7 @@ from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
 
 TRIALS = Path(__file__).parent / "trial_vuts.py"
-LATER = "design2-later"
-DESIGNS[LATER] = replace(DESIGNS["design2"], x1_m=120.0)
+LATER = "design2?x1_m=120"
 
 
 @dataclass(frozen=True)

@@ -196,10 +196,10 @@ def campaign(
         out: new folder to write; `runs/<vut>-<date>` by default.
         given: which cases are chosen (`level`, `against`, `sampler`, `cases`, `batch`, `in_flight`,
             `seed`, `v_vut0_mps`, `stop_after_converged`, `audit`, `learn_from`), how a case is run
-            and judged (`people`, `scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
-            `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`), where it runs (`workers`,
-            `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`); see
-            `CampaignKeywords`.
+            and judged (`people`, `scenario`, `follow_up_s`, `fail_when`, `require`, `policies`,
+            `pov`, `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`), where it runs
+            (`workers`, `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);
+            see `CampaignKeywords`.
 
     An interrupted campaign goes on with `resume`.
     """
@@ -240,7 +240,7 @@ def resume(
     recorded = read_settings(folder)
     named = {name: one for name, one in given.items() if one is not None or name == "workers"}
     fields, runner = given_again(vut, named, {name: recorded.get(name) for name in ("vut", "pov")})
-    settings = settings_of(folder, recorded, fields, trust=trust_vut)
+    settings = settings_of(folder, recorded, fields, trust=trust_vut, goes_on=True)
     if "level" in named:
         policies = policies_folder(settings.policies, settings.scenario)
         scenario_levels, own = settings.scenario.levels, settings.pov is not None

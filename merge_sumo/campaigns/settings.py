@@ -301,22 +301,26 @@ def settings_of(
     given: Mapping[str, object] | None = None,
     *,
     trust: bool = False,
+    goes_on: bool = False,
 ) -> CampaignSettings:
     """Return the settings of a campaign, as its folder records them or as they are given anew.
+
+    Only a campaign that goes on runs the earlier version that it is against.
 
     Raises `UserError` where one is missing or something else, and, without `trust`, where a folder
     that may be a stranger's names a controller that nobody named here.
     """
-    record = {**recorded, **(given or {})}
-    _check_begun_here(folder, record, given or {})
+    given = {**({} if goes_on else {"against": None}), **(given or {})}
+    record = {**recorded, **given}
+    _check_begun_here(folder, record, given)
     if not trust:
-        check_own_code(folder, recorded, given or {})
+        check_own_code(folder, recorded, given)
     known = {
         spec.name: record[spec.name] for spec in fields(CampaignSettings) if spec.name in record
     }
     if not isinstance(known.get("scenario"), Scenario):
         known["scenario"] = scenario_of(record, folder / SETTINGS)
-    if isinstance(known.get("policies"), str) and "policies" not in (given or {}):
+    if isinstance(known.get("policies"), str) and "policies" not in given:
         _check_still_there(folder, known["policies"])
     required = (spec.name for spec in fields(CampaignSettings) if spec.default is MISSING)
     for name in required:

@@ -172,6 +172,12 @@ class TestRefuses:
             resume_campaign(Path("run"), {"cases": 20})
         assert not Path("it-ran").exists()
 
+    def test_nothing_where_a_study_runs_the_new_version_alone(self, call, monkeypatch):
+        run_campaign(settings(vut="design2", cases=10), Path("run"))
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(Path("theirs").absolute()))
+        assert call("rerun", "run", 0).code == 0
+        assert call("run", "--case", "run", 0, "--vut", "old.py:f").code in (0, 1)
+
     def test_a_link_in_the_place_of_the_old_version(self):
         run_campaign(settings(cases=10), Path("run"))
         shutil.move(Path("run") / AGAINST, "elsewhere")
@@ -183,8 +189,8 @@ class TestRefuses:
 class TestCommand:
     def test_gate_and_page_say_what_broke(self, call):
         command = ("campaign", "--vut", "new.py:f", "--against", "old.py:f", "--level", "0")
-        command = (*command, "--cases", "25", "--seed", "3", "--out", "run", "-q")
-        said = call(*command, "--gate", "regressions", "--junit", "run.xml", "--json")
+        more = ("--cases", "25", "--seed", "3", "--out", "run", "-q", "--json")
+        said = call(*command, *more, "--gate", "regressions", "--junit", "run.xml")
         assert said.code == 1
         result = json.loads(said.out)
         count = result["against"]["levels"]["0"]["changes"]["broke"]

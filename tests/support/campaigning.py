@@ -26,5 +26,5 @@ def resume_campaign(
     trust: bool = False,
     **other: Any,
 ) -> Run:
-    settings = settings_of(folder, read_settings(folder), given, trust=trust)
+    settings = settings_of(folder, read_settings(folder), given, trust=trust, goes_on=True)
     return campaign.resume_campaign(settings, resolve(settings, net), folder, **other)

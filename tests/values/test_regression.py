@@ -48,8 +48,8 @@ def test_is_the_larger_of_new_and_minus_old(new_m, old_m, margin, gap_m):
     assert found.margin == pytest.approx(margin)
     assert found.failed == (margin < 0.0)
     assert found.signed_gap_m == pytest.approx(gap_m)
-    gaps = np.array([[NAN if gap is None else gap] for gap in (new_m, old_m)])
-    assert regression_gaps_m(*gaps, 6.0) == pytest.approx([gap_m])
+    new, old = (np.array([NAN if gap is None else gap]) for gap in (new_m, old_m))
+    assert regression_gaps_m(new, old, 6.0) == pytest.approx([gap_m])
 
 
 def test_takes_the_margins_of_another_criterion_as_they_are():
