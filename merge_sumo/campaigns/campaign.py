@@ -167,6 +167,10 @@ def resume_campaign(
         opened: list[_Open] = []
         compared: list[tuple[Changes, bool]] = []
         for at, of_version, planned in _with_earlier(folder, settings, plan, workers):
+            if opened and not (opened[0].history or os.path.lexists(at)):
+                # It was stopped between the making of its two folders.
+                with Journal.create(at, record_of(of_version, planned)):
+                    pass
             journal, before, dropped = Journal.reopen(at)
             journals.enter_context(journal)
             record, changes, rewrite = _compared(before, of_version, planned, force=force)

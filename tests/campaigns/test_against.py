@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.against import AGAINST, earlier_run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run
+from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.candidates import spread_out
@@ -121,6 +121,15 @@ class TestBytes:
         (Path("run") / OUTCOMES).write_bytes(b"".join(kept))
         assert len(kept) < ran == len(Run(Path("run") / AGAINST).outcomes)
         resume_campaign(Path("run"))
+        assert lines(Path("run")) == whole
+
+    def test_are_the_same_after_a_stop_before_the_second_folder(self, whole):
+        shutil.copytree("whole", "run")
+        shutil.rmtree(Path("run") / AGAINST)
+        shutil.rmtree(Path("run") / TRAJECTORIES)
+        (Path("run") / TRAJECTORIES).mkdir()
+        (Path("run") / OUTCOMES).write_bytes(b"")
+        resume_campaign(Path("run"), trust=True)
         assert lines(Path("run")) == whole
 
     def test_are_the_same_after_a_torn_line_of_the_old_version(self, whole):
