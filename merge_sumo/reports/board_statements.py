@@ -41,7 +41,7 @@ from merge_sumo.studies.stress import STRESS, stress_of
 from merge_sumo.system.printable import printable, quoted, two_digits
 from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.fmc import fmc, radius_for
-from merge_sumo.values.scenario import OWN, MergeScenario, level_name
+from merge_sumo.values.scenario import OWN, MergeScenario, lane_of, level_name
 from merge_sumo.values.score import FAILURE_SCORE
 from merge_sumo.values.severity import meanings
 
@@ -240,9 +240,12 @@ class BoardModel:
         if not isinstance(scenario, MergeScenario):
             return
         x_m, v_mps, slow_mps = scenario.x_pov0_m, scenario.v_pov0_mps, scenario.bounds("v_vut0_mps")
+        point = (
+            "the merge point M" if lane_of(scenario) is None else "M, where a merge is expected,"
+        )
         text = (
-            "In each, another driver starts on the mainline, {} to {} m before the merge point M "
-            "at {} to {} m/s, and the VUT on the ramp, {} m before M"
+            f"In each, another driver starts on the mainline, {{}} to {{}} m before {point} "
+            "at {} to {} m/s, and the VUT on the ramp, {} m before it"
         )
         ends = [
             *(Figure(x, f"{-x:g}", SETTINGS, "scenario.x_pov0_m") for x in reversed(x_m)),

@@ -68,8 +68,9 @@ class TestSentences:
         assert found[Severity.CONTACT] == "bodies touch at the merge or within 5 s after it"
         assert found[Severity.HARSH].endswith("brake harder than 3 m/s² after the merge")
 
-    def test_speak_of_m_and_of_no_lane_without_one(self, tmp_path):
-        run = write_run(tmp_path / "run", per_level=20)
+    def test_speak_of_m_and_of_no_lane_without_one(self, tmp_path_factory):
+        # The page names its folder, which pytest would name after this test.
+        run = write_run(tmp_path_factory.mktemp("point") / "run", per_level=20)
         page = report_page(run)
         assert "(front bumpers within 6 m at M;" in text_of(page)
         assert "lane" not in without(text_of(page), ("along the lane", "where the lanes run"))
