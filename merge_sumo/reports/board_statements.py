@@ -30,6 +30,7 @@ from merge_sumo.analysis.verdict import Verdict, judge
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report_model import kept_truth, road_of_run
+from merge_sumo.road.scenario_file import SUFFIX, shipped_scenarios
 from merge_sumo.studies.certificate import CERTIFICATE, certificate_of
 from merge_sumo.studies.counterfactuals import AVOIDANCE, read_avoidance
 from merge_sumo.studies.crosscheck import CROSSCHECK, Verdicts, crosscheck_of
@@ -37,13 +38,13 @@ from merge_sumo.studies.failures_per_merge import RESULT as PER_MERGE
 from merge_sumo.studies.failures_per_merge import per_merge_of
 from merge_sumo.studies.probability import RESULT as PROBABILITY
 from merge_sumo.studies.probability import probability_of
-from merge_sumo.studies.stress import STRESS, stress_of
+from merge_sumo.studies.stress import STRESS, Stress, stress_of
 from merge_sumo.system.printable import printable, quoted, two_digits
 from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.fmc import fmc, radius_for
-from merge_sumo.values.scenario import OWN, MergeScenario, lane_of, level_name
-from merge_sumo.values.score import FAILURE_SCORE
-from merge_sumo.values.severity import meanings
+from merge_sumo.values.scenario import OWN, US23, MergeScenario, lane_of, level_name
+from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.severity import Severity, meanings
 
 OF_A_CAMPAIGN: Final = (
     *("vut", "levels", "scenario", "fail_when", "require", "v_vut0_mps"),
@@ -308,6 +309,15 @@ class BoardModel:
                 self._lines(verdict.cases),
                 self._lines(verdict.contacts, f"{failing}, severity = contact"),
             )
+        passing = sum(
+            not o.failed and o.measures.severity == Severity.CONTACT for o in self.run.outcomes
+        )
+        if passing:
+            yield say(
+                "In {} other cases bodies touch, too: they are no failures by what counts as one "
+                "here. With --fail-when unsafe they are.",
+                self._lines(passing, "severity = contact, not failing"),
+            )
         if verdict.errors or verdict.timeouts:
             yield say(
                 "{} cases ended in an error and {} by the timeout: they say nothing about merging.",
@@ -318,13 +328,20 @@ class BoardModel:
             yield self._found_at(level, found)
         worst = failures(self.run.outcomes)
         if worst:
-            index, dx_m = worst[0].index, worst[0].measures.dx_m
-            figures = [figure(index, OUTCOMES, "index of the failing line with the lowest score")]
-            if dx_m is not None:
-                figures.append(Figure(dx_m, f"{abs(dx_m):.1f}", OUTCOMES, f"line {index}: dx_m"))
-            text = "The worst case is {}"
-            text += "." if dx_m is None else ": front bumpers {} m apart as the VUT merges."
-            yield say(text, *figures, command=self._command("replay", f" {index} --gui"))
+            yield self._worst(worst[0])
+
+    def _worst(self, outcome: Outcome) -> Statement:
+        index, found = outcome.index, outcome.measures
+        text = "The worst case is {}"
+        figures = [figure(index, OUTCOMES, "index of the failing line with the lowest score")]
+        if found.impact_speed_mps is not None:
+            text += ": bodies touch at a relative speed of {} m/s"
+            key = f"line {index}: impact_speed_mps"
+            figures.append(figure(found.impact_speed_mps, OUTCOMES, key, ".1f"))
+        elif found.dx_m is not None:
+            text += ": front bumpers {} m apart as the VUT merges"
+            figures.append(figure(abs(found.dx_m), OUTCOMES, f"line {index}: dx_m", ".1f"))
+        return say(f"{text}.", *figures, command=self._command("replay", f" {index} --gui"))
 
     def _found_at(self, level: int, found: LevelSummary) -> Statement:
         at = f"level = {level}"
@@ -364,8 +381,25 @@ class BoardModel:
         yield self._certified()
 
     def _again(self, option: str) -> str:
-        vut, seed = self.run.settings.get("vut"), self.run.settings.get("seed") or 0
-        return f"merge-sumo campaign --vut {quoted(str(vut))} --seed {seed} {option}"
+        cases, seed = self.summary.cases, self.run.settings.get("seed") or 0
+        return f"merge-sumo campaign {self._setup} --cases {cases} --seed {seed} {option}"
+
+    @property
+    def _setup(self) -> str:
+        """What a command needs to test the same again."""
+        run, criterion = self.run, self.run.criterion
+        name, levels = run.scenario.name, run.levels
+        given: dict[str, Any] = {option: run.settings.get(option) for option in ("vut", "pov")}
+        if name != US23.name:
+            given["scenario"] = name if name in shipped_scenarios() else f"{name}{SUFFIX}"
+        given["policies"] = run.settings.get("policies")
+        if criterion.require is not None:
+            given["require"] = criterion.require
+        elif not criterion.is_papers or "scenario" in given:
+            given["fail-when"] = criterion.text
+        if len(levels) == 1:
+            given["level"] = level_name(levels[0])
+        return " ".join(f"--{k} {quoted(str(one))}" for k, one in given.items() if one is not None)
 
     def _searched(self, level: int, found: LevelSummary) -> Iterator[Statement]:
         at, dims = f"level = {level}", len(self.run.scenario.dimensions(level))
@@ -418,7 +452,7 @@ class BoardModel:
         if known is None:
             return Statement(
                 "Not certified: that no region of failures of a stated size was missed.",
-                command=f"merge-sumo certify --vut {quoted(str(self.run.settings.get('vut')))}; "
+                command=f"merge-sumo certify {self._setup}; "
                 + self._command("board", " --certificate DIR"),
             )
         if known.found is None:
@@ -441,16 +475,20 @@ class BoardModel:
             )
             return
         density = known.traffic.density_veh_per_km or 0.0
+        least, most = known.outside
+        not_counted = f"{two_digits(100.0 * least)} to {two_digits(100.0 * most)} %"
         yield say(
             "In 1,000 merges in the traffic {} ({} cars/km), failures with {} to {} cars of the "
             "mainline are expected, whatever the mixture of levels is ({} confidence); so at most "
-            "{} of 1,000 merges fail with a car that is counted.",
+            "{} of 1,000 merges fail with a counted car. {} of the traffic is not counted, as its "
+            "speed is outside the pool.",
             figure(known.traffic.name, PER_MERGE, "traffic.name"),
             figure(density, PER_MERGE, "traffic.density_veh_per_km"),
             _in_1000(known.low, "low"),
             _in_1000(known.high, "high"),
             share(known.confidence, PER_MERGE, "confidence"),
             _in_1000(known.high, "high"),
+            Figure(most, not_counted, PER_MERGE, "outside"),
         )
         parts, figures = [], []
         for level, one in known.levels.items():
@@ -512,6 +550,13 @@ class BoardModel:
                     self._lines(one.failures, at),
                     figure(one.hardest_mps2, OUTCOMES, f"{at}: largest {BRAKING.name}", ".3g"),
                 )
+            if one.slows_more:
+                yield say(
+                    f"Level {level_name(level)}: in {{}} of {{}} failures {_driver(known)} slows "
+                    "down by more than that.",
+                    self._lines(one.slows_more, f"{which}, level = {level}: {SLOWDOWN.name}"),
+                    self._lines(one.failures, f"{which}, level = {level}"),
+                )
         yield say(
             "What none of {} drivers does may still be what up to {} of drivers do ({} "
             "confidence): a failure outside is rare beside these people, and not impossible.",
@@ -547,12 +592,19 @@ class BoardModel:
                 command=self._command("stress"),
             )
             return
-        yield say(
-            "{} of {} failures remain failures in all {} runs of the stress test.",
-            figure(len(known.robust), STRESS, "failures in no passes and no without_verdict"),
-            figure(len(known.failures), STRESS, "failures"),
-            figure(known.runs, STRESS, "rungs.runs"),
-        )
+        if not known.failures:
+            yield say(
+                "No case fails; {} cases ran in all {} runs of the stress test.",
+                figure(known.cases, STRESS, "cases"),
+                figure(known.runs, STRESS, "rungs.runs"),
+            )
+        else:
+            yield self._fail_throughout(known)
+            if len(known.robust) < len(known.failures):
+                yield Statement(
+                    "A narrow region of failures has few that remain, although others near them "
+                    "fail: a campaign in a scenario with the change shows how large it then is."
+                )
         ran = [(rung, flips) for rung in known.rungs if (flips := known.share(rung)) is not None]
         if ran:
             parts, figures = [], []
@@ -569,6 +621,15 @@ class BoardModel:
                     figure(rung.about, STRESS, f"rungs.{rung.name}.about"),
                     figure(rung.skipped, STRESS, f"rungs.{rung.name}.skipped"),
                 )
+
+    def _fail_throughout(self, known: Stress) -> Statement:
+        return say(
+            "{} of {} failures remain failures in all {} runs of the stress test, each with one "
+            "thing changed.",
+            figure(len(known.robust), STRESS, "failures in no run's passes or without_verdict"),
+            figure(len(known.failures), STRESS, "failures"),
+            figure(known.runs, STRESS, "rungs.runs"),
+        )
 
     def _simulators(self) -> Iterator[Statement]:
         known = self.crosscheck
@@ -600,7 +661,8 @@ class BoardModel:
     def _same_verdicts(self, peer: str, verdicts: Verdicts) -> Iterator[Statement]:
         cases = figure(verdicts.cases, CROSSCHECK, "verdicts.recorded + verdicts.fresh")
         yield say(
-            "In another simulator, {}, {} of {} cases end as in SUMO; {} of them fail in SUMO.",
+            "In another simulator, {}, with the same drivers, criterion and equations of motion, "
+            "{} of {} cases end as in SUMO; {} of them fail in SUMO.",
             figure(peer, CROSSCHECK, "peer"),
             figure(verdicts.same, CROSSCHECK, "verdicts.recorded + verdicts.fresh - differences"),
             cases,
@@ -620,7 +682,7 @@ class BoardModel:
 
 UNSAID: Final = (
     "No rate of crashes per kilometre or per year: a failure as defined above is no crash on a "
-    "road, and nobody has measured how common these encounters are.",
+    "road.",
     "No proof of safety: a search shows failures and cannot show that there are none.",
     "Nothing of tyres, steering, sensors or software timing beyond the equations of motion, except "
     "where a stress test above says so.",

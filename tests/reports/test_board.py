@@ -17,6 +17,7 @@ import merge_sumo as ms
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run
 from merge_sumo.reports.board import PAGE, RECORD, SCHEMA, write_board
 from merge_sumo.reports.board_statements import BoardModel, Statement
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.crosscheck import CROSSCHECK, Crosscheck, Motion, Verdicts
 from merge_sumo.studies.stress import STRESS, Flips, Rung, Stress
 from merge_sumo.system.records import to_plain
@@ -97,7 +98,10 @@ class TestNumbers:
         lines = [json.loads(line) for line in (made.folder / OUTCOMES).read_text().splitlines()]
         failing = [o for o in lines if o["score"] is not None and o["score"] < -500]
         touching = [o for o in failing if o["severity"] == "contact"]
-        first, second, *levels = sentences(made, "found")
+        passing = [o for o in lines if o not in failing and o["severity"] == "contact"]
+        first, *others, second = sentences(made, "found")[: 2 + bool(passing)]
+        levels = sentences(made, "found")[2 + bool(passing) :]
+        assert [other.figures[0].value for other in others] == [len(passing)] * bool(passing)
         assert first.text.startswith(
             f"{len(failing)} of 180 cases fail; in {len(touching)} of them bodies touch"
         )
@@ -107,7 +111,9 @@ class TestNumbers:
         assert levels[1].text.startswith(f"Level 1: {len(at_1)} of 60 cases fail")
         worst = min(failing, key=lambda o: o["score"])
         assert levels[-1].figures[0].value == worst["index"]
-        assert levels[-1].figures[1].value == worst["dx_m"]
+        measure = "dx_m" if worst["impact_speed_mps"] is None else "impact_speed_mps"
+        assert levels[-1].figures[1].value == abs(worst[measure])
+        assert levels[-1].figures[1].key == f"line {worst['index']}: {measure}"
 
     def test_of_people_are_those_of_the_outcomes(self, made):
         lines = [json.loads(line) for line in (made.folder / OUTCOMES).read_text().splitlines()]
@@ -124,8 +130,12 @@ class TestNumbers:
         assert checked_figures(made, [STRESS, CROSSCHECK]) >= 5
 
     def test_of_a_stress_test(self, made):
-        first, flips, skipped = (s.text for s in sentences(made, "robust"))
-        assert first == "2 of 3 failures remain failures in all 3 runs of the stress test."
+        first, narrow, flips, skipped = (s.text for s in sentences(made, "robust"))
+        assert first == (
+            "2 of 3 failures remain failures in all 3 runs of the stress test, each with one thing "
+            "changed."
+        )
+        assert narrow.startswith("A narrow region of failures has few that remain")
         assert flips == (
             "Share of verdicts that flip: 0.67 % (an actuator lag of .2 s); 0.33 % (noise of the "
             "start)."
@@ -135,8 +145,8 @@ class TestNumbers:
     def test_of_another_simulator(self, made):
         verdicts, motion, _ = (s.text for s in sentences(made, "simulators"))
         assert verdicts == (
-            "In another simulator, highway-env 1.10, 42 of 42 cases end as in SUMO; 5 of them fail "
-            "in SUMO."
+            "In another simulator, highway-env 1.10, with the same drivers, criterion and "
+            "equations of motion, 42 of 42 cases end as in SUMO; 5 of them fail in SUMO."
         )
         assert motion.endswith("differs from that of highway-env 1.10 by 3e-09 m at most.")
 
@@ -238,7 +248,8 @@ class TestOfACampaign:
         known = json.loads((run.folder / "failures-per-merge.json").read_text())
         first, level, _ = sentences(run, "often")
         assert [f.value for f in first.figures] == [
-            *("exid-5", 8.7, known["low"], known["high"], 0.95, known["high"])
+            *("exid-5", 8.7, known["low"], known["high"], 0.95, known["high"]),
+            known["outside"][1],
         ]
         in_1000 = float(f"{1000.0 * known['high']:.2g}")
         assert f"at most {in_1000:g} of 1,000 merges" in first.text
@@ -275,3 +286,14 @@ class TestOfACampaign:
             with pytest.raises(ms.UserError, match=f"{name} is of another campaign: its vut"):
                 write_board(other)
             (other.folder / name).unlink()
+
+
+def test_commands_set_up_what_was_tested(tmp_path):
+    def command(**changed: Any) -> str:
+        folder = tmp_path / str(len([*tmp_path.iterdir()]))
+        statement = sentences(write_run(folder, 20, levels=(1,), **changed), "remains")[0]
+        return statement.command
+
+    assert command().endswith(" --vut handmade --level 1 --cases 20 --seed 1 --audit 100")
+    on_lane = command(scenario=named_scenario("us23-lane"))
+    assert " --scenario us23-lane --fail-when paper --level 1 " in on_lane
