@@ -989,7 +989,7 @@ def stress(
 
     Args:
         run: the campaign, or its folder, into which `stress.json` is written.
-        draws: times that all cases run where the change is drawn at random.
+        draws: times that all cases run where the change is drawn at random, 1 to 1,000.
         seed: same seed, same draws.
         net: net for that; must be the one of the campaign.
         trust_vut: run the controller that the folder names although it was not made here.

@@ -712,7 +712,8 @@ class CrosscheckResult(Result):
 def _verdict_lines(verdicts: Verdicts) -> list[str]:
     """Return how many verdicts are the same, and the first of the others."""
     lines = [
-        f"  verdicts  {counted(verdicts.recorded, 'recorded case')} and "
+        f"  verdicts  {counted(verdicts.recorded, 'recorded case')}"
+        f"{', those with the lowest scores,' if verdicts.lowest_only else ''} and "
         f"{counted(verdicts.fresh, 'fresh case')}, {counted(verdicts.failures, 'failure')} in "
         f"SUMO: {verdicts.same:,} of {verdicts.cases:,} the same"
     ]

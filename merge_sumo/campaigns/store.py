@@ -137,6 +137,17 @@ class Run:
         return printable(str(self.settings.get("pov"))[:NAME_CHARACTERS])
 
     @property
+    def interruption(self) -> str:
+        """A sentence on a campaign that has fewer cases than it was to have; empty for others."""
+        wanted = self.settings.get("cases")
+        may_end = self.settings.get("stop_after_converged") is not None
+        fewer = isinstance(wanted, int) and len(self.outcomes) < wanted and not may_end
+        if not (self.torn or fewer):
+            return ""
+        torn = f"; the last line of {OUTCOMES} is torn, and its case left out" if self.torn else ""
+        return f"This campaign was interrupted, and what is shown is of the cases that ran{torn}."
+
+    @property
     def ran_again(self) -> int:
         """Number of cases that ran again because a process had died or had been stopped."""
         count = self.settings.get(RAN_AGAIN)
@@ -337,6 +348,11 @@ def batch_file(folder: Path, batch: int) -> Path:
 
 
 def _no_campaign(folder: Path, error: OSError) -> UserError:
+    if error.errno in (errno.ENOENT, errno.ENOTDIR):
+        return UserError(
+            f"{folder} is not a campaign: there is no {error.filename}; name a folder that "
+            "`merge-sumo campaign` has written"
+        )
     return UserError(f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror})")
 
 

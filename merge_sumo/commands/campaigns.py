@@ -335,11 +335,19 @@ def report(given: Given, run: RunArgument) -> None:
     """
     from merge_sumo import api
 
-    path = api.report(run, **given.keywords)
+    opened = api.open_run(run)
+    path = api.report(opened, **given.keywords)
     if given.as_json:
         print_json({"report": str(path)})
     else:
         show(path)
+    _say_interruption(opened)
+
+
+def _say_interruption(opened: CampaignRun) -> None:
+    """Say on standard error that a campaign was interrupted, where it was."""
+    if sentence := opened.run.interruption:
+        say(sentence)
 
 
 @app.verb(
@@ -363,7 +371,9 @@ def board(given: Given, run: RunArgument) -> None:
     """
     from merge_sumo import api
 
-    given.print(api.board(run, **given.keywords))
+    opened = api.open_run(run)
+    given.print(api.board(opened, **given.keywords))
+    _say_interruption(opened)
 
 
 @app.verb(

@@ -240,7 +240,9 @@ def failures_per_merge(
 @app.verb(
     options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"),
     own={
-        "draws": option(int, 5, "Times that all cases run where a change is drawn at random."),
+        "draws": option(
+            int, 5, "Times that all cases run where a change is drawn at random, 1 to 1,000."
+        ),
         "seed": SEED,
     },
 )
@@ -286,7 +288,8 @@ def explain(
         "cases": option(
             int | None,
             None,
-            "Cases that drive there: those recorded, and fresh uniform ones where there are fewer.",
+            "Cases that drive there. Fewer than recorded: those with the lowest scores, mostly "
+            "failures. More: fresh uniform ones, too.",
             show_default="those recorded",
         ),
         "seed": SEED,

@@ -1,7 +1,7 @@
 """The page for a safety board, and the same as JSON for a safety case.
 
 Both show the topics of `board_statements` and nothing else. The page has no script and loads
-nothing; printed on A4 it has about two pages.
+nothing; printed on A4 it has two or three pages.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.board_statements import BoardModel, Topic
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report import check_page
+from merge_sumo.studies.crosscheck import check_crosscheck_of
+from merge_sumo.studies.stress import check_stress_of
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import check_own, replace_own
 
@@ -42,6 +44,10 @@ def write_board(
     check_page(html)
     _check_record(record)
     model = BoardModel(run, certificate, people=people)
+    if model.stress is not None:
+        check_stress_of(run, model.stress)
+    if model.crosscheck is not None:
+        check_crosscheck_of(run, model.crosscheck)
     topics = model.topics()
     files = _hashes(model, topics)
     replace_own(html, board_page(run, topics, files).encode(errors="backslashreplace"))
@@ -58,6 +64,7 @@ def board_page(run: Run, topics: list[Topic], files: dict[str, str]) -> str:
         styles=("board.css",),
         vut=run.vut,
         scenario=run.scenario.name,
+        interruption=run.interruption,
         in_short=[by_name[name] for name in IN_SHORT if name in by_name],
         topics=topics,
         files=files,
@@ -70,6 +77,7 @@ def board_record(run: Run, topics: list[Topic], files: dict[str, str]) -> dict[s
         "schema": SCHEMA,
         "vut": run.vut,
         "scenario": run.scenario.name,
+        "interruption": run.interruption,
         "files": files,
         "topics": [asdict(topic) for topic in topics],
     }

@@ -41,6 +41,10 @@ CASE_S: Final = 10.0
 """What its program may take, and a case."""
 STEPS: Final = 3
 """Rows of a scene, from which it takes accelerations."""
+HOW: Final = (
+    "make its environment with `python -m venv crime && crime/bin/pip install commonroad-crime`, "
+    "and give crime/bin/python"
+)
 SHORT: Final = 300
 """Characters of what its program says."""
 
@@ -237,15 +241,13 @@ def _answer(python: Path, scenes: Sequence[dict[str, Any]]) -> Answer:
         raise UserError(f"--crime {python}: it cannot be run ({error})") from error
     if done.returncode:
         said = printable(done.stderr.decode(errors="replace").strip().split("\n")[-1][:SHORT])
-        raise UserError(
-            f"--crime {python}: it measures nothing ({said}); make its environment with "
-            "`python -m venv crime && crime/bin/pip install commonroad-crime`, and give "
-            "crime/bin/python"
-        )
+        raise UserError(f"--crime {python}: it measures nothing ({said}); {HOW}")
     try:
         answer: Answer = decode(done.stdout, Answer)
     except UserError as error:
-        raise UserError(f"--crime {python}: its answer is not as it should be ({error})") from error
+        raise UserError(
+            f"--crime {python} does not answer as a Python with commonroad-crime; {HOW}"
+        ) from error
     if len(answer.values) != len(scenes):
         raise UserError(f"--crime {python}: it has measured {len(answer.values)} cases")
     return answer

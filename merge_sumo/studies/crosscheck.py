@@ -21,6 +21,7 @@ from typing import Annotated, Final
 
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import replace as replaced
 
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.campaigns.store import Run
@@ -33,6 +34,7 @@ from merge_sumo.studies.crime import measured_by
 from merge_sumo.studies.probability import same_system
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
+from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import Record, decode, to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
@@ -114,6 +116,7 @@ class Verdicts(Record, frozen=True):
         other_motion: cases with the same verdict in which a driver answers otherwise at some step,
             where a rounding error decides.
         differences: the cases with another verdict or another end.
+        lowest_only: whether the campaign has more cases, and those recorded have its lowest scores.
     """
 
     recorded: Count
@@ -122,6 +125,7 @@ class Verdicts(Record, frozen=True):
     largest_m: Deviation
     other_motion: Count
     differences: tuple[Difference, ...]
+    lowest_only: bool = False
 
     @property
     def cases(self) -> int:
@@ -223,6 +227,15 @@ def crosscheck_of(folder: Path) -> Crosscheck | None:
     return known
 
 
+def check_crosscheck_of(run: Run, known: Crosscheck) -> None:
+    """Raise `UserError` where a crosscheck is of another VUT, or of more cases, than a run."""
+    if known.vut != run.vut or known.motion.cases > len(run.outcomes):
+        raise UserError(
+            f"{run.folder / CROSSCHECK} is of another campaign, or of cases that {run.folder} no "
+            f"longer has: run `merge-sumo crosscheck {quoted(run.folder)}` again"
+        )
+
+
 OnCases = Callable[[int], None]
 """Told how many cases have just run in both simulators."""
 
@@ -269,9 +282,13 @@ def crosscheck(
         motion = motion_of(plan, known, processes)
         verdicts = None
         if why is None:
-            recorded = _chosen(run, known, cases)
+            judged = [o for o in run.outcomes if o.index in known and o.score is not None]
+            recorded = judged if cases is None else _lowest(judged, cases)
             fresh = _fresh(settings, (cases or 0) - len(recorded), seed)
-            verdicts = verdicts_of(plan, recorded, known, fresh, processes, on_cases)
+            verdicts = replaced(
+                verdicts_of(plan, recorded, known, fresh, processes, on_cases),
+                lowest_only=len(recorded) < len(judged),
+            )
     found = Crosscheck(
         peer=peer,
         motion=motion,
@@ -308,12 +325,10 @@ def write_crosscheck(folder: Path, found: Crosscheck) -> None:
     replace_own(folder / CROSSCHECK, content.encode())
 
 
-def _chosen(run: Run, known: dict[int, Trajectory], cases: int | None) -> list[Outcome]:
-    """Return the recorded cases with a verdict and a motion, the lowest scores if too many."""
-    judged = [o for o in run.outcomes if o.index in known and o.score is not None]
-    if cases is not None and cases < len(judged):
-        judged = sorted(judged, key=lambda o: (o.score, o.index))[:cases]
-    return sorted(judged, key=lambda o: o.index)
+def _lowest(judged: Sequence[Outcome], cases: int) -> list[Outcome]:
+    """Return at most so many outcomes, those with the lowest scores, in the order of the cases."""
+    lowest = sorted(judged, key=lambda o: (o.score, o.index))[:cases]
+    return sorted(lowest, key=lambda o: o.index)
 
 
 def _fresh(settings: CampaignSettings, count: int, seed: int) -> list[Case]:

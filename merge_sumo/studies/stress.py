@@ -29,7 +29,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.studies.probability import same_system
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
-from merge_sumo.system.printable import counted
+from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, decode, to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
@@ -169,6 +169,17 @@ def stress_of(folder: Path) -> Stress | None:
     return known
 
 
+def check_stress_of(run: Run, known: Stress) -> None:
+    """Raise `UserError` where a stress test is of other cases than a run; it may have more."""
+    tested = [outcome for outcome in run.outcomes if outcome.is_tested][: known.cases]
+    failing = tuple(outcome.index for outcome in failures(tested))
+    if (run.vut, len(tested), failing) != (known.vut, known.cases, known.failures):
+        raise UserError(
+            f"{run.folder / STRESS} is of another campaign, or of cases that {run.folder} no "
+            f"longer has: run `merge-sumo stress {quoted(run.folder)}` again"
+        )
+
+
 # The ladder.
 
 
@@ -203,6 +214,7 @@ ERROR_V_MPS: Final = 2.0 / 3.6
 """Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
 CAR_LENGTH_M: Final = 5.0
 DEFAULT_DRAWS: Final = 5
+MOST_DRAWS: Final = 1000
 ERRORS_BY_UNIT: Final = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
 OF_VUT: Final = {"v_vut0_mps", *COORDINATES}
 """Coordinates that are no state of another car."""
@@ -303,11 +315,13 @@ def stress(
         on_cases: told how many have just ended.
 
     Raises:
-        UserError: for a campaign without a verdict, or with a net or policies of another day.
+        UserError: for numbers that make no sense, and for a campaign without a verdict, or with a
+            net or policies of another day.
     """
-    for name, number, least in (("draws", draws, 1), ("seed", seed, 0)):
-        if number < least:
-            raise UserError(f"--{name} is {number}: it must be {least} or more")
+    if not 1 <= draws <= MOST_DRAWS:
+        raise UserError(f"--draws is {draws}: it must be 1 to {MOST_DRAWS:,}")
+    if seed < 0:
+        raise UserError(f"--seed is {seed}: it must be 0 or more")
     same_system(run, record_of(settings, plan))
     tested = [outcome for outcome in run.outcomes if outcome.is_tested]
     if not tested:

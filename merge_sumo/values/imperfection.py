@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Final, Self, TypeVar
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.suggestions import meant
+from merge_sumo.system.suggestions import either, meant
 
 Bounds = tuple[float, float]
 Amount = float | Bounds
@@ -31,9 +31,11 @@ class Imperfection:
             low, high = RANGES[type(self)][field]
             numbers = value if isinstance(value, tuple) else (value,)
             if not all(math.isfinite(x) and low <= x <= high for x in numbers):
-                raise UserError(f"{field} is {value}: choose {low:g} to {high:g}")
+                raise UserError(f"{field} is {_in_words(value)}: choose {low:g} to {high:g}")
             if isinstance(value, tuple) and not value[0] < value[1]:
-                raise UserError(f"{field} is {value}: a range is low to high")
+                raise UserError(
+                    f"{field} is {_in_words(value)}: the first number of a range must be the lower"
+                )
 
     def _given(self) -> Iterator[tuple[str, Amount]]:
         """Yield (field, value) of what is not left out."""
@@ -68,24 +70,40 @@ class Imperfection:
         Raises `UserError`, with the option's name, for what it does not have.
         """
         known = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+        parts = [part for part in map(str.strip, text.split(",")) if part]
+        if not parts:
+            raise UserError(f"{option} is empty: give NAME=NUMBER, with a name of {either(known)}")
         values: dict[str, Amount] = {}
-        for part in filter(None, map(str.strip, text.split(","))):
-            name, _, number = part.partition("=")
-            if name not in known or name in values:
-                twice = "is there twice" if name in known else "is unknown"
+        for part in parts:
+            name, equals, number = part.partition("=")
+            if name not in known:
                 hint = meant(name, known) or f"choose from {', '.join(known)}"
-                raise UserError(f"{option}: {name!r:.60} {twice}: {hint.strip()}")
-            low, dots, high = number.partition("..")
-            try:
-                values[name] = (float(low), float(high)) if dots else float(low)
-            except ValueError:
-                raise UserError(
-                    f"{option}: {name} is {number!r:.60}: give a number, or a range as 0..0.5"
-                ) from None
+                raise UserError(f"{option}: {name!r:.60} is unknown: {hint.strip()}")
+            if name in values:
+                raise UserError(f"{option}: {name} is given twice")
+            if not equals:
+                raise UserError(f"{option}: {name} has no number: give {name}=NUMBER")
+            values[name] = _amount(name, number, option)
         try:
             return cls(**values)
         except UserError as error:
             raise UserError(f"{option}: {error}") from error
+
+
+def _amount(name: str, text: str, option: str) -> Amount:
+    """Return the number or the range in a text; `UserError` for none."""
+    low, dots, high = text.partition("..")
+    try:
+        return (float(low), float(high)) if dots else float(low)
+    except ValueError:
+        raise UserError(
+            f"{option}: {name} is {text!r:.60}: give a number, or a range as 0..0.5"
+        ) from None
+
+
+def _in_words(value: Amount) -> str:
+    """Return a number or a range as it is written after an option."""
+    return "..".join(f"{x:g}" for x in (value if isinstance(value, tuple) else (value,)))
 
 
 Kind = TypeVar("Kind", bound=Imperfection)

@@ -290,13 +290,16 @@ class TestSettings:
         ("text", "said"),
         [
             ("delay=1", "--sense: 'delay' is unknown: did you mean delay_s?"),
-            ("delay_s", "--sense: delay_s is '': give a number, or a range as 0..0.5"),
+            ("delay_s", "--sense: delay_s has no number: give delay_s=NUMBER"),
             ("delay_s=x", "--sense: delay_s is 'x': give a number, or a range as 0..0.5"),
-            ("delay_s=1,delay_s=2", "--sense: 'delay_s' is there twice"),
-            ("delay_s=9", "--sense: delay_s is 9.0: choose 0 to 5"),
+            ("delay_s=", "--sense: delay_s is '': give a number, or a range as 0..0.5"),
+            ("", "--sense is empty: give NAME=NUMBER, with a name of delay_s, "),
+            (" , ", "--sense is empty: give NAME=NUMBER, with a name of delay_s, "),
+            ("delay_s=1,delay_s=2", "--sense: delay_s is given twice"),
+            ("delay_s=9", "--sense: delay_s is 9: choose 0 to 5"),
             ("delay_s=nan", "--sense: delay_s is nan: choose 0 to 5"),
-            ("delay_s=0.5..0.2", "--sense: delay_s is (0.5, 0.2): a range is low to high"),
-            ("dropout=0..2", "--sense: dropout is (0.0, 2.0): choose 0 to 1"),
+            ("delay_s=0.5..0.2", "--sense: delay_s is 0.5..0.2: the first number of a range must"),
+            ("dropout=0..2", "--sense: dropout is 0..2: choose 0 to 1"),
         ],
     )
     def test_that_make_no_sensors_are_refused_in_a_sentence(self, text, said):

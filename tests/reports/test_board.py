@@ -14,7 +14,7 @@ from handmade import write_run
 from test_report import EVIL, root_of
 
 import merge_sumo as ms
-from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run
+from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
 from merge_sumo.reports.board import PAGE, RECORD, SCHEMA, write_board
 from merge_sumo.reports.board_statements import BoardModel, Statement
 from merge_sumo.road.scenario_file import named_scenario
@@ -22,18 +22,23 @@ from merge_sumo.studies.crosscheck import CROSSCHECK, Crosscheck, Motion, Verdic
 from merge_sumo.studies.stress import STRESS, Flips, Rung, Stress
 from merge_sumo.system.records import to_plain
 
-STRESSED = Stress(
-    cases=150,
-    failures=(3, 7, 9),
-    rungs=(
-        Rung(name="lag-0.2", about="an actuator lag of .2 s", runs=(Flips(passes=(7,)),)),
-        Rung(name="noise", about="noise of the start", runs=(Flips(fails=(4,)), Flips())),
-        Rung(name="twin", about="another engine", skipped="it needs SUMO"),
-    ),
-    seed=0,
-    vut="handmade",
-)
-"""Three runs: failures 3 and 9 remain; 1 of 150, 1 of 300 verdicts flip."""
+
+def stressed(run: Run) -> Stress:
+    """Return three runs of 150 cases: one failure passes; 1 of 150, 1 of 300 verdicts flip."""
+    failing = tuple(outcome.index for outcome in failures(run.outcomes[:150]))
+    return Stress(
+        cases=150,
+        failures=failing,
+        rungs=(
+            Rung(name="lag-0.2", about="an actuator lag of .2 s", runs=(Flips(failing[:1]),)),
+            Rung(name="noise", about="noise of the start", runs=(Flips(fails=(4,)), Flips())),
+            Rung(name="twin", about="another engine", skipped="it needs SUMO"),
+        ),
+        seed=0,
+        vut=run.vut,
+    )
+
+
 PEER = Crosscheck(
     peer="highway-env 1.10",
     motion=Motion(cases=12, steps=99, largest_m=3e-9, largest_mps=1e-10, worst_case=4),
@@ -54,7 +59,7 @@ def leave(folder: Path, name: str, value: Any) -> None:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Run:
     run = write_run(tmp_path_factory.mktemp("made") / "run")
-    leave(run.folder, STRESS, STRESSED)
+    leave(run.folder, STRESS, stressed(run))
     leave(run.folder, CROSSCHECK, PEER)
     return run
 
@@ -131,9 +136,10 @@ class TestNumbers:
 
     def test_of_a_stress_test(self, made):
         first, narrow, flips, skipped = (s.text for s in sentences(made, "robust"))
+        all_of = len(stressed(made).failures)
         assert first == (
-            "2 of 3 failures remain failures in all 3 runs of the stress test, each with one thing "
-            "changed."
+            f"{all_of - 1} of {all_of} failures remain failures in all 3 runs of the stress test, "
+            "each with one thing changed."
         )
         assert narrow.startswith("A narrow region of failures has few that remain")
         assert flips == (
@@ -180,7 +186,7 @@ class TestThePage:
 
     def test_shows_what_comes_from_outside_as_text(self, tmp_path):
         run = write_run(tmp_path / "run", vut=EVIL + "{}", sampler=EVIL + "{0}", per_level=4)
-        leave(run.folder, CROSSCHECK, {**to_plain(PEER), "peer": EVIL + "{1}"})
+        leave(run.folder, CROSSCHECK, {**to_plain(PEER), "peer": EVIL + "{1}", "vut": run.vut})
         html_file, _ = write_board(run)
         root = root_of(html_file.read_text())
         assert root.xpath("//script | //img") == []
@@ -225,6 +231,40 @@ class TestFiles:
         (run.folder / name).write_text("mine")
         assert_refused(call("board", run.folder), "is not replaced: move it away")
         assert (run.folder / name).read_text() == "mine"
+
+    @pytest.mark.parametrize(
+        ("name", "of_another"),
+        [
+            (STRESS, {"vut": "another"}),
+            (STRESS, {"cases": 181}),
+            (STRESS, {"failures": [0]}),
+            (CROSSCHECK, {"vut": "another"}),
+        ],
+    )
+    def test_of_another_campaign_are_refused(self, call, tmp_path, name, of_another):
+        run = write_run(tmp_path / "run")
+        known = stressed(run) if name == STRESS else PEER
+        leave(run.folder, name, {**to_plain(known), **of_another})
+        assert_refused(call("board", run.folder), f"{name} is of another campaign, or of cases")
+        assert not (run.folder / PAGE).exists()
+
+    @pytest.mark.parametrize("verb", ["board", "report"])
+    def test_of_outcomes_with_a_torn_last_line_are_said_to_be_of_fewer(self, call, tmp_path, verb):
+        run = write_run(tmp_path / "run", per_level=4)
+        path = run.folder / OUTCOMES
+        path.write_bytes(path.read_bytes()[:-120])
+        code, _, said = call(verb, run.folder)
+        assert (code, said.count("\n")) == (0, 1)
+        assert "was interrupted" in said
+        assert "the last line of outcomes.jsonl is torn" in said
+        if verb == "board":
+            assert said.strip() == json.loads((run.folder / RECORD).read_text())["interruption"]
+            assert said.strip() in (run.folder / PAGE).read_text()
+
+    def test_of_no_campaign_are_none_to_show(self, call, tmp_path):
+        assert_refused(
+            call("board", tmp_path), "is not a campaign", "name a folder that `merge-sumo campaign`"
+        )
 
 
 class TestOfACampaign:

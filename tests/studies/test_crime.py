@@ -95,7 +95,7 @@ class TestItsPython:
     @pytest.mark.parametrize(
         ("answers", "says"),
         [
-            ("3", "not as it should be"),
+            ("3", "not answer as a Python with commonroad-crime; make its"),
             ('{"version": "9", "values": []}', "has measured 0 cases"),
             ("1 / 0", "ZeroDivisionError"),
         ],
@@ -107,6 +107,10 @@ class TestItsPython:
     def test_that_is_not_there_is_refused(self, run, tmp_path):
         with pytest.raises(UserError, match="cannot be run"):
             measured_by(tmp_path / "python", run, road_for(US23))
+
+    def test_that_is_another_program_is_refused_with_what_to_do(self, run):
+        with pytest.raises(UserError, match=r"/true does not answer .* crime/bin/pip install"):
+            measured_by(Path("/usr/bin/true"), run, road_for(US23))
 
     def test_without_crime_is_refused_with_what_to_do(self, run):
         with pytest.raises(UserError, match="pip install commonroad-crime"):

@@ -15,6 +15,7 @@ from campaigning import run_campaign
 from conftest import require
 
 import merge_sumo as ms
+from merge_sumo.api.results import CrosscheckResult
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
@@ -125,6 +126,7 @@ class TestVerdicts:
         assert verdicts is not None
         assert (verdicts.recorded, verdicts.fresh, verdicts.same) == (24, 12, 36)
         assert verdicts.differences == ()
+        assert not verdicts.lowest_only
         assert verdicts.other_motion == 0
         assert verdicts.largest_m < 1e-9
         assert found.agrees
@@ -147,6 +149,8 @@ class TestVerdicts:
     def test_of_the_lowest_scores_come_first_where_few_are_wanted(self, run):
         settings = CampaignSettings(vut="design1", levels=(0,), scenario=US23)
         found = crosscheck(run, settings, resolve(settings), cases=5)
+        result = CrosscheckResult(found, run.folder / CROSSCHECK)
+        assert "5 recorded cases, those with the lowest scores, and 0 fresh" in str(result)
         (run.folder / CROSSCHECK).unlink()
         assert found.verdicts is not None
         assert (found.verdicts.cases, found.verdicts.failures) == (5, 5)

@@ -113,6 +113,12 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_sentence(tmp_path,
         stress_of(tmp_path)
 
 
+@pytest.mark.parametrize("draws", [0, 1001, 99_999_999_999])
+def test_numbers_of_draws_that_make_no_sense_are_refused(run, draws):
+    with pytest.raises(UserError, match=f"--draws is {draws}: it must be 1 to 1,000"):
+        ms.stress(run, draws=draws)
+
+
 def test_flips_by_hand(run):
     failed = next(o for o in run.run.outcomes if o.failed)
     passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
