@@ -220,7 +220,7 @@ class BoardModel:
         versions = settings.get("versions")
         known = versions if isinstance(versions, dict) else {}
         yield say(
-            "The vehicle under test (VUT), {}, was simulated in {} merges of the scenario {}, with "
+            "The vehicle under test (VUT), {}, was simulated in {} cases of the scenario {}, with "
             "merge-sumo {} and SUMO {}.",
             figure(run.vut, SETTINGS, "vut"),
             self._lines(self.summary.cases),
@@ -320,7 +320,7 @@ class BoardModel:
             )
         if verdict.errors or verdict.timeouts:
             yield say(
-                "{} cases ended in an error and {} by the timeout: they say nothing about merging.",
+                "{} cases ended in an error and {} by the timeout: they have no verdict.",
                 self._lines(verdict.errors, "end = VUT_ERROR or SIM_ERROR"),
                 self._lines(verdict.timeouts, "end = TIMEOUT, not failing"),
             )
@@ -338,8 +338,8 @@ class BoardModel:
             text += ": bodies touch at a relative speed of {} m/s"
             key = f"line {index}: impact_speed_mps"
             figures.append(figure(found.impact_speed_mps, OUTCOMES, key, ".1f"))
-        elif found.dx_m is not None:
-            text += ": front bumpers {} m apart as the VUT merges"
+        elif found.dx_m is not None and isinstance(self.run.scenario, MergeScenario):
+            text += f": front bumpers {{}} m apart at {self.run.scenario.place}"
             figures.append(figure(abs(found.dx_m), OUTCOMES, f"line {index}: dx_m", ".1f"))
         return say(f"{text}.", *figures, command=self._command("replay", f" {index} --gui"))
 
@@ -467,6 +467,9 @@ class BoardModel:
 
     def _often(self) -> Iterator[Statement]:
         known = self.per_merge
+        if not isinstance(self.run.scenario, MergeScenario):
+            yield Statement("Not known: no traffic is published for this kind of scenario.")
+            return
         if known is None:
             yield Statement(
                 "Not run: with how many mainline cars a merge fails in traffic of published "

@@ -76,6 +76,7 @@ const ofDrivers = ([low, high]) => `${low < high ? `${fixed(100 * low, 0)} to ` 
 function besidePeople(i) { // what the car that the VUT meets does in a failure
   const met = NAMES[vehicles[cases.nearest[i]]], slowed = cases.slowed_as_much[i];
   if (slowed === null || cases.pov_sustained_brake_mps2[i] === null) return "";
+  if (cases.pov_sustained_brake_mps2[i] <= 0 && cases.pov_slowdown_mps[i] <= 0) return "";
   const brakes = `brakes at ${fixed(cases.pov_sustained_brake_mps2[i], 1)} m/s² over 1.6 s, as ${ofDrivers(cases.braked_as_hard[i])} of ${data.drivers} published drivers did`;
   const slows = `slows down by ${fixed(cases.pov_slowdown_mps[i], 1)} m/s (${ofDrivers(slowed)})`;
   return `The ${met} ${brakes}, and ${slows}: ${cases.inside[i] ? "inside" : "outside"} what people do.`;
