@@ -164,7 +164,7 @@ class TestACampaign:
     [
         ("design1", "us23-traffic", 0, "paper"),
         ("level0", "us23-lane", 2, "dx_m < 12 and dx_m > -12"),
-        pytest.param("sumo:Krauss", "us23", 1, "contact", marks=pytest.mark.slow),
+        pytest.param("sumo:Krauss", "us23", 0, "contact", marks=pytest.mark.slow),
     ],
 )
 def test_sentences_are_true_on_other_roads_too(tmp_path, vut, scenario, level, fail_when):
