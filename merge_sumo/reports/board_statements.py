@@ -131,6 +131,12 @@ def _driver(people: PeopleSummary) -> str:
     return "the other driver" if people.car == "the POV" else people.car
 
 
+def _files(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the hashes of files that a record has; a record is data, and may hold anything."""
+    files = settings.get(name)
+    return files if isinstance(files, dict) else {}
+
+
 def _as_text(text: str) -> str:
     """Return a text that `say` leaves as it is."""
     return text.replace("{", "{{").replace("}", "}}")
@@ -178,7 +184,7 @@ class BoardModel:
             if settings.get(name) != self.run.settings.get(name):
                 raise UserError(f"{path} is of another campaign: its {name} differs")
         for name in ("vut_files", "pov_files"):
-            one, other = settings.get(name) or {}, self.run.settings.get(name) or {}
+            one, other = _files(settings, name), _files(self.run.settings, name)
             if differing := [
                 file for file in one.keys() & other.keys() if one[file] != other[file]
             ]:
@@ -233,8 +239,13 @@ class BoardModel:
             "The sampler {} (seed {}) chose the cases in search of failures, so the share of "
             "failures among them is no frequency.",
             figure(str(settings.get("sampler")), SETTINGS, "sampler"),
-            figure(int(settings.get("seed") or 0), SETTINGS, "seed"),
+            figure(self._seed, SETTINGS, "seed"),
         )
+
+    @property
+    def _seed(self) -> int:
+        seed = self.run.settings.get("seed")
+        return seed if isinstance(seed, int) else 0
 
     def _starts(self) -> Iterator[Statement]:
         scenario = self.run.scenario
@@ -381,8 +392,8 @@ class BoardModel:
         yield self._certified()
 
     def _again(self, option: str) -> str:
-        cases, seed = self.summary.cases, self.run.settings.get("seed") or 0
-        return f"merge-sumo campaign {self._setup} --cases {cases} --seed {seed} {option}"
+        cases = self.summary.cases
+        return f"merge-sumo campaign {self._setup} --cases {cases} --seed {self._seed} {option}"
 
     @property
     def _setup(self) -> str:
@@ -671,6 +682,8 @@ class BoardModel:
             cases,
             figure(verdicts.failures, CROSSCHECK, "verdicts.failures"),
         )
+        if verdicts.lowest_only:
+            yield Statement("These are the cases of the campaign with the lowest scores.")
         if verdicts.differences:
             explained = sum(one.is_explained for one in verdicts.differences)
             yield say(

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,9 @@ def test_when_it_dies_this_process_searches_all_levels(worth_it, alone, tmp_path
     def killed(copy):
         pids.append(copy._beside.submit(os.getpid).result())
         os.kill(pids[-1], signal.SIGKILL)
+        # Its answer may be on the way already: only then has it died before it.
+        with pytest.raises(BrokenProcessPool):
+            copy._beside.submit(os.getpid).result()
         return proposals(copy)
 
     monkeypatch.setattr(CopyBeside, "proposals", killed)
