@@ -40,8 +40,9 @@ from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.studies import stratified
 from merge_sumo.studies.failures_per_merge import OverMixtures, Part, Stated, part_of, parts_of
 from merge_sumo.studies.probability import STREAM, Expected, strata_of
-from merge_sumo.studies.stratified import Draws, Strata, cells, clopper_pearson, estimate
+from merge_sumo.studies.stratified import Draws, Strata, cells, estimate
 from merge_sumo.values.case import FloatArray
+from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.scenario import US23
 
 CONFIDENCE = 0.95

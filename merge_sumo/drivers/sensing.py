@@ -88,6 +88,7 @@ class SensedDriver(Driver):
             level=case.level,
             svo_rad=case.svo_rad,
             v_vut0_mps=case.v_vut0_mps,
+            draw=case.draw,
             scenario=scenario,
             told=told,
         )

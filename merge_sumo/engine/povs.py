@@ -266,4 +266,4 @@ def seen_from(case: Case, car: int) -> Case:
         place["lane_m"] = None
     scenario = replace(case.scenario, **place)
     told = (x_other_m, v_other_mps), (x_m, v_mps)
-    return ToldCase(level=0, v_vut0_mps=v_mps, scenario=scenario, told=told)
+    return ToldCase(level=0, v_vut0_mps=v_mps, draw=case.draw, scenario=scenario, told=told)

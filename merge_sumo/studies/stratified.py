@@ -30,6 +30,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.special import bdtr, rel_entr
 
 from merge_sumo.values.case import FloatArray
+from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.scenario import LEVELS, Scenario
 
 IntArray = NDArray[np.int64]
@@ -442,18 +443,3 @@ class _Order:
                 chance = np.tensordot(chance, of_number, axes=(0, 1))
             result[..., number] = chance
         return result
-
-
-def clopper_pearson(failures: int, cases: int, risk: float) -> tuple[float, float]:
-    """Return both ends for the share of failures among independent cases, each wrong by `risk`.
-
-    Source: Clopper and Pearson (1934). Never for cases that a sampler has chosen.
-    """
-    from scipy.stats import beta
-
-    low, high = 0.0, 1.0
-    if failures > 0:
-        low = float(beta.ppf(risk, failures, cases - failures + 1))
-    if failures < cases:
-        high = float(beta.isf(risk, failures + 1, cases - failures))
-    return low, high

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
@@ -50,6 +50,8 @@ FloatArray = NDArray[np.float64]
 _IMPERFECTIONS: Final = attrgetter(*COORDINATES)
 _NONE: Final = (None,) * len(COORDINATES)
 _PERFECT: Final = (PERFECT_SENSING, PERFECT_ACTUATION)
+MOST_DRAWS: Final = 2**32
+"""Draws of a case: their numbers have 4 bytes."""
 
 
 X_POV0, V_POV0 = US23.dimensions(0)
@@ -72,6 +74,7 @@ class Case:
         level: level of the POV.
         svo_rad: its social value orientation; None below level 2.
         v_vut0_mps: speed of the VUT at the start.
+        draw: which draw of what is random in its episode; no coordinate of the pool.
         scenario: the scenario.
 
     The others are numbers for ranges of the scenario's `sense` and `act`; None where it has none.
@@ -89,6 +92,7 @@ class Case:
     act_lag_s: float | None = None
     act_delay_s: float | None = None
     act_power_w_per_kg: float | None = None
+    draw: int = field(default=0, repr=False)
     scenario: Scenario = field(repr=False)
 
     if TYPE_CHECKING:
@@ -105,6 +109,8 @@ class Case:
         if (self.svo_rad is None) == (self.level == 2):
             raise UserError("svo_rad belongs to level 2, and only there: give it or leave it out")
         self._check_coordinates()
+        if not 0 <= self.draw < MOST_DRAWS:
+            raise UserError(f"draw is {self.draw}: choose 0 or more, and less than {MOST_DRAWS}")
         if self.svo_rad is not None and not 0.0 <= self.svo_rad < math.pi / 2:
             raise UserError(f"svo_rad is {self.svo_rad}: choose between 0 and below pi/2")
 
@@ -137,9 +143,25 @@ class Case:
         return with_numbers(self.scenario.act, ACT, self)
 
     @property
+    def start(self) -> Case:
+        """The case at its first draw: what its runs have in common."""
+        return self if self.draw == 0 else replace(self, draw=0)
+
+    @property
     def seed(self) -> int:
         """A number that the case alone decides: seeds what is drawn at random in its episode."""
-        return zlib.crc32(repr((self.level, self.svo_rad, self.starts())).encode())
+        return self._hashed((self.level, self.svo_rad, self.starts()))
+
+    @property
+    def told_seed(self) -> int:
+        """The same for a controller, by what it is told: neither level nor orientation decide."""
+        return self._hashed(self.starts())
+
+    def _hashed(self, known: object) -> int:
+        """Return a number below 2**32 for each draw, other than those of further draws."""
+        first = zlib.crc32(repr(known).encode())
+        # A CRC goes on from another one, and differs for different bytes of the same number.
+        return first if self.draw == 0 else zlib.crc32(self.draw.to_bytes(4, "little"), first)
 
     def _check_imperfections(self) -> None:
         """Raise `UserError` where a number is missing for a range, or there without one."""

@@ -238,6 +238,8 @@ class Outcome:
         case_names, measure_names, _ = record_fields(self.case.scenario)
         record: dict[str, Any] = {"index": self.index, "batch": self.batch}
         record |= {name: getattr(self.case, name) for name in case_names}
+        if self.case.draw:
+            record["draw"] = self.case.draw
         record |= {name: getattr(self.measures, name) for name in measure_names}
         record |= dict(self.measures.further)
         if self.margin is not None:
@@ -257,7 +259,7 @@ class Outcome:
             upgrade_from_0_1(record, scenario)
         known = convert(record, flat)
         coordinates = {name: getattr(known, name) for name in case_names}
-        case = scenario.case_type(**coordinates, scenario=scenario)
+        case = scenario.case_type(**coordinates, draw=known.draw, scenario=scenario)
         measures = Measures(
             **{name: getattr(known, name) for name in measure_names},
             further=tuple((name, getattr(known, name)) for name in further_measures()),
@@ -308,6 +310,7 @@ def _record_fields(
     optional = [
         *((name, types[name], None) for name in LATER),
         *further,
+        ("draw", int, 0),
         ("margin", float | None, None),
         ("foretold", Prediction | None, None),
         ("audit", AuditMark | None, None),

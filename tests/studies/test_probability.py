@@ -22,13 +22,13 @@ from merge_sumo.studies.stratified import (
     DEFENSIVE,
     Strata,
     cells,
-    clopper_pearson,
     estimate,
     of_cells,
     risks,
     upper_end,
 )
 from merge_sumo.values.case import V_POV0, dimensions
+from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.scenario import US23
 
 LEVELS = (0, 1, 2)

@@ -1,0 +1,116 @@
+"""Cases that ran more than once: a failure probability for each, and what counts as a failing case.
+
+A controller that draws random numbers, or that is driven through noise, fails with a probability.
+Each run of a case is a case of its own with another draw (`Case.draw`), and an outcome of its own.
+A case fails where more than a tolerated share of its runs fail; with none tolerated, where any run
+does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from merge_sumo.errors import UserError
+from merge_sumo.values.case import Case
+from merge_sumo.values.score import Outcome
+
+CONFIDENCE: Final = 0.95
+"""That the interval of a case holds its failure probability."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunsOfCase:
+    """The runs of one case that have a verdict.
+
+    Attributes:
+        case: the case, at draw 0.
+        outcomes: its runs, (n,), at least one, in the order in which they are recorded.
+    """
+
+    case: Case
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def runs(self) -> int:
+        """Number of runs, n."""
+        return len(self.outcomes)
+
+    @property
+    def failures(self) -> int:
+        """Number of runs that fail."""
+        return sum(outcome.failed for outcome in self.outcomes)
+
+    @property
+    def share(self) -> float:
+        """Share of the runs that fail."""
+        return self.failures / self.runs
+
+    @property
+    def worst(self) -> Outcome:
+        """The run with the lowest score: what stands for the case where one run is shown."""
+        return min(self.outcomes, key=lambda outcome: (_score(outcome), outcome.index))
+
+    def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
+        """Return where the failure probability is with a confidence (Clopper and Pearson, 1934).
+
+        It holds for a number of runs that outcomes do not decide.
+        """
+        return clopper_pearson(self.failures, self.runs, (1.0 - confidence) / 2.0)
+
+
+def _score(outcome: Outcome) -> float:
+    return 0.0 if outcome.score is None else outcome.score
+
+
+def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
+    """Return outcomes with a verdict by their case, in the order of the first run of each.
+
+    Each outcome of draw 0 begins a case; other draws join the last case with their start.
+    """
+    cases: list[tuple[Case, list[Outcome]]] = []
+    place: dict[Case, int] = {}
+    for outcome in outcomes:
+        if outcome.score is None:
+            continue
+        start = outcome.case.start
+        if outcome.case.draw == 0 or start not in place:
+            place[start] = len(cases)
+            cases.append((start, []))
+        cases[place[start]][1].append(outcome)
+    return [RunsOfCase(case, tuple(runs)) for case, runs in cases]
+
+
+def fails_above(one: RunsOfCase, tolerated: float = 0.0) -> bool:
+    """Return whether more than a tolerated share of the runs of a case fail."""
+    return one.share > tolerated
+
+
+def failing_cases(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[RunsOfCase]:
+    """Return the cases that fail in more than a tolerated share of their runs, as `by_case`."""
+    return [one for one in by_case(outcomes) if fails_above(one, tolerated)]
+
+
+def check_tolerated(tolerated: float) -> None:
+    """Raise `UserError` for what is no share of runs that may fail."""
+    if not 0.0 <= tolerated < 1.0:
+        raise UserError(
+            f"--tolerate is {tolerated}: choose the share of its runs in which a case may fail, "
+            "from 0 to below 1, say 0.1"
+        )
+
+
+def clopper_pearson(failures: int, cases: int, risk: float) -> tuple[float, float]:
+    """Return both ends for the share of failures among independent cases, each wrong by `risk`.
+
+    Source: Clopper and Pearson (1934). Never for cases that a sampler has chosen.
+    """
+    from scipy.stats import beta
+
+    low, high = 0.0, 1.0
+    if failures > 0:
+        low = float(beta.ppf(risk, failures, cases - failures + 1))
+    if failures < cases:
+        high = float(beta.isf(risk, failures + 1, cases - failures))
+    return low, high

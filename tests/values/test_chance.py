@@ -1,0 +1,107 @@
+"""Draws of a case, and cases that fail in a share of their runs."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from merge_sumo.errors import UserError
+from merge_sumo.values.case import MergeCase, to_unit
+from merge_sumo.values.chance import by_case, check_tolerated, failing_cases, fails_above
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
+
+CASE = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.5, scenario=US23)
+FAILS, PASSES = -600.0, -20.0
+
+
+def outcomes(runs: Sequence[tuple[MergeCase, int, float | None]]) -> list[Outcome]:
+    """Return outcomes of (case, draw, score), without a verdict for None."""
+    return [
+        Outcome(
+            index,
+            0,
+            replace(case, draw=draw),
+            Measures(end=End.VUT_ERROR if score is None else End.MERGED, score=score, t_end_s=9.0),
+        )
+        for index, (case, draw, score) in enumerate(runs)
+    ]
+
+
+def test_the_first_draw_is_the_case_as_it_was_and_others_have_other_seeds():
+    second = replace(CASE, draw=2)
+    # CRC-32 of "(2, 0.5, [(-273.0, 33.0), (-182.0, 18.0)])", then of the bytes 2 0 0 0.
+    assert CASE.seed == 0xF7DAFF7F
+    assert second.seed == 0x5E87D99A
+    assert len({replace(CASE, draw=draw).seed for draw in range(1000)}) == 1000
+    assert second.start == CASE
+    assert second != CASE
+    assert np.array_equal(to_unit([second], 2), to_unit([CASE], 2))
+    assert pickle.loads(pickle.dumps(second)) == second  # noqa: S301
+
+
+def test_the_seed_of_a_controller_reveals_neither_level_nor_orientation():
+    other = replace(CASE, svo_rad=1.0)
+    below = replace(CASE, level=1, svo_rad=None)
+    assert CASE.told_seed == other.told_seed == below.told_seed
+    assert CASE.told_seed != replace(CASE, draw=1).told_seed
+    assert CASE.told_seed != replace(CASE, x_pov0_m=-274.0).told_seed
+
+
+def test_a_record_names_the_draw_only_where_it_is_not_the_first():
+    first, second = outcomes([(CASE, 0, FAILS), (CASE, 7, FAILS)])
+    assert "draw" not in first.to_record()
+    assert second.to_record()["draw"] == 7
+    assert Outcome.from_json(json.dumps(second.to_record()), US23) == second
+
+
+@pytest.mark.parametrize("draw", [-1, 2**32, 2**70, 1.5, True, "1", None, [1]])
+def test_a_record_with_another_draw_is_refused(draw):
+    record = outcomes([(CASE, 7, FAILS)])[0].to_record() | {"draw": draw}
+    with pytest.raises(UserError, match="draw"):
+        Outcome.from_json(json.dumps(record), US23)
+
+
+def test_runs_are_counted_by_case_in_the_order_of_the_first_run():
+    other = replace(CASE, x_pov0_m=-200.0)
+    told = outcomes(
+        [
+            *((CASE, 0, FAILS), (other, 0, PASSES), (CASE, 1, PASSES), (CASE, 2, None)),
+            *((other, 1, PASSES), (CASE, 3, FAILS - 1.0)),
+        ]
+    )
+    one, two = by_case(told)
+    assert (one.case, one.runs, one.failures, one.share) == (CASE, 3, 2, 2 / 3)
+    assert [outcome.index for outcome in one.outcomes] == [0, 2, 5]
+    assert one.worst.index == 5
+    assert (two.case, two.runs, two.failures) == (other, 2, 0)
+    assert failing_cases(told) == [one]
+    assert failing_cases(told, 0.66) == [one]
+    assert failing_cases(told, 2 / 3) == []
+    assert fails_above(one, 0.66)
+
+
+def test_without_repeats_each_outcome_with_a_verdict_is_a_case():
+    """Also where a sampler proposes a case twice."""
+    told = outcomes([(CASE, 0, FAILS), (CASE, 0, FAILS), (CASE, 0, None), (CASE, 0, PASSES)])
+    assert [one.outcomes for one in by_case(told)] == [(told[0],), (told[1],), (told[3],)]
+    assert [one.worst for one in failing_cases(told)] == [o for o in told if o.failed]
+
+
+def test_the_interval_is_that_of_clopper_and_pearson():
+    runs = [(CASE, draw, FAILS if draw < 3 else PASSES) for draw in range(10)]
+    (one,) = by_case(outcomes(runs))
+    assert one.interval() == pytest.approx((0.0667, 0.6525), abs=1e-4)
+    assert by_case(outcomes(runs[3:4]))[0].interval() == pytest.approx((0.0, 0.975))
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])
+def test_what_is_no_share_is_not_tolerated(share):
+    with pytest.raises(UserError, match="--tolerate is"):
+        check_tolerated(share)
