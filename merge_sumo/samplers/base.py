@@ -5,13 +5,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
 from merge_sumo.samplers.allocation import even_shares
-from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.samplers.history import LevelHistory, deciding_run
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
+from merge_sumo.values.chance import RunsOfCase, by_case
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import Outcome
 
@@ -40,6 +42,8 @@ class Sampler(ABC):
     """Whether proposals depend on predictions of a twin of the VUT."""
     overlaps: ClassVar[bool] = False
     """Whether it is asked while cases run, and counts these (`pend`)."""
+    tolerated: float = 0.0
+    """Share of its runs that may fail in a case that does not: the campaign's."""
 
     def __init__(self, pool: Pool, seed: int, predictor: Predictor | None = None) -> None:
         """Propose cases from `pool`; `seed` makes the proposals reproducible.
@@ -55,6 +59,8 @@ class Sampler(ABC):
         """Outcomes with a verdict by level, and all of them; None where they are to be sorted."""
         self._histories: dict[int, LevelHistory] = {}
         """Of the first outcomes of a level; later ones are added when it is asked for."""
+        self._repeated = False
+        """Whether a case ran with more than one draw."""
         self._proposed: Counter[int] = Counter()
         self._pending: list[Case] = []
 
@@ -82,6 +88,7 @@ class Sampler(ABC):
             if outcome.index <= self._last_index:
                 self._observed = None
             self._last_index = max(outcome.index, self._last_index)
+            self._repeated |= outcome.case.draw > 0
             self._outcomes[outcome.index] = outcome
             if self._observed is not None:
                 _observe(self._observed, outcome)
@@ -121,22 +128,50 @@ class Sampler(ABC):
         return pending + (self._proposed.total() if level is None else self._proposed[level])
 
     def history(self, level: int) -> LevelHistory:
-        """Return the outcomes with a verdict at one level as arrays."""
+        """Return the outcomes with a verdict at one level as arrays, a row for each case."""
+        if self._repeated:
+            return self._repeated_history(level)
         observed = self.observed(level)
         before = self._histories.get(level)
         outcomes = observed if before is None else observed[len(before.points) :]
-        history = LevelHistory(
+        history = self._rows_of(outcomes, level)
+        if before is not None:
+            history = before.then(history)
+        self._histories[level] = history
+        return history.take(np.arange(len(observed)))
+
+    def runs(self, level: int | None = None) -> list[RunsOfCase]:
+        """Return the cases with a verdict, of one level or of all, each with its runs.
+
+        Those of a level are the rows of its history.
+        """
+        return by_case(self.observed(level))
+
+    def _repeated_history(self, level: int) -> LevelHistory:
+        """Return the history of a level where cases ran with more than one draw."""
+        cases = self.runs(level)
+        decisive = [deciding_run(one.outcomes, self.tolerated) for one in cases]
+        scores = [[run.score for run in one.outcomes] for one in cases]
+        return replace(
+            self._rows_of(decisive, level),
+            batch=np.array([one.outcomes[0].batch for one in cases], dtype=np.int64),
+            runs=np.array([one.runs for one in cases], dtype=np.int64),
+            failures=np.array([one.failures for one in cases], dtype=np.int64),
+            variance=np.array([np.var(of, ddof=1) if len(of) > 1 else np.nan for of in scores]),
+            varies=any(len({run.score for run in one.outcomes}) > 1 for one in self.runs()),
+        )
+
+    def _rows_of(self, outcomes: Sequence[Outcome], level: int) -> LevelHistory:
+        """Return outcomes as rows, as if each were the only run of its case."""
+        return LevelHistory(
             points=to_unit((o.case for o in outcomes), level, self.pool.scenario),
             score=np.array([o.score for o in outcomes], dtype=np.float64),
             failed=np.array([o.failed for o in outcomes], dtype=bool),
             # None becomes NaN.
             dx_m=np.array([o.signed_gap_m for o in outcomes], dtype=np.float64),
             batch=np.array([o.batch for o in outcomes], dtype=np.int64),
+            tolerated=self.tolerated,
         )
-        if before is not None:
-            history = before.then(history)
-        self._histories[level] = history
-        return history.take(np.arange(len(observed)))
 
     def rng(self, *key: int) -> np.random.Generator:
         """Return the generator of this proposal: seed, cases proposed so far, and a key.

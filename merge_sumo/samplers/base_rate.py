@@ -66,13 +66,13 @@ class BaseRate:
         begun = int(place[distance < SAME].max(initial=-1)) + 1
         self.following = sequence[begun : begun + n]
         anywhere = distance[: len(history.points)] < SAME
-        failures = float(history.failed[anywhere].sum())
+        failures = float(history.share[anywhere].sum())
         self.chance = (failures + PRIOR_FAILURES) / (float(anywhere.sum()) + PRIOR_CASES)
         said = np.array([np.nan if one is None else one.p_fail for one in predictions])
         picks = np.flatnonzero(~anywhere & ~np.isnan(said))[-JUDGED:]
         far = self._far_then(picks)
         promised = np.bincount(far, said[picks], minlength=2)
-        failed = np.bincount(far, history.failed[picks], minlength=2)
+        failed = np.bincount(far, history.share[picks], minlength=2)
         self._credit = np.minimum((failed + 1.0) / (promised + 1.0), 1.0)
 
     def mixed(self, picks: Proposal, following: Proposal) -> Proposal:

@@ -15,6 +15,9 @@ being nearer than any failure, are lowered by h / (h + w): h is the width of the
 typical width of what fails. That bisects the curve where the order of merging flips, gives up
 where it is a jump, and goes on along it where it is a strip of failures. Then a logistic
 regression corrects the odds by the distances to the nearest failure and to that curve.
+
+Where runs of a case differ, P(fail) is that of a run. The processes then have a noise of their own,
+all are judged by k failures of n runs, and `LatentOdds` corrects what they say.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit, logit
 
 from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.samplers.latent_odds import LatentOdds, chance_above, mean_chance
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import radius_for
@@ -79,17 +83,40 @@ class Belief:
         self.history = history
         values, low, high = margin_of(learned, limit)
         self._smooth, self._rough = (
-            Margin(learned.points, values, low, high, rough=rough) for rough in (False, True)
+            Margin(learned.points, values, low, high, rough=rough, noisy=history.varies)
+            for rough in (False, True)
         )
         self.rotation = self._smooth.rotation
         self._branches: Branches | None = None
         positive = int((values >= 0.0).sum())
         if has_gaps(history) and min(positive, len(values) - positive) >= BRANCH_FROM:
-            self._branches = Branches(learned.points, values, self._smooth)
+            self._branches = Branches(learned.points, values, self._smooth, noisy=history.varies)
         self._weigh(learned)
 
     def of(self, cases: FloatArray) -> FloatArray:
-        """Return P(fail) of cases, (m, d)."""
+        """Return P(fail) of a run of cases, (m, d), as (m,)."""
+        chance = self._believed(cases)
+        if self._latent is None:
+            return chance
+        return mean_chance(*self._latent.at(cases, _log_odds(chance)))
+
+    @property
+    def tolerates(self) -> bool:
+        """Whether a case that fails in a run may pass: chance was seen, and a share tolerated."""
+        return self.history.varies and self.history.tolerated > 0.0
+
+    def above(self, cases: FloatArray) -> FloatArray:
+        """Return the probability that cases, (m, d), fail in more runs than are tolerated, (m,).
+
+        With none tolerated it is P(fail) of a run: a case fails once a run of it does.
+        """
+        if self._latent is None or not self.tolerates:
+            return self.of(cases)
+        odds = self._latent.at(cases, _log_odds(self._believed(cases)))
+        return chance_above(*odds, self.history.tolerated)
+
+    def _believed(self, cases: FloatArray) -> FloatArray:
+        """Return P(fail) of cases, (m, d), by all experts, before the correction for chance."""
         dims = self.history.dims
         distances = [nearest(cases, self.history.points[group]) for group in self.groups]
         chances = [
@@ -109,20 +136,25 @@ class Belief:
         distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
         log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
         self._fitted: list[tuple[float, FloatArray]] = []
-        best = []
+        best, left_out = [], []
         experts: list[Margin | Branches] = [self._smooth, self._rough]
         experts += [] if self._branches is None else [self._branches]
         for expert in experts:
             chance = expert.left_out()
             lowered = _lowered(chance, distances, WIDTHS[:, None])
             evidence = _evidence(lowered, distances, learned.dims)
-            calibrations, posteriors = _calibrated(evidence, learned.failed)
+            calibrations, posteriors = _calibrated(evidence, learned.failures, learned.runs)
             posteriors = posteriors + log_prior
             place = int(posteriors.argmax())
             posterior, width, calibration = posteriors[place], WIDTHS[place], calibrations[place]
             self._fitted.append((float(width), calibration))
             best.append(float(posterior))
+            left_out.append(expit(evidence[place] @ calibration))
         self._weights = np.exp(np.array(best) - max(best))
+        self._latent = None
+        if learned.varies:
+            odds = _log_odds(np.average(left_out, axis=0, weights=self._weights))
+            self._latent = LatentOdds(learned.points, learned.runs, learned.failures, odds)
 
 
 class Calibration:
@@ -137,20 +169,20 @@ class Calibration:
 
     def __init__(self, history: LevelHistory) -> None:
         """Compare the last outcomes with the expectation from those before them."""
-        self._failing = history.points[history.failed]
+        self._failing = history.points[history.ever_failed]
         self.factors = np.ones(2)
         first = len(history.points) - PREDICTED
         if first < PREDICTED // 2:
             return
         before, since = history.take(slice(first)), history.take(slice(first, None))
-        far = is_far(since.points, before.points[before.failed])
-        predicted = np.bincount(far, Belief(before).of(since.points), minlength=2)
-        failed = np.bincount(far, since.failed, minlength=2)
+        far = is_far(since.points, before.points[before.ever_failed])
+        predicted = np.bincount(far, since.runs * Belief(before).of(since.points), minlength=2)
+        failed = np.bincount(far, since.failures, minlength=2)
         self.factors = np.minimum((failed + 1.0) / (predicted + 1.0), 1.0)
 
-    def of(self, belief: Belief, cases: FloatArray) -> FloatArray:
-        """Return the corrected P(fail) of cases, (m, d), as (m,)."""
-        corrected: FloatArray = belief.of(cases) * self.factors[is_far(cases, self._failing)]
+    def of(self, chance: FloatArray, cases: FloatArray) -> FloatArray:
+        """Return a probability of cases, (m,), corrected; these are (m, d)."""
+        corrected: FloatArray = chance * self.factors[is_far(cases, self._failing)]
         return corrected
 
 
@@ -180,7 +212,8 @@ def margin_of(history: LevelHistory, limit: float | None = None) -> tuple[FloatA
 def _as_if(history: LevelHistory, limit: float) -> LevelHistory:
     """Return the history as if all cases up to a limit had failed."""
     nearness = gap_m(history) if has_gaps(history) else history.score
-    return replace(history, failed=nearness <= limit)
+    failed = nearness <= limit
+    return replace(history, failed=failed, failures=np.where(failed, history.runs, 0))
 
 
 def gap_m(history: LevelHistory) -> FloatArray:
@@ -194,15 +227,16 @@ def has_gaps(history: LevelHistory) -> bool:
 
 
 def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
-    """Return which cases failed, and which safe ones are on either side, each (N,).
+    """Return which cases failed in a run, and which safe ones are on either side, each (N,).
 
     The side is who goes first; without a trajectory a safe case is on both.
     """
-    safe = ~history.failed
+    failed = history.ever_failed
+    safe = ~failed
     if not has_gaps(history):
-        return [history.failed, safe, safe]
+        return [failed, safe, safe]
     pov_first = np.nan_to_num(history.dx_m, nan=NO_GAP_M) >= 0.0
-    return [history.failed, safe & ~pov_first, safe & pov_first]
+    return [failed, safe & ~pov_first, safe & pov_first]
 
 
 def is_far(points: FloatArray, failing: FloatArray) -> NDArray[np.int64]:
@@ -248,25 +282,31 @@ def _evidence(chance: FloatArray, distances: list[FloatArray], dims: int) -> Flo
     """
     to_failing, before, behind = distances
     radius = radius_for(dims)
-    odds = logit(np.clip(chance, SURE, 1.0 - SURE))
+    odds = _log_odds(chance)
     to_curve = np.maximum(before, behind)
     near = [np.log((distance + NEAR) / (radius + NEAR)) for distance in (to_failing, to_curve)]
     return np.stack(np.broadcast_arrays(odds, 1.0, *near), axis=-1)
 
 
-def _calibrated(evidence: FloatArray, failed: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def _log_odds(chance: FloatArray) -> FloatArray:
+    return np.asarray(logit(np.clip(chance, SURE, 1.0 - SURE)), dtype=np.float64)
+
+
+def _calibrated(
+    evidence: FloatArray, failures: NDArray[np.int64], runs: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
     """Return the weights of the evidence, (W, 4), that predict best, and log posteriors, (W,).
 
-    The evidence is of W kinds, (W, N, 4). Logistic regressions by Newton's method, all at once; a
-    step that makes one worse is halved.
+    The evidence is of W kinds, (W, N, 4); failures of so many runs are (N,). Logistic regressions
+    by Newton's method, all at once; a step that makes one worse is halved.
     """
     mean, deviation = CALIBRATION
-    signs = np.where(failed, 1.0, -1.0)
 
     def posterior(evidence: FloatArray, weights: FloatArray) -> FloatArray:
         prior = -0.5 * np.square((weights - mean) / deviation).sum(axis=1)
         odds = (evidence @ weights[..., None])[..., 0]
-        return np.asarray(log_expit(signs * odds).sum(axis=1) + prior, dtype=np.float64)
+        likelihood = failures * log_expit(odds) + (runs - failures) * log_expit(-odds)
+        return np.asarray(likelihood.sum(axis=1) + prior, dtype=np.float64)
 
     weights = np.tile(mean, (len(evidence), 1))
     best = posterior(evidence, weights)
@@ -274,8 +314,8 @@ def _calibrated(evidence: FloatArray, failed: NDArray[np.bool_]) -> tuple[FloatA
     for _ in range(NEWTON_STEPS):
         of, now = evidence[open_], weights[open_]
         chance = expit((of @ now[..., None])[..., 0])
-        slope = ((failed - chance)[:, None] @ of)[:, 0] - (now - mean) / deviation**2
-        spread = (of * (chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ of
+        slope = ((failures - runs * chance)[:, None] @ of)[:, 0] - (now - mean) / deviation**2
+        spread = (of * (runs * chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ of
         step = np.linalg.solve(spread + np.diag(deviation**-2.0), slope[..., None])[..., 0]
         reached = posterior(of, now + step)
         while (worse := (reached < best[open_]) & (np.abs(step).max(axis=1) > SURE)).any():

@@ -199,7 +199,7 @@ class CoverageSampler(Sampler):
                 spread = spread_out(begun + n, history.dims, self.told_rng(level))[begun:]
                 return Proposal(spread, chance, chance, (None,) * n)
             return _Search(history, pending, rng, n).batch(n)
-        skill = yield from self._skill(level, history)
+        skill = yield from self._skill(level)
         base_rate = None
         if skill.breaks_promises and not few:
             base_rate = self._base_rate(level, history, pending, n)
@@ -213,7 +213,8 @@ class CoverageSampler(Sampler):
         self, level: int, history: LevelHistory, pending: FloatArray, n: int
     ) -> BaseRate:
         """Return the base rate of a level, with the sequence of its first batch."""
-        predictions = [outcome.prediction for outcome in self.observed(level)]
+        # A case is judged by what was predicted of its first run.
+        predictions = [case.outcomes[0].prediction for case in self.runs(level)]
         errors = [
             outcome.case
             for outcome in self._outcomes.values()
@@ -223,13 +224,14 @@ class CoverageSampler(Sampler):
         begins = np.random.default_rng([self.seed, 0, level])
         return BaseRate(history, predictions, unknown, n, self.proposed(level), begins)
 
-    def _skill(self, level: int, history: LevelHistory) -> Asking[PredictionSkill]:
+    def _skill(self, level: int) -> Asking[PredictionSkill]:
         """Return the skill of the predictions so far, of all levels."""
         last = self.observed(level)[-REPLAYED:]
         replayed: dict[int, FloatArray] = {}
         if last:
             indices = [outcome.index for outcome in last]
-            gaps_m = yield Query(level, history.points[-REPLAYED:], held_out=indices)
+            points = to_unit((outcome.case for outcome in last), level, self.pool.scenario)
+            gaps_m = yield Query(level, points, held_out=indices)
             replayed = dict(zip(indices, gaps_m.T, strict=True))
         outcomes = self.observed()
         # The stand-in for a gap under another criterion has the limit of the paper's scenario.
@@ -262,25 +264,31 @@ class _Search:
         limit, calibration = _limit(history), Calibration(history)
         belief = Belief(history, limit)
         candidates = of_belief(history, belief, rng, n)
-        probability, balls = calibration.of(belief, candidates), self._grid.balls(candidates)
-        worth = probability * self._grid.new(balls)
+        aim, balls = (
+            calibration.of(belief.above(candidates), candidates),
+            self._grid.balls(candidates),
+        )
+        worth = aim * self._grid.new(balls)
         best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
         refined = around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
         candidates = np.concatenate([candidates, refined])
-        probability = np.concatenate([probability, calibration.of(belief, refined)])
+        aim = np.concatenate([aim, calibration.of(belief.above(refined), refined)])
         balls = np.concatenate([balls, self._grid.balls(refined)])
-        worth = probability * (self._grid.new(balls) + EVEN_IF_COVERED)
+        worth = aim * (self._grid.new(balls) + EVEN_IF_COVERED)
         kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
-        self._candidates, self._aim = candidates[kept], probability[kept]
+        self._candidates, self._aim = candidates[kept], aim[kept]
         self._calibration = calibration
         self._belief = belief if limit is None else Belief(history)
-        self._probability = self._aim if limit is None else self._chance(self._candidates)
+        self._above = self._aim
+        if limit is not None:
+            self._above = calibration.of(self._belief.above(self._candidates), self._candidates)
 
     def batch(self, n: int, base_rate: BaseRate | None = None) -> Proposal:
         """Return the greedy batch of `n` cases, with a base rate where its picks promise more."""
-        picks, gain = greedy(self._grid, self._candidates, self._aim, self._probability, n)
+        picks, gain = greedy(self._grid, self._candidates, self._aim, self._above, n)
         points, unknown = self._candidates[picks], (None,) * n
-        batch = Proposal(points, gain, self._probability[picks], unknown)
+        chance = self._chance(points) if self._belief.tolerates else self._above[picks]
+        batch = Proposal(points, gain, chance, unknown)
         if base_rate is None:
             return batch
         following = base_rate.following
@@ -288,7 +296,7 @@ class _Search:
 
     def _chance(self, points: FloatArray) -> FloatArray:
         """Return the calibrated P(fail) of points, (m, d), as (m,)."""
-        return self._calibration.of(self._belief, points)
+        return self._calibration.of(self._belief.of(points), points)
 
 
 def _limit(history: LevelHistory) -> float | None:

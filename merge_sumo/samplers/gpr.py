@@ -101,7 +101,7 @@ class _Posterior:
         failures = history.points[history.failed]
         history = most_telling(history, MAX_LEARNED)
         process = _fit(history)
-        self._kernel = process.kernel_
+        self._kernel, self._noise = process.kernel_, float(np.max(_noise(history)))
         cross = self._kernel(history.points, queries)
         self._explained = solve_triangular(process.L_, cross, lower=True)
         badness = np.maximum(cross.T @ process.alpha_, 0.0)
@@ -132,7 +132,7 @@ class _Posterior:
         self._grid.cover(self._balls[best], 1.0)
         covariance = self._kernel(self._queries[[best]], self._queries)[0]
         covariance -= self._explained[:, best] @ self._explained
-        step = covariance / np.sqrt(variance + NOISE)
+        step = covariance / np.sqrt(variance + self._noise)
         self._explained = np.vstack([self._explained, step])
         self._variance = self._variance - np.square(step)
 
@@ -146,12 +146,24 @@ def _fit(history: LevelHistory) -> Any:
 
     dims = history.points.shape[1]
     kernel = ConstantKernel(1.0, (1e-3, 1e3)) * RBF(np.full(dims, 0.3), LENGTH_BOUNDS)
-    process = GaussianProcessRegressor(kernel, alpha=NOISE)
+    process = GaussianProcessRegressor(kernel, alpha=_noise(history))
     # One thread: rounding must not depend on the number of cores, and small matrices gain nothing.
     with threadpool_limits(1), warnings.catch_warnings():
         # A length scale at its bound is expected where P hardly depends on a coordinate.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return process.fit(history.points, history.score / FAILURE_SCORE)
+
+
+def _noise(history: LevelHistory) -> FloatArray | float:
+    """Return the variance of the noise of each case, (N,), in units of lambda^2.
+
+    Where runs of a case differ, the variance that cases with several runs have in the mean is that
+    of a single run; more runs lower it.
+    """
+    if not history.varies or np.isnan(history.variance).all():
+        return NOISE
+    of_a_run = float(np.nanmean(history.variance)) / FAILURE_SCORE**2
+    return np.asarray(NOISE + of_a_run / history.runs, dtype=np.float64)
 
 
 def predicted_score(history: LevelHistory, points: FloatArray) -> FloatArray:

@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.values.case import FloatArray
+from merge_sumo.values.score import Outcome
 
 
 @dataclass(frozen=True, slots=True)
 class LevelHistory:
-    """The outcomes of one POV level: N cases with a verdict, in the order of their index.
+    """The outcomes of one POV level: N cases with a verdict, in the order of their first run.
+
+    A case that ran several times has one row: the *deciding run* gives its score and its gap. Of
+    the runs from the worst to the best it is the first one behind those that are tolerated, so
+    that its score is below lambda exactly where more than the tolerated share of the runs failed.
 
     Attributes:
         points: cases in the unit cube, (N, d).
-        score: P, or its stand-in under another criterion than the paper's, (N,).
+        score: P of the deciding run, or its stand-in under another criterion than the paper's,
+            (N,).
         failed: score < lambda, (N,).
-        dx_m: signed gap at M, (N,), or its stand-in under another criterion: a case fails
-            within 6 m; NaN where the VUT never arrived or there is no trajectory.
-        batch: batch of the campaign in which the case ran, (N,).
+        dx_m: signed gap at M in the deciding run, (N,), or its stand-in under another criterion: a
+            case fails within 6 m; NaN where the VUT never arrived or there is no trajectory.
+        batch: batch of the campaign in which the case ran first, (N,).
+        runs: number of runs of each case, (N,).
+        failures: number of those that failed, (N,).
+        variance: variance of the score over the runs of a case, (N,); NaN for a single run.
+        varies: whether runs of a case have differed, at this level or another.
+        tolerated: share of the runs of a case that may fail.
     """
 
     points: FloatArray
@@ -28,25 +40,64 @@ class LevelHistory:
     failed: NDArray[np.bool_]
     dx_m: FloatArray
     batch: NDArray[np.int64]
+    runs: NDArray[np.int64] = field(default=None)  # type: ignore[assignment]
+    failures: NDArray[np.int64] = field(default=None)  # type: ignore[assignment]
+    variance: FloatArray = field(default=None)  # type: ignore[assignment]
+    varies: bool = False
+    tolerated: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Give each case a single run where nothing else is said."""
+        single = {
+            "runs": np.ones(len(self.points), dtype=np.int64),
+            "failures": self.failed.astype(np.int64),
+            "variance": np.full(len(self.points), np.nan),
+        }
+        for name, values in single.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, values)
 
     @property
     def dims(self) -> int:
         """Return d, the number of coordinates."""
         return int(self.points.shape[1])
 
+    @property
+    def share(self) -> FloatArray:
+        """Return the share of the runs of each case that failed, (N,)."""
+        return np.asarray(self.failures / self.runs, dtype=np.float64)
+
+    @property
+    def ever_failed(self) -> NDArray[np.bool_]:
+        """Return whether any run of a case failed, (N,)."""
+        return self.failures > 0
+
     def then(self, later: LevelHistory) -> LevelHistory:
         """Return the outcomes with later ones after them."""
         if not len(later.points):
             return self
-        pairs = ((getattr(self, f.name), getattr(later, f.name)) for f in fields(self))
-        return LevelHistory(*(np.concatenate(pair) for pair in pairs))
+        rows = {
+            name: np.concatenate([values, getattr(later, name)])
+            for name, values in self._rows().items()
+        }
+        return replace(self, **rows, varies=self.varies or later.varies)
 
     def take(self, places: slice | NDArray[np.int64]) -> LevelHistory:
         """Return some of the outcomes."""
-        return LevelHistory(
-            points=self.points[places],
-            score=self.score[places],
-            failed=self.failed[places],
-            dx_m=self.dx_m[places],
-            batch=self.batch[places],
-        )
+        return replace(self, **{name: values[places] for name, values in self._rows().items()})
+
+    def _rows(self) -> dict[str, NDArray[np.float64]]:
+        """Return the fields with a row for each case, by name."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: rows for name, rows in values.items() if isinstance(rows, np.ndarray)}
+
+
+def deciding_run(runs: Sequence[Outcome], tolerated: float) -> Outcome:
+    """Return the run of a case that decides whether more than a share of its runs failed.
+
+    The runs have verdicts. Its score is below lambda exactly where the case fails.
+    """
+    total = len(runs)
+    spared = sum(not failures / total > tolerated for failures in range(1, total + 1))
+    ordered = sorted(runs, key=lambda run: run.score or 0.0)
+    return ordered[min(spared, total - 1)]

@@ -30,8 +30,10 @@ NOISE: Final = 1e-3
 """Variance of the observation noise: it keeps matrices with close cases invertible."""
 LOG_PRIOR_VARIANCE: Final = (np.log(4.0), 1.5)
 LOG_PRIOR_LENGTH: Final = (np.log(0.4), 1.0)
+LOG_PRIOR_NOISE: Final = (np.log(0.1), 1.5)
 """Mean and standard deviation of the logarithms of the parameters before anything is known."""
 VARIANCE_BOUNDS: Final = (1e-2, 1e3)
+NOISE_BOUNDS: Final = (NOISE, 1e2)
 LENGTH_BOUNDS: Final = (0.03, 10.0)
 TREND: Final = 4.0
 """Prior variance of the plane to which a branch goes back."""
@@ -55,10 +57,13 @@ class Process:
         *,
         rough: bool = False,
         trend: float = 0.0,
+        noisy: bool = False,
     ) -> None:
         """Learn `values`, (N,), at `points`, (N, d).
 
         `trend` is the prior variance of a plane to which the process goes back far from all cases.
+        The values of one that is `noisy` differ from run to run: it learns their noise, too, and
+        predicts the value of a run.
         """
         self._rotation, self._rough, self._trend = rotation, rough, trend
         self._values = values
@@ -66,8 +71,11 @@ class Process:
         some = spaced(points, SPACING, LEARN_FROM)
         seen = self._points[some]
         plane = trend * (1.0 + seen @ seen.T)
-        self._variance, self._lengths = _learn_kernel(seen, values[some], plane, rough)
-        gram = self._covariance(self._points) + NOISE * np.eye(len(points))
+        self._variance, self._lengths, noise = _learn_kernel(
+            seen, values[some], plane, rough, noisy=noisy
+        )
+        self._of_runs = noise if noisy else 0.0
+        gram = self._covariance(self._points) + noise * np.eye(len(points))
         self._factor = cholesky(gram, lower=True, **UNCHECKED)
         self._alpha = cho_solve((self._factor, True), values, **UNCHECKED)
 
@@ -86,6 +94,7 @@ class Process:
         cross = self._covariance(turned)
         explained = solve_triangular(self._factor, cross, lower=True, **UNCHECKED)
         prior = self._variance + self._trend * (1.0 + np.square(turned).sum(axis=1))
+        prior = prior + self._of_runs
         return cross.T @ self._alpha, prior - np.square(explained).sum(axis=0)
 
     def _covariance(self, others: FloatArray) -> FloatArray:
@@ -104,12 +113,19 @@ class Margin:
     """A process on a margin of which an interval means failure."""
 
     def __init__(
-        self, points: FloatArray, values: FloatArray, low: float, high: float, *, rough: bool
+        self,
+        points: FloatArray,
+        values: FloatArray,
+        low: float,
+        high: float,
+        *,
+        rough: bool,
+        noisy: bool = False,
     ) -> None:
         """Learn `values`, (N,), at `points`, (N, d); between `low` and `high` a case fails."""
         self._interval = low, high
         self.rotation = _rotation(points, values)
-        self.process = Process(points, values, self.rotation, rough=rough)
+        self.process = Process(points, values, self.rotation, rough=rough, noisy=noisy)
 
     def left_out(self) -> FloatArray:
         """Return for each case, (N,), its probability of failing as seen by all the others."""
@@ -137,11 +153,13 @@ class Branches:
     margin jumps over it.
     """
 
-    def __init__(self, points: FloatArray, values: FloatArray, both: Margin) -> None:
+    def __init__(
+        self, points: FloatArray, values: FloatArray, both: Margin, *, noisy: bool = False
+    ) -> None:
         """Learn `values`, (N,), at `points`, (N, d), as `both` has: from -1 to 1 a case fails."""
         self._points, self._positive, self._both = points, values >= 0.0, both.process
         self._branches = [
-            Process(points[of], np.abs(values[of]), both.rotation, trend=TREND)
+            Process(points[of], np.abs(values[of]), both.rotation, trend=TREND, noisy=noisy)
             for of in (~self._positive, self._positive)
         ]
 
@@ -238,28 +256,33 @@ def _correlation(
 
 
 def _learn_kernel(
-    points: FloatArray, values: FloatArray, plane: FloatArray, rough: bool
-) -> tuple[float, FloatArray]:
-    """Return variance and lengths, (d,), of the largest posterior density.
+    points: FloatArray, values: FloatArray, plane: FloatArray, rough: bool, *, noisy: bool
+) -> tuple[float, FloatArray, float]:
+    """Return variance, lengths, (d,), and noise of the largest posterior density.
 
-    `plane` is the covariance, (n, n), of the prior plane.
+    `plane` is the covariance, (n, n), of the prior plane. The noise of a process that is not
+    `noisy` is NOISE.
     """
     n, dims = points.shape
     fixed, identity, apart = plane + NOISE * np.eye(n), np.eye(n), _apart(points, points)
-    priors = np.array([LOG_PRIOR_VARIANCE, *[LOG_PRIOR_LENGTH] * dims])
-    bounds = np.log([VARIANCE_BOUNDS, *[LENGTH_BOUNDS] * dims])
+    priors = np.array([LOG_PRIOR_VARIANCE, *[LOG_PRIOR_LENGTH] * dims, *[LOG_PRIOR_NOISE] * noisy])
+    bounds = np.log([VARIANCE_BOUNDS, *[LENGTH_BOUNDS] * dims, *[NOISE_BOUNDS] * noisy])
 
     def loss(logs: FloatArray) -> tuple[float, FloatArray]:
         """Rasmussen and Williams (2006), eq. (2.30) and (5.9), with the prior."""
-        correlation, scaled = _correlation(apart, np.exp(logs[1:]), rough)
+        correlation, scaled = _correlation(apart, np.exp(logs[1 : 1 + dims]), rough)
         covariance = np.exp(logs[0]) * correlation
-        factor = cholesky(covariance + fixed, lower=True, **UNCHECKED)
+        with_noise = plane + np.exp(logs[-1]) * identity if noisy else fixed
+        factor = cholesky(covariance + with_noise, lower=True, **UNCHECKED)
         alpha = cho_solve((factor, True), values, **UNCHECKED)
         inverse = cho_solve((factor, True), identity, **UNCHECKED)
-        weights = (inverse - np.outer(alpha, alpha)) * covariance
+        unexplained = inverse - np.outer(alpha, alpha)
+        weights = unexplained * covariance
         # d log k_j / d log l_j: u of Matern 1/2, u^2 / (1 + u) of Matern 3/2.
         steep = [u if rough and axis == 0 else u * u / (1.0 + u) for axis, u in enumerate(scaled)]
         slopes = [weights.sum(), *((weights * slope).sum() for slope in steep)]
+        if noisy:
+            slopes.append(np.exp(logs[-1]) * np.trace(unexplained))
         off = (logs - priors[:, 0]) / priors[:, 1]
         value = 0.5 * (values @ alpha + off @ off) + np.log(np.diag(factor)).sum()
         return float(value), 0.5 * np.array(slopes) + off / priors[:, 1]
@@ -273,4 +296,5 @@ def _learn_kernel(
         options={"maxiter": ITERATIONS},
     )
     parameters = np.exp(optimum.x)
-    return float(parameters[0]), np.asarray(parameters[1:], dtype=np.float64)
+    noise = float(parameters[-1]) if noisy else NOISE
+    return float(parameters[0]), np.asarray(parameters[1 : 1 + dims], dtype=np.float64), noise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -74,9 +75,9 @@ def twin_guided_batch(
     # What does not come true is not refined.
     for _ in range(ROUNDS if base_rate is None else 0):
         batch, _ = greedy(
-            candidates.grid.copy(), candidates.points, candidates.p_fail, candidates.p_fail, n
+            candidates.grid.copy(), candidates.points, candidates.above, candidates.above, n
         )
-        best = candidates.best(candidates.points, candidates.p_fail, n)
+        best = candidates.best(candidates.points, candidates.above, n)
         centres = np.concatenate([best, candidates.points[batch]])
         yield from candidates.add(around(centres, REFINED, reach, rng))
     first: list[int] = []
@@ -87,9 +88,9 @@ def twin_guided_batch(
         candidates.grid.cover(candidates.grid.balls(spread), PICKED)
     explores = n >= EXPLORES_FROM and not skill.is_doubted
     information = skill.disagreement(candidates.gaps_m) if explores else None
-    p_fail = candidates.p_fail
+    above = candidates.above
     picks, gain = greedy(
-        candidates.grid, candidates.points, p_fail, p_fail, n - len(first), information
+        candidates.grid, candidates.points, above, above, n - len(first), information
     )
     gain = np.concatenate([np.ones(len(first)), gain])
     if base_rate is None:
@@ -110,6 +111,7 @@ class _Candidates:
         points: candidates, (m, d).
         gaps_m: predicted gaps at M, (E, G, m).
         p_fail: P(fail) by twin and surrogate together, (m,).
+        above: probability of failing in more runs than are tolerated, (m,).
     """
 
     def __init__(
@@ -128,6 +130,10 @@ class _Candidates:
 
     @property
     def p_fail(self) -> FloatArray:
+        return self._predictions[-2]
+
+    @property
+    def above(self) -> FloatArray:
         return self._predictions[-1]
 
     def add(self, points: FloatArray) -> Asking[None]:
@@ -135,10 +141,13 @@ class _Candidates:
         gaps_m = yield Query(self.level, points)
         p_twin = self.skill.chance(gaps_m)
         p_surrogate = (
-            p_twin if self.surrogate is None else self.surrogate_chance(self.surrogate, points)
+            p_twin if self.surrogate is None else self._corrected(self.surrogate.of, points)
         )
         p_fail = self.skill.mixed(gaps_m, p_twin, p_surrogate)
-        fresh = gaps_m, p_twin, p_surrogate, p_fail
+        above = p_fail
+        if self.surrogate is not None and self.surrogate.tolerates:
+            above = self.skill.mixed(gaps_m, p_twin, self.surrogate_above(self.surrogate, points))
+        fresh = gaps_m, p_twin, p_surrogate, p_fail, above
         self._predictions = (
             tuple(
                 np.concatenate(pair, axis=-1) for pair in zip(self._predictions, fresh, strict=True)
@@ -148,11 +157,20 @@ class _Candidates:
         )
         self.points = np.concatenate([self.points, points])
 
-    def surrogate_chance(self, surrogate: Belief, points: FloatArray) -> FloatArray:
-        """Return P(fail), (m,), by the surrogate, calibrated where the twin is doubted."""
+    def surrogate_above(self, surrogate: Belief, points: FloatArray) -> FloatArray:
+        """Return the probability that points fail in more runs than are tolerated, (m,).
+
+        By the surrogate; calibrated where the twin is doubted.
+        """
+        return self._corrected(surrogate.above, points)
+
+    def _corrected(
+        self, chance: Callable[[FloatArray], FloatArray], points: FloatArray
+    ) -> FloatArray:
+        """Return a probability of points, (m,), by the surrogate, calibrated where due."""
         if self._calibration is None:
-            return surrogate.of(points)
-        return self._calibration.of(surrogate, points)
+            return chance(points)
+        return self._calibration.of(chance(points), points)
 
     def best(self, points: FloatArray, probability: FloatArray, most: int) -> FloatArray:
         """Return the `most` points with the largest expected gain of their own."""
@@ -161,7 +179,7 @@ class _Candidates:
 
     def proposal(self, picks: list[int], gain: FloatArray) -> Proposal:
         """Return the batch of some candidates, by index, with their gains."""
-        gaps_m, p_twin, p_surrogate, p_fail = self._predictions
+        gaps_m, p_twin, p_surrogate, p_fail, _ = self._predictions
         predictions = tuple(
             Prediction.of(gaps_m[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks
         )
@@ -183,7 +201,7 @@ def _first_candidates(
     if surrogate is not None:
         screened.append(between(surrogate, BETWEEN, rng))
         own = rng.permutation(of_belief(history, surrogate, rng, n))[:SURROGATE_CANDIDATES]
-        chance = candidates.surrogate_chance(surrogate, own)
+        chance = candidates.surrogate_above(surrogate, own)
         chosen.append(candidates.best(own, chance, OF_SURROGATE))
     if len(failing):
         screened.append(around(failing, NEAR, LOCAL_REACH * radius_for(history.dims), rng))

@@ -40,7 +40,7 @@ from merge_sumo.system.folders import add_to, check_new_file, write_new
 from merge_sumo.system.records import Record, read_record
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.scenario import DX_CRASH_M, Scenario
 from merge_sumo.values.score import Outcome
 
@@ -249,7 +249,7 @@ class Expected:
         """Return the skill of the twin, judged by predictions of its last cases, too."""
         last = self._sampler.observed(level)[-REPLAYED:]
         indices = [outcome.index for outcome in last]
-        points = self._sampler.history(level).points[-REPLAYED:]
+        points = to_unit((o.case for o in last), level, self._sampler.pool.scenario)
         gaps_m = self._twin.predict([Query(level, points, held_out=indices)])[0]
         replayed = dict(zip(indices, gaps_m.T, strict=True))
         return PredictionSkill(self._sampler.observed(), level, self._limit_m, replayed)

@@ -222,26 +222,26 @@ class TestTheCalibration:
         evidence, true = self.evidence(20_000), np.array([1.5, -1.0, 0.2, -0.3])
         luck = np.random.default_rng(9).random(len(evidence))
         failed = luck < 1.0 / (1.0 + np.exp(-evidence @ true))
-        assert _calibrated(evidence[None], failed)[0][0] == pytest.approx(true, abs=0.08)
+        assert _calibrated(evidence[None], failed, ONCE)[0][0] == pytest.approx(true, abs=0.08)
 
     @pytest.mark.parametrize("n", [1, 3])
     def test_stays_near_what_it_believed_before_while_it_has_seen_little(self, n):
-        weights, _ = _calibrated(self.evidence(n)[None], np.zeros(n, dtype=bool))
+        weights, _ = _calibrated(self.evidence(n)[None], np.zeros(n, dtype=bool), ONCE)
         assert (np.abs(weights - CALIBRATION[0]) < 2.0 * CALIBRATION[1]).all()
 
     def test_does_not_run_away_where_failures_are_perfectly_predicted(self):
         evidence = self.evidence(400)
         evidence[:, 0] *= 20.0
-        weights, posterior = _calibrated(evidence[None], evidence[:, 0] > 0.0)
+        weights, posterior = _calibrated(evidence[None], evidence[:, 0] > 0.0, ONCE)
         assert np.isfinite(posterior).all()
         assert np.abs(weights).max() < 5.0
 
     def test_calibrates_each_kind_of_evidence_as_if_it_were_the_only_one(self):
         kinds = np.array([scale * self.evidence(30) for scale in (0.1, 1.0, 30.0)])
         failed = np.random.default_rng(2).random(30) < 0.3
-        together = _calibrated(kinds, failed)
+        together = _calibrated(kinds, failed, ONCE)
         for place in range(3):
-            alone = _calibrated(kinds[[place]], failed)
+            alone = _calibrated(kinds[[place]], failed, ONCE)
             assert together[0][place] == pytest.approx(alone[0][0], rel=1e-9)
             assert together[1][place] == pytest.approx(alone[1][0], rel=1e-9)
 
