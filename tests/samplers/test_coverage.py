@@ -212,6 +212,10 @@ class TestTheBranches:
         assert smooth.at(here)[0] > 3.0 * Branches(points, values, smooth).at(here)[0]
 
 
+ONCE = np.ones(1, dtype=np.int64)
+"""Runs of each case."""
+
+
 class TestTheCalibration:
     @staticmethod
     def evidence(n: int) -> np.ndarray:
