@@ -37,7 +37,16 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "How many cases, and which": (
         *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
-        *("truth_cases", "dense", "quick", "distribution", "traffic", "density", "learn_from"),
+        *(
+            "problems",
+            "truth_cases",
+            "dense",
+            "quick",
+            "distribution",
+            "traffic",
+            "density",
+            "learn_from",
+        ),
         *("param", "cost", "trials", "rounds"),
         *("draws", "stop_after_converged", "audit"),
     ),
@@ -49,7 +58,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("out", "resume", "force", "engine", "crime", "workers", "dask", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
     ),
-    "Trust and limits": ("trust_vut", "deadline", "vut_memory", "in_process"),
+    "Trust and limits": ("trust_vut", "deadline", "limit", "vut_memory", "in_process"),
 }
 """Options of the command line by group, in the order in which the groups are shown."""
 GROUP_OF: Final = {name: group for group, names in GROUPS.items() for name in names}
@@ -58,6 +67,7 @@ KEYWORDS: Final = {
     "v_vut0": "v_vut0_mps",
     "density": "density_veh_per_km",
     "deadline": "deadline_s",
+    "limit": "limit_s",
     "vut_memory": "vut_memory_gib",
     "follow_up": "follow_up_s",
     "x": "x_pov0_m",

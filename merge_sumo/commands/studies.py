@@ -106,6 +106,92 @@ def compare(
 
 
 @app.verb(
+    options=("quiet",),
+    own={
+        "seeds": option(
+            int | None,
+            None,
+            "Searches of each sampler on each problem, with the seeds 100, 101 and so on.",
+            show_default="3, with --quick 1",
+        ),
+        "cases": option(
+            int | None,
+            None,
+            "Cases of a search, at most 400.",
+            show_default="400, with --quick 50",
+        ),
+        "quick": option(
+            bool, False, "Two problems, one seed and 50 cases: a first look.", "--quick"
+        ),
+        "limit": option(
+            float,
+            1800.0,
+            "Time that a sampler may take in a search, without simulation.",
+            metavar="SECONDS",
+        ),
+        "workers": option(
+            int | None,
+            None,
+            "Processes that search; the results are the same.",
+            show_default="one a core",
+        ),
+    },
+)
+def benchmark(
+    given: Given,
+    samplers: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SAMPLER...",
+            help="Names of samplers, of this package or of an installed one, or FILE.py:CLASS.",
+            autocompletion=complete.samplers,
+        ),
+    ],
+    problems: Annotated[
+        str | None,
+        typer.Option(help="Names of problems, separated by commas.", show_default="all"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder to write.", show_default="runs/benchmark-DATE")
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Go on in this folder: what it has is not run again."),
+    ] = None,
+) -> None:
+    """Let samplers search frozen problems whose failures are known, and give each one number.
+
+    The number is the share of the failure mode coverage of a dense truth that was found: its median
+    over the seeds, as a mean over the problems and over 50, 100 and 400 cases. Samplers of your own
+    pass the contract of samplers first; the code of no other file runs. Writes benchmark.html and
+    benchmark.json. A sampler that fails in a search keeps what it found before.
+
+    Example:  merge-sumo benchmark uniform coverage --quick
+    """
+    from merge_sumo import api
+
+    if out is not None and resume is not None:
+        raise UserError("--resume names the folder: leave --out away")
+    folder = resume or out or api.dated("benchmark")
+    names = None if problems is None else [name.strip() for name in problems.split(",")]
+
+    def how_to_go_on() -> str | None:
+        same = f"stopped; go on with the same command and --resume {quoted(folder)}"
+        return same if folder.exists() else None
+
+    with stoppable("search", how_to_go_on) as check:
+        result = api.benchmark(
+            samplers,
+            problems=names,
+            out=folder,
+            resume=resume is not None,
+            check=check,
+            **given.keywords,
+        )
+    given.print(result)
+
+
+@app.verb(
     options=("level", *SETUP, "net", "engine", "dask", "quiet"),
     own={
         "radius": option(float, 0.01, "Radius of the balls, as a share of the axes of the pool."),

@@ -305,17 +305,19 @@ def open_workers(
     *,
     preload: str | None = None,
     here_s: float | None = None,
+    apart: bool = False,
 ) -> Workers:
     """Return the workers of a cluster at the address `dask`, or else local ones.
 
-    One local worker is this process itself; more are processes of their own, which import the
-    module `preload` as they start. None is one a core. With `here_s` they are started only when
-    work in this process has taken so many seconds, and where the system lets them.
+    One local worker is this process itself, unless it is to be `apart`; more are processes of their
+    own, which import the module `preload` as they start. None is one a core. With `here_s` they are
+    started only when work in this process has taken so many seconds, and where the system lets
+    them.
     """
     if dask is not None:
         return dask_workers(dask)
     count = workers_or_cores(workers)
-    if count == 1:
+    if count == 1 and not apart:
         return Workers(InProcess, 1)
     threads = POOL_THREADS + count * ((os.cpu_count() or 1) + WORKER_THREADS)
     if here_s is None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import copy
 import importlib
-import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.source_files import module_of_file
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, VUT, lane_of
 from merge_sumo.vuts.base import (
@@ -386,24 +385,11 @@ def _load_module(name: str) -> ModuleType:
 
 def _load_file(path: Path) -> ModuleType:
     try:
-        return _execute(path.resolve(), path.stat().st_mtime_ns)
+        return module_of_file(path)
     except OSError as error:
         raise UserError(f"cannot read the VUT {path}: {error.strerror}") from error
     except (Exception, SystemExit) as error:
         raise UserError(_cannot_load(str(path), error)) from error
-
-
-@cache
-def _execute(path: Path, _changed_ns: int) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"merge_sumo_vut_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise ImportError("it is no Python file")
-    module = importlib.util.module_from_spec(spec)
-    if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))  # for the modules beside it
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def _cannot_load(what: str, error: BaseException) -> str:
