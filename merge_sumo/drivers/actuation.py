@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.values.signals import Left
 
 ROUNDING_MPS2: Final = 1e-9
 """A command this little outside the limits is a rounding error."""
@@ -26,7 +23,7 @@ def whole_steps(time_s: float) -> tuple[int, float]:
     return int(steps), steps % 1.0
 
 
-class ActuatedDriver(Driver):
+class ActuatedDriver(DriverWrapper):
     """Drives as another driver commands, through an actuator that the case describes.
 
     A command is limited to what the vehicle can do, and waits for the dead time. It then acts
@@ -37,9 +34,8 @@ class ActuatedDriver(Driver):
 
     def __init__(self, driver: Driver, longest_s: float) -> None:
         """Take the driver, and the longest dead time of its cases."""
+        super().__init__(driver)
         corridors = driver.corridors
-        super().__init__(corridors)
-        self._driver = driver
         self._commands = np.zeros((whole_steps(longest_s)[0] + 2, corridors))
         """The last commands, (D, K), a ring of rows."""
         self._row = 0
@@ -92,23 +88,3 @@ class ActuatedDriver(Driver):
     def clipped(self) -> NDArray[np.bool_]:
         """Return which of the last commands were outside the limits, (K,)."""
         return self._clipped
-
-    def reason(self, corridor: int) -> str | None:
-        """Return what the driver did wrong."""
-        return self._driver.reason(corridor)
-
-    def wishes(self) -> NDArray[np.int8] | None:
-        """Return what the driver wishes, (K,)."""
-        return self._driver.wishes()
-
-    def signals(self) -> Mapping[int, Left]:
-        """Return what the driver left."""
-        return self._driver.signals()
-
-    def files(self) -> tuple[Path, ...]:
-        """Return the files that the driver has loaded so far."""
-        return self._driver.files()
-
-    def close(self) -> None:
-        """Close the driver."""
-        self._driver.close()

@@ -183,3 +183,40 @@ class Driver(ABC):
 
     def close(self) -> None:  # noqa: B027 (most drivers hold nothing)
         """Release what the driver holds: processes, sockets."""
+
+
+class DriverWrapper(Driver):
+    """Drives by another driver, and passes on what it does not change."""
+
+    def __init__(self, driver: Driver) -> None:
+        """Take the driver."""
+        super().__init__(driver.corridors)
+        self._driver = driver
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Begin an episode for the driver."""
+        self._driver.begin(corridor, case)
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what the driver did wrong."""
+        return self._driver.reason(corridor)
+
+    def wishes(self) -> NDArray[np.int8] | None:
+        """Return what the driver wishes, (K,)."""
+        return self._driver.wishes()
+
+    def clipped(self) -> NDArray[np.bool_] | None:
+        """Return which of the driver's commands were outside the limits, if it knows."""
+        return self._driver.clipped()
+
+    def signals(self) -> Mapping[int, Left]:
+        """Return what the driver left."""
+        return self._driver.signals()
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the files that the driver has loaded so far."""
+        return self._driver.files()
+
+    def close(self) -> None:
+        """Close the driver."""
+        self._driver.close()

@@ -7,17 +7,15 @@ as that can be played, and then drives as cars do.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, Driver, Scene
+from merge_sumo.drivers.base import MERGE, NO_WISH, Driver, DriverWrapper, Scene
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, OWN, US23, VUT, Scenario, lane_of
-from merge_sumo.values.signals import Left
 
 RECOVERY_MPS2: Final = 1.0
 """Acceleration with which a POV comes back to the speed at which it started."""
@@ -105,7 +103,7 @@ def stopping_mps(room_m: FloatArray, brake_mps2: float) -> FloatArray:
     return speed
 
 
-class LanePov(Driver):
+class LanePov(DriverWrapper):
     """Drives cars of the mainline beside an acceleration lane by a driver that knows a merge at M.
 
     As long as the VUT is before M, the driver plays as ever; from M on it plays as if M were the
@@ -116,8 +114,8 @@ class LanePov(Driver):
 
     def __init__(self, driver: Driver, follow: Following = acc_mps2) -> None:
         """Take the driver of all cars, and how they follow a VUT that has merged."""
-        super().__init__(driver.corridors)
-        self._driver, self._follow = driver, follow
+        super().__init__(driver)
+        self._follow = follow
         self._v_first_mps = np.zeros(driver.corridors)
         self._end_m = np.zeros(driver.corridors)
         self._pov_length_m = np.full(driver.corridors, US23.pov_length_m)
@@ -155,22 +153,6 @@ class LanePov(Driver):
             answer = np.where(follows, np.minimum(answer, most), answer)
         self._v_vut_mps = v_vut.copy()
         return answer
-
-    def reason(self, corridor: int) -> str | None:
-        """Return what the driver of a car did wrong."""
-        return self._driver.reason(corridor)
-
-    def signals(self) -> Mapping[int, Left]:
-        """Return what the driver left."""
-        return self._driver.signals()
-
-    def files(self) -> tuple[Path, ...]:
-        """Return the files that the driver has loaded so far."""
-        return self._driver.files()
-
-    def close(self) -> None:
-        """Close the driver."""
-        self._driver.close()
 
 
 class Merging:

@@ -37,6 +37,7 @@ from merge_sumo.drivers.safety_models import (
     CarefulModel,
     Flags,
     FsmModel,
+    Pair,
     Reaction,
     Reg157Model,
     RssModel,
@@ -171,8 +172,8 @@ class RampDriver(Level0Vut):
         gap_m = np.where(arrives, np.abs(dx_m) - self.crash_m, np.inf)
         v_rear = np.where(is_rear, v_vut_mps, v_pov_mps)
         v_front = np.where(is_rear, v_pov_mps, v_vut_mps)
-        pair = gap_m, v_rear, v_front
-        unsafe = np.where(is_rear, self.model.is_unsafe(*pair), self.model.endangers(*pair))
+        pair = Pair(gap_m, v_rear, v_front)
+        unsafe = np.where(is_rear, self.model.is_unsafe(pair), self.model.endangers(pair))
         conflict = arrives & ((gap_m < 0.0) | unsafe)
         return Plan(t_s, gap_m, is_rear, v_rear, v_front, conflict)
 
@@ -195,8 +196,7 @@ class RampDriver(Level0Vut):
 
     def _demand_mps2(self, scene: Scene, present: Plan) -> FloatArray:
         """Return the deceleration that the model asks for in P1, (K,)."""
-        pair = present.gap_m, present.v_rear_mps, present.v_front_mps
-        return self.model.demand_mps2(*pair)
+        return self.model.demand_mps2(Pair(present.gap_m, present.v_rear_mps, present.v_front_mps))
 
 
 class CarefulVut(RampDriver):

@@ -11,7 +11,7 @@ UN Regulation No. 157. `tests/drivers/test_cut_in.py` compares these functions w
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,23 @@ from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S
 
 Flags = NDArray[np.bool_]
+
+
+class Pair(NamedTuple):
+    """Two vehicles on one lane, the rear one of which may have to react; arrays of shape (K,).
+
+    Attributes:
+        gap_m: between the rear bumper of the front vehicle and the front bumper of the rear one.
+        v_rear_mps: speed of the rear vehicle.
+        v_front_mps: speed of the front one.
+        a_rear_mps2: acceleration of the rear one.
+    """
+
+    gap_m: FloatArray
+    v_rear_mps: FloatArray
+    v_front_mps: FloatArray
+    a_rear_mps2: FloatArray | float = 0.0
+
 
 JERK_MPS3: Final = 12.65
 """Growth of the deceleration: UN R157, Annex 3, Appendix 3."""
@@ -47,30 +64,16 @@ class SafetyModel(ABC):
     hardest_mps2: float = HARDEST_MPS2
 
     @abstractmethod
-    def is_unsafe(
-        self,
-        gap_m: FloatArray,
-        v_rear_mps: FloatArray,
-        v_front_mps: FloatArray,
-        a_rear_mps2: FloatArray | float = 0.0,
-    ) -> Flags:
+    def is_unsafe(self, pair: Pair) -> Flags:
         """Return whether the rear vehicle is too close."""
 
-    def endangers(
-        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
-    ) -> Flags:
+    def endangers(self, pair: Pair) -> Flags:
         """Return whether the front vehicle must not get in front of the rear one like this."""
-        return self.is_unsafe(gap_m, v_rear_mps, v_front_mps)
+        return self.is_unsafe(pair)
 
-    def demand_mps2(
-        self,
-        gap_m: FloatArray,
-        v_rear_mps: FloatArray,
-        v_front_mps: FloatArray,
-        a_rear_mps2: FloatArray | float = 0.0,
-    ) -> FloatArray:
+    def demand_mps2(self, pair: Pair) -> FloatArray:
         """Return the deceleration that is asked for where it is unsafe."""
-        return np.full(np.shape(v_rear_mps), self.hardest_mps2)
+        return np.full(np.shape(pair.v_rear_mps), self.hardest_mps2)
 
 
 class CarefulModel(SafetyModel):
@@ -83,15 +86,9 @@ class CarefulModel(SafetyModel):
     released_mps2 = 0.4
     critical_ttc_s: float = 2.0
 
-    def is_unsafe(
-        self,
-        gap_m: FloatArray,
-        v_rear_mps: FloatArray,
-        v_front_mps: FloatArray,
-        a_rear_mps2: FloatArray | float = 0.0,
-    ) -> Flags:
+    def is_unsafe(self, pair: Pair) -> Flags:
         """Return whether the time to collision is at most 2 s."""
-        return ttc_s(gap_m, v_rear_mps, v_front_mps) <= self.critical_ttc_s
+        return ttc_s(*pair[:3]) <= self.critical_ttc_s
 
 
 class Reg157Model(SafetyModel):
@@ -113,16 +110,11 @@ class Reg157Model(SafetyModel):
         """Take the constant part of the bound."""
         self.bound_s = bound_s
 
-    def is_unsafe(
-        self,
-        gap_m: FloatArray,
-        v_rear_mps: FloatArray,
-        v_front_mps: FloatArray,
-        a_rear_mps2: FloatArray | float = 0.0,
-    ) -> Flags:
+    def is_unsafe(self, pair: Pair) -> Flags:
         """Return whether the time to collision is down to the bound."""
-        bound_s = (v_rear_mps - v_front_mps) / (2.0 * self.hardest_mps2) + self.bound_s
-        return ttc_s(gap_m, v_rear_mps, v_front_mps) <= bound_s
+        closing_mps = pair.v_rear_mps - pair.v_front_mps
+        bound_s = closing_mps / (2.0 * self.hardest_mps2) + self.bound_s
+        return ttc_s(*pair[:3]) <= bound_s
 
 
 class RssModel(SafetyModel):
@@ -134,16 +126,11 @@ class RssModel(SafetyModel):
     accel_mps2: float = 3.0
     brake_mps2: float = 6.0
 
-    def is_unsafe(
-        self,
-        gap_m: FloatArray,
-        v_rear_mps: FloatArray,
-        v_front_mps: FloatArray,
-        a_rear_mps2: FloatArray | float = 0.0,
-    ) -> Flags:
+    def is_unsafe(self, pair: Pair) -> Flags:
         """Return whether the gap is shorter than the safe distance."""
         limits = self.delay_s, self.accel_mps2, self.brake_mps2, self.brake_mps2
-        unsafe: Flags = gap_m < rss_distance_m(v_rear_mps, v_front_mps, *limits)
+        safe_m = rss_distance_m(pair.v_rear_mps, pair.v_front_mps, *limits)
+        unsafe: Flags = pair.gap_m < safe_m
         return unsafe
 
 
@@ -158,46 +145,31 @@ class FsmModel(SafetyModel):
     leader_mps2: float = 7.0
     margin_m: float = 2.0
 
-    def is_unsafe(
-        self,
-        gap_m: FloatArray,
-        v_rear_mps: FloatArray,
-        v_front_mps: FloatArray,
-        a_rear_mps2: FloatArray | float = 0.0,
-    ) -> Flags:
+    def is_unsafe(self, pair: Pair) -> Flags:
         """Return whether one of the two metrics is above 0."""
-        critical = self.cfs(gap_m, v_rear_mps, v_front_mps, a_rear_mps2)
-        unsafe: Flags = critical + self.pfs(gap_m, v_rear_mps, v_front_mps) > 0.0
+        unsafe: Flags = self.cfs(pair) + self.pfs(pair) > 0.0
         return unsafe
 
-    def endangers(
-        self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray
-    ) -> Flags:
+    def endangers(self, pair: Pair) -> Flags:
         """Return whether CFS is above 0: the precaution (PFS) is the rear vehicle's."""
-        unsafe: Flags = self.cfs(gap_m, v_rear_mps, v_front_mps) > 0.0
+        unsafe: Flags = self.cfs(pair) > 0.0
         return unsafe
 
-    def demand_mps2(
-        self,
-        gap_m: FloatArray,
-        v_rear_mps: FloatArray,
-        v_front_mps: FloatArray,
-        a_rear_mps2: FloatArray | float = 0.0,
-    ) -> FloatArray:
+    def demand_mps2(self, pair: Pair) -> FloatArray:
         """Return the deceleration that follows from the metrics."""
-        critical = self.cfs(gap_m, v_rear_mps, v_front_mps, a_rear_mps2)
-        proactive = self.pfs(gap_m, v_rear_mps, v_front_mps)
+        critical, proactive = self.cfs(pair), self.pfs(pair)
         comfortable = self.comfortable_mps2
         hard = comfortable + (self.hardest_mps2 - comfortable) * critical
         demand: FloatArray = np.where(critical > 0.0, hard, comfortable * proactive)
         return demand
 
-    def pfs(self, gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
+    def pfs(self, pair: Pair) -> FloatArray:
         """Return the proactive fuzzy metric, 0 (safe) to 1: the leader may brake by 7 m/s2.
 
         With d = gap - margin: 0 from v_r tau + v_r^2 / (2 * 4) - v_f^2 / (2 * 7) + margin on, 1 up
         to v_r tau + v_r^2 / (2 * 6) - v_f^2 / (2 * 7), linear between.
         """
+        gap_m, v_rear_mps, v_front_mps, _ = pair
         leader_m = v_front_mps * v_front_mps / (2.0 * self.leader_mps2)
         stop = v_rear_mps * v_rear_mps / 2.0
         reaction_m = v_rear_mps * self.delay_s - leader_m
@@ -205,13 +177,7 @@ class FsmModel(SafetyModel):
         unsafe_m = reaction_m + stop / self.hardest_mps2
         return _between(gap_m - self.margin_m, safe_m, unsafe_m)
 
-    def cfs(
-        self,
-        gap_m: FloatArray,
-        v_rear_mps: FloatArray,
-        v_front_mps: FloatArray,
-        a_rear_mps2: FloatArray | float = 0.0,
-    ) -> FloatArray:
+    def cfs(self, pair: Pair) -> FloatArray:
         """Return the critical fuzzy metric, 0 (safe) to 1: the leader keeps its speed.
 
         The rear vehicle goes on with its acceleration a (not below -4 m/s2) for tau, and then
@@ -219,6 +185,7 @@ class FsmModel(SafetyModel):
         0 from s(4) on, 1 up to s(6), linear between. Where u < v_f, 1 if the gap closes before the
         speeds are equal, else 0. Where v_r <= v_f, 0.
         """
+        gap_m, v_rear_mps, v_front_mps, a_rear_mps2 = pair
         a = np.maximum(a_rear_mps2, -self.comfortable_mps2)
         after = v_rear_mps + self.delay_s * a - v_front_mps
         approach_m = (v_rear_mps + 0.5 * a * self.delay_s - v_front_mps) * self.delay_s

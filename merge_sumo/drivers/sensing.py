@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.actuation import whole_steps
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
 from merge_sumo.drivers.following import car_met
 from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.imperfection import Sensing
 from merge_sumo.values.scenario import DT_S, VUT, Scenario
-from merge_sumo.values.signals import Left
 
 STREAM: Final = 26
 """Of the random numbers of a case, which others draw from, too."""
@@ -29,7 +26,7 @@ def far_m(scenario: Scenario) -> float:
     return scenario.x_vut0_m + ahead * scenario.farthest_start_m
 
 
-class SensedDriver(Driver):
+class SensedDriver(DriverWrapper):
     """Drives a VUT by another driver, which sees other cars as the sensors of the case show them.
 
     In each step every car is measured, with noise, or not seen: it is out of range, or the VUT is
@@ -44,9 +41,8 @@ class SensedDriver(Driver):
 
     def __init__(self, driver: Driver, scenario: Scenario) -> None:
         """Take the driver, and the scenario of its cases."""
+        super().__init__(driver)
         corridors, cars = driver.corridors, scenario.vehicles
-        super().__init__(corridors)
-        self._driver = driver
         self._before = whole_steps(scenario.sense.at_most("delay_s"))[0] + 1
         """Steps before the start that are measured, too."""
         self._seen = np.full((self._before + 1, 2, cars, corridors), np.nan)
@@ -148,27 +144,3 @@ class SensedDriver(Driver):
         shown[V] = np.where(unseen, state[V, VUT], shown[V])
         shown[:, VUT] = state[:, VUT]
         return shown
-
-    def clipped(self) -> NDArray[np.bool_] | None:
-        """Return which of the driver's commands were outside the limits, if it knows."""
-        return self._driver.clipped()
-
-    def reason(self, corridor: int) -> str | None:
-        """Return what the driver did wrong."""
-        return self._driver.reason(corridor)
-
-    def wishes(self) -> NDArray[np.int8] | None:
-        """Return what the driver wishes, (K,)."""
-        return self._driver.wishes()
-
-    def signals(self) -> Mapping[int, Left]:
-        """Return what the driver left."""
-        return self._driver.signals()
-
-    def files(self) -> tuple[Path, ...]:
-        """Return the files that the driver has loaded so far."""
-        return self._driver.files()
-
-    def close(self) -> None:
-        """Close the driver."""
-        self._driver.close()

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
+from merge_sumo.drivers.base import Driver, DriverWrapper, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.level0 import Level0Pov
 from merge_sumo.drivers.policies import (
     how_to_train,
@@ -217,13 +217,8 @@ def in_the_povs_seat(own: VutFactory, corridors: int, world: World | None) -> Dr
     return PovAdapter(driver)
 
 
-class PovAdapter(Driver):
+class PovAdapter(DriverWrapper):
     """Drives cars of the mainline by a driver of VUTs; `corridors` are those of all C cars."""
-
-    def __init__(self, driver: Driver) -> None:
-        """Take the driver."""
-        super().__init__(driver.corridors)
-        self._driver = driver
 
     def begin(self, corridor: int, case: Case) -> None:
         """Tell the driver of an episode as if its car were the VUT."""
@@ -239,18 +234,6 @@ class PovAdapter(Driver):
         except VutLostError as lost:
             how = {"final": lost.final, "killed": lost.killed}
             raise PovLostError(lost.reason, lost.corridor, **how) from lost
-
-    def reason(self, corridor: int) -> str | None:
-        """Return what the driver did wrong in a corridor."""
-        return self._driver.reason(corridor)
-
-    def files(self) -> tuple[Path, ...]:
-        """Return the files that the driver has loaded so far."""
-        return self._driver.files()
-
-    def close(self) -> None:
-        """Close the driver."""
-        self._driver.close()
 
 
 def seen_from(case: Case, car: int) -> Case:

@@ -32,10 +32,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.studies.crime import measured_by
 from merge_sumo.studies.probability import same_system
-from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.records import Record, decode, to_plain
+from merge_sumo.system.records import Record, read_record, to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S, VEHICLES
@@ -215,16 +214,7 @@ def crosscheck_of(folder: Path) -> Crosscheck | None:
 
     Raises `UserError` for a file that is not as it was written.
     """
-    path = folder / CROSSCHECK
-    try:
-        known: Crosscheck = decode(regular(path).read_bytes(), Crosscheck)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    except UserError as error:
-        raise UserError(f"{path} is not as it was written: {error}") from error
-    return known
+    return read_record(folder / CROSSCHECK, Crosscheck)
 
 
 def check_crosscheck_of(run: Run, known: Crosscheck) -> None:

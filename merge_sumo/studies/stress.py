@@ -27,10 +27,9 @@ from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.probability import same_system
-from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import counted, quoted
-from merge_sumo.system.records import Record, decode, to_plain
+from merge_sumo.system.records import Record, read_record, to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import COORDINATES, DT_S, Scenario
@@ -157,16 +156,7 @@ def stress_of(folder: Path) -> Stress | None:
 
     Raises `UserError` for a file that is not as it was written.
     """
-    path = folder / STRESS
-    try:
-        known: Stress = decode(regular(path).read_bytes(), Stress)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    except UserError as error:
-        raise UserError(f"{path} is not as it was written: {error}") from error
-    return known
+    return read_record(folder / STRESS, Stress)
 
 
 def check_stress_of(run: Run, known: Stress) -> None:

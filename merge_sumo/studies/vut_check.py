@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from merge_sumo.analysis.result import Result
-from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.drivers.base import Driver, DriverWrapper, Scene, VutLostError
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case, FloatArray, MergeCase, from_unit
@@ -112,14 +112,11 @@ def _ordinary_cases(scenario: Scenario) -> list[Case]:
     return from_unit(points, 0, scenario=scenario)
 
 
-class _Timed(Driver):
+class _Timed(DriverWrapper):
     """Passes everything on and notes what a step of one corridor costs."""
 
     def __init__(self, driver: Driver) -> None:
-        super().__init__(driver.corridors)
-        self._driver = driver
-        self.reason, self.close = driver.reason, driver.close  # type: ignore[method-assign]
-        self.wishes = driver.wishes  # type: ignore[method-assign]
+        super().__init__(driver)
         self.us_per_step: list[float] = []
         self.us_per_begin: list[float] = []
         self._begun, self._begin_s = 0, 0.0

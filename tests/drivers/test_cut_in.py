@@ -14,7 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from merge_sumo.drivers.safety_models import CarefulModel, FsmModel, Reaction, Reg157Model, RssModel
+from merge_sumo.drivers.safety_models import (
+    CarefulModel,
+    FsmModel,
+    Pair,
+    Reaction,
+    Reg157Model,
+    RssModel,
+)
 
 TABLES = Path(__file__).parents[1] / "data" / "reference"
 DT_S, STEPS, LENGTH_M, WIDTH_M, LANE_M = 0.1, 350, 4.3, 1.9, 3.5
@@ -80,7 +87,7 @@ class CutIns:
         for step in range(STEPS):
             self.touch(step, d)
             unsafe = self.unsafe(step, d, v, a) & (d + LENGTH_M >= 0.0) & ~self.ended
-            demand = self.model.demand_mps2(d, v, self.v_other, a)
+            demand = self.model.demand_mps2(Pair(d, v, self.v_other, a))
             faster = np.maximum(v + reaction.acceleration_mps2(unsafe, demand) * DT_S, 0.0)
             a, v = (faster - v) / DT_S, faster
             d = d + (self.v_other - v) * DT_S
@@ -95,7 +102,7 @@ class CutIns:
         y, u = self.y_m[step], self.u_mps[step]
         # Side by side, the published times to collision are those of |d|.
         gap = np.abs(d) if self.name in ("CC_human_driver", "Reg157") else d
-        unsafe = self.model.is_unsafe(gap, v, self.v_other, a)
+        unsafe = self.model.is_unsafe(Pair(gap, v, self.v_other, a))
         if self.name == "CC_human_driver":
             # Nothing to react to on the lane ends the published case.
             self.ended |= (y <= 0.0) & ~unsafe & (d + LENGTH_M >= 0.0)
@@ -108,7 +115,10 @@ class CutIns:
             in_time = y / u <= (d + 2.0 * LENGTH_M) / (v - self.v_other) + 0.1
         near = (y <= 0.0) | ((u > 0.0) & in_time)
         sees = near & (d + LENGTH_M >= 0.0)
-        pfs, cfs = FsmModel().pfs(d, v, self.v_other), FsmModel().cfs(d, v, self.v_other, a)
+        pfs, cfs = (
+            FsmModel().pfs(Pair(d, v, self.v_other)),
+            FsmModel().cfs(Pair(d, v, self.v_other, a)),
+        )
         self.most_pfs = np.maximum(self.most_pfs, np.where(sees, pfs, 0.0))
         self.most_cfs = np.maximum(self.most_cfs, np.where(sees, cfs, 0.0))
         return unsafe & near
@@ -117,7 +127,7 @@ class CutIns:
 def test_pfs_is_that_of_the_published_code():
     rows = table("pfs.csv")
     gap, rear, front, wanted = numbers(rows, "gap_m", "v_rear_mps", "v_front_mps", "pfs")
-    assert np.abs(FsmModel().pfs(gap, rear, front) - wanted).max() < 1e-9
+    assert np.abs(FsmModel().pfs(Pair(gap, rear, front)) - wanted).max() < 1e-9
     assert ((wanted > 0.0) & (wanted < 1.0)).mean() > 0.1
 
 
@@ -125,7 +135,7 @@ def test_cfs_is_that_of_the_published_code():
     rows = table("cfs.csv")
     gap, rear, front = numbers(rows, "gap_m", "v_rear_mps", "v_front_mps")
     a, wanted = numbers(rows, "a_rear_mps2", "cfs")
-    assert np.abs(FsmModel().cfs(gap, rear, front, a) - wanted).max() < 1e-9
+    assert np.abs(FsmModel().cfs(Pair(gap, rear, front, a)) - wanted).max() < 1e-9
     assert ((wanted > 0.0) & (wanted < 1.0)).sum() > 50
 
 

@@ -22,6 +22,7 @@ from merge_sumo.drivers.reference import (
 from merge_sumo.drivers.safety_models import (
     CarefulModel,
     FsmModel,
+    Pair,
     Reaction,
     Reg157Model,
     RssModel,
@@ -86,15 +87,15 @@ class TestFormulas:
         [(20.0, 0.0), (18.0, 0.48), (15.8, 1.0), (0.0, 1.0)],
     )
     def test_cfs(self, gap_m, wanted):
-        assert FsmModel().cfs(one(gap_m), one(20), one(10)) == pytest.approx(wanted)
+        assert FsmModel().cfs(Pair(one(gap_m), one(20), one(10))) == pytest.approx(wanted)
 
     def test_cfs_is_0_where_the_gap_opens(self):
-        assert FsmModel().cfs(one(1), one(20), one(21)) == 0.0
+        assert FsmModel().cfs(Pair(one(1), one(20), one(21))) == 0.0
 
     def test_cfs_of_a_vehicle_that_brakes_below_the_speed_of_the_leader(self):
         # Slower by 1 m/s, after 0.5^2 / 4 m of approach.
-        assert FsmModel().cfs(one(0.05), one(20.5), one(20), one(-2)) == 1.0
-        assert FsmModel().cfs(one(0.07), one(20.5), one(20), one(-2)) == 0.0
+        assert FsmModel().cfs(Pair(one(0.05), one(20.5), one(20), one(-2))) == 1.0
+        assert FsmModel().cfs(Pair(one(0.07), one(20.5), one(20), one(-2))) == 0.0
 
     @pytest.mark.parametrize(
         ("gap_m", "wanted"),
@@ -102,32 +103,32 @@ class TestFormulas:
         [(40.5, 0.0), (30.0, (17.0 + 150.0 / 7.0 - 28.0) / (2.0 + 50.0 / 3.0)), (21.7, 1.0)],
     )
     def test_pfs(self, gap_m, wanted):
-        assert FsmModel().pfs(one(gap_m), one(20), one(20)) == pytest.approx(wanted)
+        assert FsmModel().pfs(Pair(one(gap_m), one(20), one(20))) == pytest.approx(wanted)
 
 
 class TestModels:
     @pytest.mark.parametrize(("gap_m", "unsafe"), [(9.9, True), (10.1, False)])
     def test_the_careful_driver_fears_a_time_to_collision_of_two_seconds(self, gap_m, unsafe):
-        assert CarefulModel().is_unsafe(one(gap_m), one(30), one(25)) == unsafe
+        assert CarefulModel().is_unsafe(Pair(one(gap_m), one(30), one(25))) == unsafe
 
     @pytest.mark.parametrize(("gap_m", "unsafe"), [(5.09, True), (5.11, False)])
     def test_reg157_waits_until_it_has_to(self, gap_m, unsafe):
         # v_rel / 12 + 0.35 = 0.85 s at 6 m/s.
-        assert Reg157Model().is_unsafe(one(gap_m), one(30), one(24)) == unsafe
+        assert Reg157Model().is_unsafe(Pair(one(gap_m), one(30), one(24))) == unsafe
 
     def test_rss_keeps_its_distance(self):
         # 15 + 3 * 0.75^2 / 2 + 22.25^2 / 12 - 20^2 / 12
-        assert RssModel().is_unsafe(one(23.7), one(20), one(20))
-        assert not RssModel().is_unsafe(one(23.9), one(20), one(20))
+        assert RssModel().is_unsafe(Pair(one(23.7), one(20), one(20)))
+        assert not RssModel().is_unsafe(Pair(one(23.9), one(20), one(20)))
 
     def test_fsm_brakes_as_far_as_the_situation_is_unsafe(self):
         # CFS 0.48 between 4 and 6 m/s2.
-        assert FsmModel().demand_mps2(one(18), one(20), one(10)) == pytest.approx(4.96)
+        assert FsmModel().demand_mps2(Pair(one(18), one(20), one(10))) == pytest.approx(4.96)
         proactive = (17.0 + 150.0 / 7.0 - 28.0) / (2.0 + 50.0 / 3.0)
-        found = FsmModel().demand_mps2(one(30), one(20), one(20))
+        found = FsmModel().demand_mps2(Pair(one(30), one(20), one(20)))
         assert found == pytest.approx(4.0 * proactive)
-        assert FsmModel().is_unsafe(one(30), one(20), one(20))
-        assert not FsmModel().endangers(one(30), one(20), one(20))
+        assert FsmModel().is_unsafe(Pair(one(30), one(20), one(20)))
+        assert not FsmModel().endangers(Pair(one(30), one(20), one(20)))
 
     def test_the_reaction_waits_brakes_and_holds(self):
         reaction, yes, no = Reaction(1, CarefulModel()), np.array([True]), np.array([False])
