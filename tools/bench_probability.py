@@ -40,6 +40,7 @@ from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.studies import stratified
 from merge_sumo.studies.failures_per_merge import OverMixtures, Part, Stated, part_of, parts_of
 from merge_sumo.studies.probability import STREAM, Expected, strata_of
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.stratified import Draws, Strata, cells, estimate
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.chance import clopper_pearson
@@ -153,7 +154,7 @@ def campaign(cases: list[int], seeds: range) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as folder:
         run = run_campaign(CAMPAIGN, resolve(CAMPAIGN), Path(folder) / "run")
         for number in cases:
-            expected = Expected(run, CAMPAIGN, plan)
+            expected = Expected(RunStudy(run, CAMPAIGN, plan))
             strata = strata_of(expected, CAMPAIGN.scenario, stated, number, CONFIDENCE)
             yield measured("design1, level 0", strata, probability, seeds, verdicts)
 

@@ -35,6 +35,7 @@ from merge_sumo.engine.evaluate import CaseResults, evaluate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.failures_per_merge import OverMixtures, failures_per_merge
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.values.case import Case, FloatArray, MergeCase
 from merge_sumo.values.scenario import US23, VUT, MergeScenario, as_merge
 from merge_sumo.values.trajectory import Trajectory
@@ -101,7 +102,8 @@ def brute(count: int, cases: int, vuts: Sequence[str], levels: Sequence[int], en
                 )
                 out = Path(folder) / f"{density}.json"
                 kinematic = plan.with_engine(Engine.KINEMATIC)
-                found = failures_per_merge(run, settings, kinematic, traffic, out, cases=cases)
+                study = RunStudy(run, settings, kinematic)
+                found = failures_per_merge(study, traffic, out, cases=cases)
                 for level in levels:
                     agrees &= _compare(vut, level, density, found.levels[level], count, plan)
     return agrees

@@ -96,7 +96,7 @@ from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
-from merge_sumo.reports.progress import Bars, Counter, TrainingBars, is_watched
+from merge_sumo.reports.progress import Bars, TrainingBars, is_watched
 from merge_sumo.reports.repair_page import repair_page
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction_page
@@ -129,7 +129,7 @@ from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.entrants import LIMIT_S, check_spec
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
-from merge_sumo.studies.probability import same_system
+from merge_sumo.studies.run_study import RunStudy, same_system
 from merge_sumo.studies.sampler_benchmark import SamplerBenchmark
 from merge_sumo.studies.truth import Truth
 from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
@@ -486,8 +486,6 @@ def rerun(
     *,
     vut: AnyVut | None = None,
     level: int | str | None = None,
-    net: AnyPath | None = None,
-    trust_vut: bool = False,
     **given: Unpack[RerunKeywords],
 ) -> Rerun:
     """Run recorded cases again with a changed VUT; the same as `merge-sumo rerun`.
@@ -497,20 +495,48 @@ def rerun(
         indices: its cases; all of them by default.
         vut: as of `campaign`; the campaign's, as its files are now, by default.
         level: only the cases with a POV of this level; "all" by default.
-        net: net for that; must be the one of the campaign.
-        trust_vut: run the controller that a folder names although it was not made here.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
     """
     check_keywords("rerun", given, RerunKeywords)
     before = _opened(run).run
     wanted = _of_level(before, _listed(indices), level)
-    fields, runner = given_again(vut, given, {})
-    today = settings_today(before, fields, trust=trust_vut)
-    plan = resolve(today, _path(net))
     total = len(set(wanted) or before.outcomes)
-    with runner.open(plan) as opened, runner.counter(f"{today.vut} again", total) as counter:
-        return versions.rerun(before, today, plan, wanted, workers=opened, on_case=counter.ended)
+    with _study_of(before, given, "{vut} again", total, vut=vut) as study:
+        return versions.rerun(study, wanted)
+
+
+@contextmanager
+def _study_of(
+    run: Run,
+    given: RerunKeywords,
+    title: str,
+    total: int,
+    unit: str = "cases",
+    *,
+    vut: AnyVut | None = None,
+    engine: str | None = Engine.SUMO,
+) -> Iterator[RunStudy]:
+    """Open a campaign for a study that runs cases of it, with a bar that counts `total` of them.
+
+    "{vut}" in the title stands for the VUT.
+    """
+    # Whoever calls the verb: between are the verb, `with`, this function and the two below.
+    settings, plan, runner = _today(run, given, vut, stacklevel=7)
+    plan = plan.with_engine(engine)
+    counter = runner.counter(title.format(vut=settings.vut), total, unit)
+    with runner.open(plan) as opened, counter:
+        yield RunStudy(run, settings, plan, opened, counter.ended)
+
+
+def _today(
+    run: Run, given: RerunKeywords, vut: AnyVut | None, stacklevel: int
+) -> tuple[CampaignSettings, SimulationPlan, Runner]:
+    """Return how and where cases of a campaign run today: settings, their plan, and the runner."""
+    others = {name: one for name, one in given.items() if name not in ("net", "trust_vut")}
+    fields, runner = given_again(vut, others, {"vut": run.vut}, stacklevel)
+    settings = settings_today(run, fields, trust=given.get("trust_vut", False))
+    return settings, resolve(settings, _path(given.get("net"))), runner
 
 
 def _listed(indices: Iterable[int] | int) -> tuple[int, ...]:
@@ -945,9 +971,7 @@ def probability(
     distribution: AnyPath | None = None,
     confidence: float = 0.95,
     seed: int = 0,
-    net: AnyPath | None = None,
     out: AnyPath | None = None,
-    trust_vut: bool = False,
     engine: str = Engine.SUMO,
     **given: Unpack[RerunKeywords],
 ) -> ProbabilityResult:
@@ -959,9 +983,7 @@ def probability(
         distribution: JSON file that says how often cases occur; uniform by default.
         confidence: chance that the interval holds the probability.
         seed: same seed, same cases.
-        net: net for that; must be the one of the campaign.
         out: new file to write; `probability.json` in the folder of the campaign by default.
-        trust_vut: run the controller that a folder names although it was not made here.
         engine: "sumo", or "kinematic": see `truths`.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
@@ -969,21 +991,10 @@ def probability(
     check_keywords("probability", given, RerunKeywords)
     before = _opened(run).run
     target = before.folder / estimates.RESULT if out is None else Path(out)
-    fields, runner = given_again(None, given, {"vut": before.vut})
-    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
-    plan = resolve(settings, _path(net)).with_engine(engine)
-    with runner.open(plan) as opened, runner.counter("fresh cases", cases) as counter:
+    stated = _path(distribution)
+    with _study_of(before, given, "fresh cases", cases, engine=engine) as study:
         estimate = estimates.failure_probability(
-            before,
-            settings,
-            plan,
-            target,
-            cases=cases,
-            distribution=_path(distribution),
-            confidence=confidence,
-            seed=seed,
-            workers=opened,
-            on_case=lambda _: counter.ended(1),
+            study, target, cases=cases, distribution=stated, confidence=confidence, seed=seed
         )
     return ProbabilityResult(estimate, target, before.criterion, distribution is None)
 
@@ -996,9 +1007,7 @@ def failures_per_merge(
     cases: int = per_merge.DEFAULT_CASES,
     confidence: float = 0.95,
     seed: int = 0,
-    net: AnyPath | None = None,
     out: AnyPath | None = None,
-    trust_vut: bool = False,
     engine: str = Engine.SUMO,
     **given: Unpack[RerunKeywords],
 ) -> PerMergeResult:
@@ -1011,9 +1020,7 @@ def failures_per_merge(
         cases: fresh cases to run.
         confidence: chance that an interval holds.
         seed: same seed, same cases.
-        net: net for that; must be the one of the campaign.
         out: new file to write; `failures-per-merge.json` in the folder of the campaign by default.
-        trust_vut: run the controller that a folder names although it was not made here.
         engine: "sumo", or "kinematic": see `truths`.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
@@ -1023,21 +1030,9 @@ def failures_per_merge(
     on_road = traffic.checked() if isinstance(traffic, Traffic) else named_traffic(str(traffic))
     on_road = on_road.with_density(density_veh_per_km)
     target = before.folder / per_merge.RESULT if out is None else Path(out)
-    fields, runner = given_again(None, given, {"vut": before.vut})
-    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
-    plan = resolve(settings, _path(net)).with_engine(engine)
-    with runner.open(plan) as opened, runner.counter("fresh cases", cases) as counter:
+    with _study_of(before, given, "fresh cases", cases, engine=engine) as study:
         found = per_merge.failures_per_merge(
-            before,
-            settings,
-            plan,
-            on_road,
-            target,
-            cases=cases,
-            confidence=confidence,
-            seed=seed,
-            workers=opened,
-            on_case=lambda _: counter.ended(1),
+            study, on_road, target, cases=cases, confidence=confidence, seed=seed
         )
     return PerMergeResult(found, target, before.criterion)
 
@@ -1047,8 +1042,6 @@ def stress(
     *,
     draws: int = ladder.DEFAULT_DRAWS,
     seed: int = 0,
-    net: AnyPath | None = None,
-    trust_vut: bool = False,
     **given: Unpack[RerunKeywords],
 ) -> StressResult:
     """Run the cases of a campaign again, each time a little otherwise; as `merge-sumo stress`.
@@ -1057,8 +1050,6 @@ def stress(
         run: the campaign, or its folder, into which `stress.json` is written.
         draws: times that all cases run where the change is drawn at random, 1 to 1,000.
         seed: same seed, same draws.
-        net: net for that; must be the one of the campaign.
-        trust_vut: run the controller that the folder names although it was not made here.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
 
@@ -1067,19 +1058,10 @@ def stress(
     check_keywords("stress", given, RerunKeywords)
     before = _opened(run).run
     check_own(before.folder / ladder.STRESS)
-    fields, runner = given_again(None, given, {"vut": before.vut})
-    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
-    plan = resolve(settings, _path(net)).with_engine(None)
     total = sum(ladder.runs_of(change, draws) for change in ladder.RUNGS)
     cases = total * sum(outcome.is_tested for outcome in before.outcomes)
-    with runner.open(plan) as opened, runner.counter("cases again", cases) as counter:
-        found = ladder.stress(
-            *(before, settings, plan),
-            draws=draws,
-            seed=seed,
-            workers=opened,
-            on_cases=counter.ended,
-        )
+    with _study_of(before, given, "cases again", cases, engine=None) as study:
+        found = ladder.stress(study, draws=draws, seed=seed)
     return StressResult(found, before.folder / ladder.STRESS)
 
 
@@ -1089,8 +1071,6 @@ def crosscheck(
     cases: int | None = None,
     seed: int = 0,
     crime: AnyPath | None = None,
-    net: AnyPath | None = None,
-    trust_vut: bool = False,
     **given: Unpack[RerunKeywords],
 ) -> CrosscheckResult:
     """Let another simulator run a campaign, and compare; the same as `merge-sumo crosscheck`.
@@ -1103,28 +1083,14 @@ def crosscheck(
             of more, those with the lowest scores. By default those recorded.
         seed: of the fresh cases.
         crime: Python of an environment with commonroad-crime, which then measures merges, too.
-        net: net for that; must be the one of the campaign.
-        trust_vut: run the controller that a folder names although it was not made here.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
     """
     check_keywords("crosscheck", given, RerunKeywords)
     before = _opened(run).run
-    fields, runner = given_again(None, given, {"vut": before.vut})
-    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
-    plan = resolve(settings, _path(net))
     total = len(before.outcomes) if cases is None else cases
-    with runner.open(plan) as opened, runner.counter(peer_name(), total) as counter:
-        found = peers.crosscheck(
-            before,
-            settings,
-            plan,
-            cases=cases,
-            seed=seed,
-            workers=opened,
-            crime=_path(crime),
-            on_cases=counter.ended,
-        )
+    with _study_of(before, given, peer_name(), total) as study:
+        found = peers.crosscheck(study, cases=cases, seed=seed, crime=_path(crime))
     return CrosscheckResult(found, before.folder / peers.CROSSCHECK)
 
 
@@ -1138,10 +1104,8 @@ def repair(
     rounds: int = mending.DEFAULT_ROUNDS,
     cases: int | None = None,
     seed: int = 0,
-    net: AnyPath | None = None,
     out: AnyPath | None = None,
     resume: bool = False,
-    trust_vut: bool = False,
     check: Callable[[], None] | None = None,
     **given: Unpack[RerunKeywords],
 ) -> RepairResult:
@@ -1156,10 +1120,8 @@ def repair(
         rounds: most rounds of search and fresh campaign.
         cases: cases of a fresh campaign; by default as many as the campaign has.
         seed: same seed, same result.
-        net: net for that; must be the one of the campaign.
         out: new folder to write; `runs/repair-<campaign>-<date>` by default.
         resume: go on in the folder `out`.
-        trust_vut: run the controller that a folder names although it was not made here.
         check: called after every trial and every batch; may raise to stop there.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
@@ -1174,10 +1136,8 @@ def repair(
     folder = dated(f"repair-{before.folder.name}") if out is None else Path(out)
     if not resume:
         check_new(folder)
-    fields, runner = given_again(vut, given, {})
+    today, plan, runner = _today(before, given, vut, stacklevel=5)
     runner = replace(runner, check=check)
-    today = settings_today(before, fields, trust=trust_vut)
-    plan = resolve(today, _path(net))
     same_system(before, record_of(today, plan))
     motions: dict[Path, dict[tuple[str, int], Trajectory]] = {}
     bars: list[Bars] = []
@@ -1194,16 +1154,15 @@ def repair(
 
     def fresh(spec: str, number: int) -> tuple[Run, RunComparison]:
         campaign = folder / mending.CAMPAIGN.format(number)
-        ran = _fresh_campaign(
-            mending.fresh_settings(today, asked, spec, number), campaign, net, runner
-        )
+        settings = mending.fresh_settings(today, asked, spec, number)
+        ran = _fresh_campaign(settings, campaign, given.get("net"), runner)
         seen = motions[ran.folder] = {}
         compared = versions.compare_runs(
             before,
             ran,
             net=plan.road,
             given={} if today.policies is None else {"policies": today.policies},
-            trust=trust_vut,
+            trust=given.get("trust_vut", False),
             on_motion=lambda of, index, motion: seen.update({(of, index): motion}),
         )
         return ran, compared
@@ -1254,9 +1213,6 @@ def _fresh_campaign(
 def explain(
     run: AnyRun,
     indices: Iterable[int] | int = (),
-    *,
-    net: AnyPath | None = None,
-    trust_vut: bool = False,
     **given: Unpack[RerunKeywords],
 ) -> ExplanationResult:
     """Find the smallest changes with which failures pass; the same as `merge-sumo explain`.
@@ -1264,8 +1220,6 @@ def explain(
     Args:
         run: the campaign, or its folder, into which `explanations.jsonl` is written.
         indices: its failures; the ten that the report lists by default.
-        net: net for that; must be the one of the campaign.
-        trust_vut: run the controller that the folder names although it was not made here.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
     """
@@ -1274,15 +1228,11 @@ def explain(
     target = before.folder / explanation.EXPLANATIONS
     check_own(target)
     chosen = explanation.listed_failures(before, _listed(indices))
-    fields, runner = given_again(None, given, {"vut": before.vut})
-    settings = settings_of(before.folder, before.settings, fields, trust=trust_vut)
-    plan = resolve(settings, _path(net)).with_engine(None)
-    with (
-        runner.open(plan) as opened,
-        Counter("explained", len(chosen), "failures", shown=runner.progress) as counter,
-    ):
+    with _study_of(before, given, "explained", len(chosen), "failures", engine=None) as study:
         found = explanation.explain(
-            before, settings, plan, chosen, workers=opened, on_failures=counter.ended
+            *(before, study.settings, study.plan, chosen),
+            workers=study.workers,
+            on_failures=study.on_cases,
         )
     return ExplanationResult(before, tuple(found), target)
 

@@ -139,7 +139,15 @@ class StudyKeywords(Setup, Running, total=False):
 
 
 class RerunKeywords(Hosting, Running, total=False):
-    """Keywords of what runs cases of a recorded campaign: those of `Hosting` and `Running`."""
+    """Keywords of what runs cases of a recorded campaign: of `Hosting` and `Running`, and these.
+
+    Attributes:
+        net: net for that; must be the one of the campaign.
+        trust_vut: run the controller that the folder names although it was not made here.
+    """
+
+    net: Path | str | None
+    trust_vut: bool
 
 
 class CampaignKeywords(Settings, Running, total=False):
@@ -187,9 +195,9 @@ class Runner:
         here_s = HERE_S if self.workers is None and not at_once else None
         return evaluation_workers(plan.workers(self.workers), self.dask, here_s)
 
-    def counter(self, title: str, total: int) -> Counter:
-        """Return a bar that counts cases, to be used in `with`."""
-        return Counter(title, total, "cases", shown=self.progress)
+    def counter(self, title: str, total: int, unit: str = "cases") -> Counter:
+        """Return a bar that counts things called `unit`, to be used in `with`."""
+        return Counter(title, total, unit, shown=self.progress)
 
 
 def runner_of(given: Mapping[str, Any]) -> tuple[Runner, dict[str, Any]]:
@@ -277,11 +285,12 @@ def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSetting
 
 
 def given_again(
-    vut: AnyVut | None, given: Mapping[str, Any], recorded: Mapping[str, Any]
+    vut: AnyVut | None, given: Mapping[str, Any], recorded: Mapping[str, Any], stacklevel: int = 4
 ) -> tuple[dict[str, Any], Runner]:
     """Return the settings that are given for a recorded campaign, and where its cases run.
 
-    `recorded` has VUT and POV for where they are not given.
+    `recorded` has VUT and POV for where they are not given; warnings are of the caller that many
+    calls above.
     """
     runner, given = runner_of(given)
     named = {
@@ -289,7 +298,7 @@ def given_again(
     }
     drivers = {"vut": "", "pov": None, **recorded, **named}
     spec, pov_spec, workers = drivers_of(
-        drivers["vut"], drivers["pov"], runner.workers, stacklevel=4
+        drivers["vut"], drivers["pov"], runner.workers, stacklevel=stacklevel
     )
     specs = {"vut": spec, "pov": pov_spec}
     against, workers = _earlier_of(given, workers)

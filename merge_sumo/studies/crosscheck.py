@@ -23,7 +23,7 @@ import numpy as np
 from msgspec import Meta
 from msgspec.structs import replace as replaced
 
-from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import CaseResult, evaluate, workers_or_here
 from merge_sumo.engine.highway_env_simulator import HighwayEnvWorld, peer_name, why_sumo_alone
@@ -31,7 +31,7 @@ from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.studies.crime import measured_by
-from merge_sumo.studies.probability import same_system
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import Record, read_record, to_plain
@@ -231,29 +231,16 @@ OnCases = Callable[[int], None]
 
 
 def crosscheck(
-    run: Run,
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    *,
-    cases: int | None = None,
-    seed: int = 0,
-    workers: Workers | None = None,
-    crime: Path | None = None,
-    on_cases: OnCases = lambda _: None,
+    study: RunStudy, *, cases: int | None = None, seed: int = 0, crime: Path | None = None
 ) -> Crosscheck:
     """Let another simulator run a campaign; return what agrees, and write it into its folder.
 
     Args:
-        run: the campaign.
-        settings: those of the campaign, except for policies that are elsewhere and how a VUT is
-            hosted.
-        plan: that of the settings.
+        study: the campaign, and how its cases run.
         cases: cases that drive there: those recorded, and fresh uniform ones where there are fewer;
             of more, those with the lowest scores. By default those recorded.
         seed: of the fresh cases.
-        workers: where cases run, by default in this process.
         crime: Python of an environment with commonroad-crime, which then measures merges, too.
-        on_cases: told how many cases have just run.
 
     Raises:
         UserError: where HighwayEnv is not installed, for numbers that make no sense, and a run
@@ -263,20 +250,21 @@ def crosscheck(
         if number < least:
             raise UserError(f"--{name} is {number}: it must be {least} or more")
     peer = peer_name()
-    same_system(run, record_of(settings, plan))
+    study.check_same_system()
+    run = study.run
     known = run.trajectories(outcome.index for outcome in run.outcomes)
-    plan = plan.with_log(run.folder.resolve() / LOG)
+    plan = study.plan.with_log(run.folder.resolve() / LOG)
     why = why_sumo_alone(plan)
     measured = None if crime is None else _measured(crime, run, plan)
-    with workers_or_here(workers) as processes:
+    with workers_or_here(study.workers) as processes:
         motion = motion_of(plan, known, processes)
         verdicts = None
         if why is None:
             judged = [o for o in run.outcomes if o.index in known and o.score is not None]
             recorded = judged if cases is None else _lowest(judged, cases)
-            fresh = _fresh(settings, (cases or 0) - len(recorded), seed)
+            fresh = _fresh(study.settings, (cases or 0) - len(recorded), seed)
             verdicts = replaced(
-                verdicts_of(plan, recorded, known, fresh, processes, on_cases),
+                verdicts_of(plan, recorded, known, fresh, processes, study.on_cases),
                 lowest_only=len(recorded) < len(judged),
             )
     found = Crosscheck(

@@ -39,7 +39,7 @@ from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.counterfactuals import Avoidance
-from merge_sumo.studies.probability import same_system
+from merge_sumo.studies.run_study import same_system
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import Record, read_indexed, to_plain
 from merge_sumo.system.suggestions import either

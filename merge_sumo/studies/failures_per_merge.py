@@ -17,7 +17,6 @@ of psi; where the traffic states a range of its standard deviation, of both ends
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -28,10 +27,6 @@ import numpy as np
 
 from merge_sumo.analysis.exposure import Distribution, Marginal, Uniform
 from merge_sumo.analysis.traffic import SpeedsInPool, Traffic
-from merge_sumo.campaigns.campaign import OnCase
-from merge_sumo.campaigns.settings import CampaignSettings, record_of
-from merge_sumo.campaigns.store import Run
-from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.probability import (
     STREAM,
@@ -41,13 +36,12 @@ from merge_sumo.studies.probability import (
     lines_beside,
     notes_of,
     run_fresh,
-    same_system,
     strata_of,
+    write_result,
 )
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.stratified import UPPER_RISK, Draws, Estimate, Strata, estimate
-from merge_sumo.system.folders import write_new
 from merge_sumo.system.records import Record, read_record
-from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import MergeScenario, Scenario, as_merge
 from merge_sumo.values.score import Outcome
 
@@ -271,17 +265,13 @@ def _single(scenario: Scenario) -> MergeScenario:
 
 
 def failures_per_merge(
-    run: Run,
-    settings: CampaignSettings,
-    plan: SimulationPlan,
+    study: RunStudy,
     traffic: Traffic,
     out: Path,
     *,
     cases: int = DEFAULT_CASES,
     confidence: float = 0.95,
     seed: int = 0,
-    workers: Workers | None = None,
-    on_case: OnCase | None = None,
 ) -> FailuresPerMerge:
     """Estimate with how many mainline cars a merge of a campaign's VUT fails, with fresh cases.
 
@@ -289,27 +279,24 @@ def failures_per_merge(
     of the same name that ends in .jsonl.
 
     Args:
-        run: the campaign.
-        settings: as of `failure_probability`.
-        plan: that of the settings.
+        study: as of `failure_probability`.
         traffic: the traffic on the mainline.
         out: new file, which ends in .json.
         cases: fresh cases of all parts, which get about as many each.
         confidence: chance that an interval holds.
         seed: of the draws.
-        workers: where cases run, by default in this process.
-        on_case: told each fresh outcome.
 
     Raises:
         UserError: as `failure_probability`, and where traffic and scenario do not go together.
     """
     check_numbers(cases, confidence, seed)
+    settings = study.settings
     stated = parts_of(traffic, settings.scenario, settings.levels)
     if cases < len(stated):
         raise UserError(f"--cases is {cases}: give {len(stated)} or more, one for each part")
-    same_system(run, record_of(settings, plan))
+    study.check_same_system()
     lines = lines_beside(out)
-    expected = Expected(run, settings, plan)
+    expected = Expected(study)
     shared = [len(part) for part in np.array_split(np.arange(cases), len(stated))]
     drawn, chosen, notes = [], [], []
     for number, (part, share) in enumerate(zip(stated, shared, strict=True)):
@@ -318,15 +305,9 @@ def failures_per_merge(
         drawn.append((strata, draws))
         chosen += cases_of(settings, part.distribution, draws)
         notes += [{"part": number, **note} for note in notes_of(draws)]
-    outcomes = run_fresh(plan, chosen, notes, lines, on_case, workers)
+    outcomes = run_fresh(study, chosen, notes, lines)
     result = result_of(traffic, settings.scenario, stated, drawn, outcomes, confidence)
-    record = {
-        **result.to_record(),
-        "seed": seed,
-        "engine": plan.engine,
-        "campaign": record_of(settings, plan),
-    }
-    write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
+    write_result(out, study, result.to_record(), seed)
     return result
 
 

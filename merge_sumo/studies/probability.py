@@ -18,17 +18,15 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.analysis.exposure import Distribution, read_distribution
-from merge_sumo.campaigns.campaign import OnCase
-from merge_sumo.campaigns.settings import CampaignSettings, record_of
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
-from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.coverage import REPLAYED
 from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.stratified import (
     Draws,
     Estimate,
@@ -38,7 +36,6 @@ from merge_sumo.studies.stratified import (
 )
 from merge_sumo.system.folders import add_to, check_new_file, write_new
 from merge_sumo.system.records import Record, read_record
-from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.scenario import DX_CRASH_M, Scenario
@@ -61,17 +58,13 @@ WRITTEN: Final = 500
 
 
 def failure_probability(
-    run: Run,
-    settings: CampaignSettings,
-    plan: SimulationPlan,
+    study: RunStudy,
     out: Path,
     *,
     cases: int = DEFAULT_CASES,
     distribution: Path | None = None,
     confidence: float = 0.95,
     seed: int = 0,
-    workers: Workers | None = None,
-    on_case: OnCase | None = None,
 ) -> Estimate:
     """Estimate how likely the VUT of a campaign is to fail, with fresh cases.
 
@@ -79,43 +72,39 @@ def failure_probability(
     weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
 
     Args:
-        run: the campaign.
-        settings: those of the campaign, except for policies that are elsewhere and how a VUT is
-            hosted.
-        plan: that of the settings.
+        study: the campaign, and how its cases run.
         out: new file, which ends in .json.
         cases: fresh cases.
         distribution: JSON file that states how often cases occur; uniform over the pool without.
         confidence: chance that the interval holds the probability.
         seed: of the draws.
-        workers: where cases run, by default in this process; the estimate is the same.
-        on_case: told each fresh outcome.
 
     Raises:
         UserError: for a distribution or numbers that make no sense, a run whose net or policies are
             not those of today, or files that exist or cannot be written.
     """
     check_numbers(cases, confidence, seed)
-    same_system(run, record_of(settings, plan))
+    study.check_same_system()
+    settings = study.settings
     stated = read_distribution(distribution, settings.levels, settings.scenario)
     lines = lines_beside(out)
-    expected = Expected(run, settings, plan)
+    expected = Expected(study)
     strata = strata_of(expected, settings.scenario, stated, cases, confidence)
     draws = strata.draw(np.random.default_rng([seed, STREAM]))
     drawn = cases_of(settings, stated, draws)
-    outcomes = run_fresh(plan, drawn, notes_of(draws), lines, on_case, workers)
+    outcomes = run_fresh(study, drawn, notes_of(draws), lines)
     failed = np.array([outcome.failed for outcome in outcomes])
     judged = np.array([outcome.score is not None for outcome in outcomes])
     result = estimate(strata, draws, failed, judged, confidence)
-    record = {
-        **asdict(result),
-        "distribution": stated.record(),
-        "seed": seed,
-        "engine": plan.engine,
-        "campaign": record_of(settings, plan),
-    }
-    write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
+    write_result(out, study, {**asdict(result), "distribution": stated.record()}, seed)
     return result
+
+
+def write_result(out: Path, study: RunStudy, result: Mapping[str, Any], seed: int) -> None:
+    """Write what a study found with fresh cases as a new file, with all that decides it."""
+    decides = {"seed": seed, "engine": study.plan.engine, "campaign": study.record()}
+    record = {**result, **decides}
+    write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
 
 class ProbabilityFile(Record, frozen=True):
@@ -202,7 +191,8 @@ class Expected:
     What is expected decides the width of the interval, and not its validity.
     """
 
-    def __init__(self, run: Run, settings: CampaignSettings, plan: SimulationPlan) -> None:
+    def __init__(self, study: RunStudy) -> None:
+        run, settings, plan = study.run, study.settings, study.plan
         self._sampler = make_sampler("uniform", settings.pool, 0)
         self._sampler.tell(run.outcomes)
         self._by_level: dict[int, Callable[[FloatArray], FloatArray]] = {}
@@ -259,16 +249,6 @@ def _parts(points: FloatArray) -> list[FloatArray]:
     return np.array_split(points, len(points) // CHUNK + 1)
 
 
-def same_system(run: Run, today: Mapping[str, Any]) -> None:
-    """Raise `UserError` where a run had another net or other policies than today's settings."""
-    for name in ("net_sha256", "policies_sha256"):
-        if run.settings.get(name) != today[name]:
-            what, others = ("net", "another") if name == "net_sha256" else ("policies", "other")
-            raise UserError(
-                f"{run.folder} was run with {others} {what}: name what it was run with, --{what}"
-            )
-
-
 def cases_of(settings: CampaignSettings, stated: Distribution, draws: Draws) -> list[Case]:
     """Return the cases of draws from a distribution, in their order."""
     by_place: dict[int, Case] = {}
@@ -288,25 +268,18 @@ def notes_of(draws: Draws) -> list[dict[str, float]]:
 
 
 def run_fresh(
-    plan: SimulationPlan,
-    cases: Sequence[Case],
-    notes: Sequence[Mapping[str, float]],
-    lines: Path,
-    on_case: OnCase | None,
-    workers: Workers | None,
+    study: RunStudy, cases: Sequence[Case], notes: Sequence[Mapping[str, float]], lines: Path
 ) -> list[Outcome]:
     """Run cases in order, some at a time; write each outcome with what is noted of its case."""
     outcomes: list[Outcome] = []
-    with workers_or_here(workers) as processes:
-        plan = plan.for_cases(len(cases))
+    with workers_or_here(study.workers) as processes:
+        plan = study.plan.for_cases(len(cases))
         open_simulators(plan, processes)
         for first in range(0, len(cases), WRITTEN):
             ran = []
             for place, done in evaluate(plan, cases[first : first + WRITTEN], processes):
-                outcome = done.outcome(first + place, first // WRITTEN)
-                ran.append(outcome)
-                if on_case is not None:
-                    on_case(outcome)
+                ran.append(done.outcome(first + place, first // WRITTEN))
+                study.on_cases(1)
             ran.sort(key=lambda outcome: outcome.index)
             append_lines(lines, ran, notes)
             outcomes += ran

@@ -21,12 +21,11 @@ from typing import Annotated, Any, Final
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
-from merge_sumo.studies.probability import same_system
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, read_record, to_plain
@@ -283,26 +282,13 @@ RUNGS: Final = (
 """The ladder; the first rung shows whether cases repeat at all."""
 
 
-def stress(
-    run: Run,
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    *,
-    draws: int = DEFAULT_DRAWS,
-    seed: int = 0,
-    workers: Workers | None = None,
-    on_cases: Callable[[int], None] = lambda _: None,
-) -> Stress:
+def stress(study: RunStudy, *, draws: int = DEFAULT_DRAWS, seed: int = 0) -> Stress:
     """Run the cases of a campaign on every rung, and write what becomes of them into its folder.
 
     Args:
-        run: the campaign.
-        settings: those of the campaign, except for what may be elsewhere.
-        plan: that of the settings.
+        study: the campaign, and how its cases run.
         draws: times that all cases run on a rung that draws at random.
         seed: of the draws; the same for a case wherever it runs.
-        workers: where cases run, by default in this process.
-        on_cases: told how many have just ended.
 
     Raises:
         UserError: for numbers that make no sense, and for a campaign without a verdict, or with a
@@ -312,12 +298,14 @@ def stress(
         raise UserError(f"--draws is {draws}: it must be 1 to {MOST_DRAWS:,}")
     if seed < 0:
         raise UserError(f"--seed is {seed}: it must be 0 or more")
-    same_system(run, record_of(settings, plan))
+    study.check_same_system()
+    run = study.run
     tested = [outcome for outcome in run.outcomes if outcome.is_tested]
     if not tested:
         raise UserError(f"{run.folder} has no case with a verdict: nothing can be stressed")
-    with workers_or_here(workers) as opened:
-        ladder = _Ladder(plan.for_cases(len(tested)), tested, draws, seed, opened, on_cases)
+    with workers_or_here(study.workers) as opened:
+        plan = study.plan.for_cases(len(tested))
+        ladder = _Ladder(plan, tested, draws, seed, opened, study.on_cases)
         rungs = tuple(map(ladder.rung, RUNGS))
     failing = tuple(outcome.index for outcome in failures(tested))
     found = Stress(len(tested), failing, rungs, seed, run.vut)

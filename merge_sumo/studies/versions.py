@@ -24,16 +24,16 @@ from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.against import earlier_run
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.repeats import cause
-from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, same_pov, settings_of
 from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
-from merge_sumo.engine.plan import SimulationPlan, versions
+from merge_sumo.engine.plan import versions
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.hashing import changed
 from merge_sumo.system.printable import counted
-from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import US23, level_name
@@ -604,20 +604,13 @@ def settings_today(
     return settings_of(run.folder, run.settings, wanted, trust=trust)
 
 
-def rerun(
-    run: Run,
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    indices: Sequence[int] = (),
-    *,
-    workers: Workers | None = None,
-    on_case: Callable[[int], None] = lambda _: None,
-) -> Rerun:
+def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Rerun:
     """Run cases of a campaign again, by default all, with `settings_today` and their plan.
 
-    `on_case` is told how many have just ended. Raises `UserError` for an index without a case, and
-    where net or POV are not the campaign's: then not only the VUT would have changed.
+    Raises `UserError` for an index without a case, and where net or POV are not the campaign's:
+    then not only the VUT would have changed.
     """
+    run, settings, plan = study.run, study.settings, study.plan
     before = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
     if not before:
         raise UserError(f"{run.folder} has no case yet")
@@ -627,7 +620,7 @@ def rerun(
             f"{run.folder} was run on another net than {road.path}: give that with --net"
         )
     levels = sorted({outcome.case.level for outcome in before})
-    today = record_of(settings, plan)
+    today = study.record()
     for level in levels:
         if not same_pov(run.settings, today, level):
             raise UserError(
@@ -636,13 +629,13 @@ def rerun(
             )
     # In another order than the campaign's, which a VUT that remembers would repeat.
     order, by_index = before[::-1], dict[int, Outcome]()
-    with workers_or_here(workers) as processes:
+    with workers_or_here(study.workers) as processes:
         plan = plan.for_cases(len(before))
         open_simulators(plan, processes)
         for place, now in evaluate(plan, [outcome.case for outcome in order], processes):
             old = order[place]
             by_index[old.index] = now.outcome(old.index, old.batch)
-            on_case(1)
+            study.on_cases(1)
     after = [by_index[outcome.index] for outcome in before]
     evidence = f"{counted(len(before), 'case')} ran again"
     compared = _comparison(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from merge_sumo.reports.report import REPORT
 from merge_sumo.studies import probability
 from merge_sumo.studies.certificate import CERTIFICATE
 from merge_sumo.studies.probability import failure_probability
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.anchors import SUPPORTED
 from merge_sumo.system.folders import TEMPORARY, add_to, new_folder, replace_own, write_new
 from merge_sumo.values.scenario import US23
@@ -242,42 +244,43 @@ def test_a_race_for_new_folders_writes_nothing_elsewhere(common, private, other_
 
 class TestTheCasesOfAProbability:
     @pytest.fixture
-    def asked(self, run, monkeypatch) -> dict[str, Any]:
+    def study(self, run, monkeypatch) -> RunStudy:
         monkeypatch.setattr(probability, "WRITTEN", 5)
         settings = settings_of(run.folder, run.settings)
-        return {"run": run, "settings": settings, "plan": resolve(settings), "cases": 20}
+        return RunStudy(run, settings, resolve(settings))
 
-    def test_that_somebody_changes_do_not_change_the_estimate(self, asked, tmp_path):
-        honest = failure_probability(**asked, out=tmp_path / "honest.json")
+    def test_that_somebody_changes_do_not_change_the_estimate(self, study, tmp_path):
+        honest = failure_probability(study, tmp_path / "honest.json", cases=20)
         tampered = tmp_path / "tampered.jsonl"
 
-        def tamper(outcome: Any) -> None:
-            if outcome.index >= 5:
+        def tamper(_: int) -> None:
+            if tampered.exists():
                 lines = tampered.read_text().replace('"failed": true', '"failed": false')
                 tampered.write_text("{}\n" + lines.replace("-", ""))
 
-        found = failure_probability(**asked, out=tmp_path / "tampered.json", on_case=tamper)
+        tampering = replace(study, on_cases=tamper)
+        found = failure_probability(tampering, tmp_path / "tampered.json", cases=20)
         assert found == honest
         read = [(tmp_path / f"{name}.json").read_text() for name in ("honest", "tampered")]
         assert read[0] == read[1]
 
     def test_that_become_a_link_are_written_nowhere_else(
-        self, asked, common, private, other_account
+        self, study, common, private, other_account
     ):
         lines = common / "p.jsonl"
 
-        def swap(outcome: Any) -> None:
-            if outcome.index >= 5 and not lines.is_symlink():
+        def swap(_: int) -> None:
+            if lines.exists() and not lines.is_symlink():
                 other_account(put_link, str(lines), str(private / "file"))
 
         with pytest.raises(UserError, match="cannot write"):
-            failure_probability(**asked, out=common / "p.json", on_case=swap)
+            failure_probability(replace(study, on_cases=swap), common / "p.json", cases=20)
 
-    def test_that_are_there_before_are_neither_read_nor_replaced(self, asked, tmp_path):
+    def test_that_are_there_before_are_neither_read_nor_replaced(self, study, tmp_path):
         lines = tmp_path / "p.jsonl"
         lines.write_text('{"index": 0, "failed": false}\n' * 20)
         with pytest.raises(UserError, match="exists"):
-            failure_probability(**asked, out=tmp_path / "p.json")
+            failure_probability(study, tmp_path / "p.json", cases=20)
         assert not (tmp_path / "p.json").exists()
         shutil.copy(lines, tmp_path / "kept")
         assert lines.read_bytes() == (tmp_path / "kept").read_bytes()

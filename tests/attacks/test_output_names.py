@@ -36,6 +36,7 @@ from merge_sumo.reports import figures
 from merge_sumo.reports.report import REPORT, write_report
 from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability, reproduction
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system import folders
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.training import helix
@@ -479,9 +480,9 @@ class TestAReceivedFolder:
         (received / name).symlink_to("../ours/new")
         before = tree(tmp_path)
         run, out = Run(received), received / probability.RESULT
-        plan = resolve(today := settings_of(received, run.settings))
+        study = RunStudy(run, today := settings_of(received, run.settings), resolve(today))
         with pytest.raises(UserError, match=f"{name} exists"):
-            probability.failure_probability(run, today, plan, out, cases=4)
+            probability.failure_probability(study, out, cases=4)
         assert tree(tmp_path) == before
 
     def test_keeps_a_folder_of_somebodys_in_the_place_of_a_scenario(self, received, tmp_path):

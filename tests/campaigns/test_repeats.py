@@ -26,6 +26,7 @@ from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.studies.certificate import certify, runs_points_on
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.versions import rerun, settings_today
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23
@@ -174,7 +175,7 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, n
     checked = CliRunner().invoke(cli.app, ["check-vut", spec])
     assert checked.exit_code == 1
     assert "It keeps something from earlier episodes" in checked.stdout
-    again = rerun(run, today := settings_today(run, trust=True), resolve(today))
+    again = rerun(RunStudy(run, today := settings_today(run, trust=True), resolve(today)))
     assert again.unrepeated
     assert "no file of the VUT has changed" in str(again)
 

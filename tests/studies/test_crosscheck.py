@@ -32,6 +32,7 @@ from merge_sumo.studies.crosscheck import (
     crosscheck_of,
     motion_of,
 )
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import POV, US23, VUT, Scenario
 
@@ -121,7 +122,7 @@ class TestVerdicts:
     )
     def test_are_the_same_on_recorded_and_fresh_cases(self, name, tmp_path):
         run, settings = campaign_of(tmp_path / "run", named_scenario(name))
-        found = crosscheck(run, settings, resolve(settings), cases=36)
+        found = crosscheck(RunStudy(run, settings, resolve(settings)), cases=36)
         verdicts = found.verdicts
         assert verdicts is not None
         assert (verdicts.recorded, verdicts.fresh, verdicts.same) == (24, 12, 36)
@@ -137,7 +138,7 @@ class TestVerdicts:
     def test_of_ten_thousand_cases_are_the_same_or_named(self, vut, tmp_path):
         run, settings = campaign_of(tmp_path / "run", vut=vut, cases=800)
         with open_workers(None) as workers:
-            found = crosscheck(run, settings, resolve(settings), cases=10_000, workers=workers)
+            found = crosscheck(RunStudy(run, settings, resolve(settings), workers), cases=10_000)
         verdicts = found.verdicts
         assert verdicts is not None
         assert verdicts.cases == 10_000
@@ -148,7 +149,7 @@ class TestVerdicts:
 
     def test_of_the_lowest_scores_come_first_where_few_are_wanted(self, run):
         settings = CampaignSettings(vut="design1", levels=(0,), scenario=US23)
-        found = crosscheck(run, settings, resolve(settings), cases=5)
+        found = crosscheck(RunStudy(run, settings, resolve(settings)), cases=5)
         result = CrosscheckResult(found, run.folder / CROSSCHECK)
         assert "5 recorded cases, those with the lowest scores, and 0 fresh" in str(result)
         (run.folder / CROSSCHECK).unlink()
@@ -157,7 +158,7 @@ class TestVerdicts:
 
     def test_are_left_out_for_a_driver_of_sumo(self, tmp_path):
         run, settings = campaign_of(tmp_path / "run", vut="sumo:Krauss", cases=3)
-        found = crosscheck(run, settings, resolve(settings))
+        found = crosscheck(RunStudy(run, settings, resolve(settings)))
         assert found.verdicts is None
         assert "a model of SUMO" in found.why_no_verdicts
         assert found.motion.cases == 3
@@ -193,7 +194,7 @@ class TestDifferences:
             step(world, 0.9 * a_mps2, merged)
 
         monkeypatch.setattr(HighwayEnvWorld, "command", weaker)
-        found = crosscheck(run, settings, resolve(settings), cases=60)
+        found = crosscheck(RunStudy(run, settings, resolve(settings)), cases=60)
         assert found.motion.largest_m > 0.1
         assert found.verdicts is not None
         assert found.verdicts.differences

@@ -17,6 +17,7 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.studies import probability
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.stratified import (
     CELLS,
     DEFENSIVE,
@@ -316,7 +317,8 @@ class TestADistribution:
 
 def failure_probability(run, out, **other):
     settings = settings_of(run.folder, run.settings)
-    return probability.failure_probability(run, settings, resolve(settings), out, **other)
+    study = RunStudy(run, settings, resolve(settings))
+    return probability.failure_probability(study, out, **other)
 
 
 class TestOfACampaign:

@@ -21,6 +21,7 @@ from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports import version_pages
 from merge_sumo.reports.version_pages import OVER_TIME, comparison_page
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.versions import (
     Change,
     LevelChange,
@@ -299,7 +300,7 @@ def folder(run, tmp_path) -> Path:
 
 class TestRerunOfTheSameVut:
     def test_gives_every_verdict_and_score_again(self, run):
-        found = rerun(run, today := settings_today(run), resolve(today))
+        found = rerun(RunStudy(run, today := settings_today(run), resolve(today)))
         assert [o.measures for o in found.after] == [o.measures for o in run.outcomes]
         assert found.changed == []
         assert found.compared.worse(0.0) == []

@@ -22,6 +22,7 @@ from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.truth import ground_truth
 from merge_sumo.studies.versions import compare_runs, rerun
 from merge_sumo.values import score
@@ -492,9 +493,8 @@ class TestCampaigns:
             Run(tmp_path)
 
     def test_are_kept_where_recorded_cases_run_again(self, harsh):
-        again = rerun(
-            harsh, today := settings_of(harsh.folder, harsh.settings), resolve(today), (0, 1, 2)
-        )
+        today = settings_of(harsh.folder, harsh.settings)
+        again = rerun(RunStudy(harsh, today, resolve(today)), (0, 1, 2))
         assert [o.margin for o in again.after] == [o.margin for o in harsh.outcomes[:3]]
         assert not again.changed
 

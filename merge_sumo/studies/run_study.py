@@ -1,0 +1,51 @@
+"""What every study of a recorded campaign begins with: the campaign, and how its cases run now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.campaigns.store import Run
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.errors import UserError
+from merge_sumo.system.workers import Workers
+
+
+@dataclass(frozen=True, slots=True)
+class RunStudy:
+    """A recorded campaign, and how a study runs cases of it.
+
+    Attributes:
+        run: the campaign.
+        settings: those of the campaign, except for policies that are elsewhere and how a VUT is
+            hosted.
+        plan: that of the settings, with the engine of the study.
+        workers: where cases run, by default in this process; they decide no result.
+        on_cases: told how many cases have just ended.
+    """
+
+    run: Run
+    settings: CampaignSettings
+    plan: SimulationPlan
+    workers: Workers | None = None
+    on_cases: Callable[[int], None] = lambda _: None
+
+    def record(self) -> dict[str, Any]:
+        """Return what a study keeps of the system that it tested, as `campaign.json` does."""
+        return record_of(self.settings, self.plan)
+
+    def check_same_system(self) -> None:
+        """Raise `UserError` where the campaign had another net or other policies than this plan."""
+        same_system(self.run, self.record())
+
+
+def same_system(run: Run, today: Mapping[str, Any]) -> None:
+    """Raise `UserError` where a run had another net or other policies than today's settings."""
+    for name in ("net_sha256", "policies_sha256"):
+        if run.settings.get(name) != today[name]:
+            what, others = ("net", "another") if name == "net_sha256" else ("policies", "other")
+            raise UserError(
+                f"{run.folder} was run with {others} {what}: name what it was run with, --{what}"
+            )
