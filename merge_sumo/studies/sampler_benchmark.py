@@ -226,7 +226,8 @@ def _outcomes(
 def _row(outcome: Outcome) -> list[float]:
     """Return [index, level, coordinates...] of a case."""
     case = outcome.case
-    return [outcome.index, case.level, *to_unit([case], case.level, case.scenario)[0].tolist()]
+    point = to_unit([case], case.level, case.scenario)[0].tolist()
+    return [float(outcome.index), float(case.level), *point]
 
 
 def _lost(task: Task) -> Found:
