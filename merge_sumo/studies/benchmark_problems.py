@@ -19,6 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -34,9 +35,8 @@ from merge_sumo.system.records import Record, read_record
 from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.fmc import fmc, growth_bound
+from merge_sumo.values.fmc import fmc, growth_bound, radius_for
 from merge_sumo.values.imperfection import Actuation, Sensing
-from merge_sumo.values.scenario import Scenario
 from merge_sumo.values.score import FAILURE_SCORE
 from merge_sumo.vuts import frozen
 
@@ -422,18 +422,9 @@ def probes_of(truth: Truth) -> ProbeCases:
     fails = truth.score < FAILURE_SCORE
     failing = truth.points[fails]
     passing = truth.points[~fails & ~np.isnan(truth.score)]
-    from scipy.spatial import cKDTree
-
-    from merge_sumo.values.fmc import radius_for
-
     distance, _ = cKDTree(failing).query(passing)
     near = passing[distance <= radius_for(passing.shape[1])]
     # Evenly over all, which are in random order.
     chosen = [points[:: max(1, len(points) // PROBES)][:PROBES] for points in (failing, near)]
     failed = np.repeat([True, False], [len(points) for points in chosen])
     return ProbeCases(np.concatenate(chosen), failed)
-
-
-def scenario_of(problem: Problem) -> Scenario:
-    """Return the scenario of a problem."""
-    return problem.settings().scenario

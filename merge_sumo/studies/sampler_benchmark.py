@@ -583,7 +583,7 @@ def benchmark(
         on_step: told how far it is.
         check: called after every search; may raise to stop there.
     """
-    entered = _entered(samplers, workers)
+    entered = _entered(samplers, settings.limit_s, workers)
     truths, remarks = _checked_truths(settings, on_step)
     tasks = _tasks(entered, settings)
     place = folder / SEARCHES
@@ -605,10 +605,10 @@ def benchmark(
     return replace(result, folder=folder)
 
 
-def _entered(samplers: Sequence[str], workers: Workers) -> list[Entrant]:
+def _entered(samplers: Sequence[str], limit_s: float, workers: Workers) -> list[Entrant]:
     """Return the samplers, each once; `UserError` for one that breaks the contract."""
     specs = list(dict.fromkeys(samplers))
-    entered = dict(workers.run(entrants, specs, lost_entrant, chunk=1))
+    entered = dict(workers.run(partial(entrants, limit_s=limit_s), specs, lost_entrant, chunk=1))
     for one in entered.values():
         if one.fault is not None:
             raise UserError(one.fault)
