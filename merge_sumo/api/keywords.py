@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, TypedDict
+from typing import Any, Final, Literal, TypedDict
 
 from merge_sumo.campaigns.campaign import OnCase
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -97,6 +97,9 @@ class Settings(Setup, total=False):
         v_vut0_mps: initial speed of the VUT; the scenario's by default.
         stop_after_converged: stop when less than this share of new coverage is expected.
         audit: uniform cases among them, which bound what the campaign missed; none by default.
+        repeat: how often each case runs, once by default, with another draw of what is random;
+            "auto" repeats cases where chance decides. Runs count as cases.
+        tolerated: share of its runs in which a case may fail, 0 by default: it fails where more do.
         people: share of published drivers; a failure in which the POV does more than they do is
             shown apart, whatever decides it. 1 by default: the hardest of them.
         learn_from: folders of earlier campaigns to learn the VUT from.
@@ -113,6 +116,8 @@ class Settings(Setup, total=False):
     v_vut0_mps: float | None
     stop_after_converged: float | None
     audit: int | None
+    repeat: int | Literal["auto"]
+    tolerated: float
     people: float
     learn_from: Sequence[Path | str] | None
     against: AnyVut | None

@@ -6,12 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from merge_sumo.analysis.audit import CONFIDENCE, AuditCase, missed_share
 from merge_sumo.analysis.people import ALL_PEOPLE, check_share
 from merge_sumo.campaigns.audit import Audit, AuditedSampler
 from merge_sumo.campaigns.ownership import check_own_code
+from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.stopping import StoppingRule
 from merge_sumo.campaigns.store import SETTINGS, scenario_of
 from merge_sumo.campaigns.transfer import hashes, lessons
@@ -24,11 +25,12 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.system.records import RecordError, check_fields
 from merge_sumo.values.case import Pool
+from merge_sumo.values.chance import check_tolerated
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, OWN, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import kind_of
+from merge_sumo.vuts.registry import is_built_in, kind_of
 
 DEFAULT_CASES: Final = 800
 
@@ -44,6 +46,8 @@ class CampaignSettings:
     batch: int | None = None
     in_flight: int | None = None
     audit: int | None = None
+    repeat: int | Literal["auto"] = 1
+    tolerated: float = 0.0
     seed: int = 0
     v_vut0_mps: float | None = None
     stop_after_converged: float | None = None
@@ -76,8 +80,9 @@ class CampaignSettings:
                 levels = ", ".join(map(level_name, self.scenario.levels))
                 raise UserError(f"the levels are {list(self.levels)}: choose from {levels}")
         self._check_sampler()
-        for name in ("cases", "batch", "in_flight", "audit"):
-            if (number := getattr(self, name)) is not None and number < 1:
+        for name in ("cases", "batch", "in_flight", "audit", "repeat"):
+            number = getattr(self, name)
+            if isinstance(number, int) and number < 1:
                 option = name.replace("_", "-")
                 raise UserError(f"--{option} is {number}: it must be 1 or more")
         if self.batch is not None and self.batch > self.cases:
@@ -97,6 +102,12 @@ class CampaignSettings:
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
         check_share(self.people)
+        check_tolerated(self.tolerated)
+        if isinstance(self.repeat, int) and self.repeat > self.cases:
+            raise UserError(
+                f"--repeat is {self.repeat} and --cases is {self.cases}: runs of a case are among "
+                "the cases of the campaign, and cannot be more"
+            )
         self.stopping_rule()
 
     def _take_speed(self) -> None:
@@ -158,6 +169,8 @@ class CampaignSettings:
             ("--in-flight", self.in_flight),
             ("--audit", self.audit),
             ("--learn-from", self.learn_from or None),
+            ("--repeat", None if self.repeat == 1 else self.repeat),
+            ("--tolerate", self.tolerated or None),
         ):
             if given is not None:
                 raise UserError(
@@ -188,7 +201,11 @@ class CampaignSettings:
             return None
         fresh = partial(make_sampler, self.sampler, self.pool, self.seed)
         rule = StoppingRule(
-            self.stop_after_converged, self.batch or self.in_flight, fresh, self._missed
+            self.stop_after_converged,
+            self.batch or self.in_flight,
+            fresh,
+            self._missed,
+            tolerated=self.tolerated,
         )
         self._check_audit_suffices(self.stop_after_converged)
         return rule
@@ -198,10 +215,23 @@ class CampaignSettings:
         """Which cases are audit cases; None without any."""
         return None if self.audit is None else Audit(self.audit, self.cases, self.pool, self.seed)
 
+    def with_repeats(self, sampler: Sampler) -> Sampler:
+        """Return a sampler that was told nothing, with repeats among its picks."""
+        if self.repeat == "auto" and self.may_vary:
+            known = self.scenario.sense.is_random
+            return RepeatedWhereItMatters(sampler, self.tolerated, known=known)
+        return sampler if self.repeat in (1, "auto") else EachCaseRepeated(sampler, self.repeat)
+
+    @property
+    def may_vary(self) -> bool:
+        """Whether runs of a case may differ: not where the package brings all that drives."""
+        own_pov = OWN in self.levels and self.pov is not None and not is_built_in(self.pov)
+        return own_pov or self.scenario.sense.is_random or not is_built_in(self.vut)
+
     def audited(self, sampler: Sampler) -> Sampler:
-        """Return a sampler that was told nothing, with audit cases among its picks."""
-        audit = self.audit_plan
-        return sampler if audit is None else AuditedSampler(sampler, audit)
+        """Return a sampler that was told nothing, with repeats and audit cases among its picks."""
+        audit, repeating = self.audit_plan, self.with_repeats(sampler)
+        return repeating if audit is None else AuditedSampler(repeating, audit)
 
     @property
     def _missed(self) -> Callable[[Sequence[Outcome]], float] | None:

@@ -17,6 +17,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.values.case import to_unit
+from merge_sumo.values.chance import failing_cases
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import Outcome
 
@@ -50,10 +51,13 @@ class StoppingRule:
         batch: int | None,
         fresh: Callable[[], Sampler],
         missed: Callable[[Sequence[Outcome]], float] | None = None,
+        *,
+        tolerated: float = 0.0,
     ) -> None:
         """Stop below `share`; `fresh` makes a sampler that was told nothing.
 
-        `missed` gives the share that audit cases leave open after outcomes.
+        `missed` gives the share that audit cases leave open after outcomes, and a case fails where
+        more than the `tolerated` share of its runs do.
 
         Raises `UserError` for a share that is no share, or a sampler that expects nothing.
         """
@@ -68,6 +72,7 @@ class StoppingRule:
                 f"batch: choose --sampler {' or '.join(able)}"
             )
         self._share, self._batch, self._fresh, self._missed = share, batch, fresh, missed
+        self._tolerated = tolerated
         self._expected: dict[int, float] = {}
 
     def __call__(self, outcomes: Sequence[Outcome]) -> bool:
@@ -79,7 +84,7 @@ class StoppingRule:
             return False
         expected = (self.expected(outcomes, last - ago) for ago in range(PATIENCE))
         return all(gain < self._share for gain in expected) and (
-            gained(outcomes, last - PATIENCE) < PATIENCE * self._share
+            gained(outcomes, last - PATIENCE, self._tolerated) < PATIENCE * self._share
         )
 
     def expected(self, outcomes: Sequence[Outcome], batch: int) -> float:
@@ -92,16 +97,21 @@ class StoppingRule:
         return self._expected[batch]
 
 
-def gained(outcomes: Sequence[Outcome], batch: int) -> float:
-    """Return the coverage found after a batch as a share of that found up to it."""
-    before = covered_balls([outcome for outcome in outcomes if outcome.batch <= batch])
-    return covered_balls(outcomes) / before - 1.0 if before > 0.0 else math.inf
+def gained(outcomes: Sequence[Outcome], batch: int, tolerated: float = 0.0) -> float:
+    """Return the coverage found after a batch as a share of that found up to it.
+
+    Below 0 where cases that had failed turn out to be tolerated.
+    """
+    earlier = [outcome for outcome in outcomes if outcome.batch <= batch]
+    before = covered_balls(earlier, tolerated)
+    return covered_balls(outcomes, tolerated) / before - 1.0 if before > 0.0 else math.inf
 
 
-def covered_balls(outcomes: Sequence[Outcome]) -> float:
+def covered_balls(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> float:
     """Return the coverage of all levels in balls: areas and volumes do not compare."""
     balls = 0.0
-    for level in {outcome.case.level for outcome in outcomes}:
-        failing = to_unit((o.case for o in outcomes if o.failed and o.case.level == level), level)
+    cases = [one.case for one in failing_cases(outcomes, tolerated)]
+    for level in {case.level for case in cases}:
+        failing = to_unit((case for case in cases if case.level == level), level)
         balls += fmc(failing) / fmc(np.zeros((1, failing.shape[1])))
     return balls

@@ -56,7 +56,16 @@ def _vut_option(help: str, show_default: str) -> Shared:
 
 @app.verb(
     options=(
-        *(*SETTINGS, "stop_after_converged", "audit", *SETUP, "people", "net"),
+        *(
+            *SETTINGS,
+            "stop_after_converged",
+            "audit",
+            "repeat",
+            "tolerate",
+            *SETUP,
+            "people",
+            "net",
+        ),
         *(*RUNNING, "trust_vut"),
     )
 )

@@ -48,10 +48,10 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
             "learn_from",
         ),
         *("param", "cost", "trials", "rounds"),
-        *("draws", "stop_after_converged", "audit"),
+        *("draws", "stop_after_converged", "audit", "repeat"),
     ),
     "Verdict": (
-        *("fail_when", "require", "people", "gate", "tolerance", "rerun", "confidence"),
+        *("fail_when", "require", "tolerate", "people", "gate", "tolerance", "rerun", "confidence"),
         *("certificate",),
     ),
     "Where it runs, and what it writes": (
@@ -70,6 +70,7 @@ KEYWORDS: Final = {
     "limit": "limit_s",
     "vut_memory": "vut_memory_gib",
     "follow_up": "follow_up_s",
+    "tolerate": "tolerated",
     "x": "x_pov0_m",
     "v": "v_pov0_mps",
     "psi": "svo_rad",
@@ -106,6 +107,14 @@ def _checked_tolerance(tolerance: float) -> float:
     if not tolerance >= 0.0:
         raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
     return tolerance
+
+
+def _runs_of_a_case(text: str) -> int | str:
+    if text == "auto":
+        return text
+    if not text.isdecimal():
+        raise UserError(f"--repeat is {text!r}: give the number of runs of a case, or auto")
+    return int(text)
 
 
 CORES: Final = option(
@@ -224,6 +233,20 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Of the cases, so many are uniform, whatever was found: they bound, with confidence, the "
         "share of the pool where the campaign has missed failures.",
         metavar="N",
+    ),
+    "repeat": option(
+        str,
+        "1",
+        "Run each case so often, with another draw of what is random; auto repeats a case where "
+        "chance decides on it. Each run is one of the --cases.",
+        metavar="N|auto",
+        callback=_runs_of_a_case,
+    ),
+    "tolerate": option(
+        float,
+        0.0,
+        "A case fails where more than this share of its runs do.",
+        metavar="SHARE",
     ),
     "dense": option(
         bool | None,

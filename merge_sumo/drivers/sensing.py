@@ -49,8 +49,7 @@ class SensedDriver(DriverWrapper):
         """The last measured positions and speeds, (D, 2, A, K), a ring of rows; NaN if not seen."""
         self._row = 0
         steps = scenario.max_steps + round(scenario.follow_up_s / DT_S) + self._before + 1
-        random = ("noise_x_m", "noise_v_mps", "dropout")
-        self._is_random = any(scenario.sense.at_most(name) > 0.0 for name in random)
+        self._is_random = scenario.sense.is_random
         self._random = np.zeros((steps if self._is_random else 1, 3, cars, corridors))
         self._wait, self._drives_on_s = np.zeros(corridors, dtype=np.int64), np.zeros(corridors)
         """Rows back to what the VUT sees, and for how long cars have driven on since."""

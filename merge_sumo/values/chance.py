@@ -10,7 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
+from operator import itemgetter
 from typing import Final
+
+from scipy.special import betainc
 
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case
@@ -18,6 +22,11 @@ from merge_sumo.values.score import Outcome
 
 CONFIDENCE: Final = 0.95
 """That the interval of a case holds its failure probability."""
+DOUBT: Final = 0.05
+"""A case is decided where it fails in more than the tolerated share of its runs, or does not, with
+at most this posterior probability of the contrary."""
+MOST_RUNS: Final = 20
+"""Runs of a case after which it counts as decided."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +56,10 @@ class RunsOfCase:
         """Share of the runs that fail."""
         return self.failures / self.runs
 
-    @property
-    def worst(self) -> Outcome:
-        """The run with the lowest score: what stands for the case where one run is shown."""
-        return min(self.outcomes, key=lambda outcome: (_score(outcome), outcome.index))
+    def shown(self, tolerated: float = 0.0) -> Outcome:
+        """Return the run that stands for the case, failing where the case does: the worst such."""
+        alike = [o for o in self.outcomes if o.failed is fails_above(self, tolerated)]
+        return min(alike, key=lambda outcome: (_score(outcome), outcome.index))
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
         """Return where the failure probability is with a confidence (Clopper and Pearson, 1934).
@@ -90,6 +99,44 @@ def fails_above(one: RunsOfCase, tolerated: float = 0.0) -> bool:
 def failing_cases(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[RunsOfCase]:
     """Return the cases that fail in more than a tolerated share of their runs, as `by_case`."""
     return [one for one in by_case(outcomes) if fails_above(one, tolerated)]
+
+
+def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Outcome]:
+    """Return of each case the run that stands for it, and outcomes without a verdict as they are.
+
+    Of a failing case it is the worst of its runs; of another one the worst that passes. In the
+    order of the index of the first run. Without repeats, these are the outcomes.
+    """
+    known = list(outcomes)
+    if not any(outcome.case.draw for outcome in known):
+        return known
+    shown = [(one.outcomes[0].index, one.shown(tolerated)) for one in by_case(known)]
+    errors = [(outcome.index, outcome) for outcome in known if outcome.score is None]
+    return [outcome for _, outcome in sorted(shown + errors, key=itemgetter(0))]
+
+
+@cache
+def is_decided(failures: int, runs: int, tolerated: float) -> bool:
+    """Return whether runs show if a case fails in more than a tolerated share of its runs.
+
+    By the posterior of Jeffreys' prior. With none tolerated a failure decides, and nothing else.
+    """
+    if not tolerated:
+        return failures > 0
+    below = float(betainc(failures + 0.5, runs - failures + 0.5, tolerated))
+    return not DOUBT < below < 1.0 - DOUBT
+
+
+@cache
+def runs_needed(failures: int, runs: int, tolerated: float, most: int = MOST_RUNS) -> int:
+    """Return how many further runs of a case decide at least (`is_decided`); 0 from `most` on."""
+    further = 0
+    while runs + further < most:
+        ends = failures, failures + further
+        if any(is_decided(end, runs + further, tolerated) for end in ends):
+            break
+        further += 1
+    return further
 
 
 def check_tolerated(tolerated: float) -> None:

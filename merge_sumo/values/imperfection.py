@@ -129,6 +129,12 @@ class Sensing(Imperfection):
     range_m: Amount | None = None
     occluded_until_m: Amount | None = None
 
+    @property
+    def is_random(self) -> bool:
+        """Whether something of it is drawn at random."""
+        names = ("noise_x_m", "noise_v_mps", "dropout")
+        return any(self.at_most(name) > 0.0 for name in names)
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Actuation(Imperfection):

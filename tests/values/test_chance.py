@@ -79,7 +79,7 @@ def test_runs_are_counted_by_case_in_the_order_of_the_first_run():
     one, two = by_case(told)
     assert (one.case, one.runs, one.failures, one.share) == (CASE, 3, 2, 2 / 3)
     assert [outcome.index for outcome in one.outcomes] == [0, 2, 5]
-    assert one.worst.index == 5
+    assert one.shown().index == 5
     assert (two.case, two.runs, two.failures) == (other, 2, 0)
     assert failing_cases(told) == [one]
     assert failing_cases(told, 0.66) == [one]
@@ -91,7 +91,7 @@ def test_without_repeats_each_outcome_with_a_verdict_is_a_case():
     """Also where a sampler proposes a case twice."""
     told = outcomes([(CASE, 0, FAILS), (CASE, 0, FAILS), (CASE, 0, None), (CASE, 0, PASSES)])
     assert [one.outcomes for one in by_case(told)] == [(told[0],), (told[1],), (told[3],)]
-    assert [one.worst for one in failing_cases(told)] == [o for o in told if o.failed]
+    assert [one.shown() for one in failing_cases(told)] == [o for o in told if o.failed]
 
 
 def test_the_interval_is_that_of_clopper_and_pearson():
